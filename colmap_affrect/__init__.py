@@ -1,0 +1,43 @@
+"""Rectified wide-baseline features for COLMAP.
+
+Photographs in, COLMAP model out: ``colmap_affrect.run(image_path, output_path)``. The
+public names are loaded when first used, so that importing the package stays light.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import zlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+# Using zlib once before pycolmap is imported, by whomever, keeps both working; see
+# colmap_affrect.colmap.
+zlib.decompress(zlib.compress(b"warm"))
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())
+
+_PUBLIC = {
+    "AffrectError": "colmap_affrect.errors",
+    "CameraOptions": "colmap_affrect.options",
+    "ExtractionOptions": "colmap_affrect.options",
+    "LocalFeatures": "colmap_affrect.types",
+    "MappingOptions": "colmap_affrect.options",
+    "MatchingOptions": "colmap_affrect.options",
+    "ReconstructionReport": "colmap_affrect.outcomes",
+    "RunOptions": "colmap_affrect.pipeline",
+    "VerificationOptions": "colmap_affrect.options",
+    "extract_image": "colmap_affrect.extraction",
+    "load_recipe": "colmap_affrect.recipes",
+    "run": "colmap_affrect.pipeline",
+}
+
+__all__ = ["__version__", *sorted(_PUBLIC)]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_PUBLIC[name]), name)

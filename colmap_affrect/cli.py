@@ -1,0 +1,408 @@
+"""Command line: parse, call one library function, print its result."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from colmap_affrect import __version__
+from colmap_affrect.errors import AffrectError
+from colmap_affrect.options import CameraOptions, VerificationOptions
+from colmap_affrect.outcomes import (
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EXIT_NO_MODEL,
+    EXIT_OK,
+    ReconstructionReport,
+)
+from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.workspace import Workspace
+
+if TYPE_CHECKING:
+    from colmap_affrect.pipeline import RunOptions
+    from colmap_affrect.recipes import Recipe
+
+Subparsers = argparse._SubParsersAction  # the type of add_subparsers() has no public name
+
+logger = logging.getLogger("colmap_affrect")
+
+EPILOG = """\
+examples:
+  colmap-affrect run --image-path photos --output-path out
+  colmap-affrect run --image-path photos --output-path out --camera-mode single
+  colmap-affrect run --image-path photos --output-path out --recipe unrectified-rootsift
+  colmap-affrect extract --image-path photos --output-path out
+  colmap-affrect pairs   --output-path out --match-list-path pairs.txt
+  colmap-affrect match   --output-path out
+  colmap-affrect verify  --output-path out
+  colmap-affrect map     --output-path out
+
+Run a command again and it goes on where it stopped. Exit codes: 0 done, 1 failed (one line
+says why; also when images could not be read, see --max-failures), 2 wrong usage, 3 finished
+without a model, 130 interrupted.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code."""
+    options = build_parser().parse_args(arguments)
+    if options.command == "recipes":
+        return _print_recipes()
+    try:
+        with _logging(options):
+            return int(options.function(options))
+    except AffrectError as error:
+        return _fail(str(error))
+    except OSError as error:
+        return _fail(f"{error.filename or 'input/output'}: {error.strerror or error}")
+    except KeyboardInterrupt:
+        print("interrupted; run the same command again to go on", file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+def _fail(message: str) -> int:
+    print(f"error: {message}", file=sys.stderr)
+    return EXIT_FAILED
+
+
+@contextmanager
+def _logging(options: argparse.Namespace) -> Iterator[None]:
+    """Log to the terminal and to ``run.log``, which also takes what C libraries print.
+
+    COLMAP and image decoders write to file descriptor 2: it leads to the log while the
+    command runs, and Python's ``sys.stderr`` to the terminal.
+    """
+    log_path = Workspace(options.output_path).log
+    log_path.parent.mkdir(parents=True, exist_ok=True)
+    python_stderr, terminal_fd = sys.stderr, os.dup(2)
+    terminal = os.fdopen(terminal_fd, "w", buffering=1, encoding="utf-8", errors="replace")
+    with terminal, log_path.open("a", encoding="utf-8", buffering=1) as log:
+        level = logging.DEBUG if options.verbose else logging.WARNING
+        handlers = [logging.StreamHandler(terminal), logging.StreamHandler(log)]
+        handlers[0].setLevel(logging.ERROR if options.quiet else level)
+        handlers[0].setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+        handlers[1].setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        for handler in handlers:
+            logger.addHandler(handler)
+        logger.setLevel(logging.DEBUG)
+        logger.info("colmap-affrect %s: %s", __version__, " ".join(sys.argv[1:]))
+        os.dup2(log.fileno(), 2)
+        sys.stderr = terminal
+        try:
+            yield
+        except Exception:
+            logger.log(logging.DEBUG, "failed", exc_info=True)
+            raise
+        finally:
+            sys.stderr = python_stderr
+            os.dup2(terminal.fileno(), 2)
+            for handler in handlers:
+                logger.removeHandler(handler)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    parser = argparse.ArgumentParser(
+        prog="colmap-affrect",
+        description="Rectified wide-baseline features for COLMAP: photographs in, model out.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"colmap-affrect {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    run = _command(commands, "run", _run, "all stages: photographs in, COLMAP model out")
+    _add_images(run)
+    _add_recipe(run)
+    _add_pair_list(run)
+    _add_seed(run)
+    _add_json(run)
+
+    extract = _command(commands, "extract", _extract, "features into features.h5 and database.db")
+    _add_images(extract)
+    _add_recipe(extract)
+
+    pairs = _command(commands, "pairs", _pairs, "which images to match, into pairs.txt")
+    _add_pair_list(pairs)
+
+    match = _command(commands, "match", _match, "matches into matches.h5 and database.db")
+    _add_recipe(match, default=None)
+
+    verify = _command(commands, "verify", _verify, "two-view geometries into database.db")
+    _add_seed(verify)
+
+    mapping = _command(commands, "map", _map, "COLMAP models into sparse/")
+    _add_seed(mapping)
+    _add_json(mapping)
+
+    recipes = commands.add_parser("recipes", help="list the recipes")
+    recipes.set_defaults(command="recipes")
+    return parser
+
+
+def _command(
+    commands: Subparsers, name: str, function: Callable[[argparse.Namespace], int], summary: str
+) -> argparse.ArgumentParser:
+    command = commands.add_parser(
+        name,
+        help=summary,
+        description=summary,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.set_defaults(function=function)
+    _add_option(
+        command,
+        "--output-path",
+        type=Path,
+        required=True,
+        metavar="PATH",
+        help="folder for all results",
+    )
+    command.add_argument(
+        "--overwrite", action="store_true", help="discard the results of this and later stages"
+    )
+    volume = command.add_mutually_exclusive_group()
+    volume.add_argument("-q", "--quiet", action="store_true", help="errors and the result only")
+    volume.add_argument("-v", "--verbose", action="store_true", help="every image, tracebacks")
+    return command
+
+
+def _add_option(command: argparse.ArgumentParser, flag: str, **settings: Any) -> None:
+    """Add a long option, accepted with underscores too, as COLMAP writes them."""
+    underscored = "--" + flag.removeprefix("--").replace("-", "_")
+    flags = [flag, underscored] if underscored != flag else [flag]
+    command.add_argument(*flags, **settings)
+
+
+def _add_images(command: argparse.ArgumentParser) -> None:
+    _add_option(
+        command,
+        "--image-path",
+        type=Path,
+        required=True,
+        metavar="PATH",
+        help="folder of the photographs, searched with its sub-folders",
+    )
+    _add_option(
+        command,
+        "--image-list-path",
+        type=Path,
+        metavar="FILE",
+        help="names of the images to use, one per line, relative to --image-path",
+    )
+    _add_option(
+        command,
+        "--camera-mode",
+        default="auto",
+        choices=["auto", "single", "per-folder", "per-image"],
+        help="which images share a camera (default: auto, by EXIF)",
+    )
+    _add_option(
+        command,
+        "--camera-model",
+        default="SIMPLE_RADIAL",
+        metavar="MODEL",
+        help="COLMAP camera model (default: SIMPLE_RADIAL)",
+    )
+    _add_option(
+        command,
+        "--camera-params",
+        default="",
+        metavar="A,B,...",
+        help="known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792.0,524.5",
+    )
+    _add_option(
+        command,
+        "--max-failures",
+        type=int,
+        default=0,
+        metavar="N",
+        help="exit code 1 if more images than this cannot be read (default: 0)",
+    )
+
+
+def _add_recipe(command: argparse.ArgumentParser, default: str | None = "default") -> None:
+    shown = default or "that of extract"
+    _add_option(
+        command,
+        "--recipe",
+        default=default,
+        metavar="NAME",
+        help=f"one that 'recipes' lists, or the path of a TOML file (default: {shown})",
+    )
+    _add_option(
+        command,
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.OPTION=VALUE",
+        help="change one option of the recipe, e.g. --set rectifier.tilt_radius=1.8",
+    )
+
+
+def _add_pair_list(command: argparse.ArgumentParser) -> None:
+    _add_option(
+        command,
+        "--match-list-path",
+        type=Path,
+        metavar="FILE",
+        help="pairs to match, two names per line (default: all pairs)",
+    )
+
+
+def _add_seed(command: argparse.ArgumentParser) -> None:
+    _add_option(
+        command,
+        "--random-seed",
+        type=int,
+        default=0,
+        metavar="N",
+        help="seed of verification and mapping (default: 0)",
+    )
+
+
+def _add_json(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--json", action="store_true", help="print report.json, no summary")
+
+
+def _run(options: argparse.Namespace) -> int:
+    from colmap_affrect.pipeline import run
+
+    report = run(
+        options.image_path,
+        options.output_path,
+        _run_options(options),
+        overwrite=options.overwrite,
+        progress=_progress(options),
+    )
+    return _print_reconstruction(report, options)
+
+
+def _run_options(options: argparse.Namespace) -> RunOptions:
+    from colmap_affrect.pipeline import RunOptions
+
+    return RunOptions(
+        recipe=_recipe(options, options.recipe),
+        cameras=_cameras(options),
+        match_list_path=options.match_list_path,
+        image_list_path=options.image_list_path,
+        random_seed=options.random_seed,
+    )
+
+
+def _recipe(options: argparse.Namespace, name: str) -> Recipe:
+    from colmap_affrect.recipes import load_recipe
+
+    return load_recipe(name, options.set)
+
+
+def _cameras(options: argparse.Namespace) -> CameraOptions:
+    return CameraOptions(
+        mode=options.camera_mode, model=options.camera_model, params=options.camera_params
+    )
+
+
+def _extract(options: argparse.Namespace) -> int:
+    from colmap_affrect import stages
+
+    with Workspace(options.output_path).locked() as workspace:
+        report = stages.extract(
+            workspace,
+            options.image_path,
+            _recipe(options, options.recipe),
+            _cameras(options),
+            image_list_path=options.image_list_path,
+            overwrite=options.overwrite,
+            progress=_progress(options),
+        )
+    print(report.summary())
+    return _exit_code(report.failures, options)
+
+
+def _pairs(options: argparse.Namespace) -> int:
+    from colmap_affrect import stages
+
+    with Workspace(options.output_path).locked() as workspace:
+        report = stages.choose_pairs(
+            workspace, match_list_path=options.match_list_path, overwrite=options.overwrite
+        )
+    print(report.summary())
+    return EXIT_OK
+
+
+def _match(options: argparse.Namespace) -> int:
+    from colmap_affrect import stages
+
+    with Workspace(options.output_path).locked() as workspace:
+        recipe = _recipe(options, options.recipe or workspace.recipe())
+        report = stages.match(
+            workspace, recipe.matching, overwrite=options.overwrite, progress=_progress(options)
+        )
+    print(report.summary())
+    return EXIT_OK
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from colmap_affrect import stages
+
+    with Workspace(options.output_path).locked() as workspace:
+        report = stages.verify_matches(
+            workspace,
+            VerificationOptions(),
+            options.random_seed,
+            overwrite=options.overwrite,
+            progress=_progress(options),
+        )
+    print(report.summary())
+    return EXIT_OK
+
+
+def _map(options: argparse.Namespace) -> int:
+    from colmap_affrect.options import MappingOptions
+    from colmap_affrect.pipeline import map_and_report
+
+    with Workspace(options.output_path).locked() as workspace:
+        report = map_and_report(
+            workspace,
+            MappingOptions(),
+            options.random_seed,
+            overwrite=options.overwrite,
+            progress=_progress(options),
+        )
+    return _print_reconstruction(report, options)
+
+
+def _progress(options: argparse.Namespace) -> Progress:
+    return SILENT if options.quiet else Progress(sys.stderr)
+
+
+def _print_reconstruction(report: ReconstructionReport, options: argparse.Namespace) -> int:
+    print(report.to_json() if options.json else report.summary())
+    if not report.models:
+        why = "one image cannot make a model" if report.images_total == 1 else "no model was found"
+        print(f"error: {why}; see {options.output_path / 'report.json'}", file=sys.stderr)
+        return EXIT_NO_MODEL
+    return _exit_code(report.failures, options)
+
+
+def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
+    if len(failures) <= getattr(options, "max_failures", 0):
+        return EXIT_OK
+    names = ", ".join(failures)
+    print(f"error: could not read {len(failures)} of the images: {names}", file=sys.stderr)
+    return EXIT_FAILED
+
+
+def _print_recipes() -> int:
+    from colmap_affrect.recipes import load_recipe, recipe_names
+
+    for name in recipe_names():
+        print(f"{name:22s} {load_recipe(name).summary}")
+    return EXIT_OK

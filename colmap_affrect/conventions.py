@@ -1,0 +1,91 @@
+"""Coordinate conventions, and the only place where half pixels appear.
+
+1. Pixel-centre coordinates everywhere in this package: (0, 0) is the *centre* of the
+   top-left pixel, x right, y down; point arrays are (N, 2) in (x, y); an image of
+   width w and height h covers [-0.5, w - 0.5] x [-0.5, h - 0.5].
+2. COLMAP puts (0, 0) at the top-left *corner* of that pixel: ``colmap = pixel + 0.5``.
+3. Resizing by s maps ``p' = (p + 0.5) s - 0.5``; affine shapes scale by rows.
+4. Arrays are indexed [row, column] = [y, x]; sizes are given as (width, height).
+5. A rectifying map is A = lambda R(psi) diag(t, 1) R(phi), lambda > 0, t >= 1,
+   phi in [0, pi), R(a) = [[cos a, -sin a], [sin a, cos a]] acting on (x, y), y down.
+   The tilt class (t, phi) of a frame L is that of L^-1, the map that rectifies it.
+6. A local affine frame maps the unit circle to the measurement ellipse, whose radius
+   is ``MEASUREMENT_SIGMAS`` times the Gaussian scale sigma of the feature (as in kornia
+   and hloc). COLMAP's affine shape maps the unit circle to one sigma.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+HALF_PIXEL = 0.5
+
+MEASUREMENT_SIGMAS = 6.0
+"""Radius of the measurement ellipse of a local affine frame in units of sigma."""
+
+
+def colmap_from_pixel(points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Move (..., 2) points from pixel-centre to COLMAP's corner origin.
+
+    >>> colmap_from_pixel(np.array([[0.0, 2.0]]))
+    array([[0.5, 2.5]])
+    """
+    return points + points.dtype.type(HALF_PIXEL)
+
+
+def pixel_from_colmap(points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Move (..., 2) points from COLMAP's corner origin to pixel-centre.
+
+    >>> pixel_from_colmap(np.array([[0.5, 2.5]]))
+    array([[0., 2.]])
+    """
+    return points - points.dtype.type(HALF_PIXEL)
+
+
+def resized_from_original(
+    original_size: tuple[int, int], resized_size: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Map pixel-centre coordinates of an image to those of its resized version.
+
+    Args:
+        original_size: (width, height) in px.
+        resized_size: (width, height) in px.
+
+    Returns:
+        (3, 3) float64 affine map ``resized_from_original``.
+
+    >>> resized_from_original((4, 6), (8, 3)) @ np.array([0.0, 1.0, 1.0])
+    array([0.5 , 0.25, 1.  ])
+    """
+    scale = np.asarray(resized_size, dtype=np.float64) / np.asarray(original_size)
+    matrix = np.diag([scale[0], scale[1], 1.0])
+    matrix[:2, 2] = HALF_PIXEL * (scale - 1.0)
+    return matrix
+
+
+def grid_origin(step_px: int) -> float:
+    """Centre of the first cell of a grid of ``step_px`` wide cells, pixel-centre px.
+
+    >>> grid_origin(4)
+    1.5
+    """
+    return HALF_PIXEL * (step_px - 1)
+
+
+def is_inside(
+    points: NDArray[np.floating], size: tuple[int, int], margin_px: NDArray[np.floating] | float = 0
+) -> NDArray[np.bool_]:
+    """Tell which (N, 2) points lie in an image of (width, height), ``margin_px`` from its edge.
+
+    Args:
+        points: (N, 2) pixel-centre px.
+        size: (width, height) of the image in px.
+        margin_px: scalar, or (N, 2) distance in x and y that each point must keep.
+
+    Returns:
+        (N,) bool.
+    """
+    low = points >= -HALF_PIXEL + margin_px
+    high = points <= np.asarray(size) - HALF_PIXEL - margin_px
+    return np.asarray((low & high).all(axis=1))

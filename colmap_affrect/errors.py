@@ -1,0 +1,35 @@
+"""Errors that a user can act on: one line that says what, where, and what to do."""
+
+from __future__ import annotations
+
+
+class AffrectError(Exception):
+    """Base of all errors that the command line prints as one line (exit code 1)."""
+
+
+class OptionError(AffrectError):
+    """An option is unknown, has a value out of range, or contradicts another one."""
+
+
+class ImageError(AffrectError):
+    """An image cannot be read or used."""
+
+
+class PairListError(AffrectError):
+    """A pair list is unreadable or names images that are not there."""
+
+
+class StoreError(AffrectError):
+    """A file of features or matches is foreign, incomplete, or of another format version."""
+
+
+class StaleStoreError(StoreError):
+    """Results of other options or inputs are in the way of the ones asked for."""
+
+
+class DatabaseError(AffrectError):
+    """A COLMAP database cannot be used as asked."""
+
+
+class WorkspaceError(AffrectError):
+    """The output folder cannot be used: not writable, or in use by another run."""

@@ -1,0 +1,1 @@
+"""Detection, description and affine shapes."""

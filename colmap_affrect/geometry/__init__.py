@@ -1,0 +1,1 @@
+"""Pure geometry on numpy arrays: affine maps, the space of tilts, canvases of warps."""

@@ -1,0 +1,87 @@
+"""Affine maps, their decomposition into tilt coordinates, and local affine frames."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
+
+
+def rotation(angle_rad: ArrayLike) -> NDArray[np.float64]:
+    """Return R(a) = [[cos a, -sin a], [sin a, cos a]] of shape (..., 2, 2)."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+
+
+def compose_affine(
+    scale: ArrayLike, psi_rad: ArrayLike, tilt: ArrayLike, phi_rad: ArrayLike
+) -> NDArray[np.float64]:
+    """Return A = scale R(psi) diag(tilt, 1) R(phi) of shape (..., 2, 2)."""
+    tilt = np.asarray(tilt, dtype=np.float64)
+    stretch = np.stack([tilt, np.ones_like(tilt)], -1)[..., :, None]
+    matrix = rotation(psi_rad) @ (stretch * rotation(phi_rad))
+    return np.asarray(np.asarray(scale, dtype=np.float64)[..., None, None] * matrix)
+
+
+def decompose_affine(
+    matrices: NDArray[np.floating],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Invert :func:`compose_affine` for (..., 2, 2) matrices of positive determinant.
+
+    Returns:
+        scale > 0, psi in (-pi, pi], tilt >= 1, phi in [0, pi); angles in radians. At
+        tilt 1 only psi + phi has a meaning.
+    """
+    matrices = np.asarray(matrices, dtype=np.float64)
+    tilt, phi = tilts_from_metrics(unit_metrics(matrices))
+    scale = np.sqrt(np.linalg.det(matrices) / tilt)
+    unrotated = matrices @ rotation(-phi)
+    psi = np.arctan2(-unrotated[..., 0, 1], unrotated[..., 1, 1])
+    return scale, psi, tilt, phi
+
+
+def project(homography: NDArray[np.floating], points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Map (N, 2) points by a (3, 3) homography or affine map."""
+    mapped = points @ homography[:, :2].T + homography[:, 2]
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
+
+
+def transform_frames(
+    homography: NDArray[np.floating], lafs: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Carry local affine frames through a map: centres exactly, shapes by its Jacobian.
+
+    Args:
+        homography: (3, 3), target_from_source, finite and non-zero third coordinate at
+            every centre. An affine map is the special case with last row (0, 0, 1).
+        lafs: (N, 2, 3) frames in source px.
+
+    Returns:
+        (N, 2, 3) float64 frames in target px. For an affine map M with linear part B
+        the shapes become B A (the map stands on the left).
+    """
+    centers = lafs[:, :, 2]
+    mapped = centers @ homography[:, :2].T + homography[:, 2]
+    target = mapped[:, :2] / mapped[:, 2:]
+    jacobians = homography[None, :2, :2] - target[:, :, None] * homography[None, 2:, :2]
+    jacobians = jacobians / mapped[:, 2, None, None]
+    return np.concatenate([jacobians @ lafs[:, :, :2], target[:, :, None]], axis=2)
+
+
+def lafs_from_keypoints(
+    points: NDArray[np.floating], radii_px: NDArray[np.floating], angles_rad: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Build frames r R(a) from centres (N, 2), radii (N,) and orientations (N,).
+
+    Convention:
+        The first column of the shape points along the orientation; angles run from x
+        towards y (clockwise on the screen), as OpenCV's ``KeyPoint.angle`` does.
+    """
+    shapes = radii_px[:, None, None] * rotation(angles_rad)
+    return np.concatenate([shapes, points[:, :, None]], axis=2)
+
+
+def ellipse_extents(shapes: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Half width and height (N, 2) of the ellipses that (N, 2, 2) shapes make of a unit circle."""
+    return np.asarray(np.linalg.norm(shapes, axis=2))

@@ -1,0 +1,40 @@
+"""Canvases of rectifying warps: where the warped region lies and how large it is."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.geometry.affine import project, rotation
+
+
+def rectifying_affine(tilt: float, angle_rad: float) -> NDArray[np.float64]:
+    """Return the (2, 2) area-preserving map diag(sqrt t, 1/sqrt t) R(phi) of the class (t, phi)."""
+    stretch = np.array([[sqrt(tilt)], [1.0 / sqrt(tilt)]])
+    return np.asarray(stretch * rotation(angle_rad))
+
+
+def fit_canvas(
+    linear: NDArray[np.floating], points: NDArray[np.floating], margin_px: float
+) -> tuple[NDArray[np.float64], tuple[int, int]]:
+    """Translate a linear map so that mapped points fill a canvas from its first pixel on.
+
+    Args:
+        linear: (2, 2) linear part of rectified_from_image.
+        points: (N, 2) points of the region in image px, N >= 1.
+        margin_px: free space to keep round the mapped points, in canvas px.
+
+    Returns:
+        (3, 3) rectified_from_image and the canvas (width, height): the smallest integer
+        size such that every mapped point, margin included, is within the pixel centres.
+    """
+    mapped = points @ linear.T
+    low = mapped.min(axis=0) - margin_px
+    matrix = np.eye(3)
+    matrix[:2, :2] = linear
+    matrix[:2, 2] = -low
+    extent = project(matrix, points).max(axis=0) + margin_px
+    width, height = np.ceil(extent - 1e-9).astype(int) + 1
+    return matrix, (int(width), int(height))

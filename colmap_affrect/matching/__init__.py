@@ -1,0 +1,1 @@
+"""Which images to match, and matching."""

@@ -1,0 +1,130 @@
+"""What stages and runs report: frozen, printable, JSON out."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from typing import Any
+
+EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """One stage of a run.
+
+    Attributes:
+        name: extract, pairs, match, verify or map.
+        wall_s: seconds.
+        num_done: images or pairs worked on now.
+        num_kept: images or pairs found done already.
+        failures: image name to reason.
+    """
+
+    name: str
+    wall_s: float
+    num_done: int
+    num_kept: int = 0
+    failures: dict[str, str] = dataclasses.field(default_factory=dict)
+
+    def summary(self) -> str:
+        """Return one line."""
+        kept = f", {self.num_kept} already there" if self.num_kept else ""
+        failed = f", {len(self.failures)} failed" if self.failures else ""
+        return f"{self.name}: {self.num_done} done{kept}{failed} in {self.wall_s:.1f} s"
+
+
+@dataclass(frozen=True)
+class ModelSummary:
+    """One COLMAP model; the error is the mean over observations in px."""
+
+    registered_names: tuple[str, ...]
+    num_points3D: int
+    mean_track_length: float
+    mean_reprojection_error_px: float
+
+
+@dataclass(frozen=True)
+class ReconstructionReport:
+    """A whole run; numbers of points and tracks are those of the largest model.
+
+    Attributes:
+        status: ``ok`` (all images in one model), ``partial``, or ``no_model``.
+        unregistered: image name to reason: unreadable, no features, no verified pair, or
+            not registered.
+        models: all models, largest first, as written to sparse/0, sparse/1, ...
+    """
+
+    images_total: int
+    unregistered: dict[str, str]
+    models: tuple[ModelSummary, ...]
+    num_verified_pairs: int
+    num_pairs: int
+    stages: tuple[StageReport, ...]
+    recipe: str
+    random_seed: int
+    versions: dict[str, str]
+
+    @property
+    def status(self) -> str:
+        """See the class docstring."""
+        if not self.models:
+            return "no_model"
+        return "partial" if self.unregistered else "ok"
+
+    @property
+    def registered_names(self) -> tuple[str, ...]:
+        """Names of the images in the largest model."""
+        return self.models[0].registered_names if self.models else ()
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Images that could not be read, with the reason."""
+        return {name: why for stage in self.stages for name, why in stage.failures.items()}
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the content of ``report.json``."""
+        largest = self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
+        return {
+            "status": self.status,
+            "images_total": self.images_total,
+            "images_registered": len(largest.registered_names),
+            "registered_names": list(largest.registered_names),
+            "unregistered": self.unregistered,
+            "num_models": len(self.models),
+            "points3D": largest.num_points3D,
+            "mean_track_length": largest.mean_track_length,
+            "mean_reprojection_error_px": largest.mean_reprojection_error_px,
+            "models": [list(model.registered_names) for model in self.models],
+            "num_pairs": self.num_pairs,
+            "num_verified_pairs": self.num_verified_pairs,
+            "stages": [dataclasses.asdict(stage) for stage in self.stages],
+            "recipe": self.recipe,
+            "random_seed": self.random_seed,
+            "versions": self.versions,
+        }
+
+    def to_json(self) -> str:
+        """Return ``report.json`` as text."""
+        return json.dumps(self.to_mapping(), indent=2, ensure_ascii=False) + "\n"
+
+    def summary(self) -> str:
+        """Return one screen of text."""
+        registered = len(self.registered_names)
+        lines = [f"registered  {registered} of {self.images_total} images"]
+        lines += [f"            not {name}: {why}" for name, why in self.unregistered.items()]
+        lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
+        if self.models:
+            model = self.models[0]
+            lines += [
+                f"points      {model.num_points3D}",
+                f"track       {model.mean_track_length:.2f} images on average",
+                f"error       {model.mean_reprojection_error_px:.2f} px on average",
+            ]
+        if len(self.models) > 1:
+            sizes = ", ".join(str(len(model.registered_names)) for model in self.models)
+            lines += [f"models      {len(self.models)}, of {sizes} images"]
+        seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
+        lines += [f"seconds     {seconds}"]
+        return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Deciding what to warp: an image in, a rectification plan out."""

@@ -1,0 +1,68 @@
+"""Rectifier ``dense-shapes``: cover the shapes of all blocks, then give each to its nearest centre.
+
+The paper's DenseAffNet (Sec. 3) with an exchangeable shape source.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
+from colmap_affrect.geometry.tilts import cover_shapes
+from colmap_affrect.options import DenseShapesOptions
+from colmap_affrect.types import Mask, Rectification, RectificationPlan, ShapeGrid
+
+
+def plan_dense_shapes(
+    grid: ShapeGrid, image_size: tuple[int, int], options: DenseShapesOptions
+) -> RectificationPlan:
+    """Turn a grid of shapes into disjoint regions with one affine warp each.
+
+    Args:
+        grid: shapes of the rectifying maps; blocks that are not textured count as identity.
+        image_size: (width, height) in px.
+        options: radius of the balls, largest tilt, share to cover, smallest region.
+    """
+    metrics = grid.metrics.reshape(-1, 3)
+    textured = grid.textured.ravel()
+    cover = cover_shapes(
+        metrics,
+        textured.astype(np.float64),
+        radius=options.tilt_radius,
+        max_tilt=options.max_tilt,
+        covered_frac=options.covered_frac,
+        max_num_centers=options.max_num_rectifications,
+    )
+    labels = cover.labels.reshape(grid.textured.shape)
+    min_blocks = options.min_region_frac * labels.size
+    items = []
+    for label, (tilt, angle) in enumerate(cover.centers):
+        blocks = (labels == label) & grid.textured
+        if np.count_nonzero(blocks) > min_blocks:
+            items.append(_rectification(blocks, grid, image_size, float(tilt), float(angle)))
+    return RectificationPlan(image_size, tuple(items))
+
+
+def _rectification(
+    blocks: Mask, grid: ShapeGrid, image_size: tuple[int, int], tilt: float, angle_rad: float
+) -> Rectification:
+    width, height = image_size
+    region = np.repeat(np.repeat(blocks, grid.step_px, axis=0), grid.step_px, axis=1)
+    region = region[:height, :width]
+    matrix, canvas_size = fit_canvas(
+        rectifying_affine(tilt, angle_rad), _outline(region), margin_px=MARGIN_PX
+    )
+    return Rectification(matrix, canvas_size, region, tilt, angle_rad)
+
+
+MARGIN_PX = 16.0
+"""Surroundings of a region that its descriptors may see, in warp px."""
+
+
+def _outline(region: Mask) -> NDArray[np.float64]:
+    """Return (N, 2) pixel centres whose convex hull is that of the region."""
+    rows = np.flatnonzero(region.any(axis=1))
+    first = region[rows].argmax(axis=1)
+    last = region.shape[1] - 1 - region[rows, ::-1].argmax(axis=1)
+    return np.stack([np.concatenate([first, last]), np.concatenate([rows, rows])], 1).astype(float)

@@ -1,0 +1,336 @@
+"""The five stages; each skips what is done and leaves its results in the workspace."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap.mapping import map_incrementally, read_models
+from colmap_affrect.colmap.verification import verified_pairs, verify
+from colmap_affrect.errors import ImageError, StoreError
+from colmap_affrect.executor import available_cores, map_ordered
+from colmap_affrect.extraction import extract_file
+from colmap_affrect.imaging import IMAGE_SUFFIXES
+from colmap_affrect.matching.nearest import MatchableImage, match_features, matchable
+from colmap_affrect.matching.pairs import Pair, exhaustive_pairs, read_pairs, write_pairs
+from colmap_affrect.options import (
+    CameraOptions,
+    MappingOptions,
+    MatchingOptions,
+    VerificationOptions,
+)
+from colmap_affrect.outcomes import ModelSummary, StageReport
+from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.recipes import Recipe
+from colmap_affrect.store import FeatureStore, MatchStore, PairMatches, pair_key
+from colmap_affrect.workspace import Workspace
+
+logger = logging.getLogger(__name__)
+
+PAIRS_PER_WRITE = 64
+INPUTS = "inputs.sha256"
+"""File in sparse/ that names the verified pairs the models were made from."""
+MATCHING_CACHE_BYTES = 1 << 30
+
+
+def list_images(image_path: Path, image_list_path: Path | None = None) -> list[str]:
+    """Return the sorted names, relative to ``image_path``, of all images or of those listed.
+
+    Folders are searched through; hidden ones and files of other formats are passed over.
+
+    Raises:
+        ImageError: when there are none, or a listed one is missing.
+    """
+    if not image_path.is_dir():
+        raise ImageError(f"{image_path}: no such folder; give the folder of the photographs")
+    if image_list_path is not None:
+        return _listed_images(image_path, image_list_path)
+    paths = (path.relative_to(image_path) for path in image_path.rglob("*"))
+    names = sorted(
+        path.as_posix()
+        for path in paths
+        if path.suffix.lower() in IMAGE_SUFFIXES and not any(p.startswith(".") for p in path.parts)
+    )
+    if not names:
+        raise ImageError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)})")
+    return names
+
+
+def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
+    try:
+        lines = image_list_path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ImageError(f"{image_list_path}: cannot be read ({error})") from error
+    names = sorted({line.strip() for line in lines if line.strip() and not line.startswith("#")})
+    missing = [name for name in names if not (image_path / name).is_file()]
+    if missing or not names:
+        what = f"lists {missing[0]}, which is not in {image_path}" if missing else "is empty"
+        raise ImageError(f"{image_list_path}: {what}")
+    return names
+
+
+def extract(
+    workspace: Workspace,
+    image_path: Path,
+    recipe: Recipe,
+    cameras: CameraOptions,
+    *,
+    image_list_path: Path | None = None,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> StageReport:
+    """Extract features of all images and put cameras, images and keypoints into the database.
+
+    An image that cannot be read is reported and passed over.
+    """
+    start = time.perf_counter()
+    names = list_images(image_path, image_list_path)
+    _refuse_colliding_keys(names)
+    colmap_database.check_cameras(cameras)
+    options = {
+        "image_path": str(image_path.resolve()),
+        "image_list_path": str(image_list_path.resolve()) if image_list_path else "",
+        "camera": cameras.to_mapping(),
+        **recipe.extraction.to_mapping(),
+    }
+    workspace.claim("extract", options, overwrite=overwrite, recipe=recipe.name)
+    store = FeatureStore(workspace.features)
+    done = store.complete(names)
+    missing = [name for name in names if name not in done]
+    failures = {}
+    with progress.stage("extract", len(missing), "images") as advance:
+        for name in missing:
+            try:
+                features, size = extract_file(image_path / name, recipe.extraction)
+            except ImageError as error:
+                logger.warning("%s", error)
+                failures[name] = str(error)
+            else:
+                logger.debug("%s: %d features", name, len(features))
+                if not len(features):
+                    logger.warning("%s: no features (blank or too small?)", name)
+                store.write(name, features, size)
+            advance(1)
+    if len(failures) == len(names):
+        raise ImageError(f"{image_path}: none of the {len(names)} images can be read")
+    failures |= _write_images_and_keypoints(workspace, store)
+    seconds = time.perf_counter() - start
+    return StageReport("extract", seconds, len(missing) - len(failures), len(done), failures)
+
+
+def _refuse_colliding_keys(names: Sequence[str]) -> None:
+    """Hloc's pair keys turn '/' into '-': two names must not become the same."""
+    seen: dict[str, str] = {}
+    for name in names:
+        other = seen.setdefault(pair_key(name, ""), name)
+        if other != name:
+            raise StoreError(
+                f"{other} and {name} have the same key in hloc's match files, where '/' becomes "
+                "'-'; rename one of them"
+            )
+
+
+def _write_images_and_keypoints(workspace: Workspace, store: FeatureStore) -> dict[str, str]:
+    """Bring the database up to date; return the images that COLMAP does not take, with reasons."""
+    record = workspace.require("extract")
+    cameras = CameraOptions.from_mapping(record["camera"], str(workspace.config))
+    names = store.names()
+    rejected = colmap_database.import_images(
+        workspace.database, Path(record["image_path"]), names, cameras
+    )
+    ids = colmap_database.image_ids(workspace.database)
+    with colmap_database.open_database(workspace.database) as database:
+        for name in names:
+            if name in ids:
+                colmap_database.write_keypoints(database, ids[name], store.read_frames(name))
+    return dict.fromkeys(rejected, f"COLMAP does not take it (camera mode {cameras.mode})")
+
+
+def choose_pairs(
+    workspace: Workspace, *, match_list_path: Path | None = None, overwrite: bool = False
+) -> StageReport:
+    """Write the list of the pairs to match: every pair of images, or those of a list."""
+    start = time.perf_counter()
+    workspace.require("extract")
+    names = FeatureStore(workspace.features).names()
+    pairs = read_pairs(match_list_path, names) if match_list_path else exhaustive_pairs(names)
+    listed = str(match_list_path.resolve()) if match_list_path else ""
+    workspace.claim("pairs", {"match_list_path": listed}, overwrite=overwrite)
+    write_pairs(workspace.pairs, pairs)
+    return StageReport("pairs", time.perf_counter() - start, len(pairs))
+
+
+def match(
+    workspace: Workspace,
+    options: MatchingOptions,
+    *,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> StageReport:
+    """Match the listed pairs and put the raw matches into the database."""
+    start = time.perf_counter()
+    pairs = _listed_pairs(workspace)
+    workspace.claim("match", options.to_mapping(), overwrite=overwrite)
+    features, matches = FeatureStore(workspace.features), MatchStore(workspace.matches)
+    done = matches.complete(pair_key(*pair) for pair in pairs)
+    missing = [pair for pair in pairs if pair_key(*pair) not in done]
+    cache = _MatchableCache(features, options)
+
+    def match_pair(pair: Pair) -> PairMatches:
+        first, second = cache[pair[0]], cache[pair[1]]
+        found = match_features(first, second, options)
+        return PairMatches(pair, found.indices, 1.0 - found.ratios, len(first.keypoints))
+
+    with progress.stage("match", len(missing), "pairs") as advance:
+        batch: list[PairMatches] = []
+        try:
+            for found in map_ordered(match_pair, missing, available_cores()):
+                batch.append(found)
+                advance(1)
+                if len(batch) == PAIRS_PER_WRITE:
+                    matches.write(batch)
+                    batch = []
+        finally:
+            if batch:
+                matches.write(batch)
+    _write_matches(workspace, pairs, features, matches)
+    return StageReport("match", time.perf_counter() - start, len(missing), len(done))
+
+
+class _MatchableCache:
+    """Images ready for matching, the least recently used dropped over a memory budget."""
+
+    def __init__(self, store: FeatureStore, options: MatchingOptions) -> None:
+        self._store, self._options = store, options
+        self._images: OrderedDict[str, MatchableImage] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __getitem__(self, name: str) -> MatchableImage:
+        with self._lock:
+            if name not in self._images:
+                features = self._store.read(name)
+                self._images[name] = matchable(
+                    features.descriptors, features.keypoints, self._options
+                )
+            self._images.move_to_end(name)
+            while sum(i.descriptors.nbytes for i in self._images.values()) > MATCHING_CACHE_BYTES:
+                self._images.popitem(last=False)
+            return self._images[name]
+
+
+def _listed_pairs(workspace: Workspace) -> list[Pair]:
+    workspace.require("pairs")
+    names = FeatureStore(workspace.features).names()
+    return read_pairs(workspace.pairs, names) if len(names) > 1 else []
+
+
+def _write_matches(
+    workspace: Workspace, pairs: Sequence[Pair], features: FeatureStore, matches: MatchStore
+) -> None:
+    _write_images_and_keypoints(workspace, features)
+    ids = colmap_database.image_ids(workspace.database)
+    pairs = [pair for pair in pairs if pair[0] in ids and pair[1] in ids]
+    with colmap_database.open_database(workspace.database) as database:
+        for (name1, name2), indices in zip(pairs, _indices(matches, pairs), strict=True):
+            colmap_database.write_matches(database, ids[name1], ids[name2], indices)
+
+
+def _indices(matches: MatchStore, pairs: Sequence[Pair]) -> Iterable[NDArray[np.int64]]:
+    return matches.read_indices(pairs) if pairs else []
+
+
+def verify_matches(
+    workspace: Workspace,
+    options: VerificationOptions,
+    random_seed: int,
+    *,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> StageReport:
+    """Estimate the two-view geometries of all matched pairs."""
+    start = time.perf_counter()
+    workspace.require("match")
+    pairs = _listed_pairs(workspace)
+    recorded = {**options.to_mapping(), "random_seed": random_seed}
+    workspace.claim("verify", recorded, overwrite=overwrite)
+    features, matches = FeatureStore(workspace.features), MatchStore(workspace.matches)
+    _write_matches(workspace, pairs, features, matches)
+    done = colmap_database.num_two_view_geometries(workspace.database)
+    with progress.stage("verify", len(pairs), "pairs") as advance:
+        verify(workspace.database, options, random_seed)
+        advance(len(pairs))
+    return StageReport("verify", time.perf_counter() - start, len(pairs) - done, done)
+
+
+def map_images(
+    workspace: Workspace,
+    options: MappingOptions,
+    random_seed: int,
+    *,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> tuple[StageReport, list[ModelSummary]]:
+    """Reconstruct; the models are mapped anew only when the verified pairs have changed."""
+    start = time.perf_counter()
+    workspace.require("verify")
+    extracted = workspace.require("extract")
+    recorded = {**options.to_mapping(), "random_seed": random_seed}
+    workspace.claim("map", recorded, overwrite=overwrite)
+    inputs = colmap_database.geometry_digest(workspace.database)
+    if (workspace.sparse / INPUTS).exists() and (workspace.sparse / INPUTS).read_text() == inputs:
+        models = read_models(workspace.sparse)
+        return StageReport("map", time.perf_counter() - start, 0, len(models)), models
+    num_images = len(colmap_database.image_ids(workspace.database))
+    with progress.stage("map", num_images, "images") as advance:
+        models = map_incrementally(
+            workspace.database,
+            Path(extracted["image_path"]),
+            workspace.sparse,
+            options,
+            random_seed,
+            intrinsics_given=bool(extracted["camera"]["params"]),
+            next_image=advance,
+        )
+    (workspace.sparse / INPUTS).write_text(inputs)
+    return StageReport("map", time.perf_counter() - start, len(models)), models
+
+
+def num_listed_pairs(workspace: Workspace) -> int:
+    """Return the number of pairs that were to be matched."""
+    return len(_listed_pairs(workspace))
+
+
+def num_verified_pairs(workspace: Workspace, min_num_inliers: int) -> int:
+    """Return the number of pairs with a two-view geometry."""
+    return len(verified_pairs(workspace.database, min_num_inliers))
+
+
+def reconstruction_problems(
+    workspace: Workspace, names: Sequence[str], registered: Sequence[str], min_num_inliers: int
+) -> dict[str, str]:
+    """Tell for each image outside the largest model why it is not in it."""
+    num_keypoints = FeatureStore(workspace.features).num_keypoints()
+    ids = colmap_database.image_ids(workspace.database)
+    verified = verified_pairs(workspace.database, min_num_inliers)
+    in_pairs = {image_id for pair in verified for image_id in pair}
+    reasons = {}
+    for name in names:
+        if name in registered:
+            continue
+        if name not in num_keypoints or name not in ids:
+            reasons[name] = "unreadable"
+        elif not num_keypoints[name]:
+            reasons[name] = "no features"
+        elif ids[name] not in in_pairs:
+            reasons[name] = "no verified pair"
+        else:
+            reasons[name] = "not registered"
+    return reasons

@@ -1,0 +1,200 @@
+"""Features and matches in HDF5, in hloc's layout (the only user of h5py).
+
+``features.h5``: a group per image name with ``keypoints`` (N, 2) float32, ``descriptors``
+(D, N) float16, ``scores`` (N,), ``image_size`` (width, height) and, of our own, ``lafs``
+(N, 2, 3) float32 and ``rectification_ids`` (N,). ``matches.h5``: a group per pair with
+``matches0`` (N0,), -1 where unmatched, and ``matching_scores0`` (N0,). Coordinates have
+their origin at the centre of the first pixel. Files are opened for one image or one batch
+of pairs and closed again; the attribute ``complete`` is written last, so that a killed
+run loses at most the group it was writing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.errors import StoreError
+from colmap_affrect.types import LocalFeatures
+
+FORMAT_VERSION = 1
+MAX_INT16 = 32767
+
+
+@dataclass(frozen=True)
+class PairMatches:
+    """Raw matches of one pair.
+
+    Attributes:
+        names: the two image names, in the order of the columns.
+        indices: (M, 2) int64, strictly rising in column 0.
+        scores: (M,) float32 in [0, 1], larger is better.
+        num_keypoints1: number of features of the first image.
+    """
+
+    names: tuple[str, str]
+    indices: NDArray[np.int64]
+    scores: NDArray[np.float32]
+    num_keypoints1: int
+
+
+class _Store:
+    """A HDF5 file of complete groups."""
+
+    kind = ""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @contextmanager
+    def _open(self, mode: str) -> Iterator[h5py.File]:
+        try:
+            file = h5py.File(self.path, mode)
+        except OSError as error:
+            raise StoreError(
+                f"{self.path}: cannot be opened as HDF5 ({error}); if it is damaged or another "
+                "program has it open, close that program or run again with --overwrite"
+            ) from error
+        with file:
+            if mode == "a" and "format" not in file.attrs and not len(file):
+                file.attrs["format"] = f"colmap_affrect/{self.kind}"
+                file.attrs["format_version"] = FORMAT_VERSION
+                file.attrs["pixel_origin"] = "center"
+            self._check_format(file)
+            yield file
+
+    def _check_format(self, file: h5py.File) -> None:
+        found = file.attrs.get("format")
+        version = file.attrs.get("format_version")
+        if found != f"colmap_affrect/{self.kind}" or version != FORMAT_VERSION:
+            raise StoreError(
+                f"{self.path}: expected {self.kind} of format version {FORMAT_VERSION}, found "
+                f"{found or 'a file of another program'} {version or ''}; "
+                "use another --output-path"
+            )
+
+    def complete(self, keys: Iterable[str]) -> set[str]:
+        """Return those of the keys whose group is there and complete."""
+        if not self.path.exists():
+            return set()
+        with self._open("r") as file:
+            return {key for key in keys if key in file and file[key].attrs.get("complete", False)}
+
+    def names(self) -> list[str]:
+        """Return the sorted names of all complete groups."""
+        found: list[str] = []
+        if self.path.exists():
+            with self._open("r") as file:
+                file.visititems(
+                    lambda key, item: found.append(key) if item.attrs.get("complete") else None
+                )
+        return sorted(found)
+
+    @staticmethod
+    def _write(file: h5py.File, key: str, datasets: dict[str, Any]) -> None:
+        if key in file:
+            del file[key]
+        group = file.create_group(key)
+        for name, values in datasets.items():
+            group.create_dataset(name, data=values)
+        group.attrs["complete"] = True
+
+
+class FeatureStore(_Store):
+    """Local features by image name."""
+
+    kind = "features"
+
+    def write(self, name: str, features: LocalFeatures, image_size: tuple[int, int]) -> None:
+        """Write the features of one image, in the place of incomplete ones."""
+        with self._open("a") as file:
+            self._write(
+                file,
+                name,
+                {
+                    "keypoints": features.keypoints.astype(np.float32),
+                    "descriptors": features.descriptors.T.astype(np.float16),
+                    "scores": features.responses,
+                    "image_size": np.asarray(image_size),
+                    "lafs": features.lafs.astype(np.float32),
+                    "rectification_ids": features.rectification_ids,
+                },
+            )
+
+    def read(self, name: str) -> LocalFeatures:
+        """Read the features of one image.
+
+        Raises:
+            StoreError: if they are missing or incomplete.
+        """
+        with self._open("r") as file:
+            if name not in file or not file[name].attrs.get("complete", False):
+                raise StoreError(f"{self.path}: no features of {name}; run extract first")
+            group = file[name]
+            return LocalFeatures(
+                group["lafs"][()].astype(np.float64),
+                group["scores"][()],
+                np.ascontiguousarray(group["descriptors"][()].T, dtype=np.float32),
+                group["rectification_ids"][()],
+            )
+
+    def num_keypoints(self) -> dict[str, int]:
+        """Return the number of features of each image."""
+        names = self.names()
+        if not names:
+            return {}
+        with self._open("r") as file:
+            return {name: len(file[name]["keypoints"]) for name in names}
+
+    def read_frames(self, name: str) -> NDArray[np.float32]:
+        """Read the (N, 2, 3) frames of one image."""
+        with self._open("r") as file:
+            return np.asarray(file[name]["lafs"][()])
+
+
+def pair_key(name1: str, name2: str) -> str:
+    """Return hloc's group name of a pair: '/' becomes '-', the two joined by '/'."""
+    return f"{name1.replace('/', '-')}/{name2.replace('/', '-')}"
+
+
+class MatchStore(_Store):
+    """Raw matches by pair of image names."""
+
+    kind = "matches"
+
+    def write(self, pairs: Iterable[PairMatches]) -> None:
+        """Write a batch of pairs."""
+        with self._open("a") as file:
+            for pair in pairs:
+                matches0 = np.full(pair.num_keypoints1, -1, np.int64)
+                scores0 = np.zeros(pair.num_keypoints1, np.float16)
+                matches0[pair.indices[:, 0]] = pair.indices[:, 1]
+                scores0[pair.indices[:, 0]] = pair.scores
+                wide = matches0.max(initial=0) > MAX_INT16
+                datasets = {
+                    "matches0": matches0.astype(np.int32 if wide else np.int16),
+                    "matching_scores0": scores0,
+                }
+                self._write(file, pair_key(*pair.names), datasets)
+
+    def read_indices(self, pairs: Sequence[tuple[str, str]]) -> Iterator[NDArray[np.int64]]:
+        """Yield the (M, 2) match indices of each pair.
+
+        Raises:
+            StoreError: at a pair without matches.
+        """
+        with self._open("r") as file:
+            for name1, name2 in pairs:
+                key = pair_key(name1, name2)
+                if key not in file:
+                    raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
+                matches0 = file[key]["matches0"][()].astype(np.int64)
+                rows = np.flatnonzero(matches0 >= 0)
+                yield np.stack([rows, matches0[rows]], axis=1)

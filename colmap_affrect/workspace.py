@@ -1,0 +1,224 @@
+"""The output folder: its files, its lock, and the record of the options that made them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from colmap_affrect.errors import StaleStoreError, WorkspaceError
+
+logger = logging.getLogger(__name__)
+
+STAGES = ("extract", "pairs", "match", "verify", "map")
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Paths below an output folder.
+
+    ``config.toml`` records, by stage, the options that made what is there. A stage that
+    is run again with the same options goes on where it stopped; with other options it
+    refuses, and ``overwrite`` removes its results and those of the stages after it.
+    """
+
+    path: Path
+
+    @property
+    def features(self) -> Path:
+        """Features by image (HDF5)."""
+        return self.path / "features.h5"
+
+    @property
+    def pairs(self) -> Path:
+        """List of the pairs to match (text)."""
+        return self.path / "pairs.txt"
+
+    @property
+    def matches(self) -> Path:
+        """Raw matches by pair (HDF5)."""
+        return self.path / "matches.h5"
+
+    @property
+    def database(self) -> Path:
+        """COLMAP database."""
+        return self.path / "database.db"
+
+    @property
+    def sparse(self) -> Path:
+        """Folder of the COLMAP models 0, 1, ..."""
+        return self.path / "sparse"
+
+    @property
+    def report(self) -> Path:
+        """Report of the last run (JSON)."""
+        return self.path / "report.json"
+
+    @property
+    def config(self) -> Path:
+        """Record of the options (TOML)."""
+        return self.path / "config.toml"
+
+    @property
+    def log(self) -> Path:
+        """Log of all runs."""
+        return self.path / "run.log"
+
+    @contextmanager
+    def locked(self) -> Iterator[Workspace]:
+        """Create the folder and keep other runs out of it.
+
+        Raises:
+            WorkspaceError: when it cannot be written or another run uses it.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            lock = FileLock(self.path / ".lock")
+            lock.acquire(timeout=0)
+        except Timeout as error:
+            raise WorkspaceError(
+                f"{self.path}: another colmap-affrect is working in this folder; wait for it "
+                "or use another --output-path"
+            ) from error
+        except OSError as error:
+            raise WorkspaceError(
+                f"{self.path}: cannot be used as output folder ({error.strerror or error})"
+            ) from error
+        try:
+            yield self
+        finally:
+            lock.release()
+
+    def recorded(self) -> dict[str, Any]:
+        """Return the options on record by stage; empty where there are none."""
+        if not self.config.exists():
+            return {}
+        try:
+            return tomllib.loads(self.config.read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise WorkspaceError(f"{self.config}: damaged ({error}); remove it") from error
+
+    def recipe(self) -> str:
+        """Return the name of the recipe that the features were made with."""
+        return str(self.require("extract") and self.recorded()["recipe"])
+
+    def claim(
+        self, stage: str, options: Mapping[str, Any], *, overwrite: bool = False, recipe: str = ""
+    ) -> None:
+        """Put the options of a stage on record before it begins.
+
+        Args:
+            stage: one of ``STAGES``.
+            options: what the results depend on; nested mappings of plain values.
+            overwrite: discard the results of this stage and the later ones first.
+            recipe: name of the recipe, for the record only.
+
+        Raises:
+            StaleStoreError: when other options made the results that are there.
+        """
+        record = self.recorded()
+        if overwrite:
+            self._discard(record, stage)
+        self._refuse_foreign_database(record)
+        known = record.get(stage)
+        if known is not None:
+            difference = _first_difference(known, options)
+            if difference:
+                raise StaleStoreError(
+                    f"{self.path}: the {stage} stage was run there with {difference}; use "
+                    "--overwrite to redo it and the stages after it, or another --output-path"
+                )
+        record[stage] = dict(options)
+        record["recipe"] = recipe or record.get("recipe", "")
+        ordered = {name: record[name] for name in ("recipe", *STAGES) if name in record}
+        self.config.write_text(dump_toml(ordered), encoding="utf-8")
+
+    def require(self, stage: str) -> dict[str, Any]:
+        """Return the recorded options of an earlier stage.
+
+        Raises:
+            WorkspaceError: when it has not been run.
+        """
+        record = self.recorded()
+        if stage not in record:
+            raise WorkspaceError(
+                f"{self.path}: the {stage} stage has not been run there; run "
+                f"'colmap-affrect {stage}' with this --output-path first"
+            )
+        options: dict[str, Any] = record[stage]
+        return options
+
+    def _refuse_foreign_database(self, record: Mapping[str, Any]) -> None:
+        if self.database.exists() and "extract" not in record:
+            raise StaleStoreError(
+                f"{self.database}: exists and was not made here; it is left as it is, use "
+                "another --output-path"
+            )
+
+    def _discard(self, record: dict[str, Any], stage: str) -> None:
+        """Forget a stage and those after it and remove what they made."""
+        for later in STAGES[STAGES.index(stage) :]:
+            record.pop(later, None)
+        first = STAGES.index(stage)
+        outdated = [self.sparse, self.report]
+        if first <= STAGES.index("verify"):
+            outdated.append(self.database)
+        if first <= STAGES.index("match"):
+            outdated.append(self.matches)
+        if first <= STAGES.index("pairs"):
+            outdated.append(self.pairs)
+        if first == 0:
+            outdated.append(self.features)
+        for path in outdated:
+            logger.info("overwrite: removing %s", path)
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+
+
+def _first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    old, new = _flat(known), _flat(now)
+    for key in sorted(old.keys() | new.keys()):
+        if old.get(key) != new.get(key):
+            return f"{key}={old.get(key)!r}, and it is {new.get(key)!r} now"
+    return ""
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = list(value) if isinstance(value, tuple) else value
+    return flat
+
+
+def dump_toml(values: Mapping[str, Any], prefix: str = "") -> str:
+    """Write nested mappings of numbers, strings, booleans and lists as TOML.
+
+    >>> print(dump_toml({"a": {"x": 1.5, "b": {"y": ["s", True]}}}), end="")
+    [a]
+    x = 1.5
+    <BLANKLINE>
+    [a.b]
+    y = ["s", true]
+    <BLANKLINE>
+    """
+    plain = {key: value for key, value in values.items() if not isinstance(value, Mapping)}
+    text = f"[{prefix}]\n" if prefix and plain else ""
+    text += "".join(f"{key} = {json.dumps(value)}\n" for key, value in plain.items())
+    text += "\n" if plain else ""
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            text += dump_toml(value, f"{prefix}.{key}" if prefix else key)
+    return text
