@@ -34,7 +34,21 @@ _PUBLIC = {
     "run": "colmap_affrect.pipeline",
 }
 
-__all__ = ["__version__", *sorted(_PUBLIC)]
+__all__ = [
+    "AffrectError",
+    "CameraOptions",
+    "ExtractionOptions",
+    "LocalFeatures",
+    "MappingOptions",
+    "MatchingOptions",
+    "ReconstructionReport",
+    "RunOptions",
+    "VerificationOptions",
+    "__version__",
+    "extract_image",
+    "load_recipe",
+    "run",
+]
 
 
 def __getattr__(name: str) -> Any:

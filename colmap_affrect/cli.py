@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from colmap_affrect.pipeline import RunOptions
     from colmap_affrect.recipes import Recipe
 
-Subparsers = argparse._SubParsersAction  # the type of add_subparsers() has no public name
+    # The type of add_subparsers() has no public name.
+    Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
 logger = logging.getLogger("colmap_affrect")
 
@@ -141,7 +142,13 @@ def build_parser() -> argparse.ArgumentParser:
     _add_seed(mapping)
     _add_json(mapping)
 
-    recipes = commands.add_parser("recipes", help="list the recipes")
+    recipes = commands.add_parser(
+        "recipes",
+        help="list the recipes",
+        description="list the recipes",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     recipes.set_defaults(command="recipes")
     return parser
 
@@ -149,7 +156,7 @@ def build_parser() -> argparse.ArgumentParser:
 def _command(
     commands: Subparsers, name: str, function: Callable[[argparse.Namespace], int], summary: str
 ) -> argparse.ArgumentParser:
-    command = commands.add_parser(
+    command: argparse.ArgumentParser = commands.add_parser(
         name,
         help=summary,
         description=summary,

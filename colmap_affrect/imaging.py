@@ -77,12 +77,15 @@ def warp(image: GrayImage, rectification: Rectification) -> GrayImage:
     return np.ascontiguousarray(dense[::density], dtype=np.uint8)
 
 
-def warp_mask(mask: Mask, rectification: Rectification) -> NDArray[np.uint8]:
-    """Carry an image mask into the warp (nearest neighbour; 255 inside, 0 outside)."""
+def warp_mask(rectification: Rectification) -> NDArray[np.uint8]:
+    """Carry the region of a rectification into its warp (nearest; 255 inside, 0 outside)."""
+    image_from_mask = np.eye(3)
+    image_from_mask[:2, 2] = rectification.region_origin
+    rectified_from_mask = rectification.rectified_from_image @ image_from_mask
     return np.asarray(
         cv2.warpAffine(
-            mask.astype(np.uint8) * 255,
-            rectification.rectified_from_image[:2],
+            rectification.region.astype(np.uint8) * 255,
+            rectified_from_mask[:2],
             rectification.canvas_size,
             flags=cv2.INTER_NEAREST,
             borderMode=cv2.BORDER_CONSTANT,
@@ -90,3 +93,10 @@ def warp_mask(mask: Mask, rectification: Rectification) -> NDArray[np.uint8]:
         ),
         dtype=np.uint8,
     )
+
+
+def connected_groups(mask: Mask, gap: int) -> list[Mask]:
+    """Split an (H, W) mask into groups of pixels that are at most ``gap`` - 1 px apart."""
+    joined = cv2.dilate(mask.astype(np.uint8), np.ones((gap, gap), np.uint8))
+    num_groups, groups = cv2.connectedComponents(joined, connectivity=8)
+    return [mask & (groups == group) for group in range(1, num_groups)]

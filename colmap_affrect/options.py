@@ -22,6 +22,8 @@ class Options:
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
         """Build from a mapping; unknown keys and values of a wrong type raise OptionError."""
+        if not isinstance(values, Mapping):
+            raise OptionError(f"{where}: expected options, got {values!r}")
         fields = {item.name: item for item in dataclasses.fields(cls)}
         for key in values:
             if key not in fields:
@@ -50,11 +52,17 @@ def _suggestion(key: str, known: Mapping[str, Any]) -> str:
 
 
 def _converted(value: Any, item: dataclasses.Field[Any], where: str) -> Any:
-    default = item.default if item.default is not dataclasses.MISSING else item.default_factory()  # type: ignore[misc]
+    default = item.default
+    if item.default_factory is not dataclasses.MISSING:
+        default = item.default_factory()
     if isinstance(default, Options):
         return type(default).from_mapping(value, where)
     if isinstance(default, tuple) and isinstance(value, list | tuple):
-        return tuple(value)
+        return tuple(_converted_scalar(element, default[0], where) for element in value)
+    return _converted_scalar(value, default, where)
+
+
+def _converted_scalar(value: Any, default: Any, where: str) -> Any:
     if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) is not type(default):
@@ -81,7 +89,11 @@ class DenseShapesOptions(Options):
     min_region_frac: float = 0.02
     """Regions of a smaller share of the image are not warped."""
 
+    min_part_frac: float = 0.002
+    """Scattered pieces of a region of a smaller share of the image are left out."""
+
     def __post_init__(self) -> None:
+        self._check("min_part_frac", 0.0, 1.0)
         self._check("tilt_radius", 1.05, 10.0)
         self._check("max_tilt", 1.0, 20.0)
         self._check("covered_frac", 0.0, 1.0)
@@ -144,8 +156,9 @@ class ExtractionOptions(Options):
     rectifier: DenseShapesOptions = field(default_factory=DenseShapesOptions)
     second_moment: SecondMomentOptions = field(default_factory=SecondMomentOptions)
     features: SiftOptions = field(default_factory=SiftOptions)
-    max_image_size_px: int = 3200
-    """Larger images are shrunk to this longer side before extraction; as COLMAP's SIFT does."""
+    max_image_size_px: int = 2400
+    """Larger images are shrunk to this longer side before extraction. At 2400 a photograph of
+    12 megapixels needs 1.0 GiB of memory, at 3200 (COLMAP's limit for SIFT) 1.8 GiB."""
 
     def __post_init__(self) -> None:
         self._check("max_image_size_px", 16, 1_000_000)
@@ -172,13 +185,20 @@ class MatchingOptions(Options):
 class VerificationOptions(Options):
     """Two-view geometry, the sparse preset (names as in pycolmap)."""
 
-    max_error_px: float = 4.0
+    max_error_px: float = 3.0
     min_num_inliers: int = 20
     """COLMAP's 15 is what 100 random matches reach: measured, they made wrong pairs."""
     min_inlier_ratio: float = 0.10
     """COLMAP's 0 accepts random matches once there are many of them."""
     max_num_trials: int = 10000
     ransac_min_inlier_ratio: float = 0.10
+
+    def __post_init__(self) -> None:
+        self._check("max_error_px", 0.01, 1000.0)
+        self._check("min_num_inliers", 5, 1_000_000)
+        self._check("min_inlier_ratio", 0.0, 1.0)
+        self._check("max_num_trials", 1, 100_000_000)
+        self._check("ransac_min_inlier_ratio", 0.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,11 +209,20 @@ class MappingOptions(Options):
     """COLMAP's True leaves sparse sets without a model: there most tracks have two views."""
     init_min_tri_angle_deg: float = 8.0
     init_min_num_inliers: int = 50
-    abs_pose_min_num_inliers: int = 15
+    abs_pose_min_num_inliers: int = 12
     min_model_size: int = 2
+    max_num_attempts: int = 3
+    """While images are missing, map again with another seed and keep the largest model."""
     keep_given_intrinsics: bool = True
     """Leave camera parameters that the user gave as they are; refining them on a few images
     of a sparse set moves them far away (measured: focal lengths of 1437 px to 1256 px)."""
+
+    def __post_init__(self) -> None:
+        self._check("init_min_tri_angle_deg", 0.0, 180.0)
+        self._check("init_min_num_inliers", 1, 1_000_000)
+        self._check("abs_pose_min_num_inliers", 3, 1_000_000)
+        self._check("min_model_size", 2, 1_000_000)
+        self._check("max_num_attempts", 1, 100)
 
 
 @dataclass(frozen=True, kw_only=True)

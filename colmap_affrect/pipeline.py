@@ -99,9 +99,7 @@ def map_and_report(
     report, models = stages.map_images(
         workspace, options, random_seed, overwrite=overwrite, progress=progress
     )
-    record = workspace.require("extract")
-    image_list = Path(record["image_list_path"]) if record["image_list_path"] else None
-    names = stages.list_images(Path(record["image_path"]), image_list)
+    names = stages.recorded_images(workspace)
     min_num_inliers = workspace.require("verify")["min_num_inliers"]
     registered = models[0].registered_names if models else ()
     result = ReconstructionReport(

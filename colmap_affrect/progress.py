@@ -40,7 +40,7 @@ def _update(bar: tqdm[None], count: int) -> None:
     bar.update(count)
 
 
-def _ignore(count: int) -> None:  # noqa: ARG001  (an Advance)
+def _ignore(count: int) -> None:
     pass
 
 

@@ -12,6 +12,8 @@ from typing import Any
 from colmap_affrect.errors import OptionError
 from colmap_affrect.options import ExtractionOptions, MatchingOptions
 
+SECTIONS = ("rectifier", "second_moment", "features", "matching")
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -52,6 +54,7 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
     values = _read(name)
     for setting in settings:
         _apply(values, setting)
+    _check_sections(values, name)
     summary = values.pop("summary", "")
     matching = values.pop("matching", {})
     extraction = ExtractionOptions.from_mapping(values, f"recipe {name}")
@@ -70,6 +73,12 @@ def _read(name: str) -> dict[str, Any]:
         raise OptionError(f"unknown recipe '{name}': {hint}known are {known}") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise OptionError(f"recipe {path}: cannot be read ({error})") from error
+
+
+def _check_sections(values: Mapping[str, Any], name: str) -> None:
+    for section in SECTIONS:
+        if not isinstance(values.get(section, {}), Mapping):
+            raise OptionError(f"recipe {name}: {section} is a section of options, not a value")
 
 
 def _apply(values: dict[str, Any], setting: str) -> None:

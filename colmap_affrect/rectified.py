@@ -81,17 +81,10 @@ def _strongest(features: LocalFeatures, limit: int) -> LocalFeatures:
 def _extract_in_warp(
     image: GrayImage, rectification: Rectification, rectification_id: int, extract: Extractor
 ) -> LocalFeatures:
-    mask = warp_mask(rectification.region, rectification)
+    mask = warp_mask(rectification)
     features = extract(warp(image, rectification), mask)
     lafs = transform_frames(rectification.image_from_rectified, features.lafs)
-    features = features.with_frames(lafs, rectification_id)
-    return features.select(_within_region(lafs, rectification))
-
-
-def _within_region(lafs: NDArray[np.float64], rectification: Rectification) -> NDArray[np.bool_]:
-    """Tell which frames have their centre in the region and their ellipse in the image."""
-    height, width = rectification.region.shape
-    keep = is_inside(lafs[:, :, 2], (width, height), ellipse_extents(lafs[:, :, :2]))
-    columns, rows = np.rint(lafs[:, :, 2]).astype(int).T
-    columns, rows = np.clip(columns, 0, width - 1), np.clip(rows, 0, height - 1)
-    return np.asarray(keep & rectification.region[rows, columns])
+    size = (image.shape[1], image.shape[0])
+    keep = is_inside(lafs[:, :, 2], size, ellipse_extents(lafs[:, :, :2]))
+    keep &= rectification.in_region(lafs[:, :, 2])
+    return features.with_frames(lafs, rectification_id).select(keep)

@@ -6,8 +6,8 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.mapping import map_incrementally, read_models
 from colmap_affrect.colmap.verification import verified_pairs, verify
-from colmap_affrect.errors import ImageError, StoreError
+from colmap_affrect.errors import ImageError, OptionError, StoreError
 from colmap_affrect.executor import available_cores, map_ordered
 from colmap_affrect.extraction import extract_file
-from colmap_affrect.imaging import IMAGE_SUFFIXES
+from colmap_affrect.imaging import IMAGE_SUFFIXES, read_gray
 from colmap_affrect.matching.nearest import MatchableImage, match_features, matchable
 from colmap_affrect.matching.pairs import Pair, exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.options import (
@@ -57,7 +57,9 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     names = sorted(
         path.as_posix()
         for path in paths
-        if path.suffix.lower() in IMAGE_SUFFIXES and not any(p.startswith(".") for p in path.parts)
+        if path.suffix.lower() in IMAGE_SUFFIXES
+        and not any(part.startswith(".") for part in path.parts)
+        and not (image_path / path).is_dir()
     )
     if not names:
         raise ImageError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)})")
@@ -66,15 +68,28 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
 
 def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
     try:
-        lines = image_list_path.read_text(encoding="utf-8").splitlines()
+        lines = image_list_path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ImageError(f"{image_list_path}: cannot be read ({error})") from error
-    names = sorted({line.strip() for line in lines if line.strip() and not line.startswith("#")})
-    missing = [name for name in names if not (image_path / name).is_file()]
+    listed = (line.strip() for line in lines if line.strip() and not line.startswith("#"))
+    names = sorted({PurePosixPath(name).as_posix() for name in listed})
+    missing = [name for name in names if not _is_below(image_path, name)]
     if missing or not names:
         what = f"lists {missing[0]}, which is not in {image_path}" if missing else "is empty"
         raise ImageError(f"{image_list_path}: {what}")
     return names
+
+
+def recorded_images(workspace: Workspace) -> list[str]:
+    """Return the names of all images that the extract stage was given."""
+    record = workspace.require("extract")
+    image_list = Path(record["image_list_path"]) if record["image_list_path"] else None
+    return list_images(Path(record["image_path"]), image_list)
+
+
+def _is_below(image_path: Path, name: str) -> bool:
+    inside = ".." not in PurePosixPath(name).parts and not name.startswith("/")
+    return inside and (image_path / name).is_file()
 
 
 def extract(
@@ -95,6 +110,11 @@ def extract(
     names = list_images(image_path, image_list_path)
     _refuse_colliding_keys(names)
     colmap_database.check_cameras(cameras)
+    store = FeatureStore(workspace.features)
+    if cameras.mode in ("single", "per-folder"):
+        _refuse_mixed_sizes(
+            image_path, names, cameras.mode, {} if overwrite else store.image_sizes()
+        )
     options = {
         "image_path": str(image_path.resolve()),
         "image_list_path": str(image_list_path.resolve()) if image_list_path else "",
@@ -102,7 +122,6 @@ def extract(
         **recipe.extraction.to_mapping(),
     }
     workspace.claim("extract", options, overwrite=overwrite, recipe=recipe.name)
-    store = FeatureStore(workspace.features)
     done = store.complete(names)
     missing = [name for name in names if name not in done]
     failures = {}
@@ -123,7 +142,9 @@ def extract(
         raise ImageError(f"{image_path}: none of the {len(names)} images can be read")
     failures |= _write_images_and_keypoints(workspace, store)
     seconds = time.perf_counter() - start
-    return StageReport("extract", seconds, len(missing) - len(failures), len(done), failures)
+    return StageReport(
+        "extract", seconds, len(set(missing) - set(failures)), len(done - set(failures)), failures
+    )
 
 
 def _refuse_colliding_keys(names: Sequence[str]) -> None:
@@ -135,6 +156,30 @@ def _refuse_colliding_keys(names: Sequence[str]) -> None:
             raise StoreError(
                 f"{other} and {name} have the same key in hloc's match files, where '/' becomes "
                 "'-'; rename one of them"
+            )
+
+
+def _refuse_mixed_sizes(
+    image_path: Path, names: Sequence[str], mode: str, known: Mapping[str, tuple[int, int]]
+) -> None:
+    """COLMAP leaves out images of another size than the first one that shares their camera."""
+
+    def size_of(name: str) -> tuple[int, int] | None:
+        try:
+            return known.get(name) or read_gray(image_path / name).shape[::-1]
+        except ImageError:
+            return None
+
+    first: dict[PurePosixPath, tuple[str, tuple[int, int]]] = {}
+    for name, size in zip(names, map_ordered(size_of, names, available_cores()), strict=True):
+        if size is None:
+            continue
+        folder = PurePosixPath(name).parent if mode == "per-folder" else PurePosixPath()
+        other, expected = first.setdefault(folder, (name, size))
+        if size != expected:
+            raise OptionError(
+                f"--camera-mode {mode}: {other} is {expected[0]} x {expected[1]} px, {name} is "
+                f"{size[0]} x {size[1]} px; images that share a camera must have one size"
             )
 
 
@@ -161,7 +206,12 @@ def choose_pairs(
     start = time.perf_counter()
     workspace.require("extract")
     names = FeatureStore(workspace.features).names()
-    pairs = read_pairs(match_list_path, names) if match_list_path else exhaustive_pairs(names)
+    pairs = exhaustive_pairs(names)
+    if match_list_path:
+        # Images that could not be read may be in the list; only their pairs are dropped.
+        usable = set(pairs)
+        listed_pairs = read_pairs(match_list_path, recorded_images(workspace))
+        pairs = [pair for pair in listed_pairs if pair in usable]
     listed = str(match_list_path.resolve()) if match_list_path else ""
     workspace.claim("pairs", {"match_list_path": listed}, overwrite=overwrite)
     write_pairs(workspace.pairs, pairs)
@@ -263,11 +313,12 @@ def verify_matches(
     workspace.claim("verify", recorded, overwrite=overwrite)
     features, matches = FeatureStore(workspace.features), MatchStore(workspace.matches)
     _write_matches(workspace, pairs, features, matches)
-    done = colmap_database.num_two_view_geometries(workspace.database)
-    with progress.stage("verify", len(pairs), "pairs") as advance:
-        verify(workspace.database, options, random_seed)
-        advance(len(pairs))
-    return StageReport("verify", time.perf_counter() - start, len(pairs) - done, done)
+    todo = colmap_database.num_unverified_pairs(workspace.database)
+    with progress.stage("verify", todo, "pairs") as advance:
+        if todo:
+            verify(workspace.database, options, random_seed)
+            advance(todo)
+    return StageReport("verify", time.perf_counter() - start, todo, len(pairs) - todo)
 
 
 def map_images(

@@ -56,28 +56,35 @@ class _Store:
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:
         try:
-            file = h5py.File(self.path, mode)
+            if mode == "a" and not self.path.exists():
+                self._create()
+            file = h5py.File(self.path, "r+" if mode == "a" else mode)
         except OSError as error:
             raise StoreError(
                 f"{self.path}: cannot be opened as HDF5 ({error}); if it is damaged or another "
                 "program has it open, close that program or run again with --overwrite"
             ) from error
         with file:
-            if mode == "a" and "format" not in file.attrs and not len(file):
-                file.attrs["format"] = f"colmap_affrect/{self.kind}"
-                file.attrs["format_version"] = FORMAT_VERSION
-                file.attrs["pixel_origin"] = "center"
             self._check_format(file)
             yield file
 
+    def _create(self) -> None:
+        """Make the file without groups; under another name first, it is unreadable until closed."""
+        new = self.path.with_name(self.path.name + ".new")
+        with h5py.File(new, "w") as file:
+            file.attrs["format"] = f"colmap_affrect/{self.kind}"
+            file.attrs["format_version"] = FORMAT_VERSION
+            file.attrs["pixel_origin"] = "center"
+        new.replace(self.path)
+
     def _check_format(self, file: h5py.File) -> None:
-        found = file.attrs.get("format")
+        known = file.attrs.get("format")
         version = file.attrs.get("format_version")
-        if found != f"colmap_affrect/{self.kind}" or version != FORMAT_VERSION:
+        if known != f"colmap_affrect/{self.kind}" or version != FORMAT_VERSION:
+            found = f"{known} {version}" if known else "a file of another program"
             raise StoreError(
                 f"{self.path}: expected {self.kind} of format version {FORMAT_VERSION}, found "
-                f"{found or 'a file of another program'} {version or ''}; "
-                "use another --output-path"
+                f"{found}; use another --output-path"
             )
 
     def complete(self, keys: Iterable[str]) -> set[str]:
@@ -153,6 +160,14 @@ class FeatureStore(_Store):
         with self._open("r") as file:
             return {name: len(file[name]["keypoints"]) for name in names}
 
+    def image_sizes(self) -> dict[str, tuple[int, int]]:
+        """Return the (width, height) of each image in px."""
+        names = self.names()
+        if not names:
+            return {}
+        with self._open("r") as file:
+            return {name: tuple(file[name]["image_size"][()].tolist()) for name in names}
+
     def read_frames(self, name: str) -> NDArray[np.float32]:
         """Read the (N, 2, 3) frames of one image."""
         with self._open("r") as file:
@@ -193,7 +208,7 @@ class MatchStore(_Store):
         with self._open("r") as file:
             for name1, name2 in pairs:
                 key = pair_key(name1, name2)
-                if key not in file:
+                if key not in file or not file[key].attrs.get("complete", False):
                     raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
                 matches0 = file[key]["matches0"][()].astype(np.int64)
                 rows = np.flatnonzero(matches0 >= 0)

@@ -85,7 +85,7 @@ class LocalFeatures:
     @property
     def scales(self) -> NDArray[np.float64]:
         """(N,) geometric mean radius sqrt(det A) of the measurement ellipses in px."""
-        return np.sqrt(np.linalg.det(self.lafs[:, :, :2]))
+        return np.asarray(np.sqrt(np.linalg.det(self.lafs[:, :, :2])))
 
     def select(self, index: NDArray[np.generic]) -> LocalFeatures:
         """Keep the features of an index or mask array, in its order."""
@@ -127,8 +127,9 @@ class Rectification:
     Attributes:
         rectified_from_image: (3, 3) float64 map of pixel-centre coordinates.
         canvas_size: (width, height) of the warp in px.
-        region: (H, W) bool mask in the image.
+        region: (h, w) bool mask of the part of the image.
         tilt, tilt_angle_rad: class of the map in the space of tilts.
+        region_origin: (x, y) image pixel of the mask's first pixel.
     """
 
     rectified_from_image: NDArray[np.float64]
@@ -136,11 +137,20 @@ class Rectification:
     region: Mask
     tilt: float
     tilt_angle_rad: float
+    region_origin: tuple[int, int] = (0, 0)
+
+    def in_region(self, points: NDArray[np.floating]) -> Mask:
+        """Tell which (N, 2) points, rounded to pixels of the image, belong to the region."""
+        height, width = self.region.shape
+        columns, rows = (np.rint(points).astype(int) - self.region_origin).T
+        inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+        columns, rows = np.where(inside, columns, 0), np.where(inside, rows, 0)
+        return np.asarray(inside & self.region[rows, columns])
 
     @property
     def image_from_rectified(self) -> NDArray[np.float64]:
         """(3, 3) inverse map."""
-        return np.linalg.inv(self.rectified_from_image)
+        return np.asarray(np.linalg.inv(self.rectified_from_image), dtype=np.float64)
 
     @property
     def canvas_area_px(self) -> int:

@@ -125,9 +125,9 @@ class Workspace:
             StaleStoreError: when other options made the results that are there.
         """
         record = self.recorded()
+        self._refuse_foreign_results(record)
         if overwrite:
             self._discard(record, stage)
-        self._refuse_foreign_database(record)
         known = record.get(stage)
         if known is not None:
             difference = _first_difference(known, options)
@@ -139,7 +139,9 @@ class Workspace:
         record[stage] = dict(options)
         record["recipe"] = recipe or record.get("recipe", "")
         ordered = {name: record[name] for name in ("recipe", *STAGES) if name in record}
-        self.config.write_text(dump_toml(ordered), encoding="utf-8")
+        new = self.config.with_suffix(".new")
+        new.write_text(dump_toml(ordered), encoding="utf-8")
+        new.replace(self.config)
 
     def require(self, stage: str) -> dict[str, Any]:
         """Return the recorded options of an earlier stage.
@@ -156,12 +158,15 @@ class Workspace:
         options: dict[str, Any] = record[stage]
         return options
 
-    def _refuse_foreign_database(self, record: Mapping[str, Any]) -> None:
-        if self.database.exists() and "extract" not in record:
-            raise StaleStoreError(
-                f"{self.database}: exists and was not made here; it is left as it is, use "
-                "another --output-path"
-            )
+    def _refuse_foreign_results(self, record: Mapping[str, Any]) -> None:
+        if "extract" in record:
+            return
+        for path in (self.database, self.sparse, self.features, self.matches):
+            if path.exists():
+                raise StaleStoreError(
+                    f"{path}: exists and was not made here; it is left as it is, use "
+                    "another --output-path"
+                )
 
     def _discard(self, record: dict[str, Any], stage: str) -> None:
         """Forget a stage and those after it and remove what they made."""
@@ -216,9 +221,14 @@ def dump_toml(values: Mapping[str, Any], prefix: str = "") -> str:
     """
     plain = {key: value for key, value in values.items() if not isinstance(value, Mapping)}
     text = f"[{prefix}]\n" if prefix and plain else ""
-    text += "".join(f"{key} = {json.dumps(value)}\n" for key, value in plain.items())
+    text += "".join(f"{key} = {_toml_value(value)}\n" for key, value in plain.items())
     text += "\n" if plain else ""
     for key, value in values.items():
         if isinstance(value, Mapping):
             text += dump_toml(value, f"{prefix}.{key}" if prefix else key)
     return text
+
+
+def _toml_value(value: Any) -> str:
+    """Write as JSON, which differs from TOML in characters beyond 16 bits and in DEL."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -81,7 +81,9 @@ def check_cameras(cameras: CameraOptions) -> None:
     try:
         values = [float(value) for value in cameras.params.split(",")]
     except ValueError as error:
-        raise OptionError(f"--camera-params {cameras.params}: not numbers, comma") from error
+        raise OptionError(
+            f"--camera-params {cameras.params}: not numbers separated by commas"
+        ) from error
     expected = pycolmap.Camera.create_from_model_name(1, cameras.model, 1.0, 1, 1)
     if len(values) != len(expected.params):
         raise OptionError(
@@ -98,10 +100,15 @@ def geometry_digest(path: Path) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def num_two_view_geometries(path: Path) -> int:
-    """Return the number of pairs that have been verified, successfully or not."""
+def num_unverified_pairs(path: Path) -> int:
+    """Return the number of pairs that have raw matches and no two-view geometry, good or bad."""
     with open_database(path) as database:
-        return len(database.read_two_view_geometry_num_inliers()[0])
+        pair_ids, counts = database.read_num_matches()
+        return sum(
+            count > 0
+            and not database.exists_two_view_geometry(*pycolmap.pair_id_to_image_pair(pair_id))
+            for pair_id, count in zip(pair_ids, counts, strict=True)
+        )
 
 
 def colmap_keypoints(lafs: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -7,9 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.running import run_cancellable
 from colmap_affrect.options import MappingOptions
 from colmap_affrect.outcomes import ModelSummary
+
+ATTEMPT_SEED_STEP = 1_000_003
+"""Distance of the seeds of repeated attempts, so that those of runs 0, 1, 2, ... differ."""
 
 
 def pipeline_options(
@@ -54,7 +58,9 @@ def map_incrementally(
 ) -> list[ModelSummary]:
     """Map a verified database and write the models to ``sparse_path``/0, /1, ..., largest first.
 
-    ``sparse_path`` appears only once all models are written.
+    Which pair mapping begins with is partly chance, and a bad one ends in a small model. So,
+    while images are missing, mapping is tried again and the attempt with the largest model
+    is kept. ``sparse_path`` appears only once all models are written.
 
     Args:
         database_path: database with two-view geometries.
@@ -68,28 +74,58 @@ def map_incrementally(
     partial = sparse_path.with_name(sparse_path.name + ".partial")
     for old in (partial, sparse_path):
         shutil.rmtree(old, ignore_errors=True)
-    raw = partial / "raw"
+    num_images = len(image_ids(database_path))
+    best: list[pycolmap.Reconstruction] = []
+    for attempt in range(options.max_num_attempts):
+        models = _map_once(
+            database_path,
+            image_path,
+            partial,
+            pipeline_options(
+                options,
+                random_seed + attempt * ATTEMPT_SEED_STEP,
+                intrinsics_given=intrinsics_given,
+            ),
+            next_image,
+        )
+        best = max(best, models, key=_size_of_largest)
+        if _size_of_largest(best)[0] == num_images:
+            break
+    for index, model in enumerate(best):
+        (partial / str(index)).mkdir()
+        model.write(partial / str(index))
+    partial.rename(sparse_path)
+    return [summarize(model) for model in best]
+
+
+def _map_once(
+    database_path: Path,
+    image_path: Path,
+    scratch_path: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    next_image: Callable[[int], None],
+) -> list[pycolmap.Reconstruction]:
+    raw = scratch_path / "raw"
     raw.mkdir(parents=True)
     models = run_cancellable(
         lambda token: pycolmap.incremental_mapping(
             database_path,
             image_path,
             raw,
-            options=pipeline_options(options, random_seed, intrinsics_given=intrinsics_given),
+            options=options,
             initial_image_pair_callback=lambda: next_image(2),
             next_image_callback=lambda: next_image(1),
             cancellation_token=token,
         )
     )
     shutil.rmtree(raw)
-    ordered = sorted(
+    return sorted(
         models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D())
     )
-    for index, model in enumerate(ordered):
-        (partial / str(index)).mkdir()
-        model.write(partial / str(index))
-    partial.rename(sparse_path)
-    return [summarize(model) for model in ordered]
+
+
+def _size_of_largest(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:
+    return (models[0].num_reg_images(), models[0].num_points3D()) if models else (0, 0)
 
 
 def read_models(sparse_path: Path) -> list[ModelSummary]:

@@ -34,7 +34,7 @@ def extract_rootsift(
     """
     if min(image.shape) < MIN_IMAGE_SIZE_PX or (mask is not None and not mask.any()):
         return no_features()
-    sift = cv2.SIFT_create(
+    sift = cv2.SIFT.create(
         nfeatures=0,
         nOctaveLayers=options.num_octave_layers,
         contrastThreshold=options.contrast_threshold,
@@ -50,7 +50,8 @@ def extract_rootsift(
     rows = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=np.float64)[best]
     sigmas_px = rows[:, 2] / 2.0
     lafs = lafs_from_keypoints(rows[:, :2], MEASUREMENT_SIGMAS * sigmas_px, np.deg2rad(rows[:, 3]))
-    return LocalFeatures(lafs, responses[best], root_normalized(descriptors[best]))
+    described = root_normalized(descriptors[best].astype(np.float32))
+    return LocalFeatures(lafs, responses[best], described)
 
 
 def no_features() -> LocalFeatures:
@@ -63,4 +64,4 @@ def no_features() -> LocalFeatures:
 def root_normalized(descriptors: NDArray[np.floating]) -> NDArray[np.float32]:
     """Divide non-negative rows by their sum and take square roots: rows of unit length."""
     sums = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)
-    return np.sqrt(descriptors / sums, dtype=np.float32)
+    return np.asarray(np.sqrt(descriptors / sums), dtype=np.float32)

@@ -28,12 +28,15 @@ def second_moment_shapes(image: GrayImage, options: SecondMomentOptions) -> Shap
     tensor = _block_tensor(image, options.derivative_sigma_px)
     mean_log = np.zeros((*tensor.shape[:2], 2), dtype=np.float32)
     for sigma_px in options.integration_sigmas_px:
-        mean_log += _log_metric(cv2.GaussianBlur(tensor, (0, 0), sigma_px / STEP_PX))
-    mean_log /= len(options.integration_sigmas_px)
-    local = cv2.GaussianBlur(tensor, (0, 0), min(options.integration_sigmas_px) / STEP_PX)
+        mean_log += _log_metric(_smooth(tensor, sigma_px)) / len(options.integration_sigmas_px)
+    local = _smooth(tensor, min(options.integration_sigmas_px))
     textured = local[..., 0] + local[..., 1] > options.min_gradient**2
     mean_log[~textured] = 0.0
     return ShapeGrid(_metric_from_log(mean_log), textured, grid_origin(STEP_PX), STEP_PX)
+
+
+def _smooth(tensor: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    return np.asarray(cv2.GaussianBlur(tensor, (0, 0), sigma_px / STEP_PX), dtype=np.float32)
 
 
 def _block_tensor(image: GrayImage, derivative_sigma_px: float) -> NDArray[np.float32]:

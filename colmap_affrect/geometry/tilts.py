@@ -156,7 +156,7 @@ def cover_shapes(
             break
         chosen.append(best)
         votes = np.where(in_ball[best], np.float32(0), votes)
-    centers = candidates[chosen]
+    centers = np.asarray(candidates[chosen], dtype=np.float64)
     return Cover(centers, nearest_centers(metrics, centers, radius))
 
 

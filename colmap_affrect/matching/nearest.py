@@ -19,6 +19,9 @@ from colmap_affrect.options import MatchingOptions
 CHUNK_ELEMENTS = 1 << 24
 """Similarities held at once: 64 MiB of float32."""
 
+ROUNDING = np.float32(1e-6)
+"""Similarities closer to 1 than this are equal: two copies of a descriptor have ratio 1."""
+
 
 @dataclass(frozen=True)
 class MatchableImage:
@@ -97,7 +100,7 @@ def _nearest(
         second = similarity.max(axis=1)
         nearest[begin : begin + step] = best
         ratios[begin : begin + step] = np.sqrt(
-            np.maximum(1.0 - first, 0.0) / np.maximum(1.0 - second, 1e-12)
+            np.maximum(1.0 - first, ROUNDING) / np.maximum(1.0 - second, ROUNDING)
         )
     return nearest, ratios
 

@@ -30,16 +30,16 @@ def read_pairs(path: Path, names: Sequence[str]) -> list[Pair]:
         PairListError: when the file is unreadable or a name is not among ``names``.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise PairListError(f"{path}: cannot be read ({error})") from error
     known = set(names)
     pairs: dict[Pair, None] = {}
     problems = []
     for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
+        pair = _split(line, known) or _split(line.strip(), known)
+        if pair is None and (not line.strip() or line.lstrip().startswith("#")):
             continue
-        pair = _split(line.strip(), known)
         if pair is None:
             problems.append(f"line {number}: {line.strip()!r}{_suggestion(line, names)}")
         elif pair[0] != pair[1]:
@@ -61,10 +61,11 @@ def write_pairs(path: Path, pairs: Sequence[Pair]) -> None:
 
 
 def _split(line: str, known: set[str]) -> Pair | None:
-    for match in re.finditer(r"\s*[\t,]\s*|\s+", line):
-        first, second = line[: match.start()], line[match.end() :]
-        if first in known and second in known:
-            return first, second
+    for separator in (r"\t", r"\s*[\t,]\s*|\s+", " "):
+        for match in re.finditer(separator, line):
+            first, second = line[: match.start()], line[match.end() :]
+            if first in known and second in known:
+                return first, second
     return None
 
 

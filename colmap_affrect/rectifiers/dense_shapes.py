@@ -10,8 +10,15 @@ from numpy.typing import NDArray
 
 from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
 from colmap_affrect.geometry.tilts import cover_shapes
+from colmap_affrect.imaging import connected_groups
 from colmap_affrect.options import DenseShapesOptions
 from colmap_affrect.types import Mask, Rectification, RectificationPlan, ShapeGrid
+
+MARGIN_PX = 16.0
+"""Surroundings of a region that its descriptors may see, in warp px."""
+
+GAP_BLOCKS = 5
+"""Groups of blocks closer than this are warped together."""
 
 
 def plan_dense_shapes(
@@ -35,29 +42,31 @@ def plan_dense_shapes(
         max_num_centers=options.max_num_rectifications,
     )
     labels = cover.labels.reshape(grid.textured.shape)
-    min_blocks = options.min_region_frac * labels.size
-    items = []
+    items: list[Rectification] = []
     for label, (tilt, angle) in enumerate(cover.centers):
         blocks = (labels == label) & grid.textured
-        if np.count_nonzero(blocks) > min_blocks:
-            items.append(_rectification(blocks, grid, image_size, float(tilt), float(angle)))
+        if np.count_nonzero(blocks) < options.min_region_frac * labels.size:
+            continue
+        # The canvas of a warp is the bounding box of its region: for a region in several
+        # places one canvas for each is far smaller than one for all.
+        for part in connected_groups(blocks, GAP_BLOCKS):
+            if np.count_nonzero(part) < options.min_part_frac * labels.size:
+                continue
+            items.append(_rectification(part, grid, image_size, float(tilt), float(angle)))
     return RectificationPlan(image_size, tuple(items))
 
 
 def _rectification(
     blocks: Mask, grid: ShapeGrid, image_size: tuple[int, int], tilt: float, angle_rad: float
 ) -> Rectification:
-    width, height = image_size
-    region = np.repeat(np.repeat(blocks, grid.step_px, axis=0), grid.step_px, axis=1)
-    region = region[:height, :width]
-    matrix, canvas_size = fit_canvas(
-        rectifying_affine(tilt, angle_rad), _outline(region), margin_px=MARGIN_PX
-    )
-    return Rectification(matrix, canvas_size, region, tilt, angle_rad)
-
-
-MARGIN_PX = 16.0
-"""Surroundings of a region that its descriptors may see, in warp px."""
+    rows, columns = np.flatnonzero(blocks.any(axis=1)), np.flatnonzero(blocks.any(axis=0))
+    crop = blocks[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    left, top = int(columns[0]) * grid.step_px, int(rows[0]) * grid.step_px
+    region = np.repeat(np.repeat(crop, grid.step_px, axis=0), grid.step_px, axis=1)
+    region = region[: image_size[1] - top, : image_size[0] - left]
+    outline = _outline(region) + np.array([left, top])
+    matrix, canvas_size = fit_canvas(rectifying_affine(tilt, angle_rad), outline, MARGIN_PX)
+    return Rectification(matrix, canvas_size, region, tilt, angle_rad, (left, top))
 
 
 def _outline(region: Mask) -> NDArray[np.float64]:

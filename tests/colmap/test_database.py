@@ -1,0 +1,289 @@
+"""What is written to a COLMAP database comes back, and nothing wrong gets in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from numpy.testing import assert_allclose
+from strategies import Array, frames
+from synthetic import blobs, texture, write_image
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import (
+    colmap_keypoints,
+    image_ids,
+    import_images,
+    open_database,
+    write_keypoints,
+    write_matches,
+)
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.errors import DatabaseError
+from colmap_affrect.features.rootsift import extract_rootsift
+from colmap_affrect.geometry.affine import lafs_from_keypoints, rotation, transform_frames
+from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
+from colmap_affrect.imaging import warp
+from colmap_affrect.options import CameraOptions, SiftOptions
+from colmap_affrect.types import Rectification
+
+FLOAT32_ROUNDING = 1e-5
+"""Coordinates up to 200 px and shapes up to 80 px in float32, relative to their size."""
+
+ELLIPSE_ERROR_DEG = 3.0
+
+
+@pytest.fixture
+def image_folder(tmp_path: Path) -> Path:
+    """Four images of two sizes, in folders, with names that need care."""
+    folder = tmp_path / "images"
+    for seed, name in enumerate(["b.png", "a.png", "wing/č 1.png", "wing/a.png"]):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_image(path, texture((90, 60) if seed < 3 else (64, 80), seed))
+    return folder
+
+
+NAMES = ["a.png", "b.png", "wing/a.png", "wing/č 1.png"]
+
+
+@pytest.fixture
+def database_path(tmp_path: Path, image_folder: Path) -> Path:
+    """A database with the images of the folder and no keypoints."""
+    path = tmp_path / "database.db"
+    assert import_images(path, image_folder, NAMES, CameraOptions()) == []
+    return path
+
+
+def some_frames(count: int) -> Array:
+    """Frames that differ from each other."""
+    rng = np.random.default_rng(count)
+    points = rng.uniform(0, [90, 60], (count, 2))
+    return lafs_from_keypoints(points, rng.uniform(5, 80, count), rng.uniform(-3, 3, count))
+
+
+def test_import_images_adds_all_images_and_names_those_colmap_cannot_read(
+    tmp_path: Path, image_folder: Path
+) -> None:
+    (image_folder / "text.png").write_bytes(b"no image")
+    path = tmp_path / "database.db"
+    unreadable = import_images(path, image_folder, ["text.png", *NAMES], CameraOptions())
+    assert unreadable == ["text.png"]
+    assert sorted(image_ids(path)) == NAMES
+
+
+def test_import_images_again_adds_only_what_is_new(tmp_path: Path, image_folder: Path) -> None:
+    path = tmp_path / "database.db"
+    import_images(path, image_folder, NAMES[1:3], CameraOptions())
+    before = image_ids(path)
+    import_images(path, image_folder, NAMES, CameraOptions())
+    after = image_ids(path)
+    assert {name: after[name] for name in before} == before
+    assert sorted(after) == NAMES
+    with open_database(path) as database:
+        assert (database.num_images(), database.num_frames()) == (4, 4)
+
+
+@pytest.mark.parametrize(("mode", "count"), [("single", 1), ("per-folder", 2), ("per-image", 3)])
+def test_import_images_shares_cameras_by_mode(
+    tmp_path: Path, image_folder: Path, mode: str, count: int
+) -> None:
+    path = tmp_path / "database.db"
+    names = NAMES[:2] + NAMES[3:]
+    options = CameraOptions(mode=mode, model="PINHOLE", params="100,101,45,30")
+    assert import_images(path, image_folder, names, options) == []
+    with open_database(path) as database:
+        cameras = database.read_all_cameras()
+    assert len(cameras) == count
+    for camera in cameras:
+        assert camera.model == pycolmap.CameraModelId.PINHOLE
+        assert_allclose(camera.params, [100, 101, 45, 30])
+        assert (camera.width, camera.height) == (90, 60)
+
+
+def test_image_ids_of_a_file_that_is_no_database_is_a_database_error(tmp_path: Path) -> None:
+    path = tmp_path / "not a database.db"
+    path.write_bytes(b"something else, long enough to have a header of its own" * 10)
+    with pytest.raises(DatabaseError, match=r"not a database\.db"):
+        image_ids(path)
+
+
+def test_colmap_keypoints_move_by_half_a_pixel_and_divide_shapes_by_six() -> None:
+    laf = np.array([[[12.0, -6.0, 10.0], [3.0, 18.0, 20.0]]])
+    keypoints = colmap_keypoints(laf)
+    assert keypoints.dtype == np.float32
+    assert_allclose(keypoints, [[10.5, 20.5, 2.0, -1.0, 0.5, 3.0]])
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20)
+@given(frames())
+def test_write_keypoints_round_trips_frames(database_path: Path, lafs: Array) -> None:
+    database_path.with_name("copy.db").write_bytes(database_path.read_bytes())
+    with open_database(database_path.with_name("copy.db")) as database:
+        write_keypoints(database, 2, lafs)
+        stored = database.read_keypoints(2).astype(float)
+    assert stored.shape == (len(lafs), 6)
+    assert_allclose(stored[:, :2], lafs[:, :, 2] + 0.5, atol=200 * FLOAT32_ROUNDING)
+    assert_allclose(
+        stored[:, 2:].reshape(-1, 2, 2) * MEASUREMENT_SIGMAS,
+        lafs[:, :, :2],
+        atol=80 * FLOAT32_ROUNDING,
+    )
+
+
+@pytest.mark.parametrize("count", [0, 1, 40_000])
+def test_write_keypoints_writes_any_number_of_frames(database_path: Path, count: int) -> None:
+    lafs = some_frames(count)
+    with open_database(database_path) as database:
+        write_keypoints(database, 1, lafs)
+        assert database.exists_keypoints(1)
+        assert database.num_keypoints_for_image(1) == count
+        np.testing.assert_array_equal(
+            database.read_keypoints(1).reshape(-1, 6), colmap_keypoints(lafs)
+        )
+
+
+def test_write_keypoints_keeps_keypoints_that_are_there(database_path: Path) -> None:
+    with open_database(database_path) as database:
+        write_keypoints(database, 1, some_frames(5))
+        write_keypoints(database, 1, some_frames(5) + 1.0)
+        np.testing.assert_array_equal(database.read_keypoints(1), colmap_keypoints(some_frames(5)))
+
+
+def test_write_keypoints_refuses_another_number_than_is_there(database_path: Path) -> None:
+    with open_database(database_path) as database:
+        write_keypoints(database, 1, some_frames(5))
+        with pytest.raises(DatabaseError, match=r"5 keypoints .* 9"):
+            write_keypoints(database, 1, some_frames(9))
+        assert database.num_keypoints_for_image(1) == 5
+
+
+@pytest.mark.parametrize("place", [(1, 0, 2), (2, 1, 0)])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_write_keypoints_refuses_values_that_are_not_finite(
+    database_path: Path, place: tuple[int, int, int], value: float
+) -> None:
+    lafs = some_frames(4)
+    lafs[place] = value
+    with open_database(database_path) as database:
+        with pytest.raises(DatabaseError, match="finite"):
+            write_keypoints(database, 3, lafs)
+        assert not database.exists_keypoints(3)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 77.0])
+def test_elliptic_blob_of_30_degrees_keeps_its_axis_in_the_database(
+    database_path: Path, turn_deg: float
+) -> None:
+    # An ellipse of axis ratio 2 with its long axis 30 degrees from x towards y.
+    ellipse = rotation(np.deg2rad(30.0)) @ np.diag([10.0, 5.0])
+    image = blobs((220, 200), [[110.3, 99.6]], ellipse)
+    # The map diag(t, 1) R(phi) that makes it round stretches the direction -phi: 120 degrees.
+    linear = rectifying_affine(2.0, np.deg2rad(60.0))
+    corners = np.array([[0.0, 0.0], [219.0, 0.0], [0.0, 199.0], [219.0, 199.0]])
+    matrix, canvas = fit_canvas(linear, corners, margin_px=0.0)
+    plan = Rectification(matrix, canvas, np.ones(image.shape, bool), 2.0, np.deg2rad(60.0))
+    features = extract_rootsift(warp(image, plan), SiftOptions())
+    lafs = transform_frames(plan.image_from_rectified, features.lafs)
+    best = np.linalg.norm(lafs[:, :, 2] - [110.3, 99.6], axis=1).argmin()
+    laf = lafs[best : best + 1].copy()
+    laf[0, :, :2] = laf[0, :, :2] @ rotation(np.deg2rad(turn_deg))
+    with open_database(database_path) as database:
+        write_keypoints(database, 1, laf)
+        x, y, *shape = database.read_keypoints(1)[0].astype(float)
+    assert np.hypot(x - 110.8, y - 100.1) < 0.1
+    values, vectors = np.linalg.eigh(np.reshape(shape, (2, 2)) @ np.reshape(shape, (2, 2)).T)
+    angle_deg = np.rad2deg(np.arctan2(vectors[1, 1], vectors[0, 1])) % 180.0
+    assert abs(angle_deg - 30.0) < ELLIPSE_ERROR_DEG
+    assert_allclose(np.sqrt(values), [5.0, 10.0], rtol=0.2)
+    names = ("x", "y", "a11", "a12", "a21", "a22")
+    keypoint = pycolmap.FeatureKeypoint(dict(zip(names, (x, y, *shape), strict=True)))
+    # COLMAP's scale is the mean length of the columns, between the two half axes.
+    assert 5.0 < keypoint.compute_scale() < 10.0
+
+
+@pytest.fixture
+def matchable_path(database_path: Path) -> Path:
+    """A database whose images 1 to 4 have 5, 7, 0 and 40000 keypoints."""
+    with open_database(database_path) as database:
+        for image_id, count in enumerate([5, 7, 0, 40_000], 1):
+            write_keypoints(database, image_id, some_frames(count))
+    return database_path
+
+
+@pytest.mark.parametrize("pair", [(1, 2), (2, 1)])
+@pytest.mark.parametrize("dtype", [np.int32, np.int64, np.uint32, np.uint16])
+def test_write_matches_round_trips_in_the_order_of_the_pair(
+    matchable_path: Path, pair: tuple[int, int], dtype: type
+) -> None:
+    matches = np.array([[4, 1], [0, 3], [2, 2]], dtype=dtype)
+    with open_database(matchable_path) as database:
+        write_matches(database, *pair, matches)
+        np.testing.assert_array_equal(database.read_matches(*pair), matches)
+        np.testing.assert_array_equal(database.read_matches(*pair[::-1]), matches[:, ::-1])
+
+
+def test_write_matches_writes_indices_above_the_range_of_16_bits(matchable_path: Path) -> None:
+    matches = np.array([[39_999, 6], [32_768, 0]])
+    with open_database(matchable_path) as database:
+        write_matches(database, 4, 2, matches)
+        np.testing.assert_array_equal(database.read_matches(4, 2), matches)
+
+
+@pytest.mark.parametrize("pair", [(1, 2), (1, 3)])
+def test_write_matches_of_no_matches_leaves_a_row(
+    matchable_path: Path, pair: tuple[int, int]
+) -> None:
+    with open_database(matchable_path) as database:
+        write_matches(database, *pair, np.zeros((0, 2), np.int64))
+        assert database.exists_matches(*pair)
+        assert len(database.read_matches(*pair)) == 0
+
+
+@pytest.mark.parametrize("pair", [(1, 2), (2, 1)])
+def test_write_matches_keeps_matches_that_are_there(
+    matchable_path: Path, pair: tuple[int, int]
+) -> None:
+    with open_database(matchable_path) as database:
+        write_matches(database, 1, 2, np.array([[4, 6]]))
+        write_matches(database, *pair, np.array([[0, 0], [1, 1]]))
+        assert database.read_matches(1, 2).tolist() == [[4, 6]]
+
+
+@pytest.mark.parametrize(
+    ("pair", "matches"),
+    [
+        ((1, 2), np.array([[0.0, 1.0]])),
+        ((1, 2), np.array([[3.7, 2.2]], np.float32)),
+        ((1, 2), np.array([[True, False]])),
+        ((1, 2), np.array([[0, 1, 2]])),
+        ((1, 2), np.array([0, 1])),
+        ((1, 2), np.array([[-1, 0]])),
+        ((1, 2), np.array([[5, 0]])),
+        ((1, 2), np.array([[0, 7]])),
+        ((2, 1), np.array([[0, 5]])),
+        ((1, 3), np.array([[0, 0]])),
+        ((4, 2), np.array([[40_000, 1]])),
+        ((4, 2), np.array([[40_000, 1]], np.uint16).astype(np.int16)),
+        ((1, 2), np.array([[4_294_967_295, 0]], np.uint32)),
+        ((1, 2), np.array([[1 << 32, 0]])),
+        ((1, 1), np.array([[0, 1]])),
+        ((1, 99), np.array([[0, 1]])),
+    ],
+    ids=[
+        "float64", "float32", "bool", "three columns", "one dimension", "negative",
+        "first out of range", "second out of range", "out of range in reversed pair",
+        "image without keypoints", "one past the end", "wrapped to 16 bits",
+        "-1 as uint32", "33 bits", "same image", "unknown image",
+    ],
+)  # fmt: skip
+def test_write_matches_refuses_what_would_crash_colmap(
+    matchable_path: Path, pair: tuple[int, int], matches: np.ndarray
+) -> None:
+    with open_database(matchable_path) as database:
+        with pytest.raises(DatabaseError):
+            write_matches(database, *pair, matches)
+        assert database.num_matches() == 0
+        assert database.num_matched_image_pairs() == 0

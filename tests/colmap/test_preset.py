@@ -1,0 +1,318 @@
+"""The sparse preset on scenes with known truth, written through our writer."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database, write_keypoints, write_matches
+from colmap_affrect.colmap.mapping import pipeline_options
+from colmap_affrect.colmap.verification import two_view_options
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS, pixel_from_colmap
+from colmap_affrect.options import MappingOptions, VerificationOptions
+
+SEED = 3
+
+ROTATION_ERROR_DEG = 0.05
+"""Keypoints are exact; what is left are float32 coordinates and the optimiser's tolerance."""
+
+SIZE = (1600, 1200)
+
+Pair = tuple[int, int]
+Matches = dict[Pair, NDArray[np.integer]]
+
+
+def synthesize(
+    path: Path, num_images: int, num_points: int
+) -> tuple[pycolmap.Reconstruction, dict[int, NDArray[np.floating]], Matches]:
+    """Let COLMAP make a scene; return the truth, keypoints (corner origin) and all matches."""
+    pycolmap.set_random_seed(SEED)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_frames_per_rig=num_images, num_points3D=num_points
+    )
+    with open_database(path) as database:
+        truth = pycolmap.synthesize_dataset(options, database)
+        ids = sorted(image.image_id for image in database.read_all_images())
+        keypoints = {image_id: database.read_keypoints(image_id)[:, :2] for image_id in ids}
+        matches = {pair: database.read_matches(*pair) for pair in combinations(ids, 2)}
+    return truth, keypoints, matches
+
+
+def write_scene(
+    path: Path,
+    cameras: list[pycolmap.Camera],
+    images: list[pycolmap.Image],
+    keypoints: dict[int, NDArray[np.floating]],
+    matches: Matches,
+) -> Path:
+    """Write a database through our writer, from keypoints with COLMAP's corner origin."""
+    with open_database(path) as database:
+        for camera in cameras:
+            database.write_camera(camera, use_camera_id=True)
+        for image in images:
+            database.write_image(image, use_image_id=True)
+        for image_id, points in keypoints.items():
+            lafs = np.zeros((len(points), 2, 3))
+            lafs[:, :, :2] = MEASUREMENT_SIGMAS * np.eye(2)
+            lafs[:, :, 2] = pixel_from_colmap(points.astype(float))
+            write_keypoints(database, image_id, lafs)
+        for pair, indices in matches.items():
+            write_matches(database, *pair, indices)
+    return path
+
+
+def bare_images(truth: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """Images with the names, ids and cameras of a model and nothing else."""
+    return [
+        pycolmap.Image(name=image.name, image_id=image_id, camera_id=image.camera_id)
+        for image_id, image in sorted(truth.images.items())
+    ]
+
+
+def rewrite(
+    folder: Path,
+    num_images: int,
+    num_points: int,
+    kept: dict[Pair, range] | None = None,
+) -> tuple[Path, pycolmap.Reconstruction]:
+    """Write a synthesized scene through our writer.
+
+    Args:
+        kept: the pairs to keep, each with the 3D points whose matches it keeps.
+    """
+    truth, keypoints, matches = synthesize(folder / "source.db", num_images, num_points)
+    if kept is not None:
+        matches = {pair: of_points(truth, pair, matches[pair], kept[pair]) for pair in kept}
+    cameras = list(truth.cameras.values())
+    path = write_scene(folder / "ours.db", cameras, bare_images(truth), keypoints, matches)
+    return path, truth
+
+
+def of_points(
+    truth: pycolmap.Reconstruction, pair: Pair, matches: NDArray[np.integer], points: range
+) -> NDArray[np.integer]:
+    """Matches of 3D points whose rank among the ids is in a range."""
+    ranks = {point_id: rank for rank, point_id in enumerate(sorted(truth.points3D))}
+    seen = [truth.images[pair[0]].points2D[index].point3D_id for index in matches[:, 0]]
+    return matches[[point_id in ranks and ranks[point_id] in points for point_id in seen]]
+
+
+def verify(path: Path, options: pycolmap.TwoViewGeometryOptions | None = None) -> dict[Pair, int]:
+    """Verify a database and return the inliers of each pair that passed."""
+    chosen = two_view_options(VerificationOptions(), SEED) if options is None else options
+    pycolmap.geometric_verification(path, two_view_geometry_options=chosen)
+    with open_database(path) as database:
+        pair_ids, counts = database.read_two_view_geometry_num_inliers()
+    return {
+        pycolmap.pair_id_to_image_pair(pair_id): int(count)
+        for pair_id, count in zip(pair_ids, counts, strict=True)
+        if count
+    }
+
+
+def reconstruct(
+    path: Path, options: pycolmap.IncrementalPipelineOptions | None = None
+) -> list[pycolmap.Reconstruction]:
+    """Map a verified database; models by falling number of images."""
+    output = path.parent / "sparse"
+    output.mkdir(exist_ok=True)
+    ours = pipeline_options(MappingOptions(), SEED, intrinsics_given=False)
+    chosen = ours if options is None else options
+    models = pycolmap.incremental_mapping(path, path.parent, output, options=chosen)
+    return sorted(models.values(), key=lambda model: -model.num_reg_images())
+
+
+def registered(model: pycolmap.Reconstruction) -> list[str]:
+    """Names of the registered images, sorted."""
+    return sorted(model.images[image_id].name for image_id in model.reg_image_ids())
+
+
+def rotation_errors_deg(
+    model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction
+) -> list[float]:
+    """Errors of the relative rotation of every two registered images."""
+    errors = []
+    for id1, id2 in combinations(sorted(model.reg_image_ids()), 2):
+        relative = [
+            scene.images[id2].cam_from_world().rotation
+            * scene.images[id1].cam_from_world().rotation.inverse()
+            for scene in (model, truth)
+        ]
+        errors.append(np.rad2deg((relative[0] * relative[1].inverse()).angle()))
+    return errors
+
+
+def test_synthetic_scene_through_our_writer_registers_all_images_in_place(
+    tmp_path: Path,
+) -> None:
+    path, truth = rewrite(tmp_path, num_images=5, num_points=150)
+    verified = verify(path)
+    assert len(verified) == 10
+    (model,) = reconstruct(path)
+    assert registered(model) == sorted(image.name for image in truth.images.values())
+    assert model.num_points3D() >= 140
+    assert max(rotation_errors_deg(model, truth)) < ROTATION_ERROR_DEG
+    assert model.compute_mean_reprojection_error() < 0.05
+    # The principal point is half the size: a shift by half a pixel would show in the points.
+    point = next(iter(model.points3D.values()))
+    element = point.track.elements[0]
+    with open_database(path) as database:
+        stored = database.read_keypoints(element.image_id)[element.point2D_idx, :2]
+    with open_database(tmp_path / "source.db") as database:
+        source = database.read_keypoints(element.image_id)[element.point2D_idx, :2]
+    assert_allclose(stored, source, atol=1e-3)
+
+
+@pytest.mark.parametrize("order", ["forward", "reversed"])
+def test_pairs_given_in_either_order_verify_the_same(tmp_path: Path, order: str) -> None:
+    truth, keypoints, matches = synthesize(tmp_path / "source.db", 3, 100)
+    if order == "reversed":
+        matches = {pair[::-1]: indices[:, ::-1] for pair, indices in matches.items()}
+    path = write_scene(
+        tmp_path / "ours.db", list(truth.cameras.values()), bare_images(truth), keypoints, matches
+    )
+    expected = {(1, 2): 90, (1, 3): 90, (2, 3): 90}
+    verified = verify(path)
+    assert verified.keys() == expected.keys()
+    assert all(verified[pair] >= count for pair, count in expected.items())
+
+
+def test_two_images_register_with_our_preset_and_not_with_colmaps_default(
+    tmp_path: Path,
+) -> None:
+    path, truth = rewrite(tmp_path, num_images=2, num_points=400)
+    verify(path)
+    assert reconstruct(path, pycolmap.IncrementalPipelineOptions(random_seed=SEED)) == []
+    (model,) = reconstruct(path)
+    assert registered(model) == sorted(image.name for image in truth.images.values())
+    assert max(rotation_errors_deg(model, truth)) < 10 * ROTATION_ERROR_DEG
+
+
+def test_two_view_tracks_only_register_with_our_preset_and_not_with_colmaps_default(
+    tmp_path: Path,
+) -> None:
+    # A chain of images; each pair sees other points, so no track is longer than two.
+    thirds = {(1, 2): range(0, 200), (2, 3): range(200, 400), (3, 4): range(400, 600)}
+    path, _ = rewrite(tmp_path, num_images=4, num_points=600, kept=thirds)
+    assert verify(path).keys() == thirds.keys()
+    assert reconstruct(path, pycolmap.IncrementalPipelineOptions(random_seed=SEED)) == []
+    models = reconstruct(path)
+    assert models
+    assert models[0].num_reg_images() >= 2
+    assert {point.track.length() for point in models[0].points3D.values()} == {2}
+
+
+def test_same_seed_registers_the_same_images_in_the_same_models(tmp_path: Path) -> None:
+    results = []
+    for run in ("first", "second"):
+        (tmp_path / run).mkdir()
+        pairs = {(1, 2): range(0, 150), (2, 3): range(50, 200), (3, 4): range(100, 250)}
+        path, _ = rewrite(tmp_path / run, num_images=4, num_points=250, kept=pairs)
+        inliers = verify(path)
+        models = reconstruct(path)
+        results.append((inliers, [(registered(model), model.num_points3D()) for model in models]))
+    assert results[0] == results[1]
+    assert len(results[0][1][0][0]) >= 3
+
+
+def random_pairs(folder: Path, count: int, num_pairs: int) -> Path:
+    """Pairs of images whose correspondences are uniformly random."""
+    rng = np.random.default_rng(count)
+    width, height = SIZE
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.2 * width, width, height)
+    ids = range(1, 2 * num_pairs + 1)
+    images = [pycolmap.Image(name=f"{i:02}.png", image_id=i, camera_id=1) for i in ids]
+    keypoints = {i: rng.uniform(0, SIZE, (count, 2)) for i in ids}
+    same = np.stack([np.arange(count)] * 2, axis=1)
+    matches: Matches = {(i, i + 1): same for i in ids[::2]}
+    return write_scene(folder / f"random{count}.db", [camera], images, keypoints, matches)
+
+
+@pytest.mark.parametrize(("count", "num_pairs"), [(200, 2), (1000, 1), (5000, 1)])
+def test_random_matches_are_rejected_by_our_preset(
+    tmp_path: Path, count: int, num_pairs: int
+) -> None:
+    assert verify(random_pairs(tmp_path, count, num_pairs)) == {}
+
+
+def test_random_matches_are_accepted_by_colmaps_default(tmp_path: Path) -> None:
+    # What the preset is for; and proof that the pairs of the test above can pass.
+    path = random_pairs(tmp_path, 1000, 1)
+    assert len(verify(path, pycolmap.TwoViewGeometryOptions(ransac=dict(random_seed=1)))) == 1
+
+
+def test_random_matches_among_true_ones_are_sorted_out(tmp_path: Path) -> None:
+    truth, keypoints, matches = synthesize(tmp_path / "source.db", 2, 300)
+    rng = np.random.default_rng(0)
+    true_pairs = matches[1, 2]
+    wrong = np.stack([rng.permutation(len(keypoints[i]))[:200] for i in (1, 2)], axis=1)
+    wrong = wrong[~(wrong[:, None] == true_pairs[None]).all(axis=2).any(axis=1)]
+    path = write_scene(
+        tmp_path / "ours.db",
+        list(truth.cameras.values()),
+        bare_images(truth),
+        keypoints,
+        {(1, 2): np.concatenate([true_pairs, wrong])},
+    )
+    verify(path)
+    with open_database(path) as database:
+        inliers = database.read_two_view_geometry(1, 2).inlier_matches
+    correct = (inliers[:, None] == true_pairs[None]).all(axis=2).any(axis=1)
+    assert np.count_nonzero(correct) >= 0.98 * len(true_pairs)
+    # A wrong match passes where its point lies within 4 px of the epipolar line by chance.
+    assert np.count_nonzero(~correct) <= 0.05 * len(wrong)
+
+
+def test_two_view_options_pass_every_value_on() -> None:
+    options = VerificationOptions(
+        max_error_px=3.0,
+        min_num_inliers=21,
+        min_inlier_ratio=0.17,
+        max_num_trials=777,
+        ransac_min_inlier_ratio=0.13,
+    )
+    passed = two_view_options(options, 5)
+    assert (passed.min_num_inliers, passed.min_inlier_ratio) == (21, 0.17)
+    ransac = passed.ransac
+    assert (ransac.max_error, ransac.min_inlier_ratio) == (3.0, 0.13)
+    assert (ransac.max_num_trials, ransac.random_seed) == (777, 5)
+
+
+def test_pipeline_options_pass_every_value_on() -> None:
+    options = MappingOptions(
+        ignore_two_view_tracks=True,
+        init_min_tri_angle_deg=7.0,
+        init_min_num_inliers=44,
+        abs_pose_min_num_inliers=17,
+        min_model_size=6,
+    )
+    passed = pipeline_options(options, 5, intrinsics_given=False)
+    assert (passed.min_model_size, passed.random_seed) == (6, 5)
+    mapper = passed.mapper
+    assert (mapper.init_min_tri_angle, mapper.init_min_num_inliers) == (7.0, 44)
+    assert (mapper.abs_pose_min_num_inliers, mapper.random_seed) == (17, 5)
+    assert passed.triangulation.ignore_two_view_tracks is True
+    assert passed.triangulation.random_seed == 5
+    defaults = pipeline_options(MappingOptions(), 0, intrinsics_given=False)
+    assert defaults.triangulation.ignore_two_view_tracks is False
+
+
+@pytest.mark.parametrize(
+    ("given", "keep", "refined"),
+    [(False, True, True), (True, True, False), (True, False, True), (False, False, True)],
+)
+def test_pipeline_options_leave_given_intrinsics_alone_if_asked_to(
+    given: bool, keep: bool, refined: bool
+) -> None:
+    options = MappingOptions(keep_given_intrinsics=keep)
+    passed = pipeline_options(options, 0, intrinsics_given=given)
+    assert passed.ba_refine_focal_length is refined
+    assert passed.ba_refine_extra_params is refined
+    assert passed.mapper.abs_pose_refine_focal_length is refined
+    assert passed.mapper.abs_pose_refine_extra_params is refined

@@ -1,0 +1,22 @@
+"""Settings shared by all tests: the hypothesis profile, and the way to the helpers."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from hypothesis import HealthCheck, settings
+
+# Tests are imported by path (``--import-mode=importlib``), their helpers by name.
+sys.path.insert(0, str(Path(__file__).parent))
+
+settings.register_profile(
+    "ci",
+    derandomize=True,
+    deadline=None,
+    max_examples=60,
+    database=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.register_profile("nightly", parent=settings.get_profile("ci"), max_examples=1000)
+settings.load_profile("ci")

@@ -1,0 +1,73 @@
+"""Fixed-radius neighbours against all distances."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import Array
+
+from colmap_affrect.geometry.neighbors import neighbors_within
+
+# Eighths are exact in binary, so points at exactly the radius are no matter of rounding.
+coordinates = st.integers(-400, 400).map(lambda eighths: eighths / 8)
+point_sets = st.lists(st.tuples(coordinates, coordinates), max_size=60).map(
+    lambda points: np.array(points, dtype=float).reshape(-1, 2)
+)
+radii = st.sampled_from([0.125, 0.625, 1.25, 5.0, 12.5, 200.0])
+
+
+def all_neighbors(points: Array, radius: float) -> list[list[int]]:
+    """Neighbours by comparing every pair."""
+    squares = ((points[:, None] - points[None]) ** 2).sum(axis=2)
+    return [np.flatnonzero(row <= radius**2).tolist() for row in squares]
+
+
+@given(point_sets, radii)
+def test_neighbors_within_equals_all_distances(points: Array, radius: float) -> None:
+    lists = neighbors_within(points, radius)
+    assert lists.starts.shape == (len(points) + 1,)
+    actual = [
+        sorted(lists.indices[begin:end].tolist())
+        for begin, end in zip(lists.starts[:-1], lists.starts[1:], strict=True)
+    ]
+    assert actual == all_neighbors(points, radius)
+
+
+@given(point_sets.filter(len), st.data())
+def test_of_lists_the_neighbors_of_the_points_asked_for_in_order(
+    points: Array, data: st.DataObject
+) -> None:
+    asked = np.array(data.draw(st.lists(st.integers(0, len(points) - 1), max_size=10)), dtype=int)
+    rows, neighbors = neighbors_within(points, 5.0).of(asked)
+    expected = all_neighbors(points, 5.0)
+    assert (np.diff(rows) >= 0).all()
+    for position, point in enumerate(asked):
+        assert sorted(neighbors[rows == position].tolist()) == expected[point]
+
+
+def test_neighbors_within_includes_points_at_exactly_the_radius_and_the_point_itself() -> None:
+    lists = neighbors_within(np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 4.125]]), 5.0)
+    assert sorted(lists.of(np.array([0]))[1].tolist()) == [0, 1]
+    assert sorted(lists.of(np.array([2]))[1].tolist()) == [1, 2]
+
+
+def test_neighbors_within_keeps_points_of_the_same_place_apart() -> None:
+    lists = neighbors_within(np.array([[7.0, 2.0]] * 3 + [[2.0, 7.0]]), 1.0)
+    assert sorted(lists.of(np.array([1]))[1].tolist()) == [0, 1, 2]
+    assert lists.of(np.array([3]))[1].tolist() == [3]
+
+
+def test_neighbors_within_does_not_join_row_ends_with_the_next_row() -> None:
+    # The last cell of one row of cells and the first of the next have neighbouring keys.
+    xs, ys = np.meshgrid(np.arange(0.0, 50.0, 0.5), np.arange(0.0, 5.0, 0.5))
+    points = np.stack([xs.ravel(), ys.ravel()], axis=1)
+    rows, neighbors = neighbors_within(points, 1.0).of(np.arange(len(points)))
+    assert np.linalg.norm(points[rows] - points[neighbors], axis=1).max() <= 1.0
+    assert len(rows) == sum(map(len, all_neighbors(points, 1.0)))
+
+
+def test_neighbors_within_of_no_points_is_empty() -> None:
+    lists = neighbors_within(np.zeros((0, 2)), 3.0)
+    rows, neighbors = lists.of(np.zeros(0, dtype=int))
+    assert len(rows) == len(neighbors) == 0

@@ -1,0 +1,307 @@
+"""Properties of the space of tilts against a singular value decomposition, and covers of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from strategies import Array, affine_shapes, classes, scales, turns
+
+from colmap_affrect.geometry.affine import compose_affine, rotation
+from colmap_affrect.geometry.tilts import (
+    GRID_TILTS,
+    IDENTITY_LABEL,
+    UNCOVERED_LABEL,
+    ball_threshold,
+    cosh_distances,
+    cover_shapes,
+    covering_grid,
+    metrics_from_tilts,
+    nearest_centers,
+    tilt_distance,
+    tilts_from_metrics,
+    unit_metrics,
+)
+
+ARCCOSH_ROUNDING = 1e-6
+"""arccosh(1 + e) = sqrt(2 e): rounding of 1e-13 in cosh d is 5e-7 in d."""
+
+RADIUS = 1.7
+MAX_TILT = 5.8
+
+Class = tuple[float, float]
+
+
+def transition_tilt(matrix1: Array, matrix2: Array) -> float:
+    """Ratio of the singular values of M1 M2^-1: the definition of the transition tilt."""
+    singular = np.linalg.svd(matrix1 @ np.linalg.inv(matrix2), compute_uv=False)
+    return float(singular[0] / singular[1])
+
+
+def random_classes(seed: int, count: int, max_tilt: float) -> tuple[Array, Array]:
+    """Classes whose log tilts and angles are uniform."""
+    rng = np.random.default_rng(seed)
+    return max_tilt ** rng.random(count), np.pi * rng.random(count)
+
+
+@given(classes(), classes(), scales, scales, turns, turns)
+def test_tilt_distance_is_the_log_of_the_transition_tilt_by_svd(
+    class1: Class, class2: Class, scale1: float, scale2: float, psi1: float, psi2: float
+) -> None:
+    matrix1 = compose_affine(scale1, psi1, *class1)
+    matrix2 = compose_affine(scale2, psi2, *class2)
+    expected = transition_tilt(matrix1, matrix2)
+    assert_allclose(np.exp(tilt_distance(*class1, *class2)), expected, rtol=ARCCOSH_ROUNDING)
+
+
+def test_tilt_distance_has_the_closed_form_that_the_authors_program_misses() -> None:
+    # The program has t1 / t2 for 1 / (t1 t2): cosh d = 1.78 where the identity is at log 2.
+    assert_allclose(tilt_distance(2.0, 1.0, 1.0, 0.0), np.log(2.0), atol=ARCCOSH_ROUNDING)
+    tilt1, tilt2, turn = 2.0, 5.0, 0.3
+    cosh = (
+        (tilt1 / tilt2 + tilt2 / tilt1) * np.cos(turn) ** 2
+        + (tilt1 * tilt2 + 1 / (tilt1 * tilt2)) * np.sin(turn) ** 2
+    ) / 2
+    actual = tilt_distance(tilt1, 0.2 + turn, tilt2, 0.2)
+    assert_allclose(np.cosh(actual), cosh, rtol=1e-12)
+
+
+@given(classes(), classes())
+def test_tilt_distance_is_symmetric_and_zero_on_equal_classes(class1: Class, class2: Class) -> None:
+    forward, backward = tilt_distance(*class1, *class2), tilt_distance(*class2, *class1)
+    assert_allclose(forward, backward, atol=ARCCOSH_ROUNDING)
+    assert_allclose(tilt_distance(*class1, *class1), 0.0, atol=ARCCOSH_ROUNDING)
+
+
+@given(classes(), classes(), turns)
+def test_tilt_distance_has_period_pi_and_ignores_a_common_turn(
+    class1: Class, class2: Class, turn: float
+) -> None:
+    (tilt1, angle1), (tilt2, angle2) = class1, class2
+    distance = tilt_distance(tilt1, angle1, tilt2, angle2)
+    shifted = tilt_distance(tilt1, angle1 + np.pi, tilt2, angle2)
+    turned = tilt_distance(tilt1, angle1 + turn, tilt2, angle2 + turn)
+    assert_allclose([shifted, turned], distance, atol=ARCCOSH_ROUNDING)
+
+
+@given(classes(), classes(), classes())
+def test_tilt_distance_obeys_the_triangle_inequality(a: Class, b: Class, c: Class) -> None:
+    assert tilt_distance(*a, *c) <= (
+        tilt_distance(*a, *b) + tilt_distance(*b, *c) + ARCCOSH_ROUNDING
+    )
+
+
+@given(affine_shapes(), affine_shapes(), affine_shapes())
+def test_cosh_distances_ignore_a_common_map_on_the_right(
+    matrix1: Array, matrix2: Array, common: Array
+) -> None:
+    before = cosh_distances(unit_metrics(matrix1[None]), unit_metrics(matrix2[None]))
+    after = cosh_distances(
+        unit_metrics(matrix1[None] @ common), unit_metrics(matrix2[None] @ common)
+    )
+    # Condition numbers of 8 in both maps and in the common one.
+    assert_allclose(after, before, rtol=1e-9)
+
+
+@given(affine_shapes(), turns)
+def test_unit_metrics_of_the_rectifying_map_ignore_the_orientation_of_the_frame(
+    frame: Array, turn: float
+) -> None:
+    expected = unit_metrics(np.linalg.inv(frame))
+    actual = unit_metrics(np.linalg.inv(frame @ rotation(turn)))
+    assert_allclose(actual, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_unit_metrics_hold_s11_s22_s12_of_the_gram_matrix() -> None:
+    matrix = np.array([[2.0, 1.0], [0.0, 3.0]])
+    # M^T M = [[4, 2], [2, 10]], det M = 6.
+    assert_allclose(unit_metrics(matrix), [4 / 6, 10 / 6, 2 / 6])
+
+
+@given(classes())
+def test_metrics_from_tilts_equal_the_metrics_of_the_maps(cls: Class) -> None:
+    assert_allclose(
+        metrics_from_tilts(*cls), unit_metrics(compose_affine(1.0, 0.0, *cls)), atol=1e-12
+    )
+
+
+@given(affine_shapes())
+def test_tilts_from_metrics_name_the_class_of_the_map(matrix: Array) -> None:
+    tilt, angle = tilts_from_metrics(unit_metrics(matrix))
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    assert_allclose(tilt, singular[0] / singular[1], rtol=ARCCOSH_ROUNDING)
+    assert 0.0 <= angle < np.pi
+    same_class = compose_affine(1.0, 0.0, tilt, angle)
+    assert_allclose(transition_tilt(matrix, same_class), 1.0, atol=1e-5)
+
+
+def test_cosh_distances_are_a_matrix_of_first_by_second() -> None:
+    metrics1 = metrics_from_tilts([1.0, 2.0, 3.0], [0.0, 0.4, 1.1])
+    metrics2 = metrics_from_tilts([5.0, 1.5], [2.0, 0.7])
+    distances = np.arccosh(cosh_distances(metrics1, metrics2))
+    assert distances.shape == (3, 2)
+    assert_allclose(distances[2, 0], tilt_distance(3.0, 1.1, 5.0, 2.0))
+    assert_allclose(distances[1, 1], tilt_distance(2.0, 0.4, 1.5, 0.7))
+
+
+def test_ball_threshold_of_1_7_is_1_144118() -> None:
+    assert_allclose(ball_threshold(RADIUS), 1.144118, atol=5e-7)
+
+
+def test_covering_grid_has_six_tilts_by_32_angles() -> None:
+    grid = covering_grid()
+    assert grid.shape == (192, 2)
+    assert_allclose(GRID_TILTS, [2.0, 2.50945, 3.14866, 3.95070, 4.95703, 6.21970], atol=1e-5)
+    assert_allclose(np.unique(grid[:, 0]), np.sort(GRID_TILTS))
+    assert_allclose(np.unique(grid[:, 1]), np.arange(32) * np.pi / 32)
+    assert len(np.unique(grid, axis=0)) == 192
+
+
+@pytest.mark.parametrize(("tilt", "half_width_deg"), [(2.0, 20.97), (3.9507, 8.35)])
+def test_ball_of_1_7_has_the_angular_half_width_of_the_paper(
+    tilt: float, half_width_deg: float
+) -> None:
+    accuracy_deg = 0.005  # the oracle has two decimals
+    inside = tilt_distance(tilt, np.deg2rad(half_width_deg - accuracy_deg), tilt, 0.0)
+    outside = tilt_distance(tilt, np.deg2rad(half_width_deg + accuracy_deg), tilt, 0.0)
+    assert inside < np.log(RADIUS) < outside
+
+
+def test_covering_grid_and_identity_cover_the_disc_up_to_5_8() -> None:
+    tilts, angles = np.meshgrid(
+        np.geomspace(1.0, MAX_TILT, 160), np.linspace(0.0, np.pi, 257), indexing="ij"
+    )
+    labels = nearest_centers(
+        metrics_from_tilts(tilts.ravel(), angles.ravel()), covering_grid(), RADIUS
+    )
+    assert np.count_nonzero(labels == UNCOVERED_LABEL) == 0
+
+
+def test_covering_grid_does_not_cover_tilt_11() -> None:
+    # 6.2197 * 1.7 = 10.6: the outer rim of the outer ring of balls.
+    labels = nearest_centers(metrics_from_tilts([10.4, 11.0], 0.0), covering_grid(), RADIUS)
+    assert labels[0] >= 0
+    assert labels[1] == UNCOVERED_LABEL
+
+
+def test_nearest_centers_choose_by_distance_and_within_the_ball() -> None:
+    centers = np.array([[2.0, 0.3], [4.0, 0.3], [4.0, 1.8]])
+    metrics = metrics_from_tilts([1.2, 2.1, 3.5, 4.2, 4.0], [2.5, 0.35, 0.3, 1.75, 1.05])
+    labels = nearest_centers(metrics, centers, RADIUS)
+    assert labels.tolist() == [IDENTITY_LABEL, 0, 1, 2, UNCOVERED_LABEL]
+
+
+def test_nearest_centers_without_centers_knows_only_the_identity() -> None:
+    labels = nearest_centers(metrics_from_tilts([1.0, 1.6, 1.8], 0.9), np.zeros((0, 2)), RADIUS)
+    assert labels.tolist() == [IDENTITY_LABEL, IDENTITY_LABEL, UNCOVERED_LABEL]
+
+
+@given(
+    st.integers(0, 10_000),
+    st.integers(1, 60),
+    st.floats(0.5, 1.0),
+    st.integers(0, 6),
+    st.floats(1.2, 2.5),
+)
+def test_cover_shapes_covers_the_share_asked_for_or_reaches_a_limit(
+    seed: int, count: int, covered_frac: float, max_num_centers: int, radius: float
+) -> None:
+    tilts, angles = random_classes(seed, count, MAX_TILT)
+    metrics = metrics_from_tilts(tilts, angles)
+    cover = cover_shapes(
+        metrics,
+        np.ones(count),
+        radius=radius,
+        max_tilt=MAX_TILT,
+        covered_frac=covered_frac,
+        max_num_centers=max_num_centers,
+    )
+    references = [(1.0, 0.0), *cover.centers]
+    distances = np.array(
+        [[tilt_distance(t, a, *reference) for reference in references]
+         for t, a in zip(tilts, angles, strict=True)]
+    )  # fmt: skip
+    covered = distances.min(axis=1) < np.log(radius)
+    np.testing.assert_array_equal(cover.labels != UNCOVERED_LABEL, covered)
+    chosen = np.where(cover.labels == IDENTITY_LABEL, 0, cover.labels + 1)[covered]
+    assert_allclose(
+        distances[covered, chosen], distances[covered].min(axis=1), atol=ARCCOSH_ROUNDING
+    )
+    assert len(cover.centers) <= max_num_centers
+    reachable = cosh_distances(metrics, metrics_from_tilts(*covering_grid().T))
+    hopeless = ~covered & (reachable.min(axis=1) >= ball_threshold(radius))
+    enough = np.count_nonzero(covered) >= covered_frac * count - 1e-6
+    stuck = np.count_nonzero(hopeless) == np.count_nonzero(~covered)
+    assert enough or len(cover.centers) == max_num_centers or stuck
+
+
+@given(st.integers(0, 10_000), st.integers(2, 80))
+def test_cover_shapes_does_not_depend_on_the_order_of_the_shapes(seed: int, count: int) -> None:
+    tilts, angles = random_classes(seed, count, MAX_TILT)
+    order = np.random.default_rng(seed + 1).permutation(count)
+    first, second = (
+        cover_shapes(
+            metrics_from_tilts(tilts[index], angles[index]),
+            np.ones(count),
+            radius=RADIUS,
+            max_tilt=MAX_TILT,
+            covered_frac=0.9,
+            max_num_centers=5,
+        )
+        for index in (np.arange(count), order)
+    )
+    assert_allclose(first.centers, second.centers)
+    np.testing.assert_array_equal(first.labels[order], second.labels)
+
+
+def cover_with_defaults(tilts: list[float], angles: list[float], weights: list[float]) -> Array:
+    """Centres that cover all votes with at most 8 balls of 1.7."""
+    cover = cover_shapes(
+        metrics_from_tilts(tilts, angles),
+        np.array(weights),
+        radius=RADIUS,
+        max_tilt=MAX_TILT,
+        covered_frac=1.0,
+        max_num_centers=8,
+    )
+    return cover.centers
+
+
+def test_cover_shapes_takes_the_heaviest_votes_first() -> None:
+    centers = cover_with_defaults([3.0, 3.0, 3.0], [0.5, 0.5, 2.0], [1.0, 1.0, 5.0])
+    assert len(centers) == 2
+    assert tilt_distance(*centers[0], 3.0, 2.0) < np.log(RADIUS)
+    assert tilt_distance(*centers[1], 3.0, 0.5) < np.log(RADIUS)
+
+
+def test_cover_shapes_needs_no_center_for_shapes_near_the_identity() -> None:
+    assert len(cover_with_defaults([1.0, 1.4, 1.69], [0.0, 0.9, 2.5], [1.0, 1.0, 1.0])) == 0
+
+
+def test_cover_shapes_ignores_shapes_beyond_the_largest_tilt() -> None:
+    assert len(cover_with_defaults([5.9, 7.0, 1.0], [0.5, 0.5, 0.0], [9.0, 9.0, 1.0])) == 0
+
+
+def test_cover_shapes_ignores_shapes_without_weight() -> None:
+    assert len(cover_with_defaults([3.0, 4.0], [0.5, 2.0], [0.0, 0.0])) == 0
+
+
+def test_cover_shapes_of_no_shapes_is_empty() -> None:
+    assert len(cover_with_defaults([], [], [])) == 0
+
+
+def test_cover_shapes_chooses_among_the_candidates_given() -> None:
+    candidates = np.array([[2.0, 0.0], [3.2, 0.52]])
+    cover = cover_shapes(
+        metrics_from_tilts([3.0], [0.5]),
+        np.ones(1),
+        radius=RADIUS,
+        max_tilt=MAX_TILT,
+        covered_frac=1.0,
+        max_num_centers=8,
+        candidates=candidates,
+    )
+    assert_allclose(cover.centers, candidates[1:])
+    assert cover.labels.tolist() == [0]

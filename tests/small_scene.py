@@ -1,0 +1,66 @@
+"""Photographs of a small room corner, rendered fast: enough for a COLMAP model of all images."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from synthetic import texture, write_image
+
+from colmap_affrect.types import GrayImage
+
+Array = NDArray[np.float64]
+
+IMAGE_SIZE = (320, 240)
+FOCAL_PX = 300.0
+INTRINSICS = f"{FOCAL_PX},{FOCAL_PX},{IMAGE_SIZE[0] / 2},{IMAGE_SIZE[1] / 2}"
+"""Value of --camera-params for a PINHOLE camera."""
+
+NAMES = ["a.png", "b c.png", "side/č.png", "side/d.png"]
+
+TEXTURE_PX = 400
+
+# Textured rectangles: origin and the two edges, far ones first.
+FACES = (
+    ((-3.0, -2.0, 7.0), (6.0, 0.0, 0.0), (0.0, 4.0, 0.0)),  # wall behind
+    ((-3.0, -2.0, 7.0), (0.0, 0.0, -4.0), (0.0, 4.0, 0.0)),  # wall on the left
+    ((-3.0, 1.4, 7.0), (6.0, 0.0, 0.0), (0.0, 0.0, -4.5)),  # floor
+    ((-0.7, 0.2, 5.0), (1.4, 0.0, 0.0), (0.0, 1.2, 0.0)),  # box, front
+)
+
+
+cached_texture = cache(texture)
+
+
+def photograph(position: tuple[float, float, float], yaw_deg: float) -> GrayImage:
+    """Render the faces, each over those before it."""
+    width, height = IMAGE_SIZE
+    yaw = np.deg2rad(yaw_deg)
+    world_to_camera = np.array(
+        [[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]]
+    )
+    camera = np.array([[FOCAL_PX, 0, width / 2 - 0.5], [0, FOCAL_PX, height / 2 - 0.5], [0, 0, 1]])
+    image = np.full((height, width), 90, np.uint8)
+    for seed, (origin, edge1, edge2) in enumerate(FACES):
+        plane = np.column_stack([edge1, edge2, np.subtract(origin, position)])
+        image_from_texture = camera @ world_to_camera @ plane @ np.diag([1 / TEXTURE_PX] * 2 + [1])
+        size = (TEXTURE_PX, TEXTURE_PX)
+        warped = cv2.warpPerspective(cached_texture(size, seed), image_from_texture, IMAGE_SIZE)
+        covered = cv2.warpPerspective(
+            np.full(size[::-1], 255, np.uint8), image_from_texture, IMAGE_SIZE
+        )
+        image = np.where(covered > 127, warped, image)
+    return image
+
+
+def write_photographs(folder: Path, count: int = len(NAMES)) -> list[str]:
+    """Write the first ``count`` photographs below ``folder`` and return their names."""
+    for index, name in enumerate(NAMES[:count]):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shift = 0.55 * (index - 1.5)
+        write_image(path, photograph((shift, -0.1 * index, 0.1 * index), -5.0 * (index - 1.5)))
+    return NAMES[:count]

@@ -1,0 +1,208 @@
+"""The real command line in processes of its own: what it prints where, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import termios
+from pathlib import Path
+
+import pytest
+from small_scene import INTRINSICS, write_photographs
+
+from colmap_affrect import __version__
+from colmap_affrect.workspace import Workspace
+
+COMMANDS = ["run", "extract", "pairs", "match", "verify", "map", "recipes"]
+TIMEOUT_S = 60
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos")
+    write_photographs(folder, 3)
+    return folder
+
+
+def run_command(*arguments: object, python: tuple[str, ...] = ()) -> subprocess.CompletedProcess:
+    command = [sys.executable, *python, "-m", "colmap_affrect", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+
+
+def run_arguments(photos: Path, out: Path) -> list[str]:
+    return [
+        "--image-path", str(photos), "--output-path", str(out),
+        "--camera-mode", "single", "--camera-model", "PINHOLE", "--camera-params", INTRINSICS,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
+def test_help_has_options_and_examples(command: list[str]) -> None:
+    done = run_command(*command, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "colmap-affrect run --image-path photos --output-path out" in done.stdout
+    assert "Exit codes: 0 done" in done.stdout
+    if not command:
+        assert all(f"    {name} " in done.stdout for name in COMMANDS)
+    elif command != ["recipes"]:
+        assert all(flag in done.stdout for flag in ("--output-path", "--overwrite", "--quiet"))
+
+
+def test_help_loads_no_heavy_package() -> None:
+    script = (
+        "import sys; from colmap_affrect.cli import main\n"
+        "try: main(['run', '--help'])\n"
+        "except SystemExit as end: assert end.code == 0\n"
+        "heavy = {'torch', 'kornia', 'pycolmap', 'cv2', 'h5py', 'matplotlib', 'scipy'}\n"
+        "print('loaded', sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", script],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[-1] == "loaded []"
+
+
+def test_version_is_that_of_the_package() -> None:
+    done = run_command("--version")
+    assert (done.returncode, done.stdout) == (0, f"colmap-affrect {__version__}\n")
+
+
+def test_recipes_lists_both() -> None:
+    done = run_command("recipes")
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    assert [line.split()[0] for line in lines] == ["default", "unrectified-rootsift"]
+    assert all(len(line.split()) > 3 for line in lines)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["rum"],
+        ["run"],
+        ["run", "--image-path", "x"],
+        ["map", "--output-path", "{out}", "--camera-mode", "single"],
+        ["run", "--image-path", "x", "--output-path", "{out}", "--camera-mode", "double"],
+        ["run", "--image-path", "x", "--output-path", "{out}", "--random-seed", "one"],
+        ["match", "--output-path", "{out}", "-q", "-v"],
+    ],
+)
+def test_wrong_usage_ends_with_2_and_does_nothing(tmp_path: Path, arguments: list[str]) -> None:
+    out = tmp_path / "out"
+    done = run_command(*[argument.format(out=out) for argument in arguments])
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "usage: colmap-affrect" in done.stderr
+    assert "error:" in done.stderr.splitlines()[-1]
+    assert not out.exists()
+
+
+def test_json_goes_to_stdout_alone_and_progress_to_stderr(photos: Path, tmp_path: Path) -> None:
+    done = run_command("run", *run_arguments(photos, tmp_path / "out"), "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["images_registered"] == 3
+    assert report == json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
+    lines = done.stderr.splitlines()
+    assert "extract: 3/3 images" in lines
+    assert "match: 3/3 pairs" in lines
+    # What COLMAP prints is in the log.
+    assert all(line.split(":")[0] in ("extract", "match", "verify", "map") for line in lines)
+    log = (tmp_path / "out" / "run.log").read_text(encoding="utf-8")
+    assert "colmap-affrect" in log
+    assert ".cc:" in log
+
+
+def test_quiet_prints_the_result_only_and_verbose_every_image(photos: Path, tmp_path: Path) -> None:
+    arguments = run_arguments(photos, tmp_path / "out")
+    done = run_command("run", *arguments, "-q", python=("-W", "error"))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("registered  3 of 3 images\n")
+    done = run_command("extract", *arguments, "--overwrite", "--verbose")
+    assert done.returncode == 0
+    assert done.stdout.startswith("extract: 3 done in ")
+    assert "DEBUG: a.png: " in done.stderr
+
+
+def test_long_options_are_accepted_with_underscores(photos: Path, tmp_path: Path) -> None:
+    underscored = [
+        argument.replace("-", "_").replace("__", "--", 1) if argument.startswith("--") else argument
+        for argument in run_arguments(photos, tmp_path / "out")
+    ]
+    assert "--image_path" in underscored
+    done = run_command("extract", *underscored, "--max_failures", 0, "--quiet")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_failure_prints_one_line_and_leaves_the_traceback_in_the_log(tmp_path: Path) -> None:
+    done = run_command("run", "--image-path", tmp_path / "none", "--output-path", tmp_path / "out")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.splitlines() == [
+        f"error: {tmp_path / 'none'}: no such folder; give the folder of the photographs"
+    ]
+    log = (tmp_path / "out" / "run.log").read_text()
+    assert "Traceback" in log
+    assert "ImageError" in log
+
+
+def _restore_interrupt() -> None:
+    """Test runners in the background ignore SIGINT, and their children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@pytest.mark.parametrize("line", ["extract: 1/3 images", "match: 1/3 pairs", "map: 2/3 images"])
+def test_interrupt_ends_with_130_and_a_later_run_completes(
+    photos: Path, tmp_path: Path, line: str
+) -> None:
+    arguments = ["run", *run_arguments(photos, tmp_path / "out")]
+    with subprocess.Popen(
+        [sys.executable, "-m", "colmap_affrect", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=_restore_interrupt,
+    ) as process:
+        while (printed := process.stderr.readline().strip()) != line:
+            assert printed, process.wait()
+        os.kill(process.pid, signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=TIMEOUT_S)
+    assert (process.returncode, stdout) == (130, "")
+    lines = stderr.splitlines()
+    assert lines[-1] == "interrupted; run the same command again to go on"
+    stages = ("extract: ", "match: ", "verify: ", "map: ")
+    assert all(text.startswith(stages) for text in lines[:-1])
+    assert not Workspace(tmp_path / "out").report.exists()
+    done = run_command(*arguments, "-q")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("registered  3 of 3 images")
+
+
+def test_terminal_gets_bars(photos: Path, tmp_path: Path) -> None:
+    controller, terminal = pty.openpty()
+    termios.tcsetwinsize(terminal, (24, 80))
+    arguments = run_arguments(photos, tmp_path / "out")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "colmap_affrect", "extract", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=terminal,
+        text=True,
+    )
+    with process:
+        os.close(terminal)
+        shown = b""
+        try:
+            while data := os.read(controller, 4096):
+                shown += data
+        except OSError:  # Linux tells the end of a terminal so.
+            pass
+        finally:
+            os.close(controller)
+    assert process.returncode == 0
+    assert b"extract: 100%" in shown
+    assert b"3/3" in shown

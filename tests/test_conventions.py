@@ -1,0 +1,280 @@
+"""Coordinate conventions: half pixels, resizing, angles, and those of OpenCV and pycolmap."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from strategies import IMAGE_SIZE, Array, frames
+from synthetic import BACKGROUND, blobs, centroid, texture
+
+import colmap_affrect
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.conventions import (
+    MEASUREMENT_SIGMAS,
+    colmap_from_pixel,
+    grid_origin,
+    is_inside,
+    pixel_from_colmap,
+    resized_from_original,
+)
+from colmap_affrect.features.rootsift import extract_rootsift
+from colmap_affrect.geometry.affine import project, rotation, transform_frames
+from colmap_affrect.options import SiftOptions
+from colmap_affrect.types import LocalFeatures
+
+sizes = st.tuples(st.integers(1, 4000), st.integers(1, 4000))
+
+UPSCALE_BIAS_PX = 0.05
+"""Without precise upscaling OpenCV's SIFT is off by 0.25 px in x and in y."""
+
+ORIENTATION_ERROR_DEG = 3.0
+"""A third of a bin of SIFT's histogram of 36 gradient directions."""
+
+
+def angles_deg(features: LocalFeatures) -> Array:
+    """Orientation of each frame: direction of its first column, x towards y."""
+    first = features.lafs[:, :, 0]
+    return np.asarray(np.rad2deg(np.arctan2(first[:, 1], first[:, 0])))
+
+
+def angle_difference_deg(angle1: float, angle2: float) -> float:
+    """Angle between two directions."""
+    return abs((angle1 - angle2 + 180.0) % 360.0 - 180.0)
+
+
+def test_colmap_from_pixel_adds_half_a_pixel_in_x_and_y() -> None:
+    assert_allclose(colmap_from_pixel(np.array([[0.0, 7.0]])), [[0.5, 7.5]])
+
+
+def test_pixel_from_colmap_subtracts_half_a_pixel_in_x_and_y() -> None:
+    assert_allclose(pixel_from_colmap(np.array([[0.0, 7.0]])), [[-0.5, 6.5]])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_colmap_from_pixel_keeps_the_precision_and_its_argument(dtype: type) -> None:
+    points = np.array([[1.0, 2.0]], dtype=dtype)
+    assert colmap_from_pixel(points).dtype == dtype
+    assert pixel_from_colmap(points).dtype == dtype
+    assert_allclose(points, [[1.0, 2.0]])
+
+
+@given(frames())
+def test_pixel_from_colmap_inverts_colmap_from_pixel(lafs: Array) -> None:
+    points = lafs[:, :, 2]
+    assert_allclose(pixel_from_colmap(colmap_from_pixel(points)), points, atol=1e-12)
+
+
+@given(sizes, sizes)
+def test_resized_from_original_maps_image_corners_to_image_corners(
+    original: tuple[int, int], resized: tuple[int, int]
+) -> None:
+    matrix = resized_from_original(original, resized)
+    corners = np.array([[0.0, 0.0], [original[0], original[1]]]) - 0.5
+    expected = np.array([[0.0, 0.0], [resized[0], resized[1]]]) - 0.5
+    assert_allclose(project(matrix, corners), expected, atol=1e-9)
+
+
+@given(sizes, sizes)
+def test_resized_from_original_inverts_with_swapped_sizes(
+    original: tuple[int, int], resized: tuple[int, int]
+) -> None:
+    there = resized_from_original(original, resized)
+    back = resized_from_original(resized, original)
+    assert_allclose(back @ there, np.eye(3), atol=1e-9)
+
+
+@given(sizes, sizes, frames())
+def test_resizing_commutes_with_the_move_to_colmap_coordinates(
+    original: tuple[int, int], resized: tuple[int, int], lafs: Array
+) -> None:
+    points = lafs[:, :, 2]
+    matrix = resized_from_original(original, resized)
+    scale = np.divide(resized, original)
+    # COLMAP scales corner-origin coordinates by the bare factor.
+    assert_allclose(
+        colmap_from_pixel(project(matrix, points)), colmap_from_pixel(points) * scale, rtol=1e-9
+    )
+
+
+def test_resized_from_original_scales_affine_shapes_by_rows() -> None:
+    laf = np.array([[[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]])
+    resized = transform_frames(resized_from_original((8, 8), (8, 4)), laf)
+    assert_allclose(resized[0, :, :2], [[1.0, 2.0], [1.5, 2.0]])
+
+
+@pytest.mark.parametrize("resized", [(100, 60), (67, 60), (150, 33)])
+def test_resized_from_original_follows_a_blob_through_opencv_resize(
+    resized: tuple[int, int],
+) -> None:
+    original, center = (200, 120), np.array([[81.3, 47.6]])
+    image = blobs(original, center, 8.0 * np.eye(2), background=0.0)
+    small = cv2.resize(image, resized, interpolation=cv2.INTER_AREA)
+    expected = project(resized_from_original(original, resized), center)[0]
+    assert_allclose(centroid(small), expected, atol=0.02)
+
+
+@pytest.mark.parametrize("step_px", [1, 4, 5])
+def test_grid_origin_is_the_mean_of_the_pixels_of_the_first_cell(step_px: int) -> None:
+    assert_allclose(grid_origin(step_px), np.arange(step_px).mean())
+
+
+def test_is_inside_accepts_whole_pixels_up_to_their_outer_edge() -> None:
+    points = np.array([[-0.5, 2.5], [4.5, -0.5], [-0.51, 0], [0, 2.51], [4.51, 0], [3, 2], [2, 3]])
+    assert is_inside(points, (5, 3)).tolist() == [True, True, False, False, False, True, False]
+
+
+def test_is_inside_keeps_the_margin_of_each_point_and_axis() -> None:
+    points = np.array([[2.0, 4.0], [2.0, 4.0], [2.0, 4.0]])
+    margins = np.array([[2.5, 4.5], [2.6, 0.0], [0.0, 4.6]])
+    assert is_inside(points, (20, 10), margins).tolist() == [True, False, False]
+    assert is_inside(points[:1], (20, 10), 2.6).tolist() == [False]
+
+
+@pytest.mark.parametrize(
+    ("direction", "angle_deg"), [((1, 0), 0.0), ((0, 1), 90.0), ((-1, 0), 180.0), ((0, -1), -90.0)]
+)
+def test_convention_sift_frame_points_towards_rising_gray_values(
+    direction: tuple[int, int], angle_deg: float
+) -> None:
+    # A blob with a fainter one beside it: gray values rise from the blob's foot towards both,
+    # and the half with the slope of the wide blob behind it dominates the histogram.
+    center = np.array([60.0, 50.0])
+    image = blobs(
+        (121, 101),
+        [center, center + 9.0 * np.array(direction)],
+        [4.0 * np.eye(2), 9.0 * np.eye(2)],
+        amplitude=70.0,
+    )
+    features = extract_rootsift(image, SiftOptions())
+    near = np.linalg.norm(features.keypoints - center, axis=1) < 6.0
+    assert near.any()
+    found = angles_deg(features)[near]
+    assert min(angle_difference_deg(float(angle), angle_deg) for angle in found) < 10.0
+
+
+@pytest.mark.parametrize("turn_deg", [25.0, 90.0, -130.0])
+def test_convention_sift_frames_turn_with_the_image(turn_deg: float) -> None:
+    size, center = (260, 240), np.array([130.0, 120.0])
+    matrix = np.eye(3)
+    matrix[:2, :2] = rotation(np.deg2rad(turn_deg))
+    matrix[:2, 2] = center - matrix[:2, :2] @ center
+    image = texture(size, seed=3, finest_sigma_px=2.0)
+    turned = cv2.warpAffine(image, matrix[:2], size, flags=cv2.INTER_CUBIC)
+    before = extract_rootsift(image, SiftOptions())
+    after = extract_rootsift(turned, SiftOptions())
+    central = np.linalg.norm(before.keypoints - center, axis=1) + before.scales < 120.0
+    errors = []
+    for laf in transform_frames(matrix, before.lafs[central]):
+        near = np.linalg.norm(after.keypoints - laf[:, 2], axis=1) < 0.5
+        near &= np.abs(np.log2(after.scales / np.sqrt(np.linalg.det(laf[:, :2])))) < 0.2
+        if near.any():
+            expected_deg = float(np.rad2deg(np.arctan2(laf[1, 0], laf[0, 0])))
+            found = angles_deg(after)[near]
+            errors.append(min(angle_difference_deg(float(a), expected_deg) for a in found))
+    assert len(errors) > 100
+    assert np.median(errors) < ORIENTATION_ERROR_DEG
+
+
+def test_convention_sift_with_precise_upscale_has_no_bias() -> None:
+    rng = np.random.default_rng(5)
+    errors = []
+    for sigma_px in (2.0, 3.0, 4.5, 7.0):
+        places = np.array([[50.0, 60.0], [130.0, 50.0], [70.0, 140.0]])
+        places = places + rng.uniform(-0.5, 0.5, places.shape)
+        image = blobs((190, 200), places, sigma_px * np.eye(2))
+        keypoints = extract_rootsift(image, SiftOptions()).keypoints
+        distances = np.linalg.norm(keypoints[:, None] - places[None], axis=2)
+        assert distances.min(axis=0).max() < 0.5
+        errors.append(keypoints[distances.argmin(axis=0)] - places)
+    bias = np.concatenate(errors).mean(axis=0)
+    assert np.abs(bias).max() < UPSCALE_BIAS_PX
+
+
+@pytest.mark.parametrize("sigma_px", [3.0, 6.0])
+def test_convention_frame_radius_is_six_sigma_of_a_blob(sigma_px: float) -> None:
+    image = blobs((180, 150), [[90.2, 70.7]], sigma_px * np.eye(2))
+    features = extract_rootsift(image, SiftOptions())
+    nearest = np.linalg.norm(features.keypoints - [90.2, 70.7], axis=1).argmin()
+    # The response of a difference of Gaussians (factor 2^(1/3)) peaks 10 % below sigma.
+    assert_allclose(features.scales[nearest], MEASUREMENT_SIGMAS * sigma_px, rtol=0.2)
+
+
+def test_convention_pycolmap_sift_reports_corner_origin() -> None:
+    image = blobs((81, 61), [[40.0, 30.0]], 5.0 * np.eye(2))
+    extractor = pycolmap.FeatureExtractor.create(pycolmap.FeatureExtractionOptions(use_gpu=False))
+    keypoints, _ = extractor.extract(pycolmap.Bitmap.from_array(image))
+    places = np.array([[keypoint.x, keypoint.y] for keypoint in keypoints])
+    assert np.linalg.norm(places - [40.5, 30.5], axis=1).min() < 0.1
+
+
+@pytest.fixture
+def raw_database(tmp_path: Path) -> pycolmap.Database:
+    """A database of two images with ids 1 and 2 and no keypoints."""
+    database = pycolmap.Database.open(tmp_path / "raw.db")
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1000.0, 640, 480)
+    camera_id = database.write_camera(camera)
+    for name in ("a.png", "b.png"):
+        database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
+    return database
+
+
+def test_convention_database_stores_wrapped_and_fractional_indices_silently(
+    raw_database: pycolmap.Database,
+) -> None:
+    raw_database.write_matches(1, 2, np.array([[-25536, 3]], dtype=np.int16))
+    assert raw_database.read_matches(1, 2).tolist() == [[4294941760, 3]]
+
+
+@pytest.mark.parametrize("columns", [2, 4, 6])
+def test_convention_database_returns_keypoints_of_all_layouts_exactly(
+    raw_database: pycolmap.Database, columns: int
+) -> None:
+    keypoints = np.arange(7 * columns, dtype=np.float32).reshape(7, columns) / 3
+    raw_database.write_keypoints(1, keypoints)
+    np.testing.assert_array_equal(raw_database.read_keypoints(1), keypoints)
+
+
+def test_convention_database_swaps_the_columns_of_a_reversed_pair(
+    raw_database: pycolmap.Database,
+) -> None:
+    matches = np.array([[0, 5], [3, 2]], dtype=np.uint32)
+    raw_database.write_matches(2, 1, matches)
+    np.testing.assert_array_equal(raw_database.read_matches(2, 1), matches)
+    np.testing.assert_array_equal(raw_database.read_matches(1, 2), matches[:, ::-1])
+
+
+def test_half_pixels_occur_only_in_conventions() -> None:
+    shift = re.compile(r"HALF_PIXEL|[+-]=?\s*(np\.float\d+\()?0?\.5(?![\d])(?!\s*\*)")
+    package = Path(colmap_affrect.__path__[0])
+    sources = {path.relative_to(package).as_posix(): path for path in package.rglob("*.py")}
+    guilty = [
+        f"{name}:{number}: {line.strip()}"
+        for name, path in sorted(sources.items())
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if shift.search(line.split("#")[0])
+    ]
+    assert any(line.startswith("conventions.py:") for line in guilty), "the pattern is blind"
+    assert [line for line in guilty if not line.startswith("conventions.py:")] == []
+
+
+def test_open_database_closes_so_that_it_can_be_opened_again(tmp_path: Path) -> None:
+    for count in range(2):
+        with open_database(tmp_path / "again.db") as database:
+            assert database.num_cameras() == count
+            camera = pycolmap.Camera.create_from_model_name(
+                pycolmap.INVALID_CAMERA_ID, "PINHOLE", 500.0, *IMAGE_SIZE
+            )
+            database.write_camera(camera)
+
+
+def test_background_of_blobs_is_what_centroid_expects() -> None:
+    image = blobs((90, 70), [[31.25, 40.5]], [[4.0, 0.0], [2.0, 5.0]])
+    assert_allclose(centroid(image, BACKGROUND), [31.25, 40.5], atol=0.02)
