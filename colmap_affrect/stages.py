@@ -63,6 +63,9 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     )
     if not names:
         raise ImageError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)})")
+    for name in names:
+        if name != name.encode("utf-8", "replace").decode("utf-8"):
+            raise ImageError(f"{image_path}: the name {name!r} is not UTF-8; rename it")
     return names
 
 

@@ -42,7 +42,7 @@ ARRAYS_ONLY = {"conventions", "errors"}
 """All that geometry may import beside itself: it takes and returns plain arrays."""
 
 HOMES = {
-    "cv2": {"imaging", "features.rootsift", "features.second_moment", "rectifiers.dense_shapes"},
+    "cv2": {"imaging", "features.rootsift", "features.second_moment"},
     "h5py": {"store"},
     "pycolmap": {"colmap"},
     "tqdm": {"progress"},

@@ -25,23 +25,26 @@ def run_cancellable(
     token = pycolmap.CancellationToken()
     outcome: list[Result] = []
     failure: list[BaseException] = []
+    # Not Thread.join: interrupted in Python 3.11, it takes the running thread for ended, and
+    # the interpreter then ends under pycolmap's feet (bpo-45274).
+    ended = threading.Event()
 
     def work() -> None:
         try:
             outcome.append(call(token))
         except BaseException as error:  # noqa: BLE001  (raised again by the waiting thread)
             failure.append(error)
+        finally:
+            ended.set()
 
-    thread = threading.Thread(target=work)
-    thread.start()
+    threading.Thread(target=work).start()
     try:
-        while thread.is_alive():
-            thread.join(POLL_S)
+        while not ended.wait(POLL_S):
             if tick:
                 tick()
     except KeyboardInterrupt:
         token.cancel()
-        thread.join()
+        ended.wait()
         raise
     if failure:
         raise failure[0]

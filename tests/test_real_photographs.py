@@ -1,0 +1,72 @@
+"""The claims of the README on real photographs in ../shared, which the project does not hold."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+from registration import SUBSETS, camera_options, compute_matches, link_images, run_seed
+from registration_metrics import read_true_poses
+
+SCENES = Path(__file__).parents[2] / "shared" / "scenes"
+SUBSET_BY_NAME = {subset.name: subset for subset in SUBSETS}
+
+pytestmark = [
+    pytest.mark.shared,
+    pytest.mark.skipif(not SCENES.is_dir(), reason="the photographs of ../shared are not here"),
+]
+
+
+def correct_by_seed(name, tmp_path, num_seeds):
+    subset = SUBSET_BY_NAME[name]
+    cameras = camera_options(subset, SCENES)
+    images = tmp_path / "images"
+    link_images(subset.image_paths(SCENES), images)
+    folder = tmp_path / "default"
+    folder.mkdir()
+    compute_matches("default", cameras, images, folder)
+    truth = read_true_poses(SCENES / subset.scene)
+    return [run_seed(folder, images, cameras, truth, seed) for seed in range(num_seeds)]
+
+
+@pytest.mark.parametrize(
+    ("name", "min_correct", "median_error_deg"),
+    [
+        ("fountain 0,5,10", 3, 0.5),
+        ("herz 0,8,16,24", 4, 0.5),
+        ("kermit /2", 6, 2.0),
+        ("sacre_coeur /2", 5, 2.0),
+    ],
+)
+def test_sparse_subset_registers_correctly(name, min_correct, median_error_deg, tmp_path):
+    rows = correct_by_seed(name, tmp_path, num_seeds=5)
+    assert sum(row["correct"] >= min_correct for row in rows) >= 4
+    errors = sorted(row["rotation_error_deg"] for row in rows)
+    assert errors[2] < median_error_deg
+
+
+def test_peak_memory_of_extraction_stays_under_1500_mb_on_12_megapixels(tmp_path):
+    source = SCENES / "strecha_herz_jesus_p25" / "images" / "0008.jpg"
+    image = cv2.resize(cv2.imread(str(source)), (4000, 3000), interpolation=cv2.INTER_CUBIC)
+    cv2.imwrite(str(tmp_path / "large.jpg"), image)
+    script = (
+        "import resource, sys; from pathlib import Path\n"
+        "from colmap_affrect.extraction import extract_file\n"
+        "from colmap_affrect.recipes import load_recipe\n"
+        "features, size = extract_file(Path(sys.argv[1]), load_recipe('default').extraction)\n"
+        "assert size == (4000, 3000) and len(features) > 5000\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    output = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path / "large.jpg")],
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
+    kilobytes = int(output) // (1024 if sys.platform == "darwin" else 1)
+    assert 200_000 < kilobytes < 1_500_000

@@ -1,0 +1,92 @@
+"""Golden runs on the sample scenes: the default recipe, with two-sided bands."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.extraction import extract_file
+from colmap_affrect.geometry.affine import project
+from colmap_affrect.matching.nearest import match_features, matchable
+from colmap_affrect.options import CameraOptions
+from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.recipes import load_recipe
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+from registration_metrics import pose_metrics, read_true_poses
+
+SCENES = Path(__file__).parents[1] / "sample_scenes"
+COURTYARD_CAMERA = CameraOptions(mode="single", model="PINHOLE", params="1080,1080,360,270")
+
+
+@pytest.fixture(scope="module")
+def courtyard(tmp_path_factory):
+    """The default recipe on the courtyard with its intrinsics: report and poses by name."""
+    output = tmp_path_factory.mktemp("courtyard")
+    report = run(SCENES / "courtyard" / "images", output, RunOptions(cameras=COURTYARD_CAMERA))
+    model = pycolmap.Reconstruction(output / "sparse" / "0")
+    poses = {}
+    for image in model.images.values():
+        matrix = image.cam_from_world().matrix()
+        poses[image.name] = (matrix[:, :3], matrix[:, 3])
+    return report, poses
+
+
+def test_courtyard_registers_every_photograph_where_it_stands(courtyard):
+    _, poses = courtyard
+    truth = read_true_poses(SCENES / "courtyard")
+    num_correct, rotation_error_deg = pose_metrics(poses, truth)
+    assert len(truth) == 9
+    assert num_correct == 9
+    # Exactly 0 would mean that the ground truth leaked into the run.
+    assert 1e-4 < rotation_error_deg < 0.3
+
+
+def test_courtyard_report_is_within_bands(courtyard):
+    report, _ = courtyard
+    values = report.to_mapping()
+    assert values["status"] == "ok"
+    assert values["unregistered"] == {}
+    assert 800 < values["points3D"] < 20_000
+    assert 2.0 < values["mean_track_length"] < 6.0
+    assert 0.1 < values["mean_reprojection_error_px"] < 1.5
+    assert values["num_pairs"] == 36
+    assert 12 <= values["num_verified_pairs"] <= 36
+
+
+@functools.cache
+def facade_view(recipe_name, view):
+    recipe = load_recipe(recipe_name)
+    path = next((SCENES / "facade" / "images").glob(f"view_{view}_*"))
+    features, _ = extract_file(path, recipe.extraction)
+    return matchable(features.descriptors, features.keypoints, recipe.matching)
+
+
+@pytest.mark.parametrize(("view", "low", "high"), [(4, 300, 6000), (5, 120, 3000), (6, 30, 2000)])
+def test_facade_matches_follow_the_true_homography(view, low, high):
+    homography = np.loadtxt(SCENES / "facade" / f"H_1_{view}.txt")
+    correct = {}
+    for name in ("default", "unrectified-rootsift"):
+        first, second = facade_view(name, 1), facade_view(name, view)
+        matches = match_features(first, second, load_recipe(name).matching).indices
+        expected = project(homography, first.keypoints[matches[:, 0]])
+        errors = np.linalg.norm(expected - second.keypoints[matches[:, 1]], axis=1)
+        correct[name] = int((errors < 3.0).sum())
+    assert low < correct["default"] < high
+    assert correct["default"] > 1.5 * correct["unrectified-rootsift"]
+
+
+def test_scene_images_are_photographs_without_exif():
+    paths = sorted(SCENES.glob("*/images/*.jpg"))
+    assert len(paths) == 6 + 9 + 8
+    for path in paths:
+        assert b"Exif" not in path.read_bytes()[:4096]
+        image = cv2.imread(str(path))
+        assert image.std() > 20
+    assert sum(path.stat().st_size for path in SCENES.rglob("*") if path.is_file()) < 6_000_000
