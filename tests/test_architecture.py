@@ -46,6 +46,7 @@ HOMES = {
     "h5py": {"store"},
     "pycolmap": {"colmap"},
     "tqdm": {"progress"},
+    "threadpoolctl": {"executor"},
     "filelock": {"workspace"},
     "argparse": {"cli"},
     "torch": set(),

@@ -69,13 +69,23 @@ def map_incrementally(
         options: the mapping preset.
         random_seed: seed of all random parts.
         intrinsics_given: the user gave the camera parameters.
-        next_image: called with the number of images registered since the last call.
+        next_image: called with the number of images registered since the last call; never
+            more than there are, also when mapping is tried again.
     """
     partial = sparse_path.with_name(sparse_path.name + ".partial")
     for old in (partial, sparse_path):
         shutil.rmtree(old, ignore_errors=True)
     num_images = len(image_ids(database_path))
+    most_shown = 0
     best: list[pycolmap.Reconstruction] = []
+
+    def show(count: int) -> None:
+        nonlocal most_shown
+        news = min(count, num_images) - most_shown
+        if news > 0:
+            most_shown += news
+            next_image(news)
+
     for attempt in range(options.max_num_attempts):
         models = _map_once(
             database_path,
@@ -86,7 +96,7 @@ def map_incrementally(
                 random_seed + attempt * ATTEMPT_SEED_STEP,
                 intrinsics_given=intrinsics_given,
             ),
-            next_image,
+            show,
         )
         best = max(best, models, key=_size_of_largest)
         if _size_of_largest(best)[0] == num_images:
@@ -103,8 +113,16 @@ def _map_once(
     image_path: Path,
     scratch_path: Path,
     options: pycolmap.IncrementalPipelineOptions,
-    next_image: Callable[[int], None],
+    show: Callable[[int], None],
 ) -> list[pycolmap.Reconstruction]:
+    """Map once; ``show`` is told how many images have been registered so far."""
+    count = 0
+
+    def add(number: int) -> None:
+        nonlocal count
+        count += number
+        show(count)
+
     raw = scratch_path / "raw"
     raw.mkdir(parents=True)
     models = run_cancellable(
@@ -113,8 +131,8 @@ def _map_once(
             image_path,
             raw,
             options=options,
-            initial_image_pair_callback=lambda: next_image(2),
-            next_image_callback=lambda: next_image(1),
+            initial_image_pair_callback=lambda: add(2),
+            next_image_callback=lambda: add(1),
             cancellation_token=token,
         )
     )

@@ -13,14 +13,11 @@ Result = TypeVar("Result")
 POLL_S = 0.2
 
 
-def run_cancellable(
-    call: Callable[[pycolmap.CancellationToken], Result], tick: Callable[[], None] | None = None
-) -> Result:
+def run_cancellable(call: Callable[[pycolmap.CancellationToken], Result]) -> Result:
     """Run ``call`` in a thread; on Ctrl-C cancel it, wait until it has ended, and re-raise.
 
     Args:
         call: takes the token that pycolmap's call must be given.
-        tick: called several times a second while waiting.
     """
     token = pycolmap.CancellationToken()
     outcome: list[Result] = []
@@ -40,8 +37,7 @@ def run_cancellable(
     threading.Thread(target=work).start()
     try:
         while not ended.wait(POLL_S):
-            if tick:
-                tick()
+            pass
     except KeyboardInterrupt:
         token.cancel()
         ended.wait()
