@@ -113,11 +113,9 @@ def extract(
     names = list_images(image_path, image_list_path)
     _refuse_colliding_keys(names)
     colmap_database.check_cameras(cameras)
-    store = FeatureStore(workspace.features)
     if cameras.mode in ("single", "per-folder"):
-        _refuse_mixed_sizes(
-            image_path, names, cameras.mode, {} if overwrite else store.image_sizes()
-        )
+        known = {} if overwrite else FeatureStore(workspace.features).image_sizes()
+        _refuse_mixed_sizes(image_path, names, cameras.mode, known)
     options = {
         "image_path": str(image_path.resolve()),
         "image_list_path": str(image_list_path.resolve()) if image_list_path else "",
@@ -125,6 +123,7 @@ def extract(
         **recipe.extraction.to_mapping(),
     }
     workspace.claim("extract", options, overwrite=overwrite, recipe=recipe.name)
+    store = _feature_store(workspace)
     done = store.complete(names)
     missing = [name for name in names if name not in done]
     failures = {}
@@ -148,6 +147,14 @@ def extract(
     return StageReport(
         "extract", seconds, len(set(missing) - set(failures)), len(done - set(failures)), failures
     )
+
+
+def _feature_store(workspace: Workspace) -> FeatureStore:
+    return FeatureStore(workspace.features, workspace.options_digest("extract"))
+
+
+def _match_store(workspace: Workspace) -> MatchStore:
+    return MatchStore(workspace.matches, workspace.options_digest("extract", "match"))
 
 
 def _refuse_colliding_keys(names: Sequence[str]) -> None:
@@ -208,7 +215,7 @@ def choose_pairs(
     """Write the list of the pairs to match: every pair of images, or those of a list."""
     start = time.perf_counter()
     workspace.require("extract")
-    names = FeatureStore(workspace.features).names()
+    names = _feature_store(workspace).names()
     pairs = exhaustive_pairs(names)
     if match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
@@ -232,7 +239,7 @@ def match(
     start = time.perf_counter()
     pairs = _listed_pairs(workspace)
     workspace.claim("match", options.to_mapping(), overwrite=overwrite)
-    features, matches = FeatureStore(workspace.features), MatchStore(workspace.matches)
+    features, matches = _feature_store(workspace), _match_store(workspace)
     done = matches.complete(pair_key(*pair) for pair in pairs)
     missing = [pair for pair in pairs if pair_key(*pair) not in done]
     cache = _MatchableCache(features, options)
@@ -281,7 +288,7 @@ class _MatchableCache:
 
 def _listed_pairs(workspace: Workspace) -> list[Pair]:
     workspace.require("pairs")
-    names = FeatureStore(workspace.features).names()
+    names = _feature_store(workspace).names()
     return read_pairs(workspace.pairs, names) if len(names) > 1 else []
 
 
@@ -314,7 +321,7 @@ def verify_matches(
     pairs = _listed_pairs(workspace)
     recorded = {**options.to_mapping(), "random_seed": random_seed}
     workspace.claim("verify", recorded, overwrite=overwrite)
-    features, matches = FeatureStore(workspace.features), MatchStore(workspace.matches)
+    features, matches = _feature_store(workspace), _match_store(workspace)
     _write_matches(workspace, pairs, features, matches)
     todo = colmap_database.num_unverified_pairs(workspace.database)
     with progress.stage("verify", todo, "pairs") as advance:
@@ -371,7 +378,7 @@ def reconstruction_problems(
     workspace: Workspace, names: Sequence[str], registered: Sequence[str], min_num_inliers: int
 ) -> dict[str, str]:
     """Tell for each image outside the largest model why it is not in it."""
-    num_keypoints = FeatureStore(workspace.features).num_keypoints()
+    num_keypoints = _feature_store(workspace).num_keypoints()
     ids = colmap_database.image_ids(workspace.database)
     verified = verified_pairs(workspace.database, min_num_inliers)
     in_pairs = {image_id for pair in verified for image_id in pair}

@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.errors import StoreError
+from colmap_affrect.errors import StaleStoreError, StoreError
 from colmap_affrect.types import LocalFeatures
 
 FORMAT_VERSION = 1
@@ -46,12 +46,14 @@ class PairMatches:
 
 
 class _Store:
-    """A HDF5 file of complete groups."""
+    """A HDF5 file of complete groups that were all made with the same options."""
 
     kind = ""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, options_digest: str = "") -> None:
+        """Name the file, and the options that its content must have been made with (any if '')."""
         self.path = path
+        self.options_digest = options_digest
 
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:
@@ -75,6 +77,7 @@ class _Store:
             file.attrs["format"] = f"colmap_affrect/{self.kind}"
             file.attrs["format_version"] = FORMAT_VERSION
             file.attrs["pixel_origin"] = "center"
+            file.attrs["options_digest"] = self.options_digest
         new.replace(self.path)
 
     def _check_format(self, file: h5py.File) -> None:
@@ -85,6 +88,11 @@ class _Store:
             raise StoreError(
                 f"{self.path}: expected {self.kind} of format version {FORMAT_VERSION}, found "
                 f"{found}; use another --output-path"
+            )
+        if self.options_digest and file.attrs.get("options_digest") != self.options_digest:
+            raise StaleStoreError(
+                f"{self.path}: was made with other options than config.toml beside it records; "
+                "run again with --overwrite"
             )
 
     def complete(self, keys: Iterable[str]) -> set[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import shutil
@@ -18,6 +19,7 @@ from colmap_affrect.errors import StaleStoreError, WorkspaceError
 
 logger = logging.getLogger(__name__)
 
+LOCAL = ("image_path", "image_list_path", "camera", "match_list_path")
 STAGES = ("extract", "pairs", "match", "verify", "map")
 
 
@@ -142,6 +144,18 @@ class Workspace:
         new = self.config.with_suffix(".new")
         new.write_text(dump_toml(ordered), encoding="utf-8")
         new.replace(self.config)
+
+    def options_digest(self, *stages: str) -> str:
+        """Return a sha256 of the recorded options of stages, those that decide the results.
+
+        Paths and cameras are left out: they do not change features or matches.
+        """
+        record = self.recorded()
+        options = {
+            stage: {key: value for key, value in record.get(stage, {}).items() if key not in LOCAL}
+            for stage in stages
+        }
+        return hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()
 
     def require(self, stage: str) -> dict[str, Any]:
         """Return the recorded options of an earlier stage.

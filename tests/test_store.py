@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from colmap_affrect.errors import StoreError
+from colmap_affrect.errors import StaleStoreError, StoreError
 from colmap_affrect.store import FeatureStore, MatchStore, PairMatches, pair_key
 from colmap_affrect.types import LocalFeatures
 
@@ -50,6 +50,15 @@ def store(tmp_path: Path) -> FeatureStore:
 @pytest.fixture
 def matches(tmp_path: Path) -> MatchStore:
     return MatchStore(tmp_path / "matches.h5")
+
+
+def test_store_of_other_options_is_refused(tmp_path):
+    path = tmp_path / "matches.h5"
+    pair = PairMatches(("a", "b"), np.array([[0, 1]]), np.ones(1, np.float32), 2)
+    MatchStore(path, "digest of old options").write([pair])
+    with pytest.raises(StaleStoreError, match="other options"):
+        MatchStore(path, "digest of new options").complete(["a/b"])
+    assert MatchStore(path, "digest of old options").complete(["a/b"]) == {"a/b"}
 
 
 @pytest.mark.parametrize("count", [0, 1, 40_000])
