@@ -53,7 +53,7 @@ def canvas_points(plan: Rectification) -> Array:
     return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
 
 
-@settings(max_examples=25)
+@settings(max_examples=60)
 @given(st.floats(1.0, 6.22), tilt_angles, st.sampled_from([0, 1]))
 @example(1.0, 0.0, 1)
 @example(6.22, 0.0, 0)
