@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.mapping import map_incrementally, read_models
 from colmap_affrect.colmap.verification import verified_pairs, verify
-from colmap_affrect.errors import ImageError, OptionError, StoreError
+from colmap_affrect.errors import ImageError, OptionError, StaleStoreError, StoreError
 from colmap_affrect.executor import available_cores, map_ordered
 from colmap_affrect.extraction import extract_file
 from colmap_affrect.imaging import IMAGE_SUFFIXES, read_gray
@@ -224,8 +224,21 @@ def choose_pairs(
         pairs = [pair for pair in listed_pairs if pair in usable]
     listed = str(match_list_path.resolve()) if match_list_path else ""
     workspace.claim("pairs", {"match_list_path": listed}, overwrite=overwrite)
+    _refuse_lost_pairs(workspace, pairs)
     write_pairs(workspace.pairs, pairs)
     return StageReport("pairs", time.perf_counter() - start, len(pairs))
+
+
+def _refuse_lost_pairs(workspace: Workspace, pairs: Sequence[Pair]) -> None:
+    """Pairs may be added, but those that are matched already would stay in the database."""
+    if not workspace.pairs.exists() or not workspace.pairs.stat().st_size:
+        return
+    lost = sorted(set(_listed_pairs(workspace)) - set(pairs))
+    if lost:
+        raise StaleStoreError(
+            f"{workspace.pairs}: has pairs that are not to be matched any more, such as "
+            f"{' and '.join(lost[0])}; use --overwrite to redo the pairs stage and those after it"
+        )
 
 
 def match(

@@ -577,6 +577,24 @@ def test_pair_list_may_name_an_image_that_cannot_be_read(
     assert Workspace(tmp_path / "out").pairs.read_text() == "a.png\tb c.png\n"
 
 
+def test_pair_list_that_lost_pairs_is_refused(copy: Workspace, call: Call) -> None:
+    names = FeatureStore(copy.features).names()
+    path = copy.path.parent / "list.txt"
+    for lines, overwrite, expected in [
+        ([names[:2], names[1:3]], ["--overwrite"], 0),
+        ([names[:2], names[1:3], names[2:4]], [], 0),
+        ([names[:2]], [], 1),
+        ([names[:2]], ["--overwrite"], 0),
+    ]:
+        path.write_text("".join("\t".join(line) + "\n" for line in lines), encoding="utf-8")
+        arguments = ["--output-path", copy.path, "--match-list-path", path, *overwrite]
+        code, _, stderr = call("pairs", *arguments)
+        assert code == expected, stderr
+        if expected:
+            assert names[1] in stderr[-1]
+            assert "--overwrite" in stderr[-1]
+
+
 def test_match_index_out_of_range_is_refused_before_it_is_written(copy: Workspace) -> None:
     pair = ("a.png", "b c.png")
     count = FeatureStore(copy.features).num_keypoints()[pair[1]]
