@@ -5,8 +5,8 @@ colmap_affrect by name or TOML path) computes features and raw matches of a subs
 verification and mapping run once per seed, with the sparse preset of colmap_affrect for all
 methods. Usage:
 
-    python tests/benchmarks/registration.py --methods sift default --work-path /tmp/bench/cache \
-        --output-path /tmp/bench/registration.json
+    python tests/benchmarks/registration.py --methods sift default --work-path out/cache \
+        --output-path out/registration.json
 
 Prints two Markdown tables of everything in the JSON file; rows of methods and subsets that are not
 run this time are kept. Features and raw matches below --work-path are reused as long as the
