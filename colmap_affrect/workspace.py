@@ -110,7 +110,8 @@ class Workspace:
 
     def recipe(self) -> str:
         """Return the name of the recipe that the features were made with."""
-        return str(self.require("extract") and self.recorded()["recipe"])
+        self.require("extract")
+        return str(self.recorded()["recipe"])
 
     def claim(
         self, stage: str, options: Mapping[str, Any], *, overwrite: bool = False, recipe: str = ""
