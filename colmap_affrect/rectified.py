@@ -51,9 +51,9 @@ def found_again(original: LocalFeatures, rectified: LocalFeatures) -> NDArray[np
     """Tell which features of the image itself a warp shows at the same place and scale.
 
     Same means centres within half a sigma and scales within ``SAME_SCALE_RATIO`` in the
-    image, whatever the orientation. A warp's region holds just those pixels whose shape is nearer to the class of
-    the warp than to the identity, so of the two the residual tilt of the rectified
-    feature is the smaller one, and the one to keep.
+    image, whatever the orientation. A warp's region holds just those pixels whose shape is
+    nearer to the class of the warp than to the identity, so of the two the residual tilt of
+    the rectified feature is the smaller one, and the one to keep.
     """
     scales1, scales2 = original.scales, rectified.scales
     radius = DUPLICATE_RADIUS_SIGMAS / MEASUREMENT_SIGMAS * scales1
