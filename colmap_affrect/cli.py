@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import os
 import sys
@@ -25,6 +26,7 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.workspace import Workspace
 
 if TYPE_CHECKING:
+    from colmap_affrect.extraction import Resources
     from colmap_affrect.pipeline import RunOptions
     from colmap_affrect.recipes import Recipe
 
@@ -121,6 +123,8 @@ def build_parser() -> argparse.ArgumentParser:
     run = _command(commands, "run", _run, "all stages: photographs in, COLMAP model out")
     _add_images(run)
     _add_recipe(run)
+    _add_resources(run)
+    _add_depth(run)
     _add_pair_list(run)
     _add_seed(run)
     _add_json(run)
@@ -128,6 +132,8 @@ def build_parser() -> argparse.ArgumentParser:
     extract = _command(commands, "extract", _extract, "features into features.h5 and database.db")
     _add_images(extract)
     _add_recipe(extract)
+    _add_resources(extract)
+    _add_depth(extract)
 
     pairs = _command(commands, "pairs", _pairs, "which images to match, into pairs.txt")
     _add_pair_list(pairs)
@@ -137,6 +143,14 @@ def build_parser() -> argparse.ArgumentParser:
 
     verify = _command(commands, "verify", _verify, "two-view geometries into database.db")
     _add_seed(verify)
+
+    escalate = _command(
+        commands,
+        "escalate",
+        _escalate,
+        "match pairs that failed again, with more warps (recipes that escalate, as on-demand)",
+    )
+    _add_resources(escalate)
 
     mapping = _command(commands, "map", _map, "COLMAP models into sparse/")
     _add_seed(mapping)
@@ -254,6 +268,46 @@ def _add_recipe(command: argparse.ArgumentParser, default: str | None = "default
     )
 
 
+def _add_resources(command: argparse.ArgumentParser) -> None:
+    _add_option(
+        command,
+        "--weights",
+        type=Path,
+        metavar="FOLDER",
+        help="weights of networks (default: $COLMAP_AFFRECT_WEIGHTS, torch's cache, download)",
+    )
+    _add_option(
+        command,
+        "--device",
+        default="auto",
+        metavar="DEVICE",
+        help="for networks: auto, cpu, cuda, cuda:1, mps (default: auto)",
+    )
+
+
+def _add_depth(command: argparse.ArgumentParser) -> None:
+    source = command.add_mutually_exclusive_group()
+    source.add_argument(
+        "--depth-path",
+        "--depth_path",
+        type=Path,
+        metavar="FOLDER",
+        help="depth maps named as the images: a/b.jpg has a/b.npy, .npz, .png, .exr or .h5",
+    )
+    source.add_argument(
+        "--depth-model",
+        "--depth_model",
+        metavar="NAME",
+        help="monocular depth network: name or local folder for Hugging Face transformers",
+    )
+    _add_option(
+        command,
+        "--depth-kind",
+        choices=["z", "ray", "inverse"],
+        help="what depth maps hold: z, distance from the camera, or inverse depth (default: z)",
+    )
+
+
 def _add_pair_list(command: argparse.ArgumentParser) -> None:
     _add_option(
         command,
@@ -301,13 +355,30 @@ def _run_options(options: argparse.Namespace) -> RunOptions:
         match_list_path=options.match_list_path,
         image_list_path=options.image_list_path,
         random_seed=options.random_seed,
+        resources=_resources(options),
     )
 
 
 def _recipe(options: argparse.Namespace, name: str) -> Recipe:
     from colmap_affrect.recipes import load_recipe
 
-    return load_recipe(name, options.set)
+    return load_recipe(name, [*options.set, *_depth_settings(options)])
+
+
+def _depth_settings(options: argparse.Namespace) -> list[str]:
+    path = getattr(options, "depth_path", None)
+    given = {
+        "path": str(path.resolve()) if path else None,
+        "model": getattr(options, "depth_model", None),
+        "kind": getattr(options, "depth_kind", None),
+    }
+    return [f"depth.{key}={json.dumps(value)}" for key, value in given.items() if value]
+
+
+def _resources(options: argparse.Namespace) -> Resources:
+    from colmap_affrect.extraction import Resources
+
+    return Resources(options.weights, options.device)
 
 
 def _cameras(options: argparse.Namespace) -> CameraOptions:
@@ -326,6 +397,7 @@ def _extract(options: argparse.Namespace) -> int:
             _recipe(options, options.recipe),
             _cameras(options),
             image_list_path=options.image_list_path,
+            resources=_resources(options),
             overwrite=options.overwrite,
             progress=_progress(options),
         )
@@ -368,6 +440,22 @@ def _verify(options: argparse.Namespace) -> int:
             progress=_progress(options),
         )
     print(report.summary())
+    return EXIT_OK
+
+
+def _escalate(options: argparse.Namespace) -> int:
+    from colmap_affrect import stages
+
+    with Workspace(options.output_path).locked() as workspace:
+        report = stages.escalate(
+            workspace,
+            resources=_resources(options),
+            overwrite=options.overwrite,
+            progress=_progress(options),
+        )
+        levels = stages.pair_levels(workspace)
+    print(report.summary())
+    print(", ".join(f"{count} pairs by {name}" for name, count in levels.items()))
     return EXIT_OK
 
 

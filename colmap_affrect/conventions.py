@@ -64,6 +64,29 @@ def resized_from_original(
     return matrix
 
 
+DEFAULT_FOCAL_RATIO = 1.2
+"""COLMAP's guess of a focal length where EXIF has none, in units of the longer side."""
+
+
+def camera_matrix(
+    image_size: tuple[int, int], focal: tuple[float, float] | None = None
+) -> NDArray[np.float64]:
+    """Return (3, 3) pinhole intrinsics in pixel-centre px, principal point in the middle.
+
+    Args:
+        image_size: (width, height) in px.
+        focal: (fx, fy) in px; by default ``DEFAULT_FOCAL_RATIO`` times the longer side.
+
+    >>> camera_matrix((10, 5))
+    array([[12. ,  0. ,  4.5],
+           [ 0. , 12. ,  2. ],
+           [ 0. ,  0. ,  1. ]])
+    """
+    fx, fy = focal or (DEFAULT_FOCAL_RATIO * max(image_size),) * 2
+    cx, cy = (np.asarray(image_size, dtype=np.float64) / 2.0) - HALF_PIXEL
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
 def grid_origin(step_px: int) -> float:
     """Centre of the first cell of a grid of ``step_px`` wide cells, pixel-centre px.
 

@@ -1,61 +1,204 @@
-"""Features of one image file by the options of a recipe."""
+"""Features of image files by the options of a recipe."""
 
 from __future__ import annotations
 
+import hashlib
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.conventions import resized_from_original
-from colmap_affrect.features.rootsift import extract_rootsift
-from colmap_affrect.features.second_moment import second_moment_shapes
+from colmap_affrect.conventions import camera_matrix, resized_from_original
+from colmap_affrect.depth import depth_source
+from colmap_affrect.errors import DepthError, OptionError
+from colmap_affrect.features.registry import make_profile, make_shape_source, needed_weights
+from colmap_affrect.features.weights import resolve
 from colmap_affrect.geometry.affine import transform_frames
 from colmap_affrect.imaging import read_gray, shrink_to
-from colmap_affrect.options import ExtractionOptions
+from colmap_affrect.interfaces import Computing, FeatureProfile, Rectifier, Sources
+from colmap_affrect.options import CoverOptions, ExtractionOptions
 from colmap_affrect.rectified import extract_rectified
-from colmap_affrect.rectifiers.dense_shapes import plan_dense_shapes
-from colmap_affrect.types import GrayImage, LocalFeatures, RectificationPlan
+from colmap_affrect.rectifiers.registry import make_rectifier
+from colmap_affrect.types import GrayImage, LocalFeatures, Photograph, RectificationPlan
+
+logger = logging.getLogger(__name__)
 
 MIN_RECTIFIABLE_PX = 32
 """Images with a shorter side are not rectified: no block would see its surroundings."""
 
 
-def extract_file(path: Path, options: ExtractionOptions) -> tuple[LocalFeatures, tuple[int, int]]:
-    """Read an image and extract its features.
+@dataclass(frozen=True)
+class Resources:
+    """What extraction needs from outside and what does not change its results.
 
-    Returns:
-        Features with frames in px of the stored image, and its (width, height).
+    Attributes:
+        weights_path: folder with the weights of networks; None searches the usual places.
+        device: ``auto``, ``cpu``, ``cuda``, ``cuda:1``, ``mps``.
+        depth_cache_path: folder that keeps the depth maps of a network; None keeps none.
+    """
+
+    weights_path: Path | None = None
+    device: str = "auto"
+    depth_cache_path: Path | None = None
+
+
+@dataclass(frozen=True)
+class ExtractedImage:
+    """Features of one image file.
+
+    Attributes:
+        features: frames in px of the stored image.
+        image_size: (width, height) of the stored image in px.
+        warning: why it was not rectified though it was to be; empty if all went well.
+    """
+
+    features: LocalFeatures
+    image_size: tuple[int, int]
+    warning: str = ""
+
+
+@dataclass(frozen=True)
+class ImageExtractor:
+    """A recipe ready to work: built once by :func:`prepare`, used for every image.
+
+    Attributes:
+        options: of the recipe.
+        profile: detector and descriptor.
+        rectifiers: one per level, that of every image first, then those of escalation.
+    """
+
+    options: ExtractionOptions
+    profile: FeatureProfile
+    rectifiers: tuple[Rectifier, ...]
+
+    def extract_file(
+        self,
+        path: Path,
+        name: str = "",
+        intrinsics: NDArray[np.float64] | None = None,
+        level: int = 0,
+    ) -> ExtractedImage:
+        """Read an image and extract its features.
+
+        Args:
+            path: the image file.
+            name: key of its depth map; the file's name by default.
+            intrinsics: (3, 3) camera matrix in pixel-centre px of the stored image; by default
+                COLMAP's guess of a focal length of 1.2 times the longer side.
+            level: 0 for the features that every image gets; above that, only those that the
+                rectifier of this level of escalation adds.
+
+        Raises:
+            ImageError: when the file cannot be read.
+        """
+        photograph, original_size = self.photograph(path, name, intrinsics)
+        plan, warning = self._plan_or_warn(photograph, level)
+        features = self.execute(photograph.gray, plan, with_original=level == 0)
+        if photograph.size != original_size:
+            original_from_resized = np.linalg.inv(
+                resized_from_original(original_size, photograph.size)
+            )
+            features = features.with_frames(transform_frames(original_from_resized, features.lafs))
+        return ExtractedImage(
+            features.select(features.inside(original_size)), original_size, warning
+        )
+
+    def photograph(
+        self, path: Path, name: str = "", intrinsics: NDArray[np.float64] | None = None
+    ) -> tuple[Photograph, tuple[int, int]]:
+        """Read an image at the size of processing; also return its stored (width, height)."""
+        image = read_gray(path)
+        original_size = (image.shape[1], image.shape[0])
+        gray = shrink_to(image, self.options.max_image_size_px)
+        size = (gray.shape[1], gray.shape[0])
+        original_camera = camera_matrix(original_size) if intrinsics is None else intrinsics
+        camera = resized_from_original(original_size, size) @ original_camera
+        return Photograph(gray, name or path.name, path, camera), original_size
+
+    def plan(self, photograph: Photograph, level: int = 0) -> RectificationPlan:
+        """Decide which warps of a photograph to look at.
+
+        Raises:
+            DepthError: when the rectifier needs a depth map and it cannot be used.
+        """
+        if min(photograph.size) < MIN_RECTIFIABLE_PX:
+            return RectificationPlan(photograph.size)
+        return self.rectifiers[level].plan(photograph)
+
+    def execute(
+        self, image: GrayImage, plan: RectificationPlan, *, with_original: bool = True
+    ) -> LocalFeatures:
+        """Extract the features of a plan, frames in px of the (H, W) uint8 image."""
+        limit = self.options.features.max_num_rectified_features
+        return extract_rectified(image, plan, self.profile, limit, with_original=with_original)
+
+    def _plan_or_warn(self, photograph: Photograph, level: int) -> tuple[RectificationPlan, str]:
+        try:
+            return self.plan(photograph, level), ""
+        except DepthError as error:
+            logger.warning("%s: extracted without rectification: %s", photograph.name, error)
+            return RectificationPlan(photograph.size), f"not rectified: {error}"
+
+
+def extract_image(image: GrayImage, options: ExtractionOptions | None = None) -> LocalFeatures:
+    """Extract the features of one (H, W) uint8 image, frames in its px.
+
+    For many images build the extractor once with :func:`prepare`.
+    """
+    extractor = prepare(options or ExtractionOptions())
+    size = (image.shape[1], image.shape[0])
+    photograph = Photograph(image, "", None, camera_matrix(size))
+    return extractor.execute(image, extractor.plan(photograph))
+
+
+def recorded_weights(
+    options: ExtractionOptions, resources: Resources | None = None
+) -> dict[str, str]:
+    """Return the sha256 of every file of weights that a recipe reads, by file name."""
+    found = resolve(needed_weights(options), (resources or Resources()).weights_path)
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in found.values()}
+
+
+def prepare(
+    options: ExtractionOptions,
+    resources: Resources | None = None,
+    image_names: Sequence[str] | None = None,
+) -> ImageExtractor:
+    """Find everything a recipe needs, before any image is touched, and build its parts.
+
+    Args:
+        options: of the recipe.
+        resources: weights, device, cache.
+        image_names: the images to come, to see whether there are depth maps for them.
 
     Raises:
-        ImageError: when the file cannot be read.
+        WeightsError: when a file of weights is neither found nor downloaded.
+        DeviceError: when the device is not there.
+        OptionError: when depth maps are needed and no source is given.
+        DepthError: when the folder of depth maps has none of the images.
     """
-    image = read_gray(path)
-    original_size = (image.shape[1], image.shape[0])
-    image = shrink_to(image, options.max_image_size_px)
-    features = extract_image(image, options)
-    size = (image.shape[1], image.shape[0])
-    if size != original_size:
-        original_from_resized = np.linalg.inv(resized_from_original(original_size, size))
-        lafs = transform_frames(original_from_resized, features.lafs)
-        features = features.with_frames(lafs)
-    return features.select(features.inside(original_size)), original_size
-
-
-def extract_image(image: GrayImage, options: ExtractionOptions) -> LocalFeatures:
-    """Plan the rectifications of a (H, W) uint8 image and extract its features."""
-
-    def extract(view: GrayImage, mask: NDArray[np.uint8] | None) -> LocalFeatures:
-        return extract_rootsift(view, options.features, mask)
-
-    plan = plan_rectifications(image, options)
-    return extract_rectified(image, plan, extract, options.features.max_num_rectified_features)
-
-
-def plan_rectifications(image: GrayImage, options: ExtractionOptions) -> RectificationPlan:
-    """Decide which warps of a (H, W) uint8 image to look at."""
-    size = (image.shape[1], image.shape[0])
-    if options.rectifier.name == "identity" or min(size) < MIN_RECTIFIABLE_PX:
-        return RectificationPlan(size, ())
-    shapes = second_moment_shapes(image, options.second_moment)
-    return plan_dense_shapes(shapes, size, options.rectifier)
+    resources = resources or Resources()
+    needed = needed_weights(options)
+    computing = Computing(resolve(needed, resources.weights_path), resources.device)
+    profile = make_profile(options.features, computing)
+    depth = None
+    needing = [item.name for item in options.rectifiers if item.uses_depth]
+    if needing:
+        depth = depth_source(options.depth, resources.depth_cache_path, resources.device)
+        if depth is None:
+            raise OptionError(
+                f"rectifier {needing[0]} needs depth maps: give --depth-path FOLDER, or "
+                "--depth-model NAME for a monocular depth network"
+            )
+        if image_names is not None:
+            depth.require_some(image_names)
+    rectifiers = []
+    for item in options.rectifiers:
+        shapes = None
+        if isinstance(item, CoverOptions):
+            shapes = make_shape_source(item.shape_source, options, computing)
+        rectifiers.append(make_rectifier(item, Sources(shapes, depth if item.uses_depth else None)))
+    return ImageExtractor(options, profile, tuple(rectifiers))

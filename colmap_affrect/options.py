@@ -1,6 +1,6 @@
 """Options of all stages: frozen dataclasses, checked, rejecting unknown keys.
 
-A recipe is a TOML file of the sections ``rectifier``, ``second_moment``, ``features`` and
+A recipe is a TOML file whose sections are the fields of :class:`ExtractionOptions` and
 ``matching``; what it leaves out keeps the defaults below.
 """
 
@@ -10,9 +10,19 @@ import dataclasses
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Self
+from importlib import metadata
+from typing import Any, ClassVar, Self
 
 from colmap_affrect.errors import OptionError
+
+RECTIFIERS = "colmap_affrect.rectifiers"
+FEATURES = "colmap_affrect.features"
+"""Entry-point groups of other packages' rectifiers and feature profiles."""
+
+
+def entry_points(group: str) -> dict[str, metadata.EntryPoint]:
+    """Return the entry points of a group by name."""
+    return {point.name: point for point in metadata.entry_points(group=group)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +55,15 @@ class Options:
         if not low <= value <= high:
             raise OptionError(f"{name}={value} is outside [{low:g}, {high:g}]")
 
+    def _check_fixed(self, name: str) -> None:
+        """Refuse another value than the default, which says what kind of options these are."""
+        self._check_choice(name, (self.__dataclass_fields__[name].default,))
+
+    def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
+        value = getattr(self, name)
+        if value not in choices:
+            raise OptionError(f"{name}={value!r} is not one of {', '.join(choices)}")
+
 
 def _suggestion(key: str, known: Mapping[str, Any]) -> str:
     close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
@@ -55,11 +74,28 @@ def _converted(value: Any, item: dataclasses.Field[Any], where: str) -> Any:
     default = item.default
     if item.default_factory is not dataclasses.MISSING:
         default = item.default_factory()
+    if "section" in item.metadata:
+        section = item.metadata["section"]
+        if isinstance(default, Options):
+            return _options(value, section, where)
+        if not isinstance(value, list | tuple):
+            raise OptionError(f"{where}: expected a list of sections [[{item.name}]]")
+        return tuple(_options(element, section, where) for element in value)
     if isinstance(default, Options):
         return type(default).from_mapping(value, where)
     if isinstance(default, tuple) and isinstance(value, list | tuple):
         return tuple(_converted_scalar(element, default[0], where) for element in value)
     return _converted_scalar(value, default, where)
+
+
+def _options(value: Any, section: str, where: str) -> Options:
+    if not isinstance(value, Mapping):
+        raise OptionError(f"{where}: expected options, got {value!r}")
+    try:
+        chosen = options_class(section, value)
+    except OptionError as error:
+        raise OptionError(f"{where}: {error}") from error
+    return chosen.from_mapping(value, where)
 
 
 def _converted_scalar(value: Any, default: Any, where: str) -> Any:
@@ -72,37 +108,159 @@ def _converted_scalar(value: Any, default: Any, where: str) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DenseShapesOptions(Options):
-    """Rectifier: which warps are planned."""
+class RectifierOptions(Options):
+    """Base of the options of all rectifiers."""
 
-    name: str = "dense-shapes"
-    """``dense-shapes``, or ``identity`` for no rectification at all."""
+    name: str = ""
+    uses_depth: ClassVar[bool] = False
+    """Whether it reads a depth map of every photograph."""
+
+    def __post_init__(self) -> None:
+        self._check_fixed("name")
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentityOptions(RectifierOptions):
+    """No warps."""
+
+    name: str = "identity"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AffineWarpOptions(RectifierOptions):
+    """How large affine warps are rendered."""
+
+    area_preserving: bool = True
+    """Warp by diag(sqrt t, 1 / sqrt t), which keeps the area; False: by diag(1, 1 / t), which
+    never magnifies (the paper)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AsiftOptions(AffineWarpOptions):
+    """The same warps of the whole image for every photograph."""
+
+    name: str = "asift"
+    covering: str = "near-optimal"
+    """``near-optimal``: 24 maps that with the identity cover all tilts to 5.8 (Rodriguez et al.
+    2018); ``asift``: the 60 of ASIFT with tilts to 8 (Morel & Yu 2009, the paper)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_choice("covering", ("near-optimal", "asift"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoverOptions(AffineWarpOptions):
+    """Greedy cover of the affine shapes of a photograph in the space of tilts."""
+
     shape_source: str = "second-moment"
+    """``second-moment`` (structure tensor) or ``affnet`` (network)."""
     tilt_radius: float = 1.7
     """Radius r of a covering ball as a tilt ratio. Paper: 1.7."""
     max_tilt: float = 5.8
     """Shapes of a larger tilt neither vote nor count. Paper: 5.8."""
     covered_frac: float = 0.95
-    """Share of the textured blocks that the balls must hold. Paper: 0.95."""
+    """Share of the shapes that the balls must hold. Paper: 0.95."""
     max_num_rectifications: int = 8
-    """Upper bound on the warps of one image."""
-    min_region_frac: float = 0.02
-    """Regions of a smaller share of the image are not warped."""
-
-    min_part_frac: float = 0.002
-    """Scattered pieces of a region of a smaller share of the image are left out."""
+    """Upper bound on the covering maps."""
 
     def __post_init__(self) -> None:
-        self._check("min_part_frac", 0.0, 1.0)
+        super().__post_init__()
+        self._check_choice("shape_source", ("second-moment", "affnet"))
         self._check("tilt_radius", 1.05, 10.0)
         self._check("max_tilt", 1.0, 20.0)
         self._check("covered_frac", 0.0, 1.0)
         self._check("max_num_rectifications", 0, 192)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DenseShapesOptions(CoverOptions):
+    """Each block of the photograph is warped by the covering map nearest to its shape."""
+
+    name: str = "dense-shapes"
+    min_region_frac: float = 0.02
+    """Regions of a smaller share of the image are not warped."""
+    min_part_frac: float = 0.002
+    """Scattered pieces of a region of a smaller share of the image are left out."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self._check("min_region_frac", 0.0, 1.0)
-        if self.name not in ("dense-shapes", "identity"):
-            raise OptionError(f"name={self.name!r} is not one of dense-shapes, identity")
-        if self.shape_source != "second-moment":
-            raise OptionError(f"shape_source={self.shape_source!r} is not second-moment")
+        self._check("min_part_frac", 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AffNetShapesOptions(CoverOptions):
+    """The whole photograph is warped by every covering map of its shapes."""
+
+    name: str = "affnet-shapes"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneOptions(Options):
+    """Planes from the normals of a depth map (the paper's depth-map-based method)."""
+
+    num_candidates: int = 500
+    """Candidate normals, on a spiral over the whole sphere. Paper: 500."""
+    bin_angle_deg: float = 35.0
+    """Normals at most this far from a candidate vote for it."""
+    min_separation_deg: float = 87.5
+    """Planes are at least this far apart."""
+    max_num_planes: int = 3
+    min_votes_frac: float = 0.15
+    """Share of the pixels that a plane must have."""
+    max_angle_deg: float = 75.0
+    """Planes seen at a larger angle are not rectified."""
+    min_region_frac: float = 0.03
+    """Connected regions of a smaller share of the image are not rectified."""
+    orthogonal: bool = False
+    """Turn the normals of up to three planes into exactly orthogonal ones."""
+    antipodal: bool = False
+    """Count opposite normals as one plane."""
+
+    def __post_init__(self) -> None:
+        self._check("num_candidates", 10, 100_000)
+        self._check("bin_angle_deg", 1.0, 89.0)
+        self._check("min_separation_deg", 0.0, 180.0)
+        self._check("max_num_planes", 1, 100)
+        self._check("min_votes_frac", 0.0, 1.0)
+        self._check("max_angle_deg", 0.0, 85.0)
+        self._check("min_region_frac", 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthPlanesOptions(RectifierOptions):
+    """One homography per planar region, as if seen from the front."""
+
+    name: str = "depth-planes"
+    planes: PlaneOptions = field(default_factory=PlaneOptions)
+    keep_original: str = "everywhere"
+    """Features of the photograph itself are kept ``everywhere`` or ``outside`` of the rectified
+    regions (the paper)."""
+    uses_depth: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_choice("keep_original", ("everywhere", "outside"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthAffNetOptions(CoverOptions):
+    """Planar regions from depth, each warped by a cover of the shapes inside it."""
+
+    name: str = "depth-affnet"
+    planes: PlaneOptions = field(default_factory=PlaneOptions)
+    uses_depth: ClassVar[bool] = True
+
+
+RECTIFIER_OPTIONS: dict[str, type[RectifierOptions]] = {
+    "identity": IdentityOptions,
+    "asift": AsiftOptions,
+    "affnet-shapes": AffNetShapesOptions,
+    "depth-planes": DepthPlanesOptions,
+    "depth-affnet": DepthAffNetOptions,
+    "dense-shapes": DenseShapesOptions,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,38 +282,168 @@ class SecondMomentOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SiftOptions(Options):
-    """Feature profile ``rootsift``."""
+class AffNetOptions(Options):
+    """Shape source ``affnet``."""
 
-    profile: str = "rootsift"
+    scales: tuple[float, ...] = (1.0, 0.5, 0.25)
+    """Sizes of the image at which dense shapes are estimated; their log-Euclidean mean counts."""
+    paper: bool = False
+    """Normalise by mean and deviation of the whole image and use the full size only, as the
+    authors did; otherwise by those of the surrounding 33 x 33 px."""
+    min_deviation: float = 3.0
+    """Standard deviation of the surroundings, in gray values, under which a block counts as flat;
+    not with ``paper``."""
+    max_num_keypoints: int = 4000
+    """Sparse shapes are those of the strongest keypoints."""
+
+    def __post_init__(self) -> None:
+        self._check("min_deviation", 0.0, 255.0)
+        self._check("max_num_keypoints", 1, 1_000_000)
+        if not self.scales or not all(0.05 <= scale <= 1.0 for scale in self.scales):
+            raise OptionError("scales needs at least one value, each in [0.05, 1]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthOptions(Options):
+    """Where depth maps come from, for rectifiers that use them."""
+
+    path: str = ""
+    """Folder of depth maps, named as the images: ``a/b.jpg`` has ``a/b.npy``, or .npz, .png, .exr,
+    .h5 (also after the image's full name, ``a/b.jpg.npy``)."""
+    model: str = ""
+    """Monocular depth model: a name or local folder for Hugging Face transformers."""
+    kind: str = "z"
+    """What the values of the files are: ``z`` (along the optical axis), ``ray`` (distance from the
+    camera), or ``inverse`` (1 / z)."""
+    png_scale: float = 0.001
+    """Depth of one step of a 16-bit PNG; only the ratio of depths matters."""
+
+    def __post_init__(self) -> None:
+        self._check_choice("kind", ("z", "ray", "inverse"))
+        self._check("png_scale", 1e-12, 1e12)
+        if self.path and self.model:
+            raise OptionError("path and model cannot both be given: depth comes from one of them")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureOptions(Options):
+    """Base of the options of all feature profiles."""
+
+    profile: str = ""
     max_num_features: int = 8192
     """Most features of the image itself, by response."""
     max_num_rectified_features: int = 6144
     """Most features of all warps together, by response."""
+
+    def __post_init__(self) -> None:
+        self._check_fixed("profile")
+        self._check("max_num_features", 1, 1_000_000)
+        self._check("max_num_rectified_features", 1, 1_000_000)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DogOptions(FeatureOptions):
+    """OpenCV's difference-of-Gaussians detector."""
+
     contrast_threshold: float = 0.013
-    """OpenCV's contrast threshold; lower finds fainter features (OpenCV's default: 0.04)."""
+    """OpenCV's contrast threshold; lower finds fainter features (OpenCV and the paper: 0.04)."""
     edge_threshold: float = 10.0
     num_octave_layers: int = 3
     sigma_px: float = 1.6
 
     def __post_init__(self) -> None:
-        self._check("max_num_features", 1, 1_000_000)
-        self._check("max_num_rectified_features", 1, 1_000_000)
+        super().__post_init__()
         self._check("contrast_threshold", 0.0, 1.0)
         self._check("edge_threshold", 1.0, 1e6)
         self._check("num_octave_layers", 1, 10)
         self._check("sigma_px", 0.5, 10.0)
-        if self.profile != "rootsift":
-            raise OptionError(f"profile={self.profile!r} is not rootsift")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SiftOptions(DogOptions):
+    """Feature profile ``rootsift``."""
+
+    profile: str = "rootsift"
+
+
+DETECTORS = ("dog", "keynet", "hessian")
+DESCRIPTORS = ("hardnet", "hardnet8", "hynet", "sosnet", "tfeat", "mkd", "hardtfeat")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AffNetHardNetOptions(DogOptions):
+    """Feature profile ``affnet-hardnet``: detector, AffNet, OriNet and a learned descriptor."""
+
+    profile: str = "affnet-hardnet"
+    detector: str = "dog"
+    """``dog`` (OpenCV, as in the paper), ``keynet`` or ``hessian``."""
+    descriptor: str = "hardnet"
+    affine_shape: bool = True
+    """Estimate affine shapes by AffNet; otherwise measurement regions are circles."""
+    patch_sigmas: float = 12.0
+    """Half width of a patch in units of the feature's sigma (12 as in the paper, for DoG)."""
+    batch_size: int = 512
+    """Patches that go through a network at once."""
+    dtype: str = "float32"
+    """Arithmetic of the networks: ``float32``, or ``float16`` and ``bfloat16`` where the device
+    is faster with them."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_choice("detector", DETECTORS)
+        self._check_choice("descriptor", DESCRIPTORS)
+        self._check_choice("dtype", ("float32", "float16", "bfloat16"))
+        self._check("patch_sigmas", 1.0, 100.0)
+        self._check("batch_size", 1, 1_000_000)
+
+
+FEATURE_OPTIONS: dict[str, type[FeatureOptions]] = {
+    "rootsift": SiftOptions,
+    "affnet-hardnet": AffNetHardNetOptions,
+}
+
+
+def options_class(section: str, values: Mapping[str, Any]) -> type[Options]:
+    """Return the class of the options of a section by the name it gives.
+
+    Args:
+        section: ``rectifier`` or ``features``.
+        values: what the section holds; ``name`` or ``profile`` chooses the class, built in or
+            of another package.
+
+    Raises:
+        OptionError: for an unknown name.
+    """
+    if section == "rectifier":
+        name, built_in, group = values.get("name", "dense-shapes"), RECTIFIER_OPTIONS, RECTIFIERS
+        return _chosen(name, built_in, group)
+    return _chosen(values.get("profile", "rootsift"), FEATURE_OPTIONS, FEATURES)
+
+
+def _chosen(name: Any, built_in: Mapping[str, type[Options]], group: str) -> type[Options]:
+    if name in built_in:
+        return built_in[name]
+    plugins = entry_points(group)
+    if name in plugins:
+        chosen: type[Options] = plugins[name].load().Options
+        return chosen
+    known = {**built_in, **plugins}
+    raise OptionError(f"unknown '{name}'{_suggestion(str(name), known)}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExtractionOptions(Options):
     """Everything that decides the features of an image."""
 
-    rectifier: DenseShapesOptions = field(default_factory=DenseShapesOptions)
+    rectifier: RectifierOptions = field(
+        default_factory=DenseShapesOptions, metadata={"section": "rectifier"}
+    )
+    escalation: tuple[RectifierOptions, ...] = field(default=(), metadata={"section": "rectifier"})
+    """Rectifiers for pairs that fail verification, one after the other until it succeeds."""
     second_moment: SecondMomentOptions = field(default_factory=SecondMomentOptions)
-    features: SiftOptions = field(default_factory=SiftOptions)
+    affnet: AffNetOptions = field(default_factory=AffNetOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
+    features: FeatureOptions = field(default_factory=SiftOptions, metadata={"section": "features"})
     max_image_size_px: int = 2400
     """Larger images are shrunk to this longer side before extraction. At 2400 a photograph of
     12 megapixels needs 1.0 GiB of memory, at 3200 (COLMAP's limit for SIFT) 1.8 GiB."""
@@ -163,13 +451,20 @@ class ExtractionOptions(Options):
     def __post_init__(self) -> None:
         self._check("max_image_size_px", 16, 1_000_000)
 
+    @property
+    def rectifiers(self) -> tuple[RectifierOptions, ...]:
+        """The rectifiers of all levels, that of every image first."""
+        return (self.rectifier, *self.escalation)
+
 
 @dataclass(frozen=True, kw_only=True)
 class MatchingOptions(Options):
     """Matching of two images."""
 
     max_ratio: float = 0.85
-    """Largest ratio of first to second descriptor distance, tested in both directions."""
+    """Largest ratio of first to second descriptor distance."""
+    ratio_both_ways: bool = True
+    """Test the ratio in both directions; False: from image 1 to 2 only, as in the paper."""
     min_contrast_distance_px: float = 10.0
     """The second neighbour must be this far from the first (FGINN; MODS: 10-30 px)."""
     duplicate_radius_px: float = 2.0
@@ -234,6 +529,4 @@ class CameraOptions(Options):
     params: str = ""
 
     def __post_init__(self) -> None:
-        modes = ("auto", "single", "per-folder", "per-image")
-        if self.mode not in modes:
-            raise OptionError(f"mode={self.mode!r} is not one of {', '.join(modes)}")
+        self._check_choice("mode", ("auto", "single", "per-folder", "per-image"))

@@ -20,6 +20,7 @@ class StageReport:
         num_done: images or pairs worked on now.
         num_kept: images or pairs found done already.
         failures: image name to reason.
+        warnings: image name to what went less well than asked for.
     """
 
     name: str
@@ -27,12 +28,14 @@ class StageReport:
     num_done: int
     num_kept: int = 0
     failures: dict[str, str] = dataclasses.field(default_factory=dict)
+    warnings: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def summary(self) -> str:
         """Return one line."""
         kept = f", {self.num_kept} already there" if self.num_kept else ""
         failed = f", {len(self.failures)} failed" if self.failures else ""
-        return f"{self.name}: {self.num_done} done{kept}{failed} in {self.wall_s:.1f} s"
+        warned = f", {len(self.warnings)} with a warning" if self.warnings else ""
+        return f"{self.name}: {self.num_done} done{kept}{failed}{warned} in {self.wall_s:.1f} s"
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,8 @@ class ReconstructionReport:
         unregistered: image name to reason: unreadable, no features, no verified pair, or
             not registered.
         models: all models, largest first, as written to sparse/0, sparse/1, ...
+        pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
+            and ``none``; empty for other recipes.
     """
 
     images_total: int
@@ -65,6 +70,7 @@ class ReconstructionReport:
     recipe: str
     random_seed: int
     versions: dict[str, str]
+    pair_levels: dict[str, int] = dataclasses.field(default_factory=dict)
 
     @property
     def status(self) -> str:
@@ -99,6 +105,7 @@ class ReconstructionReport:
             "models": [list(model.registered_names) for model in self.models],
             "num_pairs": self.num_pairs,
             "num_verified_pairs": self.num_verified_pairs,
+            "pair_levels": self.pair_levels,
             "stages": [dataclasses.asdict(stage) for stage in self.stages],
             "recipe": self.recipe,
             "random_seed": self.random_seed,
@@ -115,6 +122,9 @@ class ReconstructionReport:
         lines = [f"registered  {registered} of {self.images_total} images"]
         lines += [f"            not {name}: {why}" for name, why in self.unregistered.items()]
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
+        if self.pair_levels:
+            counts = ", ".join(f"{count} by {name}" for name, count in self.pair_levels.items())
+            lines += [f"decided     {counts}"]
         if self.models:
             model = self.models[0]
             lines += [
@@ -125,6 +135,9 @@ class ReconstructionReport:
         if len(self.models) > 1:
             sizes = ", ".join(str(len(model.registered_names)) for model in self.models)
             lines += [f"models      {len(self.models)}, of {sizes} images"]
+        lines += [
+            f"warning     {name}: {why}" for stage in self.stages for name, why in stage.warnings.items()
+        ]
         seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
         lines += [f"seconds     {seconds}"]
         return "\n".join(lines)

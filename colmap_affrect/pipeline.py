@@ -9,13 +9,16 @@ from importlib import metadata
 from pathlib import Path
 
 from colmap_affrect import stages
+from colmap_affrect.extraction import Resources
 from colmap_affrect.options import CameraOptions, MappingOptions, VerificationOptions
 from colmap_affrect.outcomes import ReconstructionReport, StageReport
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.workspace import Workspace
 
-REPORTED_PACKAGES = ("colmap-affrect", "pycolmap", "opencv-python-headless", "numpy", "h5py")
+REPORTED_PACKAGES = (
+    "colmap-affrect", "pycolmap", "opencv-python-headless", "numpy", "h5py", "torch", "kornia",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +30,7 @@ class RunOptions:
         match_list_path: list of the pairs to match; None for all pairs.
         image_list_path: list of the images to use; None for all below the folder.
         random_seed: seed of verification and mapping.
+        resources: weights and device of networks.
     """
 
     recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
@@ -36,6 +40,7 @@ class RunOptions:
     match_list_path: Path | None = None
     image_list_path: Path | None = None
     random_seed: int = 0
+    resources: Resources = field(default_factory=Resources)
 
 
 def run(
@@ -72,6 +77,7 @@ def run(
                 options.recipe,
                 options.cameras,
                 image_list_path=options.image_list_path,
+                resources=options.resources,
                 overwrite=overwrite,
                 progress=progress,
             ),
@@ -81,6 +87,10 @@ def run(
                 workspace, options.verification, options.random_seed, progress=progress
             ),
         ]
+        if options.recipe.extraction.escalation:
+            reports.append(
+                stages.escalate(workspace, resources=options.resources, progress=progress)
+            )
         return map_and_report(
             workspace, options.mapping, options.random_seed, earlier=reports, progress=progress
         )
@@ -112,6 +122,7 @@ def map_and_report(
         recipe=workspace.recipe(),
         random_seed=random_seed,
         versions=installed_versions(),
+        pair_levels=stages.pair_levels(workspace),
     )
     workspace.report.write_text(result.to_json(), encoding="utf-8")
     return result

@@ -10,9 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.options import ExtractionOptions, MatchingOptions
-
-SECTIONS = ("rectifier", "second_moment", "features", "matching")
+from colmap_affrect.options import ExtractionOptions, MatchingOptions, options_class
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,6 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
     values = _read(name)
     for setting in settings:
         _apply(values, setting)
-    _check_sections(values, name)
     summary = values.pop("summary", "")
     matching = values.pop("matching", {})
     extraction = ExtractionOptions.from_mapping(values, f"recipe {name}")
@@ -75,12 +72,6 @@ def _read(name: str) -> dict[str, Any]:
         raise OptionError(f"recipe {path}: cannot be read ({error})") from error
 
 
-def _check_sections(values: Mapping[str, Any], name: str) -> None:
-    for section in SECTIONS:
-        if not isinstance(values.get(section, {}), Mapping):
-            raise OptionError(f"recipe {name}: {section} is a section of options, not a value")
-
-
 def _apply(values: dict[str, Any], setting: str) -> None:
     key, separator, text = setting.partition("=")
     if not separator or not key.strip():
@@ -96,3 +87,17 @@ def _apply(values: dict[str, Any], setting: str) -> None:
         if not isinstance(target, Mapping):
             raise OptionError(f"--set {setting}: {section} is not a section")
     target[option] = value
+    if key.strip() in CHOICES:
+        _keep_known(target, key.strip())
+
+
+CHOICES = {"rectifier.name": "rectifier", "features.profile": "features"}
+"""Options that choose the class of their section, which other options there depend on."""
+
+
+def _keep_known(section: dict[str, Any], key: str) -> None:
+    """Drop what the recipe says of another rectifier or profile than the one now chosen."""
+    name = CHOICES[key]
+    fields = options_class(name, section).__dataclass_fields__
+    for option in set(section) - set(fields):
+        del section[option]

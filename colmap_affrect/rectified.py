@@ -1,26 +1,24 @@
-"""Execute a rectification plan: warp, detect, describe, carry back, unite."""
+"""Execute a rectification plan: warp, detect, carry back, choose, describe, unite."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.geometry.affine import ellipse_extents, transform_frames
 from colmap_affrect.geometry.neighbors import neighbors_within
 from colmap_affrect.imaging import warp, warp_mask
+from colmap_affrect.interfaces import FeatureProfile
 from colmap_affrect.types import (
     GrayImage,
     LocalFeatures,
+    Mask,
     Rectification,
     RectificationPlan,
+    View,
+    in_mask,
     union,
 )
-
-Extractor = Callable[[GrayImage, NDArray[np.uint8] | None], LocalFeatures]
-"""Detect and describe in an image, where the mask is not 0 (everywhere if it is None)."""
 
 DUPLICATE_RADIUS_SIGMAS = 0.5
 MAX_DUPLICATE_RADIUS_PX = 4.0
@@ -29,31 +27,110 @@ SAME_SCALE_RATIO = 2 ** (1 / 3)
 
 
 def extract_rectified(
-    image: GrayImage, plan: RectificationPlan, extract: Extractor, max_num_rectified: int
+    image: GrayImage,
+    plan: RectificationPlan,
+    profile: FeatureProfile,
+    max_num_rectified: int,
+    *,
+    with_original: bool = True,
 ) -> LocalFeatures:
     """Return the features of the image and of all planned warps, frames in image px.
 
-    Of the features in warps the ``max_num_rectified`` strongest are kept. A feature of
-    the image that a warp found again gives way to it.
+    Of the features in warps the ``max_num_rectified`` strongest are kept. A feature of the
+    image that the warp of a region found again gives way to it. Only what stays is described,
+    and all of it in one call.
+
+    Args:
+        image: (H, W) uint8.
+        plan: warps of this image.
+        profile: detector and descriptor.
+        max_num_rectified: bound on the features of all warps together.
+        with_original: False leaves out the features of the image itself.
     """
-    original = extract(image, None)
-    warped = [
-        _extract_in_warp(image, rectification, index + 1, extract)
-        for index, rectification in enumerate(plan.items)
+    rectifications: list[Rectification | None] = [None] if with_original else []
+    rectifications += plan.items
+    if not rectifications:
+        return LocalFeatures.empty(profile.descriptor_size)
+    views = [_view(image, rectification) for rectification in rectifications]
+    detected = [profile.detect(view) for view in views]
+    carried = [_carried(*pair) for pair in zip(detected, rectifications, strict=True)]
+    keep = [_usable(*pair, plan) for pair in zip(carried, rectifications, strict=True)]
+    warped = slice(1 if with_original else 0, None)
+    _keep_strongest(keep[warped], carried[warped], max_num_rectified)
+    regional = [
+        features.select(kept)
+        for features, kept, rectification in zip(carried, keep, rectifications, strict=True)
+        if rectification is not None and rectification.region is not None
     ]
-    if not warped:
-        return original
-    rectified = _strongest(union(warped), max_num_rectified)
-    return union([original.select(~found_again(original, rectified)), rectified])
+    if with_original and regional:
+        keep[0] &= ~found_again(carried[0], union(regional))
+    chosen = [features.select(kept) for features, kept in zip(detected, keep, strict=True)]
+    described = profile.describe([view[0] for view in views], chosen)
+    first_id = 0 if with_original else 1
+    return union(
+        [
+            _carried(features, rectification).with_rectification_id(first_id + number)
+            for number, (features, rectification) in enumerate(
+                zip(described, rectifications, strict=True)
+            )
+        ]
+    )
 
 
-def found_again(original: LocalFeatures, rectified: LocalFeatures) -> NDArray[np.bool_]:
-    """Tell which features of the image itself a warp shows at the same place and scale.
+def _view(image: GrayImage, rectification: Rectification | None) -> View:
+    if rectification is None:
+        return image, None
+    size = (image.shape[1], image.shape[0])
+    return warp(image, rectification), warp_mask(rectification, size)
+
+
+def _carried(features: LocalFeatures, rectification: Rectification | None) -> LocalFeatures:
+    """Carry features of a view back into the image."""
+    if rectification is None:
+        return features
+    return features.with_frames(
+        transform_frames(rectification.image_from_rectified, features.lafs)
+    )
+
+
+def _usable(
+    features: LocalFeatures, rectification: Rectification | None, plan: RectificationPlan
+) -> Mask:
+    """Tell which features, frames in image px, belong to their part of the image.
+
+    Those of a warp must have their measurement region inside the image: what lies outside
+    is invented by the warp.
+    """
+    if rectification is None:
+        if plan.original_region is None:
+            return np.ones(len(features), dtype=bool)
+        return in_mask(plan.original_region, features.keypoints)
+    extents = ellipse_extents(features.lafs[:, :, :2])
+    inside = is_inside(features.keypoints, plan.image_size, extents)
+    return np.asarray(inside & rectification.in_region(features.keypoints))
+
+
+def _keep_strongest(keep: list[Mask], features: list[LocalFeatures], limit: int) -> None:
+    """Clear in ``keep`` all but the ``limit`` strongest of the features of several views."""
+    if not keep:
+        return
+    kept = np.concatenate(keep)
+    responses = np.concatenate([part.responses for part in features])
+    candidates = np.flatnonzero(kept)
+    order = np.argsort(-responses[candidates], kind="stable")
+    kept[candidates[order[limit:]]] = False
+    ends = np.cumsum([len(part) for part in features])
+    for part, mask in zip(np.split(kept, ends[:-1]), keep, strict=True):
+        mask[:] = part
+
+
+def found_again(original: LocalFeatures, rectified: LocalFeatures) -> Mask:
+    """Tell which features of the image itself a regional warp shows at the same place and scale.
 
     Same means centres within half a sigma and scales within ``SAME_SCALE_RATIO`` in the
-    image, whatever the orientation. A warp's region holds just those pixels whose shape is
-    nearer to the class of the warp than to the identity, so of the two the residual tilt of
-    the rectified feature is the smaller one, and the one to keep.
+    image, whatever the orientation. A region holds just those pixels whose shape is nearer
+    to the class of its warp than to the identity, so of the two the residual tilt of the
+    rectified feature is the smaller one, and the one to keep.
     """
     scales1, scales2 = original.scales, rectified.scales
     radius = DUPLICATE_RADIUS_SIGMAS / MEASUREMENT_SIGMAS * scales1
@@ -71,20 +148,3 @@ def found_again(original: LocalFeatures, rectified: LocalFeatures) -> NDArray[np
     same_scale = np.abs(np.log(scales1[rows] / scales2[others])) < np.log(SAME_SCALE_RATIO)
     again[rows[(distances < radius[rows]) & same_scale]] = True
     return again
-
-
-def _strongest(features: LocalFeatures, limit: int) -> LocalFeatures:
-    best = np.argsort(-features.responses, kind="stable")[:limit]
-    return features.select(np.sort(best))
-
-
-def _extract_in_warp(
-    image: GrayImage, rectification: Rectification, rectification_id: int, extract: Extractor
-) -> LocalFeatures:
-    mask = warp_mask(rectification)
-    features = extract(warp(image, rectification), mask)
-    lafs = transform_frames(rectification.image_from_rectified, features.lafs)
-    size = (image.shape[1], image.shape[0])
-    keep = is_inside(lafs[:, :, 2], size, ellipse_extents(lafs[:, :, :2]))
-    keep &= rectification.in_region(lafs[:, :, 2])
-    return features.with_frames(lafs, rectification_id).select(keep)

@@ -6,7 +6,8 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -17,12 +18,13 @@ from colmap_affrect.colmap.mapping import map_incrementally, read_models
 from colmap_affrect.colmap.verification import verified_pairs, verify
 from colmap_affrect.errors import ImageError, OptionError, StaleStoreError, StoreError
 from colmap_affrect.executor import available_cores, map_ordered
-from colmap_affrect.extraction import extract_file
+from colmap_affrect.extraction import ImageExtractor, Resources, prepare, recorded_weights
 from colmap_affrect.imaging import IMAGE_SUFFIXES, read_gray
 from colmap_affrect.matching.nearest import MatchableImage, match_features, matchable
 from colmap_affrect.matching.pairs import Pair, exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.options import (
     CameraOptions,
+    ExtractionOptions,
     MappingOptions,
     MatchingOptions,
     VerificationOptions,
@@ -102,12 +104,14 @@ def extract(
     cameras: CameraOptions,
     *,
     image_list_path: Path | None = None,
+    resources: Resources | None = None,
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> StageReport:
     """Extract features of all images and put cameras, images and keypoints into the database.
 
-    An image that cannot be read is reported and passed over.
+    An image that cannot be read is reported and passed over. One that cannot be rectified, for
+    want of a depth map, is extracted as it is, with a warning.
     """
     start = time.perf_counter()
     names = list_images(image_path, image_list_path)
@@ -121,32 +125,61 @@ def extract(
         "image_list_path": str(image_list_path.resolve()) if image_list_path else "",
         "camera": cameras.to_mapping(),
         **recipe.extraction.to_mapping(),
+        "weights": recorded_weights(recipe.extraction, resources),
     }
+    extractor = _extractor(workspace, recipe.extraction, resources, names)
     workspace.claim("extract", options, overwrite=overwrite, recipe=recipe.name)
     store = _feature_store(workspace)
     done = store.complete(names)
     missing = [name for name in names if name not in done]
-    failures = {}
+    failures, warnings = {}, {}
     with progress.stage("extract", len(missing), "images") as advance:
         for name in missing:
             try:
-                features, size = extract_file(image_path / name, recipe.extraction)
+                found = extractor.extract_file(
+                    image_path / name, name, _intrinsics(image_path / name, extractor, cameras)
+                )
             except ImageError as error:
                 logger.warning("%s", error)
                 failures[name] = str(error)
             else:
-                logger.debug("%s: %d features", name, len(features))
-                if not len(features):
+                logger.debug("%s: %d features", name, len(found.features))
+                if not len(found.features):
                     logger.warning("%s: no features (blank or too small?)", name)
-                store.write(name, features, size)
+                if found.warning:
+                    warnings[name] = found.warning
+                store.write(name, found.features, found.image_size)
             advance(1)
     if len(failures) == len(names):
         raise ImageError(f"{image_path}: none of the {len(names)} images can be read")
     failures |= _write_images_and_keypoints(workspace, store)
-    seconds = time.perf_counter() - start
     return StageReport(
-        "extract", seconds, len(set(missing) - set(failures)), len(done - set(failures)), failures
+        "extract",
+        time.perf_counter() - start,
+        len(set(missing) - set(failures)),
+        len(done - set(failures)),
+        failures,
+        warnings,
     )
+
+
+def _extractor(
+    workspace: Workspace,
+    options: ExtractionOptions,
+    resources: Resources | None,
+    names: Sequence[str],
+) -> ImageExtractor:
+    resources = replace(resources or Resources(), depth_cache_path=workspace.depth)
+    return prepare(options, resources, names)
+
+
+def _intrinsics(
+    path: Path, extractor: ImageExtractor, cameras: CameraOptions
+) -> NDArray[np.float64] | None:
+    """Return the camera matrix of an image file if its rectification depends on it."""
+    if not any(rectifier.uses_depth for rectifier in extractor.options.rectifiers):
+        return None
+    return colmap_database.read_camera_matrix(path, cameras)
 
 
 def _feature_store(workspace: Workspace) -> FeatureStore:
@@ -205,7 +238,9 @@ def _write_images_and_keypoints(workspace: Workspace, store: FeatureStore) -> di
     with colmap_database.open_database(workspace.database) as database:
         for name in names:
             if name in ids:
-                colmap_database.write_keypoints(database, ids[name], store.read_frames(name))
+                colmap_database.write_keypoints(
+                    database, ids[name], store.read_frames(name), store.level_ends(name)
+                )
     return dict.fromkeys(rejected, f"COLMAP does not take it (camera mode {cameras.mode})")
 
 
@@ -255,41 +290,53 @@ def match(
     features, matches = _feature_store(workspace), _match_store(workspace)
     done = matches.complete(pair_key(*pair) for pair in pairs)
     missing = [pair for pair in pairs if pair_key(*pair) not in done]
-    cache = _MatchableCache(features, options)
+    with progress.stage("match", len(missing), "pairs") as advance:
+        _match_pairs(missing, features, matches, options, 0, advance)
+    _write_matches(workspace, pairs, features, matches)
+    return StageReport("match", time.perf_counter() - start, len(missing), len(done))
+
+
+def _match_pairs(
+    pairs: Sequence[Pair],
+    features: FeatureStore,
+    matches: MatchStore,
+    options: MatchingOptions,
+    level: int,
+    advance: Callable[[int], None],
+) -> None:
+    """Match pairs by the features of all levels up to this one; what is done is written."""
+    cache = _MatchableCache(features, options, level)
 
     def match_pair(pair: Pair) -> PairMatches:
         first, second = cache[pair[0]], cache[pair[1]]
         found = match_features(first, second, options)
-        return PairMatches(pair, found.indices, 1.0 - found.ratios, len(first.keypoints))
+        return PairMatches(pair, found.indices, 1.0 - found.ratios, len(first.keypoints), level)
 
-    with progress.stage("match", len(missing), "pairs") as advance:
-        batch: list[PairMatches] = []
-        try:
-            for found in map_ordered(match_pair, missing, available_cores()):
-                batch.append(found)
-                advance(1)
-                if len(batch) == PAIRS_PER_WRITE:
-                    matches.write(batch)
-                    batch = []
-        finally:
-            if batch:
+    batch: list[PairMatches] = []
+    try:
+        for found in map_ordered(match_pair, pairs, available_cores()):
+            batch.append(found)
+            advance(1)
+            if len(batch) == PAIRS_PER_WRITE:
                 matches.write(batch)
-    _write_matches(workspace, pairs, features, matches)
-    return StageReport("match", time.perf_counter() - start, len(missing), len(done))
+                batch = []
+    finally:
+        if batch:
+            matches.write(batch)
 
 
 class _MatchableCache:
     """Images ready for matching, the least recently used dropped over a memory budget."""
 
-    def __init__(self, store: FeatureStore, options: MatchingOptions) -> None:
-        self._store, self._options = store, options
+    def __init__(self, store: FeatureStore, options: MatchingOptions, level: int) -> None:
+        self._store, self._options, self._level = store, options, level
         self._images: OrderedDict[str, MatchableImage] = OrderedDict()
         self._lock = threading.Lock()
 
     def __getitem__(self, name: str) -> MatchableImage:
         with self._lock:
             if name not in self._images:
-                features = self._store.read(name)
+                features = self._store.read(name, self._level)
                 self._images[name] = matchable(
                     features.descriptors, features.keypoints, self._options
                 )
@@ -338,10 +385,104 @@ def verify_matches(
     _write_matches(workspace, pairs, features, matches)
     todo = colmap_database.num_unverified_pairs(workspace.database)
     with progress.stage("verify", todo, "pairs") as advance:
-        if todo:
-            verify(workspace.database, options, random_seed)
-            advance(todo)
+        _verify_new(workspace, options, random_seed)
+        advance(todo)
     return StageReport("verify", time.perf_counter() - start, todo, len(pairs) - todo)
+
+
+def escalate(
+    workspace: Workspace,
+    *,
+    resources: Resources | None = None,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> StageReport:
+    """Match pairs that fail verification again with the features of further rectifiers.
+
+    Level by level (the recipe's ``escalation``; Mishkin, Matas, Perdoch, MODS, 2015): the images
+    of the pairs that are still open get the features that the level adds, these pairs are
+    matched and verified again, and those that succeed are left alone from then on. Nothing
+    happens when the recipe has no levels.
+    """
+    start = time.perf_counter()
+    options = workspace.extraction_options()
+    matching = workspace.matching_options()
+    verification, seed = workspace.verification_options()
+    pairs = _listed_pairs(workspace)
+    features, matches = _feature_store(workspace), _match_store(workspace)
+    workspace.claim("escalate", {"levels": len(options.escalation)}, overwrite=overwrite)
+    if overwrite:
+        levels = matches.levels(pairs)
+        higher = [pair for pair in pairs if levels[pair]]
+        with progress.stage("match", len(higher), "pairs") as advance:
+            _match_pairs(higher, features, matches, matching, 0, advance)
+        _replace_matches(workspace, higher, matches)
+        _verify_new(workspace, verification, seed)
+    extractor: ImageExtractor | None = None
+    climbed: set[Pair] = set()
+    for level, rectifier in enumerate(options.escalation, 1):
+        open_pairs = _open_pairs(workspace, pairs, verification)
+        levels = matches.levels(open_pairs)
+        todo = [pair for pair in open_pairs if levels[pair] < level]
+        climbed |= set(todo)
+        images = sorted({name for pair in todo for name in pair})
+        images = [name for name in images if len(features.level_ends(name)) <= level]
+        title = f"{rectifier.name} ({level} of {len(options.escalation)})"
+        with progress.stage(title, len(images) + len(todo), "steps") as advance:
+            for name in images:
+                extractor = extractor or _extractor(workspace, options, resources, images)
+                _extend(workspace, features, extractor, name, level)
+                advance(1)
+            _match_pairs(todo, features, matches, matching, level, advance)
+        _write_images_and_keypoints(workspace, features)
+        _replace_matches(workspace, open_pairs, matches)
+        _verify_new(workspace, verification, seed)
+    return StageReport("escalate", time.perf_counter() - start, len(climbed))
+
+
+def _open_pairs(
+    workspace: Workspace,
+    pairs: Sequence[Pair],
+    verification: VerificationOptions,
+) -> list[Pair]:
+    """Return the pairs without a two-view geometry."""
+    ids = colmap_database.image_ids(workspace.database)
+    verified = verified_pairs(workspace.database, verification.min_num_inliers)
+    return [
+        pair
+        for pair in pairs
+        if all(name in ids for name in pair)
+        and tuple(sorted(ids[name] for name in pair)) not in verified
+    ]
+
+
+def _verify_new(workspace: Workspace, options: VerificationOptions, random_seed: int) -> None:
+    if colmap_database.num_unverified_pairs(workspace.database):
+        verify(workspace.database, options, random_seed)
+
+
+def _replace_matches(workspace: Workspace, pairs: Sequence[Pair], matches: MatchStore) -> None:
+    """Put those matches into the database that differ from the ones there, to verify them anew."""
+    ids = colmap_database.image_ids(workspace.database)
+    with colmap_database.open_database(workspace.database) as database:
+        for (name1, name2), indices in zip(pairs, _indices(matches, pairs), strict=True):
+            colmap_database.replace_matches(database, ids[name1], ids[name2], indices)
+
+
+def _extend(
+    workspace: Workspace,
+    store: FeatureStore,
+    extractor: ImageExtractor,
+    name: str,
+    level: int,
+) -> None:
+    """Add to an image the features of all levels that it lacks, up to this one."""
+    record = workspace.require("extract")
+    cameras = CameraOptions.from_mapping(record["camera"], str(workspace.config))
+    path = Path(record["image_path"]) / name
+    for missing in range(len(store.level_ends(name)), level + 1):
+        found = extractor.extract_file(path, name, _intrinsics(path, extractor, cameras), missing)
+        store.extend(name, found.features)
 
 
 def map_images(
@@ -375,6 +516,25 @@ def map_images(
         )
     (workspace.sparse / INPUTS).write_text(inputs)
     return StageReport("map", time.perf_counter() - start, len(models)), models
+
+
+def pair_levels(workspace: Workspace) -> dict[str, int]:
+    """Return how many pairs each level of a recipe with escalation decided, and how many none.
+
+    Keys are the names of the rectifiers, in order, and ``none``; empty without escalation.
+    """
+    options = workspace.extraction_options()
+    if not options.escalation:
+        return {}
+    names = [rectifier.name for rectifier in options.rectifiers]
+    pairs = _listed_pairs(workspace)
+    verification, _ = workspace.verification_options()
+    open_pairs = set(_open_pairs(workspace, pairs, verification))
+    levels = _match_store(workspace).levels(pairs)
+    counts = dict.fromkeys([*names, "none"], 0)
+    for pair in pairs:
+        counts["none" if pair in open_pairs else names[levels[pair]]] += 1
+    return counts
 
 
 def num_listed_pairs(workspace: Workspace) -> int:

@@ -2,9 +2,11 @@
 
 ``features.h5``: a group per image name with ``keypoints`` (N, 2) float32, ``descriptors``
 (D, N) float16, ``scores`` (N,), ``image_size`` (width, height) and, of our own, ``lafs``
-(N, 2, 3) float32 and ``rectification_ids`` (N,). ``matches.h5``: a group per pair with
-``matches0`` (N0,), -1 where unmatched, and ``matching_scores0`` (N0,). Coordinates have
-their origin at the centre of the first pixel. Files are opened for one image or one batch
+(N, 2, 3) float32, ``rectification_ids`` (N,), and ``level_ends``: the features of level k of
+escalation follow those of level k - 1 and end at ``level_ends[k]``. ``matches.h5``: a group
+per pair with ``matches0`` (N0,), -1 where unmatched, ``matching_scores0`` (N0,) and the
+attribute ``level``, the last level whose features were matched. Coordinates have their origin
+at the centre of the first pixel. Files are opened for one image or one batch
 of pairs and closed again; the attribute ``complete`` is written last, so that a killed
 run loses at most the group it was writing.
 """
@@ -13,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.errors import StaleStoreError, StoreError
-from colmap_affrect.types import LocalFeatures
+from colmap_affrect.types import LocalFeatures, union
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MAX_INT16 = 32767
 
 
@@ -37,12 +39,14 @@ class PairMatches:
         indices: (M, 2) int64, strictly rising in column 0.
         scores: (M,) float32 in [0, 1], larger is better.
         num_keypoints1: number of features of the first image.
+        level: of escalation; features of higher levels were not looked at.
     """
 
     names: tuple[str, str]
     indices: NDArray[np.int64]
     scores: NDArray[np.float32]
     num_keypoints1: int
+    level: int = 0
 
 
 class _Store:
@@ -113,12 +117,13 @@ class _Store:
         return sorted(found)
 
     @staticmethod
-    def _write(file: h5py.File, key: str, datasets: dict[str, Any]) -> None:
+    def _write(file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:
         if key in file:
             del file[key]
         group = file.create_group(key)
         for name, values in datasets.items():
             group.create_dataset(name, data=values)
+        group.attrs.update(attributes)
         group.attrs["complete"] = True
 
 
@@ -130,35 +135,72 @@ class FeatureStore(_Store):
     def write(self, name: str, features: LocalFeatures, image_size: tuple[int, int]) -> None:
         """Write the features of one image, in the place of incomplete ones."""
         with self._open("a") as file:
-            self._write(
-                file,
-                name,
-                {
-                    "keypoints": features.keypoints.astype(np.float32),
-                    "descriptors": features.descriptors.T.astype(np.float16),
-                    "scores": features.responses,
-                    "image_size": np.asarray(image_size),
-                    "lafs": features.lafs.astype(np.float32),
-                    "rectification_ids": features.rectification_ids,
-                },
-            )
+            self._write_features(file, name, features, image_size, [len(features)])
 
-    def read(self, name: str) -> LocalFeatures:
-        """Read the features of one image.
+    def extend(self, name: str, features: LocalFeatures) -> None:
+        """Add the features of the next level; what is there keeps its indices."""
+        with self._open("a") as file:
+            group = self._group(file, name)
+            size = tuple(group["image_size"][()].tolist())
+            ends = group["level_ends"][()].tolist()
+            there = self._features(group, ends[-1])
+            first_id = int(there.rectification_ids.max(initial=0))
+            added = replace(features, rectification_ids=features.rectification_ids + first_id)
+            both = union([there, added])
+            self._write_features(file, name, both, size, [*ends, len(both)])
+
+    def _write_features(
+        self,
+        file: h5py.File,
+        name: str,
+        features: LocalFeatures,
+        image_size: tuple[int, int],
+        level_ends: list[int],
+    ) -> None:
+        self._write(
+            file,
+            name,
+            {
+                "keypoints": features.keypoints.astype(np.float32),
+                "descriptors": features.descriptors.T.astype(np.float16),
+                "scores": features.responses,
+                "image_size": np.asarray(image_size),
+                "lafs": features.lafs.astype(np.float32),
+                "rectification_ids": features.rectification_ids,
+                "level_ends": np.asarray(level_ends),
+            },
+        )
+
+    def read(self, name: str, level: int | None = None) -> LocalFeatures:
+        """Read the features of one image, up to a level of escalation or all.
 
         Raises:
             StoreError: if they are missing or incomplete.
         """
         with self._open("r") as file:
-            if name not in file or not file[name].attrs.get("complete", False):
-                raise StoreError(f"{self.path}: no features of {name}; run extract first")
-            group = file[name]
-            return LocalFeatures(
-                group["lafs"][()].astype(np.float64),
-                group["scores"][()],
-                np.ascontiguousarray(group["descriptors"][()].T, dtype=np.float32),
-                group["rectification_ids"][()],
-            )
+            group = self._group(file, name)
+            ends = group["level_ends"][()].tolist()
+            return self._features(group, ends[-1] if level is None else ends[level])
+
+    def _group(self, file: h5py.File, name: str) -> h5py.Group:
+        if name not in file or not file[name].attrs.get("complete", False):
+            raise StoreError(f"{self.path}: no features of {name}; run extract first")
+        return file[name]
+
+    @staticmethod
+    def _features(group: h5py.Group, end: int) -> LocalFeatures:
+        return LocalFeatures(
+            group["lafs"][:end].astype(np.float64),
+            group["scores"][:end],
+            np.ascontiguousarray(group["descriptors"][:, :end].T, dtype=np.float32),
+            group["rectification_ids"][:end],
+        )
+
+    def level_ends(self, name: str) -> list[int]:
+        """Return, for each level that an image has, the number of features up to it."""
+        with self._open("r") as file:
+            ends: list[int] = self._group(file, name)["level_ends"][()].tolist()
+            return ends
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of features of each image."""
@@ -205,7 +247,12 @@ class MatchStore(_Store):
                     "matches0": matches0.astype(np.int32 if wide else np.int16),
                     "matching_scores0": scores0,
                 }
-                self._write(file, pair_key(*pair.names), datasets)
+                self._write(file, pair_key(*pair.names), datasets, level=pair.level)
+
+    def levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
+        """Return the level of escalation at which each of the pairs was matched last."""
+        with self._open("r") as file:
+            return {pair: int(file[pair_key(*pair)].attrs["level"]) for pair in pairs}
 
     def read_indices(self, pairs: Sequence[tuple[str, str]]) -> Iterator[NDArray[np.int64]]:
         """Yield the (M, 2) match indices of each pair.

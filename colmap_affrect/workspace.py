@@ -9,18 +9,19 @@ import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
 from colmap_affrect.errors import StaleStoreError, WorkspaceError
+from colmap_affrect.options import ExtractionOptions, MatchingOptions, VerificationOptions
 
 logger = logging.getLogger(__name__)
 
 LOCAL = ("image_path", "image_list_path", "camera", "match_list_path")
-STAGES = ("extract", "pairs", "match", "verify", "map")
+STAGES = ("extract", "pairs", "match", "verify", "escalate", "map")
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,11 @@ class Workspace:
     def report(self) -> Path:
         """Report of the last run (JSON)."""
         return self.path / "report.json"
+
+    @property
+    def depth(self) -> Path:
+        """Folder of the depth maps that a network made."""
+        return self.path / "depth"
 
     @property
     def config(self) -> Path:
@@ -112,6 +118,23 @@ class Workspace:
         """Return the name of the recipe that the features were made with."""
         self.require("extract")
         return str(self.recorded()["recipe"])
+
+    def extraction_options(self) -> ExtractionOptions:
+        """Return the options that the features were made with."""
+        record = self.require("extract")
+        names = {item.name for item in fields(ExtractionOptions)}
+        options = {key: value for key, value in record.items() if key in names}
+        return ExtractionOptions.from_mapping(options, str(self.config))
+
+    def matching_options(self) -> MatchingOptions:
+        """Return the options that the pairs were matched with."""
+        return MatchingOptions.from_mapping(self.require("match"), str(self.config))
+
+    def verification_options(self) -> tuple[VerificationOptions, int]:
+        """Return the options and the seed that the pairs were verified with."""
+        record = dict(self.require("verify"))
+        seed = int(record.pop("random_seed"))
+        return VerificationOptions.from_mapping(record, str(self.config)), seed
 
     def claim(
         self, stage: str, options: Mapping[str, Any], *, overwrite: bool = False, recipe: str = ""
@@ -245,5 +268,10 @@ def dump_toml(values: Mapping[str, Any], prefix: str = "") -> str:
 
 
 def _toml_value(value: Any) -> str:
-    """Write as JSON, which differs from TOML in characters beyond 16 bits and in DEL."""
+    """Write as JSON, which differs from TOML in mappings, characters beyond 16 bits and DEL."""
+    if isinstance(value, Mapping):
+        entries = (f"{key} = {_toml_value(item)}" for key, item in value.items())
+        return "{" + ", ".join(entries) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -156,7 +156,7 @@ def test_options_reject_values_that_are_not_a_number(name: str) -> None:
     ("cls", "values"),
     [
         (DenseShapesOptions, {"name": "asift"}),
-        (DenseShapesOptions, {"shape_source": "affnet"}),
+        (DenseShapesOptions, {"shape_source": "sobel"}),
         (SiftOptions, {"profile": "sift"}),
         (CameraOptions, {"mode": "shared"}),
         (SecondMomentOptions, {"integration_sigmas_px": ()}),

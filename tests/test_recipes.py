@@ -8,10 +8,28 @@ from pathlib import Path
 import pytest
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.options import DenseShapesOptions, ExtractionOptions, MatchingOptions
+from colmap_affrect.options import (
+    AffNetShapesOptions,
+    CoverOptions,
+    DenseShapesOptions,
+    ExtractionOptions,
+    MatchingOptions,
+    SiftOptions,
+)
 from colmap_affrect.recipes import load_recipe, recipe_folder, recipe_names
+from colmap_affrect.workspace import dump_toml
 
-NAMES = ["default", "unrectified-rootsift"]
+NAMES = [
+    "affnet-shapes", "affnet-shapes-recommended", "asift", "asift-recommended", "default",
+    "dense-affnet", "dense-affnet-recommended", "depth-affnet", "depth-affnet-recommended",
+    "depth-planes", "depth-planes-recommended", "on-demand", "unrectified",
+    "unrectified-rootsift",
+]  # fmt: skip
+
+OF_THE_PAPER = {
+    "unrectified": "identity", "asift": "asift", "affnet-shapes": "affnet-shapes",
+    "depth-planes": "depth-planes", "depth-affnet": "depth-affnet", "dense-affnet": "dense-shapes",
+}  # fmt: skip
 
 
 def test_recipe_names_are_those_in_the_repository() -> None:
@@ -22,11 +40,16 @@ def test_recipe_names_are_those_in_the_repository() -> None:
 def test_recipe_has_a_summary_and_only_known_options(name: str) -> None:
     recipe = load_recipe(name)
     assert recipe.name == name
-    assert 10 < len(recipe.summary) < 100
+    assert 10 < len(recipe.summary) < 110
     with (recipe_folder() / f"{name}.toml").open("rb") as file:
-        assert set(tomllib.load(file)) <= {
-            "summary", "rectifier", "second_moment", "features", "matching", "max_image_size_px",
-        }  # fmt: skip
+        assert tomllib.load(file)["rectifier"]["name"] == recipe.extraction.rectifier.name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_options_of_a_recipe_survive_being_written_down(name: str) -> None:
+    options = load_recipe(name).extraction
+    written = tomllib.loads(dump_toml(options.to_mapping()))
+    assert ExtractionOptions.from_mapping(written, "config.toml") == options
 
 
 def test_default_recipe_rectifies_with_the_values_of_the_paper() -> None:
@@ -35,11 +58,38 @@ def test_default_recipe_rectifies_with_the_values_of_the_paper() -> None:
     assert (rectifier.tilt_radius, rectifier.max_tilt, rectifier.covered_frac) == (1.7, 5.8, 0.95)
 
 
-def test_recipes_differ_in_the_rectifier_only() -> None:
-    default, plain = (load_recipe(name) for name in NAMES)
+def test_default_and_unrectified_differ_in_the_rectifier_only() -> None:
+    default, plain = load_recipe("default"), load_recipe("unrectified-rootsift")
     assert plain.extraction.rectifier.name == "identity"
     assert plain.extraction.features == default.extraction.features
     assert plain.matching == default.matching
+
+
+@pytest.mark.parametrize(("name", "rectifier"), OF_THE_PAPER.items())
+def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> None:
+    recipe = load_recipe(name)
+    extraction, features = recipe.extraction, recipe.extraction.features
+    assert extraction.rectifier.name == rectifier
+    assert (features.profile, features.descriptor) == ("affnet-hardnet", "hardnet")
+    assert (features.detector, features.contrast_threshold) == ("dog", 0.04)
+    assert features.max_num_features == features.max_num_rectified_features == 1_000_000
+    assert (recipe.matching.max_ratio, recipe.matching.ratio_both_ways) == (0.85, False)
+    if isinstance(extraction.rectifier, CoverOptions):
+        cover = extraction.rectifier
+        assert (cover.tilt_radius, cover.max_tilt, cover.covered_frac) == (1.7, 5.8, 0.95)
+        assert (cover.shape_source, cover.area_preserving) == ("affnet", False)
+
+
+def test_escalation_climbs_from_no_warps_to_all_tilts() -> None:
+    levels = load_recipe("on-demand").extraction.rectifiers
+    assert [level.name for level in levels] == ["identity", "dense-shapes", "affnet-shapes", "asift"]
+
+
+def test_choosing_a_profile_drops_the_options_of_the_other_one() -> None:
+    recipe = load_recipe("asift-recommended", ["features.profile=rootsift"])
+    assert recipe.extraction.features == SiftOptions(max_num_rectified_features=32768)
+    recipe = load_recipe("unrectified", ["features.dtype=bfloat16", "features.profile=rootsift"])
+    assert recipe.extraction.features.contrast_threshold == 0.04
 
 
 def test_settings_change_single_options() -> None:
@@ -50,11 +100,10 @@ def test_settings_change_single_options() -> None:
             "second_moment.integration_sigmas_px=[4.0, 9.0]",
             "matching.max_ratio=0.7",
             "max_image_size_px=1000",
-            "rectifier.name=identity",
+            "rectifier.name=affnet-shapes",
         ],
     )
-    assert recipe.extraction.rectifier.tilt_radius == 1.8
-    assert recipe.extraction.rectifier.name == "identity"
+    assert recipe.extraction.rectifier == AffNetShapesOptions(tilt_radius=1.8)
     assert recipe.extraction.second_moment.integration_sigmas_px == (4.0, 9.0)
     assert recipe.extraction.max_image_size_px == 1000
     assert recipe.matching.max_ratio == 0.7
@@ -72,7 +121,7 @@ def test_settings_change_single_options() -> None:
         ("rectifier.tilt_radius=wide", "expected float, got str"),
         ("features.max_num_features=1.5", "expected int, got float"),
         ("matching.max_ratio.deep=1", "is not a section"),
-        ("rectifier.name=dense", "not one of dense-shapes, identity"),
+        ("rectifier.name=dense", "unknown 'dense' .did you mean 'dense-shapes'"),
     ],
 )
 def test_wrong_setting_is_one_clear_line(setting: str, message: str) -> None:
@@ -88,7 +137,7 @@ def test_value_in_the_place_of_a_section_is_one_clear_line(setting: str) -> None
 
 
 def test_unknown_recipe_is_named_with_a_suggestion_and_the_known_ones() -> None:
-    with pytest.raises(OptionError, match=r"'defualt': did you mean 'default'\? known are default"):
+    with pytest.raises(OptionError, match=r"'defualt': did you mean 'default'\? known are affnet"):
         load_recipe("defualt")
 
 

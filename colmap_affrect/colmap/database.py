@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.options import CameraOptions
 
@@ -122,24 +122,68 @@ def colmap_keypoints(lafs: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.concatenate([centers, shapes], axis=1)
 
 
-def write_keypoints(database: pycolmap.Database, image_id: int, lafs: NDArray[np.floating]) -> None:
+def write_keypoints(
+    database: pycolmap.Database,
+    image_id: int,
+    lafs: NDArray[np.floating],
+    level_ends: Sequence[int],
+) -> None:
     """Write the frames of one image unless it has the keypoints already.
+
+    Args:
+        database: an open database.
+        image_id: of the image.
+        lafs: (N, 2, 3) frames.
+        level_ends: numbers of frames that it may have had before others were added behind.
 
     Raises:
         DatabaseError: when it has other ones.
     """
-    if database.exists_keypoints(image_id):
-        there = database.num_keypoints_for_image(image_id)
-        if there != len(lafs):
-            raise DatabaseError(
-                f"image {image_id} has {there} keypoints in the database and {len(lafs)} in the "
-                "feature file; run extract again with --overwrite"
-            )
+    there = database.num_keypoints_for_image(image_id)
+    exists = database.exists_keypoints(image_id)
+    if exists and there == len(lafs):
         return
+    if exists and there not in level_ends:
+        raise DatabaseError(
+            f"image {image_id} has {there} keypoints in the database and {len(lafs)} in the "
+            "feature file; run extract again with --overwrite"
+        )
     keypoints = colmap_keypoints(lafs)
     if not np.isfinite(keypoints).all():
         raise DatabaseError(f"image {image_id}: keypoints are not finite")
-    database.write_keypoints(image_id, keypoints)
+    write = database.update_keypoints if exists else database.write_keypoints
+    write(image_id, keypoints)
+
+
+def replace_matches(
+    database: pycolmap.Database, image_id1: int, image_id2: int, indices: NDArray[np.integer]
+) -> None:
+    """Write raw matches in the place of other ones, whose two-view geometry goes too."""
+    if database.exists_matches(image_id1, image_id2):
+        if np.array_equal(database.read_matches(image_id1, image_id2), indices):
+            return
+        database.delete_matches(image_id1, image_id2)
+        if database.exists_two_view_geometry(image_id1, image_id2):
+            database.delete_two_view_geometry(image_id1, image_id2)
+    write_matches(database, image_id1, image_id2, indices)
+
+
+def read_camera_matrix(path: Path, cameras: CameraOptions) -> NDArray[np.float64] | None:
+    """Return the (3, 3) intrinsics that COLMAP gives an image, in pixel-centre px.
+
+    From ``cameras.params``, else from EXIF, else COLMAP's guess; without distortion. None
+    for a file that COLMAP cannot read.
+    """
+    try:
+        camera = pycolmap.infer_camera_from_image(
+            path,
+            pycolmap.ImageReaderOptions(camera_model=cameras.model, camera_params=cameras.params),
+        )
+    except (RuntimeError, ValueError):
+        return None
+    matrix = np.asarray(camera.calibration_matrix(), dtype=np.float64)
+    matrix[:2, 2] = pixel_from_colmap(matrix[:2, 2])
+    return matrix
 
 
 def write_matches(

@@ -10,10 +10,22 @@ from numpy.typing import NDArray
 from colmap_affrect.geometry.affine import project, rotation
 
 
-def rectifying_affine(tilt: float, angle_rad: float) -> NDArray[np.float64]:
-    """Return the (2, 2) area-preserving map diag(sqrt t, 1/sqrt t) R(phi) of the class (t, phi)."""
-    stretch = np.array([[sqrt(tilt)], [1.0 / sqrt(tilt)]])
-    return np.asarray(stretch * rotation(angle_rad))
+def rectifying_affine(
+    tilt: float, angle_rad: float, *, area_preserving: bool = True
+) -> NDArray[np.float64]:
+    """Return the (2, 2) rectifying map of the class (tilt, angle).
+
+    It is diag(sqrt t, 1 / sqrt t) R(phi), or diag(1, 1 / t) R(phi), which magnifies in no
+    direction (ASIFT, the paper).
+    """
+    zoom = sqrt(tilt) if area_preserving else 1.0
+    return np.asarray(np.array([[zoom], [zoom / tilt]]) * rotation(angle_rad))
+
+
+def image_corners(image_size: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the (4, 2) centres of the corner pixels of an image of (width, height)."""
+    right, bottom = image_size[0] - 1.0, image_size[1] - 1.0
+    return np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
 
 
 def fit_canvas(

@@ -98,6 +98,30 @@ def covering_grid() -> NDArray[np.float64]:
     return np.stack([tilts.ravel(), angles.ravel()], axis=1)
 
 
+def asift_covering() -> NDArray[np.float64]:
+    """Return the 60 maps of ASIFT beside the identity as (60, 2) rows (tilt, angle_rad).
+
+    Tilts 2^(k/2), k = 1...6; 4, 5, 7, 10, 14, 20 angles (Morel & Yu 2009, whose program rounds
+    5 t to an even number and halves it; Sec. 2.3 of the paper counts 61 with the identity).
+    """
+    rows = []
+    for level in range(1, 7):
+        tilt = 2.0 ** (level / 2.0)
+        count = (round(5.0 * tilt) + 1) // 2
+        rows += [(tilt, index * np.pi / count) for index in range(count)]
+    return np.array(rows)
+
+
+def near_optimal_covering() -> NDArray[np.float64]:
+    """Return the 24 maps that, with the identity, cover all tilts to 5.8 by 1.7-balls.
+
+    As (24, 2) rows (tilt, angle_rad). Source: Rodriguez, Delon, Morel 2018, constants for
+    r = 1.7: two rings of 8 and 16 maps, which together show 6.1 image areas.
+    """
+    rings = [(2.61757, 0.398032, 8), (5.18168, 0.198314, 16)]
+    return np.array([(tilt, step * index) for tilt, step, count in rings for index in range(count)])
+
+
 @dataclass(frozen=True)
 class Cover:
     """Covering centres of a set of shapes and the centre nearest to each shape.

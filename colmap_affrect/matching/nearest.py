@@ -1,4 +1,4 @@
-"""Mutual nearest neighbours with a two-sided, geometrically consistent ratio test (FGINN).
+"""Mutual nearest neighbours with a geometrically consistent ratio test (FGINN).
 
 The second neighbour of the ratio test is the nearest descriptor that lies at least
 ``min_contrast_distance_px`` away from the first one (Mishkin, Matas, Perdoch, MODS, 2015):
@@ -72,12 +72,12 @@ def match_features(
     rows = np.flatnonzero(ratios < options.max_ratio)
     targets, back = np.unique(forward[rows], return_inverse=True)
     backward, back_ratios = _nearest(image2.descriptors[targets], image1)
-    mutual = (backward[back] == rows) & (back_ratios[back] < options.max_ratio)
-    rows, back = rows[mutual], back[mutual]
-    matches = PutativeMatches(
-        np.stack([rows, targets[back]], axis=1),
-        np.maximum(ratios[rows], back_ratios[back]),
-    )
+    mutual = backward[back] == rows
+    worst = ratios[rows]
+    if options.ratio_both_ways:
+        worst = np.maximum(worst, back_ratios[back])
+    keep = mutual & (worst < options.max_ratio)
+    matches = PutativeMatches(np.stack([rows, targets[back]], axis=1)[keep], worst[keep])
     return _without_duplicates(matches, image1, image2, options.duplicate_radius_px)
 
 

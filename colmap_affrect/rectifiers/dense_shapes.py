@@ -12,13 +12,30 @@ from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
 from colmap_affrect.geometry.tilts import cover_shapes
 from colmap_affrect.imaging import connected_groups
 from colmap_affrect.options import DenseShapesOptions
-from colmap_affrect.types import Mask, Rectification, RectificationPlan, ShapeGrid
+from colmap_affrect.interfaces import Sources
+from colmap_affrect.types import Mask, Photograph, Rectification, RectificationPlan, ShapeGrid
 
 MARGIN_PX = 16.0
 """Surroundings of a region that its descriptors may see, in warp px."""
 
 GAP_BLOCKS = 5
 """Groups of blocks closer than this are warped together."""
+
+
+class DenseShapes:
+    """Regions of similar shape, one affine map for each (the paper's DenseAffNet)."""
+
+    Options = DenseShapesOptions
+
+    def __init__(self, options: DenseShapesOptions, sources: Sources) -> None:
+        """See :mod:`colmap_affrect.interfaces`."""
+        self.options = options
+        self.shapes = sources.shapes
+
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        """Plan one warp for each place of each region."""
+        assert self.shapes is not None
+        return plan_dense_shapes(self.shapes.grid(photograph.gray), photograph.size, self.options)
 
 
 def plan_dense_shapes(
@@ -43,7 +60,7 @@ def plan_dense_shapes(
     )
     labels = cover.labels.reshape(grid.textured.shape)
     items: list[Rectification] = []
-    for label, (tilt, angle) in enumerate(cover.centers):
+    for label, (tilt, angle) in enumerate(cover.centers.tolist()):
         blocks = (labels == label) & grid.textured
         if np.count_nonzero(blocks) < options.min_region_frac * labels.size:
             continue
@@ -52,21 +69,24 @@ def plan_dense_shapes(
         for part in connected_groups(blocks, GAP_BLOCKS):
             if np.count_nonzero(part) < options.min_part_frac * labels.size:
                 continue
-            items.append(_rectification(part, grid, image_size, float(tilt), float(angle)))
+            linear = rectifying_affine(tilt, angle, area_preserving=options.area_preserving)
+            matrix, canvas, region, origin = _placed(linear, part, grid, image_size)
+            items.append(Rectification(matrix, canvas, region, tilt, angle, origin, label))
     return RectificationPlan(image_size, tuple(items))
 
 
-def _rectification(
-    blocks: Mask, grid: ShapeGrid, image_size: tuple[int, int], tilt: float, angle_rad: float
-) -> Rectification:
+def _placed(
+    linear: NDArray[np.float64], blocks: Mask, grid: ShapeGrid, image_size: tuple[int, int]
+) -> tuple[NDArray[np.float64], tuple[int, int], Mask, tuple[int, int]]:
+    """Return map, canvas, region and its origin for the warp of some blocks of the grid."""
     rows, columns = np.flatnonzero(blocks.any(axis=1)), np.flatnonzero(blocks.any(axis=0))
     crop = blocks[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     left, top = int(columns[0]) * grid.step_px, int(rows[0]) * grid.step_px
     region = np.repeat(np.repeat(crop, grid.step_px, axis=0), grid.step_px, axis=1)
     region = region[: image_size[1] - top, : image_size[0] - left]
     outline = _outline(region) + np.array([left, top])
-    matrix, canvas_size = fit_canvas(rectifying_affine(tilt, angle_rad), outline, MARGIN_PX)
-    return Rectification(matrix, canvas_size, region, tilt, angle_rad, (left, top))
+    matrix, canvas_size = fit_canvas(linear, outline, MARGIN_PX)
+    return matrix, canvas_size, region, (left, top)
 
 
 def _outline(region: Mask) -> NDArray[np.float64]:
