@@ -444,16 +444,16 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _escalate(options: argparse.Namespace) -> int:
-    from colmap_affrect import stages
+    from colmap_affrect import escalation
 
     with Workspace(options.output_path).locked() as workspace:
-        report = stages.escalate(
+        report = escalation.escalate(
             workspace,
             resources=_resources(options),
             overwrite=options.overwrite,
             progress=_progress(options),
         )
-        levels = stages.pair_levels(workspace)
+        levels = escalation.pair_levels(workspace)
     print(report.summary())
     print(", ".join(f"{count} pairs by {name}" for name, count in levels.items()))
     return EXIT_OK

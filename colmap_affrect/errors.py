@@ -33,3 +33,15 @@ class DatabaseError(AffrectError):
 
 class WorkspaceError(AffrectError):
     """The output folder cannot be used: not writable, or in use by another run."""
+
+
+class DepthError(AffrectError):
+    """The depth map of a photograph is missing or cannot be used."""
+
+
+class WeightsError(AffrectError):
+    """The weights of a network are missing, damaged, or those of another network."""
+
+
+class DeviceError(AffrectError):
+    """The device asked for is not there."""

@@ -440,6 +440,9 @@ class ExtractionOptions(Options):
     )
     escalation: tuple[RectifierOptions, ...] = field(default=(), metadata={"section": "rectifier"})
     """Rectifiers for pairs that fail verification, one after the other until it succeeds."""
+    escalation_strong_num_inliers: int = 100
+    """A pair with fewer inliers climbs too while one of its images has no pair with as many:
+    an image that hangs on weak pairs alone is verified but rarely registered."""
     second_moment: SecondMomentOptions = field(default_factory=SecondMomentOptions)
     affnet: AffNetOptions = field(default_factory=AffNetOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
@@ -450,6 +453,7 @@ class ExtractionOptions(Options):
 
     def __post_init__(self) -> None:
         self._check("max_image_size_px", 16, 1_000_000)
+        self._check("escalation_strong_num_inliers", 0, 1_000_000)
 
     @property
     def rectifiers(self) -> tuple[RectifierOptions, ...]:

@@ -89,6 +89,11 @@ class ReconstructionReport:
         """Images that could not be read, with the reason."""
         return {name: why for stage in self.stages for name, why in stage.failures.items()}
 
+    @property
+    def warnings(self) -> dict[str, str]:
+        """Images that were worked on in another way than asked for, with the reason."""
+        return {name: why for stage in self.stages for name, why in stage.warnings.items()}
+
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of ``report.json``."""
         largest = self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
@@ -136,7 +141,9 @@ class ReconstructionReport:
             sizes = ", ".join(str(len(model.registered_names)) for model in self.models)
             lines += [f"models      {len(self.models)}, of {sizes} images"]
         lines += [
-            f"warning     {name}: {why}" for stage in self.stages for name, why in stage.warnings.items()
+            f"warning     {name}: {why}"
+            for stage in self.stages
+            for name, why in stage.warnings.items()
         ]
         seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
         lines += [f"seconds     {seconds}"]

@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 
 from colmap_affrect import stages
+from colmap_affrect.escalation import escalate, pair_levels
 from colmap_affrect.extraction import Resources
 from colmap_affrect.options import CameraOptions, MappingOptions, VerificationOptions
 from colmap_affrect.outcomes import ReconstructionReport, StageReport
@@ -88,9 +89,7 @@ def run(
             ),
         ]
         if options.recipe.extraction.escalation:
-            reports.append(
-                stages.escalate(workspace, resources=options.resources, progress=progress)
-            )
+            reports.append(escalate(workspace, resources=options.resources, progress=progress))
         return map_and_report(
             workspace, options.mapping, options.random_seed, earlier=reports, progress=progress
         )
@@ -122,7 +121,7 @@ def map_and_report(
         recipe=workspace.recipe(),
         random_seed=random_seed,
         versions=installed_versions(),
-        pair_levels=stages.pair_levels(workspace),
+        pair_levels=pair_levels(workspace),
     )
     workspace.report.write_text(result.to_json(), encoding="utf-8")
     return result

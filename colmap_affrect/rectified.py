@@ -88,9 +88,7 @@ def _carried(features: LocalFeatures, rectification: Rectification | None) -> Lo
     """Carry features of a view back into the image."""
     if rectification is None:
         return features
-    return features.with_frames(
-        transform_frames(rectification.image_from_rectified, features.lafs)
-    )
+    return features.with_frames(transform_frames(rectification.image_from_rectified, features.lafs))
 
 
 def _usable(

@@ -127,9 +127,9 @@ def extract(
         **recipe.extraction.to_mapping(),
         "weights": recorded_weights(recipe.extraction, resources),
     }
-    extractor = _extractor(workspace, recipe.extraction, resources, names)
+    extractor = make_extractor(workspace, recipe.extraction, resources, names)
     workspace.claim("extract", options, overwrite=overwrite, recipe=recipe.name)
-    store = _feature_store(workspace)
+    store = feature_store(workspace)
     done = store.complete(names)
     missing = [name for name in names if name not in done]
     failures, warnings = {}, {}
@@ -137,7 +137,7 @@ def extract(
         for name in missing:
             try:
                 found = extractor.extract_file(
-                    image_path / name, name, _intrinsics(image_path / name, extractor, cameras)
+                    image_path / name, name, intrinsics(image_path / name, extractor, cameras)
                 )
             except ImageError as error:
                 logger.warning("%s", error)
@@ -152,7 +152,7 @@ def extract(
             advance(1)
     if len(failures) == len(names):
         raise ImageError(f"{image_path}: none of the {len(names)} images can be read")
-    failures |= _write_images_and_keypoints(workspace, store)
+    failures |= write_images_and_keypoints(workspace, store)
     return StageReport(
         "extract",
         time.perf_counter() - start,
@@ -163,17 +163,18 @@ def extract(
     )
 
 
-def _extractor(
+def make_extractor(
     workspace: Workspace,
     options: ExtractionOptions,
     resources: Resources | None,
     names: Sequence[str],
 ) -> ImageExtractor:
+    """Prepare a recipe for the images of a workspace, which keeps the depth maps of networks."""
     resources = replace(resources or Resources(), depth_cache_path=workspace.depth)
     return prepare(options, resources, names)
 
 
-def _intrinsics(
+def intrinsics(
     path: Path, extractor: ImageExtractor, cameras: CameraOptions
 ) -> NDArray[np.float64] | None:
     """Return the camera matrix of an image file if its rectification depends on it."""
@@ -182,11 +183,13 @@ def _intrinsics(
     return colmap_database.read_camera_matrix(path, cameras)
 
 
-def _feature_store(workspace: Workspace) -> FeatureStore:
+def feature_store(workspace: Workspace) -> FeatureStore:
+    """Return the features of a workspace; other options than recorded are refused."""
     return FeatureStore(workspace.features, workspace.options_digest("extract"))
 
 
-def _match_store(workspace: Workspace) -> MatchStore:
+def match_store(workspace: Workspace) -> MatchStore:
+    """Return the matches of a workspace; other options than recorded are refused."""
     return MatchStore(workspace.matches, workspace.options_digest("extract", "match"))
 
 
@@ -226,7 +229,7 @@ def _refuse_mixed_sizes(
             )
 
 
-def _write_images_and_keypoints(workspace: Workspace, store: FeatureStore) -> dict[str, str]:
+def write_images_and_keypoints(workspace: Workspace, store: FeatureStore) -> dict[str, str]:
     """Bring the database up to date; return the images that COLMAP does not take, with reasons."""
     record = workspace.require("extract")
     cameras = CameraOptions.from_mapping(record["camera"], str(workspace.config))
@@ -250,7 +253,7 @@ def choose_pairs(
     """Write the list of the pairs to match: every pair of images, or those of a list."""
     start = time.perf_counter()
     workspace.require("extract")
-    names = _feature_store(workspace).names()
+    names = feature_store(workspace).names()
     pairs = exhaustive_pairs(names)
     if match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
@@ -268,7 +271,7 @@ def _refuse_lost_pairs(workspace: Workspace, pairs: Sequence[Pair]) -> None:
     """Pairs may be added, but those that are matched already would stay in the database."""
     if not workspace.pairs.exists() or not workspace.pairs.stat().st_size:
         return
-    lost = sorted(set(_listed_pairs(workspace)) - set(pairs))
+    lost = sorted(set(listed_pairs(workspace)) - set(pairs))
     if lost:
         raise StaleStoreError(
             f"{workspace.pairs}: has pairs that are not to be matched any more, such as "
@@ -285,18 +288,18 @@ def match(
 ) -> StageReport:
     """Match the listed pairs and put the raw matches into the database."""
     start = time.perf_counter()
-    pairs = _listed_pairs(workspace)
+    pairs = listed_pairs(workspace)
     workspace.claim("match", options.to_mapping(), overwrite=overwrite)
-    features, matches = _feature_store(workspace), _match_store(workspace)
+    features, matches = feature_store(workspace), match_store(workspace)
     done = matches.complete(pair_key(*pair) for pair in pairs)
     missing = [pair for pair in pairs if pair_key(*pair) not in done]
     with progress.stage("match", len(missing), "pairs") as advance:
-        _match_pairs(missing, features, matches, options, 0, advance)
+        match_pairs(missing, features, matches, options, 0, advance)
     _write_matches(workspace, pairs, features, matches)
     return StageReport("match", time.perf_counter() - start, len(missing), len(done))
 
 
-def _match_pairs(
+def match_pairs(
     pairs: Sequence[Pair],
     features: FeatureStore,
     matches: MatchStore,
@@ -305,16 +308,9 @@ def _match_pairs(
     advance: Callable[[int], None],
 ) -> None:
     """Match pairs by the features of all levels up to this one; what is done is written."""
-    cache = _MatchableCache(features, options, level)
-
-    def match_pair(pair: Pair) -> PairMatches:
-        first, second = cache[pair[0]], cache[pair[1]]
-        found = match_features(first, second, options)
-        return PairMatches(pair, found.indices, 1.0 - found.ratios, len(first.keypoints), level)
-
     batch: list[PairMatches] = []
     try:
-        for found in map_ordered(match_pair, pairs, available_cores()):
+        for found in iterate_matches(pairs, features, options, level):
             batch.append(found)
             advance(1)
             if len(batch) == PAIRS_PER_WRITE:
@@ -323,6 +319,20 @@ def _match_pairs(
     finally:
         if batch:
             matches.write(batch)
+
+
+def iterate_matches(
+    pairs: Sequence[Pair], features: FeatureStore, options: MatchingOptions, level: int
+) -> Iterable[PairMatches]:
+    """Match pairs by the features of all levels up to this one, in order."""
+    cache = _MatchableCache(features, options, level)
+
+    def match_pair(pair: Pair) -> PairMatches:
+        first, second = cache[pair[0]], cache[pair[1]]
+        found = match_features(first, second, options)
+        return PairMatches(pair, found.indices, 1.0 - found.ratios, len(first.keypoints), level)
+
+    return map_ordered(match_pair, pairs, available_cores())
 
 
 class _MatchableCache:
@@ -346,24 +356,26 @@ class _MatchableCache:
             return self._images[name]
 
 
-def _listed_pairs(workspace: Workspace) -> list[Pair]:
+def listed_pairs(workspace: Workspace) -> list[Pair]:
+    """Return the pairs of the list whose images have features."""
     workspace.require("pairs")
-    names = _feature_store(workspace).names()
+    names = feature_store(workspace).names()
     return read_pairs(workspace.pairs, names) if len(names) > 1 else []
 
 
 def _write_matches(
     workspace: Workspace, pairs: Sequence[Pair], features: FeatureStore, matches: MatchStore
 ) -> None:
-    _write_images_and_keypoints(workspace, features)
+    write_images_and_keypoints(workspace, features)
     ids = colmap_database.image_ids(workspace.database)
     pairs = [pair for pair in pairs if pair[0] in ids and pair[1] in ids]
     with colmap_database.open_database(workspace.database) as database:
-        for (name1, name2), indices in zip(pairs, _indices(matches, pairs), strict=True):
+        for (name1, name2), indices in zip(pairs, read_indices(matches, pairs), strict=True):
             colmap_database.write_matches(database, ids[name1], ids[name2], indices)
 
 
-def _indices(matches: MatchStore, pairs: Sequence[Pair]) -> Iterable[NDArray[np.int64]]:
+def read_indices(matches: MatchStore, pairs: Sequence[Pair]) -> Iterable[NDArray[np.int64]]:
+    """Read the (M, 2) matches of each pair; there is no file yet when there are no pairs."""
     return matches.read_indices(pairs) if pairs else []
 
 
@@ -378,111 +390,22 @@ def verify_matches(
     """Estimate the two-view geometries of all matched pairs."""
     start = time.perf_counter()
     workspace.require("match")
-    pairs = _listed_pairs(workspace)
+    pairs = listed_pairs(workspace)
     recorded = {**options.to_mapping(), "random_seed": random_seed}
     workspace.claim("verify", recorded, overwrite=overwrite)
-    features, matches = _feature_store(workspace), _match_store(workspace)
+    features, matches = feature_store(workspace), match_store(workspace)
     _write_matches(workspace, pairs, features, matches)
     todo = colmap_database.num_unverified_pairs(workspace.database)
     with progress.stage("verify", todo, "pairs") as advance:
-        _verify_new(workspace, options, random_seed)
+        verify_new(workspace, options, random_seed)
         advance(todo)
     return StageReport("verify", time.perf_counter() - start, todo, len(pairs) - todo)
 
 
-def escalate(
-    workspace: Workspace,
-    *,
-    resources: Resources | None = None,
-    overwrite: bool = False,
-    progress: Progress = SILENT,
-) -> StageReport:
-    """Match pairs that fail verification again with the features of further rectifiers.
-
-    Level by level (the recipe's ``escalation``; Mishkin, Matas, Perdoch, MODS, 2015): the images
-    of the pairs that are still open get the features that the level adds, these pairs are
-    matched and verified again, and those that succeed are left alone from then on. Nothing
-    happens when the recipe has no levels.
-    """
-    start = time.perf_counter()
-    options = workspace.extraction_options()
-    matching = workspace.matching_options()
-    verification, seed = workspace.verification_options()
-    pairs = _listed_pairs(workspace)
-    features, matches = _feature_store(workspace), _match_store(workspace)
-    workspace.claim("escalate", {"levels": len(options.escalation)}, overwrite=overwrite)
-    if overwrite:
-        levels = matches.levels(pairs)
-        higher = [pair for pair in pairs if levels[pair]]
-        with progress.stage("match", len(higher), "pairs") as advance:
-            _match_pairs(higher, features, matches, matching, 0, advance)
-        _replace_matches(workspace, higher, matches)
-        _verify_new(workspace, verification, seed)
-    extractor: ImageExtractor | None = None
-    climbed: set[Pair] = set()
-    for level, rectifier in enumerate(options.escalation, 1):
-        open_pairs = _open_pairs(workspace, pairs, verification)
-        levels = matches.levels(open_pairs)
-        todo = [pair for pair in open_pairs if levels[pair] < level]
-        climbed |= set(todo)
-        images = sorted({name for pair in todo for name in pair})
-        images = [name for name in images if len(features.level_ends(name)) <= level]
-        title = f"{rectifier.name} ({level} of {len(options.escalation)})"
-        with progress.stage(title, len(images) + len(todo), "steps") as advance:
-            for name in images:
-                extractor = extractor or _extractor(workspace, options, resources, images)
-                _extend(workspace, features, extractor, name, level)
-                advance(1)
-            _match_pairs(todo, features, matches, matching, level, advance)
-        _write_images_and_keypoints(workspace, features)
-        _replace_matches(workspace, open_pairs, matches)
-        _verify_new(workspace, verification, seed)
-    return StageReport("escalate", time.perf_counter() - start, len(climbed))
-
-
-def _open_pairs(
-    workspace: Workspace,
-    pairs: Sequence[Pair],
-    verification: VerificationOptions,
-) -> list[Pair]:
-    """Return the pairs without a two-view geometry."""
-    ids = colmap_database.image_ids(workspace.database)
-    verified = verified_pairs(workspace.database, verification.min_num_inliers)
-    return [
-        pair
-        for pair in pairs
-        if all(name in ids for name in pair)
-        and tuple(sorted(ids[name] for name in pair)) not in verified
-    ]
-
-
-def _verify_new(workspace: Workspace, options: VerificationOptions, random_seed: int) -> None:
+def verify_new(workspace: Workspace, options: VerificationOptions, random_seed: int) -> None:
+    """Verify the pairs of the database that have matches and no two-view geometry, good or bad."""
     if colmap_database.num_unverified_pairs(workspace.database):
         verify(workspace.database, options, random_seed)
-
-
-def _replace_matches(workspace: Workspace, pairs: Sequence[Pair], matches: MatchStore) -> None:
-    """Put those matches into the database that differ from the ones there, to verify them anew."""
-    ids = colmap_database.image_ids(workspace.database)
-    with colmap_database.open_database(workspace.database) as database:
-        for (name1, name2), indices in zip(pairs, _indices(matches, pairs), strict=True):
-            colmap_database.replace_matches(database, ids[name1], ids[name2], indices)
-
-
-def _extend(
-    workspace: Workspace,
-    store: FeatureStore,
-    extractor: ImageExtractor,
-    name: str,
-    level: int,
-) -> None:
-    """Add to an image the features of all levels that it lacks, up to this one."""
-    record = workspace.require("extract")
-    cameras = CameraOptions.from_mapping(record["camera"], str(workspace.config))
-    path = Path(record["image_path"]) / name
-    for missing in range(len(store.level_ends(name)), level + 1):
-        found = extractor.extract_file(path, name, _intrinsics(path, extractor, cameras), missing)
-        store.extend(name, found.features)
 
 
 def map_images(
@@ -518,28 +441,9 @@ def map_images(
     return StageReport("map", time.perf_counter() - start, len(models)), models
 
 
-def pair_levels(workspace: Workspace) -> dict[str, int]:
-    """Return how many pairs each level of a recipe with escalation decided, and how many none.
-
-    Keys are the names of the rectifiers, in order, and ``none``; empty without escalation.
-    """
-    options = workspace.extraction_options()
-    if not options.escalation:
-        return {}
-    names = [rectifier.name for rectifier in options.rectifiers]
-    pairs = _listed_pairs(workspace)
-    verification, _ = workspace.verification_options()
-    open_pairs = set(_open_pairs(workspace, pairs, verification))
-    levels = _match_store(workspace).levels(pairs)
-    counts = dict.fromkeys([*names, "none"], 0)
-    for pair in pairs:
-        counts["none" if pair in open_pairs else names[levels[pair]]] += 1
-    return counts
-
-
 def num_listed_pairs(workspace: Workspace) -> int:
     """Return the number of pairs that were to be matched."""
-    return len(_listed_pairs(workspace))
+    return len(listed_pairs(workspace))
 
 
 def num_verified_pairs(workspace: Workspace, min_num_inliers: int) -> int:
@@ -551,7 +455,7 @@ def reconstruction_problems(
     workspace: Workspace, names: Sequence[str], registered: Sequence[str], min_num_inliers: int
 ) -> dict[str, str]:
     """Tell for each image outside the largest model why it is not in it."""
-    num_keypoints = _feature_store(workspace).num_keypoints()
+    num_keypoints = feature_store(workspace).num_keypoints()
     ids = colmap_database.image_ids(workspace.database)
     verified = verified_pairs(workspace.database, min_num_inliers)
     in_pairs = {image_id for pair in verified for image_id in pair}

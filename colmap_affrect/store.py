@@ -5,8 +5,9 @@
 (N, 2, 3) float32, ``rectification_ids`` (N,), and ``level_ends``: the features of level k of
 escalation follow those of level k - 1 and end at ``level_ends[k]``. ``matches.h5``: a group
 per pair with ``matches0`` (N0,), -1 where unmatched, ``matching_scores0`` (N0,) and the
-attribute ``level``, the last level whose features were matched. Coordinates have their origin
-at the centre of the first pixel. Files are opened for one image or one batch
+attributes ``level``, whose features (and those of lower levels) were matched, and
+``tried_level``, the highest that was tried. Coordinates have their origin at the centre of the
+first pixel. Files are opened for one image or one batch
 of pairs and closed again; the attribute ``complete`` is written last, so that a killed
 run loses at most the group it was writing.
 """
@@ -247,12 +248,27 @@ class MatchStore(_Store):
                     "matches0": matches0.astype(np.int32 if wide else np.int16),
                     "matching_scores0": scores0,
                 }
-                self._write(file, pair_key(*pair.names), datasets, level=pair.level)
+                self._write(
+                    file, pair_key(*pair.names), datasets, level=pair.level, tried_level=pair.level
+                )
+
+    def mark_tried(self, pairs: Iterable[tuple[str, str]], level: int) -> None:
+        """Record that a level was tried for pairs, which keep the matches they have."""
+        with self._open("a") as file:
+            for pair in pairs:
+                file[pair_key(*pair)].attrs["tried_level"] = level
 
     def levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
-        """Return the level of escalation at which each of the pairs was matched last."""
+        """Return the level of escalation that the matches of each pair are from."""
+        return self._attribute("level", pairs)
+
+    def tried_levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
+        """Return the highest level of escalation that was tried for each pair."""
+        return self._attribute("tried_level", pairs)
+
+    def _attribute(self, name: str, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
         with self._open("r") as file:
-            return {pair: int(file[pair_key(*pair)].attrs["level"]) for pair in pairs}
+            return {pair: int(file[pair_key(*pair)].attrs[name]) for pair in pairs}
 
     def read_indices(self, pairs: Sequence[tuple[str, str]]) -> Iterator[NDArray[np.int64]]:
         """Yield the (M, 2) match indices of each pair.

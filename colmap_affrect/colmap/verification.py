@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.running import run_cancellable
+from colmap_affrect.conventions import colmap_from_pixel
 from colmap_affrect.options import VerificationOptions
 
 
@@ -39,6 +43,56 @@ def verify(path: Path, options: VerificationOptions, random_seed: int) -> None:
             cancellation_token=token,
         )
     )
+
+
+class PairVerifier:
+    """Tries matches of single pairs as :func:`verify` would, without writing anything.
+
+    With the same seed the result is that of :func:`verify` on a database with these matches
+    (pinned by a test).
+    """
+
+    def __init__(self, path: Path, options: VerificationOptions, random_seed: int) -> None:
+        """Read cameras and image ids of a database."""
+        self.options = two_view_options(options, random_seed)
+        with open_database(path) as database:
+            cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+            images = database.read_all_images()
+        self._images = {image.name: (image.image_id, cameras[image.camera_id]) for image in images}
+
+    def num_inliers(
+        self,
+        names: tuple[str, str],
+        keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+        indices: NDArray[np.integer],
+    ) -> int:
+        """Return the number of inliers of a two-view geometry, 0 if there is none.
+
+        Args:
+            names: of the two images.
+            keypoints: (N1, 2) and (N2, 2) in pixel-centre px.
+            indices: (M, 2) matches.
+        """
+        sides = [
+            (*self._images[name], points) for name, points in zip(names, keypoints, strict=True)
+        ]
+        if sides[0][0] > sides[1][0]:
+            sides, indices = sides[::-1], indices[:, ::-1]
+        (_, camera1, points1), (_, camera2, points2) = sides
+        geometry = pycolmap.estimate_two_view_geometry(
+            camera1,
+            stored_keypoints(points1),
+            camera2,
+            stored_keypoints(points2),
+            indices.astype(np.uint32),
+            self.options,
+        )
+        return len(geometry.inlier_matches)
+
+
+def stored_keypoints(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return (N, 2) pixel-centre points as COLMAP reads them from a database: through float32."""
+    return colmap_from_pixel(points.astype(np.float32)).astype(np.float64)
 
 
 def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], int]:

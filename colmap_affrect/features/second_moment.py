@@ -11,28 +11,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.conventions import grid_origin
+from colmap_affrect.geometry.shapes import STEP_PX, log_metrics, metrics_from_log
 from colmap_affrect.options import SecondMomentOptions
-from colmap_affrect.types import GrayImage, ShapeGrid
-
-STEP_PX = 4
-"""One shape per block of 4 x 4 px, as in the paper's dense AffNet."""
+from colmap_affrect.types import GrayImage, ShapeGrid, ShapeSamples
 
 
-def second_moment_shapes(image: GrayImage, options: SecondMomentOptions) -> ShapeGrid:
-    """Estimate one affine shape per 4 x 4 block.
+class SecondMoment:
+    """Shapes of all 4 x 4 blocks from the gradients around them."""
 
-    The tensor is averaged over blocks, then over each integration scale; the scales are
-    combined by the log-Euclidean mean of the unit metrics. Blocks whose gradients stay
-    under ``min_gradient`` are not textured and get the identity.
-    """
-    tensor = _block_tensor(image, options.derivative_sigma_px)
-    mean_log = np.zeros((*tensor.shape[:2], 2), dtype=np.float32)
-    for sigma_px in options.integration_sigmas_px:
-        mean_log += _log_metric(_smooth(tensor, sigma_px)) / len(options.integration_sigmas_px)
-    local = _smooth(tensor, min(options.integration_sigmas_px))
-    textured = local[..., 0] + local[..., 1] > options.min_gradient**2
-    mean_log[~textured] = 0.0
-    return ShapeGrid(_metric_from_log(mean_log), textured, grid_origin(STEP_PX), STEP_PX)
+    def __init__(self, options: SecondMomentOptions) -> None:
+        """Keep the options."""
+        self.options = options
+
+    def grid(self, image: GrayImage) -> ShapeGrid:
+        """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
+
+        The tensor is averaged over blocks, then over each integration scale; the scales are
+        combined by the log-Euclidean mean of the unit metrics. Blocks whose gradients stay
+        under ``min_gradient`` are not textured and get the identity.
+        """
+        tensor = _block_tensor(image, self.options.derivative_sigma_px)
+        sigmas_px = self.options.integration_sigmas_px
+        mean_log = np.zeros((*tensor.shape[:2], 2), dtype=np.float32)
+        for sigma_px in sigmas_px:
+            mean_log += log_metrics(_smooth(tensor, sigma_px)) / len(sigmas_px)
+        local = _smooth(tensor, min(sigmas_px))
+        textured = local[..., 0] + local[..., 1] > self.options.min_gradient**2
+        mean_log[~textured] = 0.0
+        return ShapeGrid(metrics_from_log(mean_log), textured, grid_origin(STEP_PX), STEP_PX)
+
+    def samples(self, image: GrayImage) -> ShapeSamples:
+        """Return the shapes of the textured blocks of a (H, W) uint8 image."""
+        return self.grid(image).samples()
 
 
 def _smooth(tensor: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
@@ -51,25 +61,3 @@ def _block_tensor(image: GrayImage, derivative_sigma_px: float) -> NDArray[np.fl
     padded = np.pad(products, ((0, bottom), (0, side), (0, 0)), mode="edge")
     grid = ((width + side) // STEP_PX, (height + bottom) // STEP_PX)
     return np.asarray(cv2.resize(padded, grid, interpolation=cv2.INTER_AREA), dtype=np.float32)
-
-
-def _log_metric(tensor: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return (..., 2) entries (l11, l12) of log(mu / sqrt det mu), a trace-free symmetric matrix.
-
-    For mu = m I + D with trace-free D the logarithm is atanh(|D| / m) D / |D|.
-    """
-    mean = (tensor[..., 0] + tensor[..., 1]) / 2
-    deviator = np.stack([(tensor[..., 0] - tensor[..., 1]) / 2, tensor[..., 2]], -1)
-    norm = np.maximum(np.linalg.norm(deviator, axis=-1), 1e-12)
-    ratio = np.minimum(norm / np.maximum(mean, 1e-12), 0.999)
-    return np.asarray((np.arctanh(ratio) / norm)[..., None] * deviator, dtype=np.float32)
-
-
-def _metric_from_log(log_metric: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Invert :func:`_log_metric`: (..., 3) unit metrics by the exponential."""
-    log_metric = log_metric.astype(np.float64)
-    norm = np.linalg.norm(log_metric, axis=-1)
-    factor = np.where(norm > 1e-9, np.sinh(norm) / np.maximum(norm, 1e-9), 1.0)
-    cosh = np.cosh(norm)
-    diagonal, off = factor * log_metric[..., 0], factor * log_metric[..., 1]
-    return np.stack([cosh + diagonal, cosh - diagonal, off], -1)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from strategies import Array
 from synthetic import texture
 
-from colmap_affrect.features.second_moment import STEP_PX, second_moment_shapes
+from colmap_affrect.features.second_moment import SecondMoment
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
+from colmap_affrect.geometry.shapes import STEP_PX
 from colmap_affrect.geometry.tilts import cosh_distances, tilts_from_metrics, unit_metrics
 from colmap_affrect.imaging import warp
 from colmap_affrect.options import SecondMomentOptions
@@ -22,6 +23,9 @@ TILT_BAND = 0.25
 smoothing before the gradients blurs a compressed texture more along one axis."""
 
 ANGLE_BAND_DEG = 5.0
+
+
+SOURCE = SecondMoment(SecondMomentOptions())
 
 
 def mean_class(grid: ShapeGrid, border_px: int = 48) -> tuple[float, float]:
@@ -67,7 +71,7 @@ def isotropic() -> GrayImage:
 def test_second_moment_shapes_of_isotropic_texture_are_near_the_identity(
     isotropic: GrayImage,
 ) -> None:
-    grid = second_moment_shapes(isotropic, SecondMomentOptions())
+    grid = SOURCE.grid(isotropic)
     assert grid.textured.all()
     assert mean_class(grid)[0] < 1.0 + TILT_BAND / 2
 
@@ -80,7 +84,7 @@ def test_second_moment_shapes_of_a_texture_stretched_by_3_undo_the_stretch(
     turn = rotation(np.deg2rad(axis_deg))
     result_from_image = turn @ np.diag([3.0, 1.0]) @ turn.T
     stretched = resample(isotropic, np.linalg.inv(result_from_image), (500, 480))
-    tilt, angle_deg = mean_class(second_moment_shapes(stretched, SecondMomentOptions()))
+    tilt, angle_deg = mean_class(SOURCE.grid(stretched))
     # The rectifying map diag(t, 1) R(phi) stretches the direction -phi: across the axis.
     expected_deg = (90.0 - axis_deg) % 180.0
     assert_allclose(tilt, 3.0, rtol=TILT_BAND)
@@ -94,12 +98,12 @@ def test_second_moment_shapes_rectify_a_stretched_texture_to_an_isotropic_one(
     turn = rotation(np.deg2rad(axis_deg))
     result_from_image = turn @ np.diag([3.0, 1.0]) @ turn.T
     stretched = resample(isotropic, np.linalg.inv(result_from_image), (500, 480))
-    tilt, angle_deg = mean_class(second_moment_shapes(stretched, SecondMomentOptions()))
+    tilt, angle_deg = mean_class(SOURCE.grid(stretched))
     linear = rectifying_affine(tilt, np.deg2rad(angle_deg))
     region = np.array([[180.0, 170.0], [320.0, 170.0], [180.0, 310.0], [320.0, 310.0]])
     matrix, canvas = fit_canvas(linear, region, margin_px=64.0)
     plan = Rectification(matrix, canvas, np.ones(stretched.shape, bool), tilt, 0.0)
-    rectified = second_moment_shapes(warp(stretched, plan), SecondMomentOptions())
+    rectified = SOURCE.grid(warp(stretched, plan))
     assert mean_class(rectified)[0] < 1.0 + TILT_BAND
 
 
@@ -112,8 +116,7 @@ def test_second_moment_shapes_of_a_warped_texture_are_the_warped_shapes(
     first = isotropic.copy()
     first[:, :320] = resample(isotropic, np.diag([0.4, 1.0]), (640, 560))[:, :320]
     second = resample(first, image_from_result, size)
-    options = SecondMomentOptions()
-    before, after = second_moment_shapes(first, options), second_moment_shapes(second, options)
+    before, after = SOURCE.grid(first), SOURCE.grid(second)
 
     rows, columns = np.indices(after.textured.shape)
     points = np.stack([columns, rows], -1) * after.step_px + after.origin_px
@@ -137,7 +140,7 @@ def test_second_moment_shapes_of_a_warped_texture_are_the_warped_shapes(
 
 
 def test_second_moment_shapes_of_a_blank_image_are_untextured_identities() -> None:
-    grid = second_moment_shapes(np.full((61, 83), 200, np.uint8), SecondMomentOptions())
+    grid = SOURCE.grid(np.full((61, 83), 200, np.uint8))
     assert not grid.textured.any()
     assert_allclose(grid.metrics, np.broadcast_to([1.0, 1.0, 0.0], grid.metrics.shape))
 
@@ -145,7 +148,7 @@ def test_second_moment_shapes_of_a_blank_image_are_untextured_identities() -> No
 def test_second_moment_shapes_of_faint_noise_are_untextured_identities() -> None:
     rng = np.random.default_rng(0)
     faint = (128 + rng.integers(-1, 2, (64, 96))).astype(np.uint8)
-    grid = second_moment_shapes(faint, SecondMomentOptions())
+    grid = SOURCE.grid(faint)
     assert not grid.textured.any()
     assert_allclose(grid.metrics, np.broadcast_to([1.0, 1.0, 0.0], grid.metrics.shape))
 
@@ -153,7 +156,7 @@ def test_second_moment_shapes_of_faint_noise_are_untextured_identities() -> None
 def test_second_moment_shapes_tell_textured_blocks_from_flat_ones() -> None:
     image = np.full((160, 320), 128, np.uint8)
     image[:, :160] = texture((160, 160), seed=5)
-    textured = second_moment_shapes(image, SecondMomentOptions()).textured
+    textured = SOURCE.grid(image).textured
     assert textured[:, :36].all()
     assert not textured[:, 56:].any()
 
@@ -167,7 +170,7 @@ def test_second_moment_shapes_have_one_cell_per_started_block(
 ) -> None:
     rng = np.random.default_rng(2)
     image = rng.integers(0, 256, size[::-1]).astype(np.uint8)
-    grid = second_moment_shapes(image, SecondMomentOptions())
+    grid = SOURCE.grid(image)
     assert grid.textured.shape == cells[::-1]
     assert grid.metrics.shape == (*cells[::-1], 3)
     assert (grid.origin_px, grid.step_px) == (1.5, 4)
@@ -177,7 +180,7 @@ def test_second_moment_shapes_have_one_cell_per_started_block(
 
 def test_second_moment_shapes_of_stripes_stay_finite_and_of_unit_area() -> None:
     stripes = np.tile(np.repeat([30, 220], 6).astype(np.uint8), (120, 10))
-    grid = second_moment_shapes(stripes, SecondMomentOptions())
+    grid = SOURCE.grid(stripes)
     s11, s22, s12 = np.moveaxis(grid.metrics, -1, 0)
     assert np.isfinite(grid.metrics).all()
     assert_allclose(s11 * s22 - s12**2, 1.0, rtol=1e-6)
@@ -186,12 +189,21 @@ def test_second_moment_shapes_of_stripes_stay_finite_and_of_unit_area() -> None:
 
 
 def test_second_moment_shapes_ignore_gain_and_offset(isotropic: GrayImage) -> None:
-    options = SecondMomentOptions()
     image = isotropic[:200, :300]
     darker = np.rint(image * 0.5 + 20).astype(np.uint8)
     # Half the gray values are rounded twice as coarsely.
     assert_allclose(
-        second_moment_shapes(darker, options).metrics,
-        second_moment_shapes(image, options).metrics,
+        SOURCE.grid(darker).metrics,
+        SOURCE.grid(image).metrics,
         atol=0.02,
     )
+
+
+def test_samples_are_the_textured_blocks_with_their_centers() -> None:
+    image = np.full((161, 318), 128, np.uint8)
+    image[:, :160] = texture((160, 161), seed=5)
+    grid, samples = SOURCE.grid(image), SOURCE.samples(image)
+    assert 0 < np.count_nonzero(grid.textured) < grid.textured.size
+    columns, rows = ((samples.points - grid.origin_px) / grid.step_px).astype(int).T
+    assert_array_equal(np.stack([rows, columns], axis=1), np.argwhere(grid.textured))
+    assert_array_equal(samples.metrics, grid.metrics[rows, columns])

@@ -1,0 +1,213 @@
+"""Escalation on demand: more warps for the pairs of images that need them, and only those.
+
+Level by level (the recipe's ``escalation``; Mishkin, Matas, Perdoch, MODS, 2015) the images of
+the pairs that are still open get the features that the level adds, and these pairs are matched
+again. New matches take the place of the old ones only when their two-view geometry has more
+inliers, so that no pair loses. Two additions make it serve mapping and not single pairs alone:
+
+- A pair that is verified but weak counts as open while one of its images has no strong pair.
+- Verified pairs of images that gained are matched again at the same level. Their new features
+  would otherwise be seen in two images only, and the mapper could not tie them to the rest.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
+from colmap_affrect.extraction import ImageExtractor, Resources
+from colmap_affrect.matching.pairs import Pair
+from colmap_affrect.options import CameraOptions
+from colmap_affrect.outcomes import StageReport
+from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.stages import (
+    PAIRS_PER_WRITE,
+    feature_store,
+    intrinsics,
+    iterate_matches,
+    listed_pairs,
+    make_extractor,
+    match_pairs,
+    match_store,
+    read_indices,
+    verify_new,
+    write_images_and_keypoints,
+)
+from colmap_affrect.workspace import Workspace
+
+
+def escalate(
+    workspace: Workspace,
+    *,
+    resources: Resources | None = None,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> StageReport:
+    """Climb the levels of the recipe; nothing happens when it has none.
+
+    Args:
+        workspace: verified.
+        resources: weights and device of networks.
+        overwrite: bring all pairs back to level 0 first; features that are there are kept.
+        progress: where to show progress.
+
+    Returns:
+        ``num_done`` counts the pairs that were matched again now.
+    """
+    start = time.perf_counter()
+    levels = workspace.extraction_options().escalation
+    workspace.claim("escalate", {"levels": len(levels)}, overwrite=overwrite)
+    ladder = _Ladder(workspace, resources)
+    if overwrite:
+        ladder.undo(progress)
+    climbed: set[Pair] = set()
+    for level, rectifier in enumerate(levels, 1):
+        title = f"{rectifier.name} ({level} of {len(levels)})"
+        for choose in (ladder.open_pairs, lambda level=level: ladder.links(level)):
+            todo = ladder.untried(choose(), level)
+            with progress.stage(title, ladder.num_steps(todo, level), "steps") as advance:
+                ladder.climb(todo, level, advance)
+            climbed |= set(todo)
+    return StageReport("escalate", time.perf_counter() - start, len(climbed))
+
+
+def pair_levels(workspace: Workspace) -> dict[str, int]:
+    """Return how many pairs each level of a recipe with escalation decided, and how many none.
+
+    Keys are the names of the rectifiers, in order, and ``none``; empty without escalation.
+    """
+    options = workspace.extraction_options()
+    if not options.escalation:
+        return {}
+    names = [rectifier.name for rectifier in options.rectifiers]
+    ladder = _Ladder(workspace, None)
+    num_inliers, levels = ladder.num_inliers(), ladder.matches.levels(ladder.pairs)
+    counts = dict.fromkeys([*names, "none"], 0)
+    for pair in ladder.pairs:
+        counts[names[levels[pair]] if num_inliers.get(pair) else "none"] += 1
+    return counts
+
+
+def open_pairs(num_inliers: Mapping[Pair, int], strong_num_inliers: int) -> list[Pair]:
+    """Return the pairs that are not verified, or weak while an image has no strong pair."""
+    secure = {
+        name for pair, count in num_inliers.items() if count >= strong_num_inliers for name in pair
+    }
+    return [pair for pair, count in num_inliers.items() if not count or not secure.issuperset(pair)]
+
+
+class _Ladder:
+    """The stores and options of a workspace, and one climb of some pairs to one level."""
+
+    def __init__(self, workspace: Workspace, resources: Resources | None) -> None:
+        self.workspace, self._resources = workspace, resources
+        self.options = workspace.extraction_options()
+        self.pairs = listed_pairs(workspace)
+        self.features, self.matches = feature_store(workspace), match_store(workspace)
+        self._extractor: ImageExtractor | None = None
+
+    def num_inliers(self) -> dict[Pair, int]:
+        """Return the inliers of each pair that is in the database, 0 where it is not verified."""
+        options, _ = self.workspace.verification_options()
+        ids = colmap_database.image_ids(self.workspace.database)
+        verified = verified_pairs(self.workspace.database, options.min_num_inliers)
+        counts = {}
+        for first, second in self.pairs:
+            if first in ids and second in ids:
+                low, high = sorted((ids[first], ids[second]))
+                counts[first, second] = verified.get((low, high), 0)
+        return counts
+
+    def open_pairs(self) -> list[Pair]:
+        """See :func:`open_pairs`."""
+        return open_pairs(self.num_inliers(), self.options.escalation_strong_num_inliers)
+
+    def links(self, level: int) -> list[Pair]:
+        """Return the verified pairs of the images that gained by a level."""
+        levels = self.matches.levels(self.pairs)
+        gained = {name for pair in self.pairs if levels[pair] == level for name in pair}
+        counts = self.num_inliers()
+        return [pair for pair, count in counts.items() if count and gained.intersection(pair)]
+
+    def untried(self, pairs: Sequence[Pair], level: int) -> list[Pair]:
+        """Return those of the pairs that were not matched at a level yet."""
+        tried = self.matches.tried_levels(pairs)
+        return [pair for pair in pairs if tried[pair] < level]
+
+    def num_steps(self, pairs: Sequence[Pair], level: int) -> int:
+        """Return how often :meth:`climb` will call ``advance``."""
+        return len(self._images_to_extend(pairs, level)) + len(pairs)
+
+    def climb(self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]) -> None:
+        """Match pairs with the features of a level and keep what has more inliers."""
+        for name in self._images_to_extend(pairs, level):
+            self._extend(name, level)
+            advance(1)
+        if pairs:
+            self._match_again(pairs, level, advance)
+        write_images_and_keypoints(self.workspace, self.features)
+        self._replace_matches()
+        verify_new(self.workspace, *self.workspace.verification_options())
+
+    def undo(self, progress: Progress) -> None:
+        """Bring all pairs back to level 0."""
+        levels = self.matches.levels(self.pairs)
+        higher = [pair for pair in self.pairs if levels[pair]]
+        with progress.stage("match", len(higher), "pairs") as advance:
+            options = self.workspace.matching_options()
+            match_pairs(higher, self.features, self.matches, options, 0, advance)
+        self.matches.mark_tried(self.pairs, 0)
+        self._replace_matches()
+        verify_new(self.workspace, *self.workspace.verification_options())
+
+    def _images_to_extend(self, pairs: Sequence[Pair], level: int) -> list[str]:
+        names = sorted({name for pair in pairs for name in pair})
+        return [name for name in names if len(self.features.level_ends(name)) <= level]
+
+    def _extend(self, name: str, level: int) -> None:
+        """Add to an image the features of all levels that it lacks, up to this one."""
+        record = self.workspace.require("extract")
+        cameras = CameraOptions.from_mapping(record["camera"], str(self.workspace.config))
+        path = Path(record["image_path"]) / name
+        if self._extractor is None:
+            self._extractor = make_extractor(self.workspace, self.options, self._resources, [name])
+        matrix = intrinsics(path, self._extractor, cameras)
+        for missing in range(len(self.features.level_ends(name)), level + 1):
+            found = self._extractor.extract_file(path, name, matrix, missing)
+            self.features.extend(name, found.features)
+
+    def _match_again(
+        self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]
+    ) -> None:
+        options, seed = self.workspace.verification_options()
+        verifier = PairVerifier(self.workspace.database, options, seed)
+        num_inliers = self.num_inliers()
+        matching = self.workspace.matching_options()
+        for batch in _batches(pairs, PAIRS_PER_WRITE):
+            better = []
+            for found in iterate_matches(batch, self.features, matching, level):
+                first, second = (self.features.read_frames(name)[:, :, 2] for name in found.names)
+                count = verifier.num_inliers(found.names, (first, second), found.indices)
+                if count > num_inliers[found.names]:
+                    better.append(found)
+                advance(1)
+            self.matches.mark_tried(batch, level)
+            self.matches.write(better)
+
+    def _replace_matches(self) -> None:
+        """Put those matches into the database that differ from the ones there."""
+        ids = colmap_database.image_ids(self.workspace.database)
+        pairs = [pair for pair in self.pairs if pair[0] in ids and pair[1] in ids]
+        with colmap_database.open_database(self.workspace.database) as database:
+            for (name1, name2), indices in zip(
+                pairs, read_indices(self.matches, pairs), strict=True
+            ):
+                colmap_database.replace_matches(database, ids[name1], ids[name2], indices)
+
+
+def _batches(pairs: Sequence[Pair], size: int) -> Iterator[Sequence[Pair]]:
+    for begin in range(0, len(pairs), size):
+        yield pairs[begin : begin + size]

@@ -1,0 +1,310 @@
+"""Planes from depth maps: normals, their clusters on the sphere, and views from the front.
+
+Depth is z-depth along the optical axis, NaN where unknown, of any unit. Normals are of unit
+length in camera coordinates (x right, y down, z forward) and face the camera: n . r < 0 for the
+ray r that sees the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.conventions import grid_origin
+
+WINDOW_RADIUS = 2
+WINDOW_SIGMA_PX = 0.8
+"""Gaussian weights of the 5 x 5 window to which a plane is fitted (the authors' values)."""
+
+MIN_WEIGHT_FRAC = 0.5
+"""Share of the window's weight that known neighbours need. A line of pixels holds 0.499 and
+cannot carry a plane, a corner of the map 0.562."""
+
+MAX_SLANT_COS = np.cos(np.deg2rad(85.0))
+"""Neighbours that no plane seen at less than 85 degrees could hold are on another surface."""
+
+SAME_AXIS_COS = np.cos(np.deg2rad(45.0))
+"""Normals at most this far from the same line belong to one axis of an orthogonal frame."""
+
+SPIRAL_STEP = 3.6
+CANDIDATES_AT_ONCE = 64
+
+
+def shrink_depth(
+    depth: NDArray[np.floating], max_size_px: int
+) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
+    """Average 1/z over square blocks until the longer side is at most ``max_size_px``.
+
+    Inverse depth of a plane is affine in the pixel, so planes stay exact. A block with an
+    unknown pixel is unknown; incomplete blocks at the right and lower side are dropped.
+
+    Args:
+        depth: (h, w) z-depth > 0, NaN where unknown.
+        max_size_px: bound on the longer side of the result.
+
+    Returns:
+        The depth map and the (3, 3) map to its pixel-centre px from those of the given one.
+    """
+    step = -(-max(depth.shape) // max_size_px)
+    step_y, step_x = np.minimum(step, depth.shape).tolist()
+    rows, columns = depth.shape[0] // step_y, depth.shape[1] // step_x
+    blocks = depth[: rows * step_y, : columns * step_x].reshape(rows, step_y, columns, step_x)
+    given_from_shrunk = np.diag([float(step_x), float(step_y), 1.0])
+    given_from_shrunk[:2, 2] = grid_origin(step_x), grid_origin(step_y)
+    return 1.0 / np.mean(1.0 / blocks, axis=(1, 3)), np.linalg.inv(given_from_shrunk)
+
+
+def normals_from_depth(
+    depth: NDArray[np.floating], camera_matrix: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Fit a plane to the 5 x 5 window of each pixel of a depth map and return its normal.
+
+    Along a plane 1/z is an affine function of the pixel. It is fitted to the window by least
+    squares with Gaussian weights; errors are thus taken along the ray, where depth has them,
+    and the normal always faces the camera. Neighbours behind a depth discontinuity have weight
+    0: those whose 1/z differs from the centre's by more than a plane seen at 85 degrees would
+    make it, which is |dr| / cos 85 deg times the centre's for rays that differ by dr.
+
+    Args:
+        depth: (h, w) z-depth > 0, NaN where unknown.
+        camera_matrix: (3, 3) intrinsics in pixel-centre px of the depth map.
+
+    Returns:
+        (h, w, 3) unit normals, NaN where the pixel or too much of its window is unknown.
+    """
+    height, width = depth.shape
+    inverse = 1.0 / np.asarray(depth, dtype=np.float64)
+    padded = np.pad(inverse, WINDOW_RADIUS, constant_values=np.nan)
+    ray_from_pixel = np.linalg.inv(camera_matrix)
+    offsets = range(-WINDOW_RADIUS, WINDOW_RADIUS + 1)
+    total_weight = 0.0
+    moments = np.zeros((9, height, width))
+    for dy in offsets:
+        for dx in offsets:
+            weight = np.exp(-(dx**2 + dy**2) / (2.0 * WINDOW_SIGMA_PX**2))
+            total_weight += weight
+            top, left = dy + WINDOW_RADIUS, dx + WINDOW_RADIUS
+            change = padded[top : top + height, left : left + width] / inverse - 1.0
+            ray_change = np.linalg.norm(ray_from_pixel[:, :2] @ [dx, dy])
+            known = np.abs(change) <= ray_change / MAX_SLANT_COS
+            weights, weighted = weight * known, weight * np.where(known, change, 0.0)
+            for index, factor in enumerate((1, dx, dy, dx * dx, dx * dy, dy * dy)):
+                moments[index] += factor * weights
+            for index, factor in enumerate((1, dx, dy), start=6):
+                moments[index] += factor * weighted
+    enough = moments[0] >= MIN_WEIGHT_FRAC * total_weight
+    slope_x, slope_y, change = _weighted_line(np.where(enough, moments, np.nan))
+    # As a form l . (x, y, 1) of the pixel; on rays r it is (K^T l) . r, and n is along -K^T l.
+    constant = 1.0 + change - slope_x * np.arange(width) - slope_y * np.arange(height)[:, None]
+    forms = np.stack([slope_x, slope_y, constant], axis=-1) @ np.asarray(camera_matrix)
+    return np.asarray(-forms / np.linalg.norm(forms, axis=-1, keepdims=True))
+
+
+def _weighted_line(
+    moments: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return slopes in x and y and the value at 0 from sums of w, wx, wy, wxx ... and q, qx, qy."""
+    x, y, xx, xy, yy, q, qx, qy = moments[1:] / moments[0]
+    xx, xy, yy, qx, qy = xx - x * x, xy - x * y, yy - y * y, qx - q * x, qy - q * y
+    determinant = xx * yy - xy * xy
+    slope_x = (yy * qx - xy * qy) / determinant
+    slope_y = (xx * qy - xy * qx) / determinant
+    return slope_x, slope_y, q - slope_x * x - slope_y * y
+
+
+def spiral_points(num_points: int) -> NDArray[np.float64]:
+    """Return (N, 3) points spread evenly over the unit sphere, along a spiral about z.
+
+    Heights are equidistant, neighbours on the spiral 3.6 / sqrt(N) apart (Saff & Kuijlaars,
+    "Distributing many points on a sphere", 1997; with both ends half a step off the poles).
+    """
+    heights = 1.0 - (2.0 * np.arange(num_points) + 1.0) / num_points
+    radii = np.sqrt(1.0 - heights**2)
+    longitudes = np.cumsum(SPIRAL_STEP / (np.sqrt(num_points) * radii))
+    return np.stack([radii * np.cos(longitudes), radii * np.sin(longitudes), heights], axis=1)
+
+
+@dataclass(frozen=True)
+class PlaneClusters:
+    """Directions that many normals share.
+
+    Attributes:
+        normals: (K, 3) unit normals in order of choice; K may be 0.
+        labels: (h, w) int32, the nearest of them for each pixel, -1 where none is near.
+    """
+
+    normals: NDArray[np.float64]
+    labels: NDArray[np.int32]
+
+
+def cluster_normals(
+    normals: NDArray[np.floating],
+    *,
+    num_candidates: int,
+    bin_angle_rad: float,
+    min_separation_rad: float,
+    max_num_planes: int,
+    min_votes_frac: float,
+    orthogonal: bool = False,
+    antipodal: bool = False,
+) -> PlaneClusters:
+    """Choose the directions with most normals greedily, then give each normal to the nearest.
+
+    Candidates are the :func:`spiral_points` of the whole sphere: normals that face a camera of
+    wide angle fill more than half of it, and candidates without normals get no votes. After
+    each choice the direction moves to the mean of its normals, those then within the bin are
+    taken away, and the others vote again (the authors counted once).
+
+    Args:
+        normals: (h, w, 3) unit normals, NaN where unknown.
+        num_candidates: directions to choose from.
+        bin_angle_rad: normals at most this far from a direction belong to it.
+        min_separation_rad: candidates nearer to a chosen direction are left out.
+        max_num_planes: upper bound of K.
+        min_votes_frac: share of all h w pixels that a direction needs.
+        orthogonal: make the chosen directions orthogonal, see :func:`orthogonalized`.
+        antipodal: count opposite normals as one direction; the sign of the result then is
+            that of the most of them.
+    """
+    known = ~np.isnan(normals).any(axis=-1)
+    waiting = np.asarray(normals[known], dtype=np.float32)
+    candidates = spiral_points(num_candidates)
+    bin_cos, separation_cos = float(np.cos(bin_angle_rad)), float(np.cos(min_separation_rad))
+    votes = _votes(candidates, waiting, bin_cos, antipodal)
+    centers = np.zeros((0, 3))
+    while len(centers) < max_num_planes:
+        far = _cosines(candidates, centers, antipodal).max(axis=1, initial=-1.0) <= separation_cos
+        best = int(np.argmax(np.where(far, votes, 0)))
+        if not far[best] or votes[best] < max(min_votes_frac * known.size, 1):
+            break
+        center = _mean_near(candidates[best], waiting, bin_cos, antipodal)
+        centers = np.concatenate([centers, center[None]])
+        taken = _cosines(waiting, center[None], antipodal)[:, 0] >= bin_cos
+        votes -= _votes(candidates, waiting[taken], bin_cos, antipodal)
+        waiting = waiting[~taken]
+    if orthogonal:
+        centers = orthogonalized(centers)
+    labels = np.full(known.shape, -1, dtype=np.int32)
+    labels[known] = _nearest(normals[known], centers, bin_cos, antipodal)
+    return PlaneClusters(centers, labels)
+
+
+def orthogonalized(normals: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the nearest set of unit normals that are pairwise orthogonal or opposite.
+
+    Nearest in the sum of squared differences: the polar factor of the matrix of axes. Normals
+    within 45 degrees of one line share its axis, as the two sides of a street do. In three
+    dimensions there are three axes: later normals that fit to none are returned as they are.
+
+    Args:
+        normals: (K, 3) unit normals.
+
+    Returns:
+        (K, 3) unit normals.
+    """
+    result = np.array(normals, dtype=np.float64)
+    axes = np.zeros((0, 3))
+    members: list[tuple[int, int, float]] = []
+    for index, normal in enumerate(result):
+        cosines = axes @ normal / np.linalg.norm(axes, axis=1)
+        axis = int(np.argmax(np.abs(cosines))) if len(axes) else 0
+        if len(axes) and abs(cosines[axis]) >= SAME_AXIS_COS:
+            sign = float(np.sign(cosines[axis]))
+            axes[axis] += sign * normal
+        elif len(axes) < 3:
+            axis, sign = len(axes), 1.0
+            axes = np.concatenate([axes, normal[None]])
+        else:
+            continue
+        members.append((index, axis, sign))
+    left, _, right = np.linalg.svd(axes, full_matrices=False)
+    for index, axis, sign in members:
+        result[index] = sign * (left @ right)[axis]
+    return result
+
+
+def fronto_parallel_homography(
+    normal: NDArray[np.floating], camera_matrix: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Return the (3, 3) map to the view that a camera turned towards a plane would have.
+
+    It is K R K^-1 with R the smallest rotation that turns the plane's normal onto the optical
+    axis. Its third coordinate at a pixel (x, y, 1) is -n . r with the pixel's ray
+    r = K^-1 (x, y, 1): positive where the pixel can see the front of the plane.
+
+    Args:
+        normal: (3,) unit normal that faces the camera; (0, 0, -1) gives the identity.
+        camera_matrix: (3, 3) intrinsics in pixel-centre px.
+    """
+    x, y, z = -np.asarray(normal, dtype=np.float64)
+    turn = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    rotation = np.eye(3) + turn + turn @ turn / (1.0 + z)
+    return np.asarray(camera_matrix @ rotation @ np.linalg.inv(camera_matrix))
+
+
+def viewing_cosines(
+    normal: NDArray[np.floating], camera_matrix: NDArray[np.floating], size: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Return the cosine of the angle between a plane's normal and the ray of each pixel.
+
+    Args:
+        normal: (3,) unit normal that faces the camera.
+        camera_matrix: (3, 3) intrinsics in pixel-centre px.
+        size: (width, height) in px.
+
+    Returns:
+        (h, w): 1 where the plane is seen from the front, 0 along it, negative from behind.
+    """
+    width, height = size
+    ray_from_pixel = np.linalg.inv(camera_matrix)
+    columns, rows = np.arange(width), np.arange(height)[:, None]
+    x, y, z = (form[0] * columns + form[1] * rows + form[2] for form in ray_from_pixel)
+    return np.asarray(-(normal[0] * x + normal[1] * y + normal[2] * z) / np.sqrt(x * x + y * y + z * z))
+
+
+def _cosines(
+    directions: NDArray[np.floating], centers: NDArray[np.floating], antipodal: bool
+) -> NDArray[np.floating]:
+    """Return (N, K) cosines of the angles between directions, or between lines."""
+    cosines = directions @ centers.T.astype(directions.dtype)
+    return np.asarray(np.abs(cosines) if antipodal else cosines)
+
+
+def _votes(
+    candidates: NDArray[np.float64], normals: NDArray[np.floating], bin_cos: float, antipodal: bool
+) -> NDArray[np.int64]:
+    """Count the normals near each candidate."""
+    return np.concatenate(
+        [
+            np.count_nonzero(_cosines(normals, part, antipodal) >= bin_cos, axis=0)
+            for part in np.split(
+                candidates, range(CANDIDATES_AT_ONCE, len(candidates), CANDIDATES_AT_ONCE)
+            )
+        ]
+    )
+
+
+def _mean_near(
+    center: NDArray[np.float64], normals: NDArray[np.floating], bin_cos: float, antipodal: bool
+) -> NDArray[np.float64]:
+    """Return the unit mean of the normals near a direction, with the sign of the most of them."""
+    cosines = normals @ center.astype(normals.dtype)
+    near = (np.abs(cosines) if antipodal else cosines) >= bin_cos
+    signs = np.sign(cosines[near])
+    mean = signs @ normals[near].astype(np.float64) * (1.0 if signs.sum() >= 0 else -1.0)
+    return np.asarray(mean / np.linalg.norm(mean))
+
+
+def _nearest(
+    normals: NDArray[np.floating],
+    centers: NDArray[np.float64],
+    bin_cos: float,
+    antipodal: bool,
+) -> NDArray[np.int32]:
+    if not len(centers):
+        return np.full(len(normals), -1, dtype=np.int32)
+    cosines = _cosines(normals, centers, antipodal)
+    near = cosines.max(axis=1) >= bin_cos
+    return np.where(near, cosines.argmax(axis=1), -1).astype(np.int32)

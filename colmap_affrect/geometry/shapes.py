@@ -1,0 +1,50 @@
+"""Affine shapes as unit metrics: from frames, and to logarithms, whose mean is a mean shape.
+
+The logarithm of a unit metric (S11, S22, S12) is a trace-free symmetric matrix, kept as its
+entries (l11, l12); its eigenvalues are +-log t. Means of shapes are means of logarithms
+(log-Euclidean mean; Arsigny, Fillard, Pennec, Ayache 2007).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.geometry.tilts import unit_metrics
+
+STEP_PX = 4
+"""Dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet."""
+
+MAX_TANH = 0.999
+"""Where logarithms end: of a metric, tilt 45."""
+
+
+def rectifying_metrics(shapes: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return (..., 3) unit metrics of L^-1, the rectifying maps of (..., 2, 2) frames L.
+
+    The metric of L^-1 is the inverse of L L^T, which of unit determinant is its adjugate.
+    """
+    ellipses = unit_metrics(np.swapaxes(shapes, -1, -2))
+    return np.stack([ellipses[..., 1], ellipses[..., 0], -ellipses[..., 2]], -1)
+
+
+def log_metrics(metrics: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return (..., 2) entries (l11, l12) of log(S / sqrt det S) for (..., 3) metrics of any scale.
+
+    For S = m I + D with trace-free D the logarithm is atanh(|D| / m) D / |D|.
+    """
+    mean = (metrics[..., 0] + metrics[..., 1]) / 2
+    deviator = np.stack([(metrics[..., 0] - metrics[..., 1]) / 2, metrics[..., 2]], -1)
+    norm = np.maximum(np.linalg.norm(deviator, axis=-1), 1e-12)
+    ratio = np.minimum(norm / np.maximum(mean, 1e-12), MAX_TANH)
+    return np.asarray((np.arctanh(ratio) / norm)[..., None] * deviator, dtype=np.float32)
+
+
+def metrics_from_log(logs: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Invert :func:`log_metrics`: (..., 3) unit metrics by the exponential."""
+    logs = logs.astype(np.float64)
+    norm = np.linalg.norm(logs, axis=-1)
+    factor = np.where(norm > 1e-9, np.sinh(norm) / np.maximum(norm, 1e-9), 1.0)
+    cosh = np.cosh(norm)
+    diagonal, off = factor * logs[..., 0], factor * logs[..., 1]
+    return np.stack([cosh + diagonal, cosh - diagonal, off], -1)

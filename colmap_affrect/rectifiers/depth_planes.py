@@ -1,0 +1,139 @@
+"""Rectifier ``depth-planes``: one homography for each planar segment, as if seen from the front.
+
+The paper's depth-map-based rectification (Sec. 3) after Toft et al. 2020: normals from a depth
+map, their clusters on the sphere, connected segments of each cluster.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.conventions import resized_from_original
+from colmap_affrect.geometry.planes import (
+    cluster_normals,
+    fronto_parallel_homography,
+    normals_from_depth,
+    shrink_depth,
+    viewing_cosines,
+)
+from colmap_affrect.imaging import connected_regions
+from colmap_affrect.interfaces import Sources
+from colmap_affrect.options import DepthPlanesOptions, PlaneOptions
+from colmap_affrect.rectifiers.regions import Region, homography_rectification
+from colmap_affrect.types import Mask, Photograph, RectificationPlan
+
+MAX_DEPTH_SIZE_PX = 640
+"""Larger depth maps are shrunk to this: windows of 5 x 5 px of them see too little of a plane,
+and noise too much (the paper's maps have 512 px)."""
+
+
+@dataclass(frozen=True)
+class PlanarSegment:
+    """Connected part of an image that shows surfaces of about the same orientation.
+
+    Attributes:
+        region: the part of the image.
+        normal: (3,) unit normal in camera coordinates, facing the camera.
+    """
+
+    region: Region
+    normal: NDArray[np.float64]
+
+
+class DepthPlanes:
+    """Planar segments as if seen from the front."""
+
+    Options = DepthPlanesOptions
+
+    def __init__(self, options: DepthPlanesOptions, sources: Sources) -> None:
+        """See :mod:`colmap_affrect.interfaces`."""
+        self.options = options
+        self.source = sources.depth
+
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        """Plan one warp for each segment.
+
+        Raises:
+            DepthError: when there is no usable depth map.
+        """
+        assert self.source is not None
+        segments = planar_segments(photograph, self.source.depth(photograph), self.options.planes)
+        items = tuple(
+            homography_rectification(
+                segment.region,
+                fronto_parallel_homography(segment.normal, photograph.camera_matrix),
+                number,
+            )
+            for number, segment in enumerate(segments)
+        )
+        outside = None
+        if self.options.keep_original == "outside":
+            outside = ~_union(segments, photograph.size)
+        return RectificationPlan(photograph.size, items, outside)
+
+
+def planar_segments(
+    photograph: Photograph, depth: NDArray[np.floating], options: PlaneOptions
+) -> list[PlanarSegment]:
+    """Segment a photograph into connected parts of planes.
+
+    A pixel belongs to a plane if its normal is nearest to that of the plane and near enough,
+    and if it sees the plane at no more than ``max_angle_deg``, the angle between the plane's
+    normal and the pixel's ray. (The authors compare the normal with the optical axis, and leave
+    out or keep a plane as a whole.) In the view from the front an area grows by 1 / cos^3 of
+    that angle, so the far end of a plane, where the view would explode, is left out.
+
+    Args:
+        photograph: with its intrinsics.
+        depth: (h, w) z-depth of the whole photograph, of any resolution; NaN where unknown.
+        options: how planes are found, and the smallest segment.
+    """
+    size_of_depth = (depth.shape[1], depth.shape[0])
+    depth, shrunk_from_depth = shrink_depth(depth, MAX_DEPTH_SIZE_PX)
+    depth_from_image = shrunk_from_depth @ resized_from_original(photograph.size, size_of_depth)
+    planes = cluster_normals(
+        normals_from_depth(depth, depth_from_image @ photograph.camera_matrix),
+        num_candidates=options.num_candidates,
+        bin_angle_rad=np.deg2rad(options.bin_angle_deg),
+        min_separation_rad=np.deg2rad(options.min_separation_deg),
+        max_num_planes=options.max_num_planes,
+        min_votes_frac=options.min_votes_frac,
+        orthogonal=options.orthogonal,
+        antipodal=options.antipodal,
+    )
+    labels = _resampled(planes.labels, depth_from_image, photograph.size)
+    min_cos = np.cos(np.deg2rad(options.max_angle_deg))
+    min_area_px = options.min_region_frac * labels.size
+    segments = []
+    for label, normal in enumerate(planes.normals):
+        for facing in (normal, -normal) if options.antipodal else (normal,):
+            cosines = viewing_cosines(facing, photograph.camera_matrix, photograph.size)
+            found = connected_regions((labels == label) & (cosines >= min_cos), min_area_px)
+            segments += [PlanarSegment(Region(*region), facing) for region in found]
+    return segments
+
+
+def _resampled(
+    labels: NDArray[np.int32], labels_from_image: NDArray[np.float64], size: tuple[int, int]
+) -> NDArray[np.int32]:
+    """Give each pixel of an image of (width, height) its nearest label; the map only scales."""
+    columns, rows = (
+        np.rint(labels_from_image[axis, axis] * np.arange(extent) + labels_from_image[axis, 2])
+        .astype(int)
+        .clip(0, labels.shape[1 - axis] - 1)
+        for axis, extent in enumerate(size)
+    )
+    return labels[rows[:, None], columns]
+
+
+def _union(segments: list[PlanarSegment], size: tuple[int, int]) -> Mask:
+    """Return the (H, W) mask of all segments."""
+    mask = np.zeros(size[::-1], dtype=bool)
+    for segment in segments:
+        left, top = segment.region.origin
+        height, width = segment.region.mask.shape
+        mask[top : top + height, left : left + width] |= segment.region.mask
+    return mask

@@ -1,0 +1,102 @@
+"""Regions of an image and the warps that show them, each on a canvas that just holds it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
+from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
+from colmap_affrect.types import Mask, Rectification, in_mask
+
+MARGIN_PX = 16.0
+"""Surroundings of a region that its descriptors may see, in warp px."""
+
+MAGNIFICATION = 2.0
+"""Area of a region in its homography's warp in units of that in the image."""
+
+MAX_CANVAS_RATIO = 4.0
+"""Bound on the canvas of a homography, its margin left out, in units of the region's area."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """Part of an image.
+
+    Attributes:
+        mask: (h, w) bool, cropped to the part.
+        origin: (x, y) image pixel of the mask's first pixel.
+    """
+
+    mask: Mask
+    origin: tuple[int, int]
+
+    @property
+    def area_px(self) -> int:
+        """Number of its pixels."""
+        return int(np.count_nonzero(self.mask))
+
+    def outline(self) -> NDArray[np.float64]:
+        """Return (N, 2) pixel centres in the image whose convex hull is that of the region."""
+        rows = np.flatnonzero(self.mask.any(axis=1))
+        first = self.mask[rows].argmax(axis=1)
+        last = self.mask.shape[1] - 1 - self.mask[rows, ::-1].argmax(axis=1)
+        points = np.stack([np.concatenate([first, last]), np.concatenate([rows, rows])], axis=1)
+        return np.asarray(points + self.origin, dtype=np.float64)
+
+    def pixels(self) -> NDArray[np.float64]:
+        """Return (N, 2) centres of all its pixels in the image."""
+        rows, columns = np.nonzero(self.mask)
+        return np.asarray(np.stack([columns, rows], axis=1) + self.origin, dtype=np.float64)
+
+    def contains(self, points: NDArray[np.floating]) -> Mask:
+        """Tell which (N, 2) points, rounded to pixels, belong to it."""
+        return in_mask(self.mask, points, self.origin)
+
+
+def affine_rectification(
+    region: Region, tilt: float, angle_rad: float, segment_id: int, *, area_preserving: bool
+) -> Rectification:
+    """Show a region by the affine map of the class (tilt, angle)."""
+    linear = rectifying_affine(tilt, angle_rad, area_preserving=area_preserving)
+    matrix, canvas_size = fit_canvas(linear, region.outline(), MARGIN_PX)
+    return Rectification(
+        matrix, canvas_size, region.mask, tilt, angle_rad, region.origin, segment_id
+    )
+
+
+def homography_rectification(
+    region: Region, homography: NDArray[np.float64], segment_id: int
+) -> Rectification:
+    """Show a region by a homography, scaled so that the region has twice its area.
+
+    The local change of area is det H / w^3 at third coordinates w, its sum over the region's
+    pixels the region's area in the warp. Where the bounding box of that, the canvas, would have
+    more than ``MAX_CANVAS_RATIO`` px per px of the region, the scale is smaller.
+
+    Args:
+        region: the part of the image.
+        homography: (3, 3) with positive determinant and positive third coordinates all over
+            the region.
+        segment_id: its number in the plan.
+    """
+    pixels = region.pixels()
+    third = pixels @ homography[2, :2] + homography[2, 2]
+    mapped_area = float(np.linalg.det(homography) * np.sum(third**-3.0))
+    outline = project(homography, region.outline())
+    box_area = float(np.prod(np.ptp(outline, axis=0)))
+    scale = sqrt(
+        region.area_px * min(MAGNIFICATION / mapped_area, MAX_CANVAS_RATIO / max(box_area, 1.0))
+    )
+    canvas_from_mapped, canvas_size = fit_canvas(scale * np.eye(2), outline, MARGIN_PX)
+    matrix = canvas_from_mapped @ homography
+    middle = np.concatenate([np.eye(2), pixels.mean(axis=0)[:, None]], axis=1)
+    jacobian = transform_frames(matrix, middle[None])[0, :, :2]
+    tilt, angle_rad = tilts_from_metrics(unit_metrics(jacobian))
+    return Rectification(
+        matrix, canvas_size, region.mask, float(tilt), float(angle_rad), region.origin, segment_id
+    )

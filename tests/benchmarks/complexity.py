@@ -1,0 +1,240 @@
+"""Cost of rectification per image, as in the paper's complexity table, and its time.
+
+For every recipe: area of all warps, keypoints, segments ("components"), warps per segment, and
+the seconds of planning, warping (with what belongs to it: masks, carrying features back, choosing)
+and features (detection and description). The last column is the time over that of the same
+features on the photographs as they are, measured in the same rounds. The areas of the paper are
+those of the warps alone; keypoints are all of an image. Usage:
+
+    python tests/benchmarks/complexity.py --methods default dense-affnet --weights WEIGHTS
+
+Recipes that need depth maps run on the image folders that have some.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean, median
+
+from pairs import Method, parse_method
+from speed import describe_machine
+
+from colmap_affrect.extraction import ImageExtractor, Resources, prepare
+from colmap_affrect.interfaces import FeatureProfile
+from colmap_affrect.options import ExtractionOptions, IdentityOptions
+from colmap_affrect.types import GrayImage, LocalFeatures, RectificationPlan, View
+
+DEFAULT_METHODS = ["default", "affnet-shapes-recommended"]
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """Some images of a folder.
+
+    Attributes:
+        name: name in the table.
+        paths: the images.
+        depth_path: folder of their depth maps, if any.
+    """
+
+    name: str
+    paths: list[Path]
+    depth_path: Path | None = None
+
+
+@dataclass
+class TimedProfile:
+    """A feature profile that adds up its seconds."""
+
+    profile: FeatureProfile
+    seconds: float = 0.0
+
+    @property
+    def descriptor_size(self) -> int:
+        """D, as that of the profile."""
+        return self.profile.descriptor_size
+
+    def detect(self, view: View) -> LocalFeatures:
+        """Detect as the profile does."""
+        start = time.perf_counter()
+        detected = self.profile.detect(view)
+        self.seconds += time.perf_counter() - start
+        return detected
+
+    def describe(
+        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
+    ) -> list[LocalFeatures]:
+        """Describe as the profile does."""
+        start = time.perf_counter()
+        described = self.profile.describe(images, detected)
+        self.seconds += time.perf_counter() - start
+        return described
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one image costs, or the mean of several."""
+
+    area_mpx: float
+    num_keypoints: float
+    num_regions: float
+    num_warps: float
+    plan_s: float
+    warp_s: float
+    features_s: float
+
+    @property
+    def total_s(self) -> float:
+        """Seconds of all steps."""
+        return self.plan_s + self.warp_s + self.features_s
+
+
+def measure(path: Path, extractor: ImageExtractor) -> Cost:
+    """Extract the features of one image; reading it is not counted."""
+    photograph, _ = extractor.photograph(path)
+    profile = TimedProfile(extractor.profile)
+    start = time.perf_counter()
+    plan = extractor.plan(photograph)
+    middle = time.perf_counter()
+    features = replace(extractor, profile=profile).execute(photograph.gray, plan)
+    execute_s = time.perf_counter() - middle
+    return Cost(
+        plan.rectified_area_px / 1e6,
+        len(features),
+        num_regions(plan),
+        len(plan.items),
+        middle - start,
+        execute_s - profile.seconds,
+        profile.seconds,
+    )
+
+
+def num_regions(plan: RectificationPlan) -> int:
+    """Count the segments of the image that a plan warps; whole images are one."""
+    return len({item.segment_id for item in plan.items})
+
+
+def mean_cost(costs: Sequence[Cost]) -> Cost:
+    """Average over images."""
+    return Cost(*(fmean(values) for values in zip(*map(_fields, costs), strict=True)))
+
+
+def median_cost(costs: Sequence[Cost]) -> Cost:
+    """Take medians over rounds."""
+    return Cost(*(median(values) for values in zip(*map(_fields, costs), strict=True)))
+
+
+def _fields(cost: Cost) -> tuple[float, ...]:
+    return tuple(vars(cost).values())
+
+
+def baseline_of(options: ExtractionOptions) -> ExtractionOptions:
+    """Return the options for the same features without rectification."""
+    return replace(options, rectifier=IdentityOptions(), escalation=())
+
+
+def image_sets(arguments: argparse.Namespace) -> list[ImageSet]:
+    """List the images that the command line names, else some of three scenes."""
+    if arguments.image_path:
+        folders = [(arguments.image_path, arguments.depth_path)]
+    else:
+        scenes, svp = arguments.shared_path / "scenes", arguments.shared_path / "pairs/svp_sample"
+        folders = [
+            (scenes / "strecha_herz_jesus_p25" / "images", None),
+            (scenes / "sceaux" / "images", None),
+            (svp / "scene1" / "images", svp / "depth" / "mega_depth" / "scene1"),
+        ]
+    return [
+        ImageSet(
+            f"{folder.parent.name}/{folder.name}",
+            chosen(sorted(folder.iterdir()), arguments.num_images),
+            depth,
+        )
+        for folder, depth in folders
+    ]
+
+
+def chosen(paths: list[Path], count: int) -> list[Path]:
+    """Take ``count`` of the paths, evenly spaced, or all if there are fewer."""
+    return paths[:: max(1, len(paths) // count)][:count]
+
+
+def table_row(method: str, costs: list[Cost], baseline: list[Cost]) -> str:
+    """Format the costs of a method by round, and its ratio to the baseline by round."""
+    cost = median_cost(costs)
+    ratios = [mine.total_s / base.total_s for mine, base in zip(costs, baseline, strict=True)]
+    warps = f"{cost.num_warps / cost.num_regions:.2f}" if cost.num_regions else "-"
+    return (
+        f"| {method} | {cost.area_mpx:.2f} | {cost.num_keypoints / 1000:.1f} "
+        f"| {cost.num_regions:.2f} | {warps} | {cost.plan_s:.2f} | {cost.warp_s:.2f} "
+        f"| {cost.features_s:.2f} | {cost.total_s:.2f} "
+        f"| {median(ratios):.2f} [{min(ratios):.2f}-{max(ratios):.2f}] |"
+    )
+
+
+def run_set(images: ImageSet, methods: list[Method], weights: Path | None, rounds: int) -> str:
+    """Measure all methods on a set of images, round by round; return a Markdown table."""
+    options: dict[str, ExtractionOptions] = {}
+    baselines: dict[str, str] = {}
+    for method in methods:
+        extraction = method.recipe.extraction
+        if any(rectifier.uses_depth for rectifier in extraction.rectifiers):
+            if images.depth_path is None:
+                continue
+            depth = replace(extraction.depth, path=str(images.depth_path), model="")
+            extraction = replace(extraction, depth=depth)
+        base = baseline_of(extraction)
+        known = [label for label, other in options.items() if other == base]
+        baselines[method.label] = known[0] if known else f"unrectified for {method.label}"
+        options[baselines[method.label]] = base
+        if method.label != baselines[method.label]:
+            options[method.label] = extraction
+    extractors = {
+        label: prepare(extraction, Resources(weights)) for label, extraction in options.items()
+    }
+    costs: dict[str, list[Cost]] = {label: [] for label in options}
+    for _ in range(rounds):
+        for label, extractor in extractors.items():
+            costs[label].append(mean_cost([measure(path, extractor) for path in images.paths]))
+    lines = [
+        f"{images.name}: mean of {len(images.paths)} images, median of {rounds} rounds",
+        "",
+        "| recipe | area (Mpx) | keypoints (K) | regions | warps/region | plan (s) | warp (s)"
+        " | features (s) | all (s) | ratio to unrectified by round |",
+        f"|---|{'--:|' * 9}",
+    ]
+    lines += [
+        table_row(label, costs[label], costs[baselines.get(label, label)]) for label in options
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Parse the command line."""
+    root = Path(__file__).resolve().parents[2]
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--methods", nargs="+", default=DEFAULT_METHODS, help="as in pairs.py")
+    parser.add_argument("--image-path", type=Path, help="folder of images")
+    parser.add_argument("--depth-path", type=Path, help="folder of their depth maps")
+    parser.add_argument("--shared-path", type=Path, default=root.parent / "shared")
+    parser.add_argument("--num-images", type=int, default=3, help="of each folder")
+    parser.add_argument("--num-rounds", type=int, default=3)
+    parser.add_argument("--weights", type=Path, help="folder of the networks' weights")
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Print a table per folder of images."""
+    arguments = parse_arguments()
+    methods = [parse_method(text) for text in arguments.methods]
+    print(describe_machine() + "\n")
+    for images in image_sets(arguments):
+        print(run_set(images, methods, arguments.weights, arguments.num_rounds), flush=True)
+
+
+if __name__ == "__main__":
+    main()

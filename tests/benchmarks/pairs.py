@@ -1,0 +1,270 @@
+"""Matches and homographies on real image pairs with known homographies.
+
+A method is a recipe, by name or TOML path, with settings: ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``.
+Each image's features are computed once per method, and matched by the recipe's options. A match
+is correct if its transfer error in image 2 is below 3 px. The error of a homography (OpenCV's
+USAC_MAGSAC on all matches) is its mean over what image 2 shows of image 1, in px of image 2.
+Recipes with escalation go from level to level, the features of level k being those of levels 0 to
+k together, until COLMAP's geometric verification succeeds, as in a run. Usage:
+
+    python tests/benchmarks/pairs.py --methods default on-demand \
+        asift=asift-recommended:features.profile=rootsift --output-path out/pairs.json
+
+Prints Markdown tables of everything in the JSON file; rows of methods and pairs that are not run
+this time are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import cv2
+import numpy as np
+from homographies import (
+    CORRECT_PX,
+    THRESHOLDS_PX,
+    counts_below,
+    homography_error,
+    transfer_errors,
+)
+from numpy.typing import NDArray
+from pair_data import SETS, HomographyPair, load_pairs
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.verification import two_view_options
+from colmap_affrect.conventions import colmap_from_pixel
+from colmap_affrect.extraction import ImageExtractor, Resources, prepare
+from colmap_affrect.matching.nearest import MatchableImage, match_features, matchable
+from colmap_affrect.options import VerificationOptions
+from colmap_affrect.recipes import Recipe, load_recipe
+from colmap_affrect.types import LocalFeatures, union
+
+Row = dict[str, Any]
+"""What was measured for one method on one pair."""
+Size = tuple[int, int]
+
+DEFAULT_METHODS = [
+    "unrectified-rootsift",
+    "default",
+    "affnet-shapes-recommended",
+    "asift-rootsift=asift-recommended:features.profile=rootsift",
+    "on-demand",
+]
+CONFIDENCE = 0.9999
+MAX_ITERATIONS = 100_000
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Method:
+    """A recipe under the name it has in the tables."""
+
+    label: str
+    recipe: Recipe
+
+
+def parse_method(text: str) -> Method:
+    """Read ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``; commas inside of brackets belong to a value."""
+    head, _, settings = text.partition(":")
+    label, _, name = head.rpartition("=")
+    changes = re.split(r",(?![^\[]*\])", settings) if settings else []
+    return Method(label or text, load_recipe(name, changes))
+
+
+@dataclass(frozen=True)
+class TimedImage:
+    """An image ready to be matched, with its (width, height) and the seconds its features took."""
+
+    matchable: MatchableImage
+    size: Size
+    seconds: float
+
+
+@dataclass
+class FeatureCache:
+    """The features of one method, computed once per image and level of escalation."""
+
+    method: Method
+    extractor: ImageExtractor
+    levels: dict[Path, list[LocalFeatures]] = field(default_factory=dict)
+    images: dict[tuple[Path, int], TimedImage] = field(default_factory=dict)
+
+    def image(self, path: Path, level: int) -> TimedImage:
+        """Return the features of the levels 0 to ``level`` together, and the time of all."""
+        if (path, level) not in self.images:
+            before = self.image(path, level - 1).seconds if level else 0.0
+            start = time.perf_counter()
+            extracted = self.extractor.extract_file(path, level=level)
+            seconds = before + time.perf_counter() - start
+            parts = self.levels.setdefault(path, [])
+            parts.append(extracted.features)
+            features = union(parts)
+            ready = matchable(features.descriptors, features.keypoints, self.method.recipe.matching)
+            self.images[path, level] = TimedImage(ready, extracted.image_size, seconds)
+        return self.images[path, level]
+
+
+def evaluate(pair: HomographyPair, cache: FeatureCache, threshold_px: float) -> Row:
+    """Match a pair, level by level, and measure it against the truth."""
+    rectifiers = cache.method.recipe.extraction.rectifiers
+    matching_s = 0.0
+    for level, rectifier in enumerate(rectifiers):
+        image1, image2 = cache.image(pair.path1, level), cache.image(pair.path2, level)
+        start = time.perf_counter()
+        matches = match_features(
+            image1.matchable, image2.matchable, cache.method.recipe.matching
+        ).indices
+        matching_s += time.perf_counter() - start
+        points1 = image1.matchable.keypoints[matches[:, 0]]
+        points2 = image2.matchable.keypoints[matches[:, 1]]
+        num_verified = verified_inliers(points1, points2, image1.size, image2.size)
+        if num_verified:
+            break
+    row = {
+        "keypoints": [len(image.matchable.keypoints) for image in (image1, image2)],
+        "matches": len(matches),
+        "correct": int((transfer_errors(pair.truth, points1, points2) < CORRECT_PX).sum()),
+        "verified_inliers": num_verified,
+        "level": rectifier.name if num_verified else None,
+        "inliers": 0,
+        "error_px": None,
+        "seconds": {"features": image1.seconds + image2.seconds, "matching": matching_s},
+    }
+    estimate, num_inliers = estimate_homography(points1, points2, threshold_px)
+    if estimate is not None:
+        error_px = homography_error(estimate, pair.truth, image1.size, image2.size)
+        row |= {"inliers": num_inliers, "error_px": error_px if math.isfinite(error_px) else None}
+    return row
+
+
+def verified_inliers(
+    points1: NDArray[np.floating], points2: NDArray[np.floating], size1: Size, size2: Size
+) -> int:
+    """Return the inliers of COLMAP's two-view geometry; 0 if a run would not take it.
+
+    Args:
+        points1: (N, 2) pixel-centre px of image 1.
+        points2: (N, 2) those of image 2 that match them.
+        size1: (width, height) of image 1 in px.
+        size2: (width, height) of image 2 in px.
+    """
+    options = VerificationOptions()
+    geometry = pycolmap.estimate_two_view_geometry(
+        unknown_camera(size1),
+        colmap_from_pixel(points1),
+        unknown_camera(size2),
+        colmap_from_pixel(points2),
+        np.stack([np.arange(len(points1))] * 2, axis=1),
+        two_view_options(options, SEED),
+    )
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    if geometry.config in (kinds.UNDEFINED, kinds.DEGENERATE):
+        return 0
+    count = len(geometry.inlier_matches)
+    return count if count >= options.min_num_inliers else 0
+
+
+def unknown_camera(size: Size) -> pycolmap.Camera:
+    """Return what COLMAP assumes of an image without EXIF: a guess that it does not rely on."""
+    return pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.2 * max(size), *size)
+
+
+def estimate_homography(
+    points1: NDArray[np.floating], points2: NDArray[np.floating], threshold_px: float
+) -> tuple[NDArray[np.float64] | None, int]:
+    """Estimate a (3, 3) homography from (N, 2) matches; also return the number of inliers."""
+    if len(points1) < 4:
+        return None, 0
+    cv2.setRNGSeed(SEED)
+    estimate, inliers = cv2.findHomography(
+        points1,
+        points2,
+        cv2.USAC_MAGSAC,
+        threshold_px,
+        maxIters=MAX_ITERATIONS,
+        confidence=CONFIDENCE,
+    )
+    return estimate, int(np.count_nonzero(inliers))
+
+
+def table(set_name: str, rows: list[Row]) -> str:
+    """Format correct matches and homography errors of one set as a Markdown table."""
+    pairs = list(dict.fromkeys(row["pair"] for row in rows))
+    thresholds = " | ".join(f"< {threshold:g}" for threshold in THRESHOLDS_PX)
+    lines = [
+        f"{set_name}: correct matches (px error of the homography), number of pairs below an error",
+        "",
+        f"| method | {' | '.join(pairs)} | {thresholds} | s/pair |",
+        f"|---|{'--:|' * (len(pairs) + len(THRESHOLDS_PX) + 1)}",
+    ]
+    for method in dict.fromkeys(row["method"] for row in rows):
+        found = {row["pair"]: row for row in rows if row["method"] == method}
+        cells = [cell(found[pair]) if pair in found else "" for pair in pairs]
+        counts = map(str, counts_below(row["error_px"] for row in found.values()))
+        seconds = fmean(sum(row["seconds"].values()) for row in found.values())
+        lines.append(f"| {method} | {' | '.join(cells)} | {' | '.join(counts)} | {seconds:.1f} |")
+    return "\n".join(lines) + "\n"
+
+
+def cell(row: Row) -> str:
+    """Format one pair: correct matches, error, and the level if the recipe has several."""
+    error = row["error_px"]
+    text = f"{row['correct']} ({'-' if error is None else f'{error:.1f}'})"
+    return f"{text} {row['level'] or 'none'}" if row["escalating"] else text
+
+
+def merge(rows: list[Row], new: Row) -> list[Row]:
+    """Put a row in the place of the one of the same set, pair and method, or at the end."""
+    key = ("set", "pair", "method")
+    same = [index for index, row in enumerate(rows) if all(row[k] == new[k] for k in key)]
+    if not same:
+        return [*rows, new]
+    return [*rows[: same[0]], new, *rows[same[0] + 1 :]]
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Parse the command line."""
+    root = Path(__file__).resolve().parents[2]
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--methods", nargs="+", default=DEFAULT_METHODS, metavar="METHOD")
+    parser.add_argument("--sets", nargs="+", choices=SETS, default=SETS, metavar="SET")
+    parser.add_argument("--pairs-path", type=Path, default=root.parent / "shared" / "pairs")
+    parser.add_argument("--weights", type=Path, help="folder of the networks' weights")
+    parser.add_argument("--threshold-px", type=float, default=1.0, help="of USAC_MAGSAC")
+    parser.add_argument("--output-path", type=Path, required=True, help="JSON file")
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Run all methods on all sets."""
+    arguments = parse_arguments()
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    output_path = arguments.output_path
+    rows = json.loads(output_path.read_text()) if output_path.exists() else []
+    for method in map(parse_method, arguments.methods):
+        extractor = prepare(method.recipe.extraction, Resources(arguments.weights))
+        for set_name in arguments.sets:
+            cache = FeatureCache(method, extractor)
+            for pair in load_pairs(arguments.pairs_path, set_name):
+                key = {"set": set_name, "pair": pair.name, "method": method.label}
+                kind = {"escalating": bool(method.recipe.extraction.escalation)}
+                row = key | kind | evaluate(pair, cache, arguments.threshold_px)
+                print(json.dumps(row), file=sys.stderr, flush=True)
+                rows = merge(rows, row)
+                output_path.write_text(json.dumps(rows, indent=1) + "\n")
+    for set_name in SETS:
+        if found := [row for row in rows if row["set"] == set_name]:
+            print(table(set_name, found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,85 @@
+"""Metrics of frames and their logarithms against inverses and eigenvalues."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from strategies import Array, affine_shapes, classes, tilt_angles
+
+from colmap_affrect.geometry.shapes import log_metrics, metrics_from_log, rectifying_metrics
+from colmap_affrect.geometry.tilts import metrics_from_tilts, tilts_from_metrics, unit_metrics
+
+SINGLE = 1e-5
+"""Relative: logarithms are kept in single precision."""
+
+Class = tuple[float, float]
+
+
+def matrices(metrics: Array) -> Array:
+    """Symmetric (..., 2, 2) matrices of (..., 3) entries (S11, S22, S12)."""
+    s11, s22, s12 = np.moveaxis(metrics, -1, 0)
+    return np.stack([np.stack([s11, s12], -1), np.stack([s12, s22], -1)], -2)
+
+
+@given(affine_shapes())
+def test_rectifying_metrics_are_those_of_the_inverse(shape: Array) -> None:
+    expected = unit_metrics(np.linalg.inv(shape))
+    assert_allclose(rectifying_metrics(shape), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_rectifying_metrics_of_a_long_frame_stretch_across_it() -> None:
+    # A frame three times longer along x is rectified by stretching y.
+    assert_allclose(rectifying_metrics(np.diag([6.0, 2.0])), [1 / 3, 3.0, 0.0])
+
+
+@given(affine_shapes(), tilt_angles)
+def test_rectifying_metrics_do_not_depend_on_the_orientation_of_a_frame(
+    shape: Array, angle: float
+) -> None:
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = shape @ np.array([[cos, -sin], [sin, cos]])
+    assert_allclose(rectifying_metrics(turned), rectifying_metrics(shape), rtol=1e-9, atol=1e-9)
+
+
+@given(classes(), st.floats(1e-3, 1e3))
+def test_log_metrics_are_matrix_logarithms_whatever_the_scale(shape: Class, scale: float) -> None:
+    metric = metrics_from_tilts(*shape)
+    values, vectors = np.linalg.eigh(matrices(metric))
+    expected = vectors @ np.diag(np.log(values)) @ vectors.T
+    l11, l12 = log_metrics(scale * metric)
+    assert_allclose([[l11, l12], [l12, -l11]], expected, atol=SINGLE)
+
+
+@given(classes())
+def test_metrics_from_log_inverts_log_metrics(shape: Class) -> None:
+    metric = metrics_from_tilts(*shape)
+    assert_allclose(metrics_from_log(log_metrics(metric)), metric, rtol=SINGLE, atol=SINGLE)
+
+
+def test_log_metrics_keep_the_shape_of_a_grid() -> None:
+    metrics = metrics_from_tilts([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], 0.3)
+    logs = log_metrics(metrics)
+    assert logs.shape == (2, 3, 2)
+    assert logs.dtype == np.float32
+    assert_allclose(metrics_from_log(logs), metrics, rtol=SINGLE)
+
+
+def test_mean_of_logs_of_opposite_stretches_is_the_identity() -> None:
+    metrics = metrics_from_tilts(3.0, [0.2, 0.2 + np.pi / 2])
+    assert_allclose(metrics_from_log(log_metrics(metrics).mean(axis=0)), [1, 1, 0], atol=SINGLE)
+
+
+def test_mean_of_logs_along_one_direction_is_the_geometric_mean_of_tilts() -> None:
+    metrics = metrics_from_tilts([2.0, 4.5], 0.7)
+    tilt, angle = tilts_from_metrics(metrics_from_log(log_metrics(metrics).mean(axis=0)))
+    assert_allclose([tilt, angle], [3.0, 0.7], rtol=SINGLE)
+
+
+def test_log_metrics_of_stripes_and_of_nothing_are_finite() -> None:
+    stripes, nothing = log_metrics(np.array([[5.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    assert_allclose(nothing, 0.0)
+    assert np.isfinite(stripes).all()
+    tilt, _ = tilts_from_metrics(metrics_from_log(stripes))
+    assert 40.0 < tilt < 50.0
