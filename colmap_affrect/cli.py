@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     # The type of add_subparsers() has no public name.
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
+Function = Callable[[argparse.Namespace], int]
+
 logger = logging.getLogger("colmap_affrect")
 
 EPILOG = """\
@@ -45,6 +47,11 @@ examples:
   colmap-affrect match   --output-path out
   colmap-affrect verify  --output-path out
   colmap-affrect map     --output-path out
+  colmap-affrect run --image-path photos --output-path out --recipe on-demand
+  colmap-affrect run --image-path photos --output-path out --recipe depth-planes-recommended \\
+      --depth-path depth
+  colmap-affrect inspect photos/a.jpg --output-path out
+  colmap-affrect weights fetch
 
 Run a command again and it goes on where it stopped. Exit codes: 0 done, 1 failed (one line
 says why; also when images could not be read, see --max-failures), 2 wrong usage, 3 finished
@@ -55,9 +62,9 @@ without a model, 130 interrupted.
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     options = build_parser().parse_args(arguments)
-    if options.command == "recipes":
-        return _print_recipes()
     try:
+        if options.output_path is None:
+            return int(options.function(options))
         with _logging(options):
             return int(options.function(options))
     except AffrectError as error:
@@ -156,20 +163,51 @@ def build_parser() -> argparse.ArgumentParser:
     _add_seed(mapping)
     _add_json(mapping)
 
-    recipes = commands.add_parser(
-        "recipes",
-        help="list the recipes",
-        description="list the recipes",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    inspect = _command(
+        commands,
+        "inspect",
+        _inspect,
+        "draw what a recipe does to one image: regions, warps, features; the plan as JSON",
+        overwrites=False,
     )
-    recipes.set_defaults(command="recipes")
+    inspect.add_argument("image", type=Path, metavar="IMAGE", help="the photograph")
+    _add_recipe(inspect)
+    _add_resources(inspect)
+    _add_depth(inspect)
+
+    recipes = _listing(commands, "recipes", _recipes, "list the recipes and what they need")
+    recipes.add_argument("name", nargs="?", help="print this recipe with all of its options")
+
+    weights = _listing(
+        commands, "weights", _weights, "list the files of weights, or fetch them beforehand"
+    )
+    weights.add_argument(
+        "action",
+        nargs="?",
+        choices=["list", "fetch"],
+        default="list",
+        help="fetch downloads what is missing, for a machine without network (default: list)",
+    )
+    weights.add_argument(
+        "keys",
+        nargs="*",
+        metavar="KEY",
+        help="which files to fetch (default: affnet, orinet, hardnet)",
+    )
+    _add_option(
+        weights,
+        "--weights",
+        type=Path,
+        metavar="FOLDER",
+        help="look there first, and fetch into it (default: torch's cache)",
+    )
     return parser
 
 
-def _command(
-    commands: Subparsers, name: str, function: Callable[[argparse.Namespace], int], summary: str
+def _listing(
+    commands: Subparsers, name: str, function: Function, summary: str
 ) -> argparse.ArgumentParser:
+    """Add a command that prints and leaves no files."""
     command: argparse.ArgumentParser = commands.add_parser(
         name,
         help=summary,
@@ -177,7 +215,15 @@ def _command(
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    command.set_defaults(function=function)
+    command.set_defaults(function=function, output_path=None)
+    return command
+
+
+def _command(
+    commands: Subparsers, name: str, function: Function, summary: str, *, overwrites: bool = True
+) -> argparse.ArgumentParser:
+    """Add a command that works in an output folder."""
+    command = _listing(commands, name, function, summary)
     _add_option(
         command,
         "--output-path",
@@ -186,9 +232,10 @@ def _command(
         metavar="PATH",
         help="folder for all results",
     )
-    command.add_argument(
-        "--overwrite", action="store_true", help="discard the results of this and later stages"
-    )
+    if overwrites:
+        command.add_argument(
+            "--overwrite", action="store_true", help="discard the results of this and later stages"
+        )
     volume = command.add_mutually_exclusive_group()
     volume.add_argument("-q", "--quiet", action="store_true", help="errors and the result only")
     volume.add_argument("-v", "--verbose", action="store_true", help="every image, tracebacks")
@@ -495,9 +542,48 @@ def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
     return EXIT_FAILED
 
 
-def _print_recipes() -> int:
-    from colmap_affrect.recipes import load_recipe, recipe_names
+def _inspect(options: argparse.Namespace) -> int:
+    from colmap_affrect.extraction import prepare
+    from colmap_affrect.report.inspection import inspect_image
 
+    recipe = _recipe(options, options.recipe)
+    extractor = prepare(recipe.extraction, _resources(options), [options.image.name])
+    for path in inspect_image(extractor, options.image, options.output_path):
+        print(path)
+    return EXIT_OK
+
+
+def _recipes(options: argparse.Namespace) -> int:
+    from colmap_affrect.features.registry import needed_weights
+    from colmap_affrect.recipes import load_recipe, recipe_names
+    from colmap_affrect.workspace import dump_toml
+
+    if options.name:
+        recipe = load_recipe(options.name)
+        everything = {**recipe.extraction.to_mapping(), "matching": recipe.matching.to_mapping()}
+        print(f"# {recipe.summary}\n{dump_toml(everything)}", end="")
+        return EXIT_OK
     for name in recipe_names():
-        print(f"{name:22s} {load_recipe(name).summary}")
+        recipe = load_recipe(name)
+        needs = list(needed_weights(recipe.extraction))
+        needs += ["depth"] if any(r.uses_depth for r in recipe.extraction.rectifiers) else []
+        print(f"{name:26s} {recipe.summary}")
+        print(f"{'':26s} needs {', '.join(needs) or 'nothing'}")
+    return EXIT_OK
+
+
+def _weights(options: argparse.Namespace) -> int:
+    from colmap_affrect.features.weights import WEIGHT_FILES, describe_weights, fetch
+
+    if options.action == "fetch":
+        keys = options.keys or ["affnet", "orinet", "hardnet"]
+        for path in fetch(keys, options.weights, progress=Progress(sys.stderr)).values():
+            print(path)
+        return EXIT_OK
+    checks = {None: "", True: ", verified", False: ", NOT the published file"}
+    for row in describe_weights(options.weights):
+        where = f"{row.path}{checks[row.verified]}" if row.path else "not found"
+        print(f"{row.key:10s} {row.file_name:32s} {row.used_for}")
+        print(f"{'':10s} {where}")
+        print(f"{'':10s} sha256 {WEIGHT_FILES[row.key].sha256 or 'not known'}; licence {row.licence or 'not stated'}")
     return EXIT_OK

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,12 +13,18 @@ from numpy.typing import NDArray
 from colmap_affrect.conventions import camera_matrix, resized_from_original
 from colmap_affrect.depth import depth_source
 from colmap_affrect.errors import DepthError, OptionError
-from colmap_affrect.features.registry import make_profile, make_shape_source, needed_weights
-from colmap_affrect.features.weights import resolve
+from colmap_affrect.features.registry import (
+    make_profile,
+    make_shape_source,
+    needed_weights,
+    uses_networks,
+)
+from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.geometry.affine import transform_frames
 from colmap_affrect.imaging import read_gray, shrink_to
 from colmap_affrect.interfaces import Computing, FeatureProfile, Rectifier, Sources
 from colmap_affrect.options import CoverOptions, ExtractionOptions
+from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.rectified import extract_rectified
 from colmap_affrect.rectifiers.registry import make_rectifier
 from colmap_affrect.types import GrayImage, LocalFeatures, Photograph, RectificationPlan
@@ -155,11 +160,18 @@ def extract_image(image: GrayImage, options: ExtractionOptions | None = None) ->
 
 
 def recorded_weights(
-    options: ExtractionOptions, resources: Resources | None = None
+    options: ExtractionOptions,
+    resources: Resources | None = None,
+    progress: Progress = SILENT,
 ) -> dict[str, str]:
-    """Return the sha256 of every file of weights that a recipe reads, by file name."""
-    found = resolve(needed_weights(options), (resources or Resources()).weights_path)
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in found.values()}
+    """Find or download the weights that a recipe reads; return their sha256 by file name.
+
+    Raises:
+        WeightsError: when a file is neither found nor downloaded.
+    """
+    resources = resources or Resources()
+    found = resolve(needed_weights(options), resources.weights_path, progress=progress)
+    return {path.name: file_sha256(path) for path in found.values()}
 
 
 def prepare(
@@ -181,13 +193,13 @@ def prepare(
         DepthError: when the folder of depth maps has none of the images.
     """
     resources = resources or Resources()
-    needed = needed_weights(options)
-    computing = Computing(resolve(needed, resources.weights_path), resources.device)
+    weights = resolve(needed_weights(options), resources.weights_path)
+    computing = Computing(weights, _device(options, resources))
     profile = make_profile(options.features, computing)
     depth = None
     needing = [item.name for item in options.rectifiers if item.uses_depth]
     if needing:
-        depth = depth_source(options.depth, resources.depth_cache_path, resources.device)
+        depth = depth_source(options.depth, resources.depth_cache_path, computing.device)
         if depth is None:
             raise OptionError(
                 f"rectifier {needing[0]} needs depth maps: give --depth-path FOLDER, or "
@@ -202,3 +214,12 @@ def prepare(
             shapes = make_shape_source(item.shape_source, options, computing)
         rectifiers.append(make_rectifier(item, Sources(shapes, depth if item.uses_depth else None)))
     return ImageExtractor(options, profile, tuple(rectifiers))
+
+
+def _device(options: ExtractionOptions, resources: Resources) -> str:
+    """Return the device that is there; torch is asked only when it is needed."""
+    if resources.device in ("auto", "cpu") and not uses_networks(options):
+        return "cpu"
+    from colmap_affrect.features.networks import resolve_device
+
+    return str(resolve_device(resources.device))

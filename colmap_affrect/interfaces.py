@@ -81,6 +81,9 @@ class DepthSource(Protocol):
             DepthError: when there is no usable map.
         """
 
+    def require_some(self, names: Sequence[str]) -> None:
+        """Raise DepthError when there cannot be a map for any of the images named."""
+
 
 @dataclass(frozen=True)
 class Sources:

@@ -57,7 +57,7 @@ class Options:
 
     def _check_fixed(self, name: str) -> None:
         """Refuse another value than the default, which says what kind of options these are."""
-        self._check_choice(name, (self.__dataclass_fields__[name].default,))
+        self._check_choice(name, (str(self.__dataclass_fields__[name].default),))
 
     def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
         value = getattr(self, name)
@@ -313,8 +313,8 @@ class DepthOptions(Options):
     model: str = ""
     """Monocular depth model: a name or local folder for Hugging Face transformers."""
     kind: str = "z"
-    """What the values of the files are: ``z`` (along the optical axis), ``ray`` (distance from the
-    camera), or ``inverse`` (1 / z)."""
+    """What the values are: ``z`` (along the optical axis), ``ray`` (distance from the camera), or
+    ``inverse`` (1 / z). For a model ``z`` means as its own configuration says."""
     png_scale: float = 0.001
     """Depth of one step of a 16-bit PNG; only the ratio of depths matters."""
 

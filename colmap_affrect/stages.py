@@ -125,7 +125,7 @@ def extract(
         "image_list_path": str(image_list_path.resolve()) if image_list_path else "",
         "camera": cameras.to_mapping(),
         **recipe.extraction.to_mapping(),
-        "weights": recorded_weights(recipe.extraction, resources),
+        "weights": recorded_weights(recipe.extraction, resources, progress),
     }
     extractor = make_extractor(workspace, recipe.extraction, resources, names)
     workspace.claim("extract", options, overwrite=overwrite, recipe=recipe.name)

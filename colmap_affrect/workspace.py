@@ -21,6 +21,7 @@ from colmap_affrect.options import ExtractionOptions, MatchingOptions, Verificat
 logger = logging.getLogger(__name__)
 
 LOCAL = ("image_path", "image_list_path", "camera", "match_list_path")
+CHOICES = (".name", ".profile")
 STAGES = ("extract", "pairs", "match", "verify", "escalate", "map")
 
 
@@ -230,7 +231,8 @@ class Workspace:
 
 def _first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     old, new = _flat(known), _flat(now)
-    for key in sorted(old.keys() | new.keys()):
+    # The name of a rectifier or profile first: with another name most other options differ too.
+    for key in sorted(old.keys() | new.keys(), key=lambda key: (not key.endswith(CHOICES), key)):
         if old.get(key) != new.get(key):
             return f"{key}={old.get(key)!r}, and it is {new.get(key)!r} now"
     return ""

@@ -15,24 +15,34 @@ PACKAGE = Path(colmap_affrect.__file__).parent
 
 ROWS = [
     {"conventions", "errors", "progress"},
-    {"geometry.affine", "geometry.canvas", "geometry.neighbors", "geometry.tilts"},
-    {"types", "outcomes", "options", "executor", "recipes"},
-    {"features.rootsift", "features.second_moment", "imaging"},
-    {"rectifiers.dense_shapes"},
+    {
+        "geometry.affine", "geometry.canvas", "geometry.neighbors", "geometry.planes",
+        "geometry.shapes", "geometry.tilts",
+    },
+    {"types", "interfaces", "outcomes", "options", "executor", "recipes"},
+    {
+        "features.affnet", "features.affnet_hardnet", "features.dog", "features.networks",
+        "features.registry", "features.rootsift", "features.second_moment", "features.weights",
+        "imaging", "depth",
+    },
+    {
+        "rectifiers.covers", "rectifiers.dense_shapes", "rectifiers.depth_affnet",
+        "rectifiers.depth_planes", "rectifiers.regions", "rectifiers.registry",
+    },
     {
         "rectified", "extraction", "store", "workspace",
         "matching.nearest", "matching.pairs",
         "colmap", "colmap.database", "colmap.mapping", "colmap.running", "colmap.verification",
     },
-    {"pipeline", "stages"},
-    set(),  # report and evaluation
+    {"pipeline", "escalation", "stages"},
+    {"report.inspection", "report.levels", "report.sheet", "report.tilt_plot"},
     {"cli", "__main__"},
 ]  # fmt: skip
 """A module imports from its own row and from those above it in this list."""
 
 ROW_OF = {module: number for number, row in enumerate(ROWS) for module in row}
 
-FREE = {"geometry", "features", "rectifiers", "matching", ""}
+FREE = {"geometry", "features", "rectifiers", "matching", "report", ""}
 """Packages whose __init__ holds no code, and the top one, which loads its names when used."""
 
 WITHIN_ROW_5 = {("extraction", "rectified")}
@@ -42,16 +52,21 @@ ARRAYS_ONLY = {"conventions", "errors"}
 """All that geometry may import beside itself: it takes and returns plain arrays."""
 
 HOMES = {
-    "cv2": {"imaging", "features.rootsift", "features.second_moment"},
-    "h5py": {"store"},
+    "cv2": {"imaging", "depth", "features.affnet", "features.dog", "features.second_moment"},
+    "h5py": {"store", "depth"},
     "pycolmap": {"colmap"},
     "tqdm": {"progress"},
     "threadpoolctl": {"executor"},
     "filelock": {"workspace"},
     "argparse": {"cli"},
-    "torch": set(),
-    "kornia": set(),
-    "matplotlib": set(),
+    "torch": {
+        "features.affnet", "features.affnet_hardnet", "features.networks", "features.weights",
+    },
+    "kornia": {
+        "features.affnet", "features.affnet_hardnet", "features.networks", "features.weights",
+    },
+    "transformers": {"depth"},
+    "matplotlib": {"report.sheet", "report.tilt_plot"},
     "scipy": set(),
     "sqlite3": set(),
 }

@@ -15,6 +15,7 @@ import pytest
 from small_scene import INTRINSICS, write_photographs
 
 from colmap_affrect import __version__
+from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.workspace import Workspace
 
 COMMANDS = ["run", "extract", "pairs", "match", "verify", "map", "recipes"]
@@ -73,12 +74,32 @@ def test_version_is_that_of_the_package() -> None:
     assert (done.returncode, done.stdout) == (0, f"colmap-affrect {__version__}\n")
 
 
-def test_recipes_lists_both() -> None:
+def test_recipes_are_listed_with_what_they_need() -> None:
     done = run_command("recipes")
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
-    assert [line.split()[0] for line in lines] == ["default", "unrectified-rootsift"]
-    assert all(len(line.split()) > 3 for line in lines)
+    assert [line.split()[0] for line in lines[::2]] == recipe_names()
+    needs = {name.split()[0]: line.strip() for name, line in zip(*[iter(lines)] * 2, strict=True)}
+    assert needs["default"] == needs["on-demand"] == "needs nothing"
+    assert needs["dense-affnet"] == "needs affnet, hardnet, orinet"
+    assert needs["depth-planes-recommended"] == "needs depth"
+
+
+def test_one_recipe_is_printed_with_all_options_and_can_be_used_as_a_file(tmp_path: Path) -> None:
+    done = run_command("recipes", "on-demand")
+    assert (done.returncode, done.stderr) == (0, "")
+    path = tmp_path / "copy.toml"
+    path.write_text(done.stdout)
+    copy, original = load_recipe(str(path)), load_recipe("on-demand")
+    assert (copy.extraction, copy.matching) == (original.extraction, original.matching)
+
+
+def test_weights_are_listed_with_where_they_are(tmp_path: Path) -> None:
+    (tmp_path / "AffNet.pth").write_bytes(b"not the published file")
+    done = run_command("weights", "--weights", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"{tmp_path / 'AffNet.pth'}, NOT the published file" in done.stdout
+    assert "65c8bb2cf71e913818522d09dcc4262bcbcef5d756baa86a41f28526c2d61160" in done.stdout
 
 
 @pytest.mark.parametrize(

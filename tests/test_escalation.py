@@ -213,9 +213,10 @@ def test_killed_run_goes_on_to_the_same_result(
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(escalation, where, killed)
-        escalate(workspace)
+        with pytest.raises(KeyboardInterrupt):
+            escalate(workspace)
     escalate(workspace)
     same_state(workspace, climbed[0])
 

@@ -10,7 +10,7 @@ import pytest
 
 from colmap_affrect import stages
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.extraction import extract_file
+from colmap_affrect.extraction import prepare
 from colmap_affrect.options import CameraOptions
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.workspace import Workspace
@@ -58,7 +58,8 @@ def test_features_of_a_shrunk_image_lie_within_the_stored_one(tmp_path):
     noise = np.random.default_rng(3).integers(0, 255, (301, 457), dtype=np.uint8)
     cv2.imwrite(str(path), cv2.GaussianBlur(noise, (0, 0), 2.0))
     recipe = load_recipe("default", ["max_image_size_px=200"])
-    features, size = extract_file(path, recipe.extraction)
+    extracted = prepare(recipe.extraction).extract_file(path)
+    features, size = extracted.features, extracted.image_size
     assert size == (457, 301)
     assert len(features) > 20
     assert features.keypoints[:, 0].max() > 380

@@ -26,6 +26,7 @@ REPORT = ReconstructionReport(
     recipe="default",
     random_seed=7,
     versions={"pycolmap": "4.2.1"},
+    pair_levels={"identity": 2, "asift": 1, "none": 7},
 )
 
 EMPTY = replace(REPORT, models=(), unregistered={"a.png": "no verified pair"}, images_total=1)
@@ -47,6 +48,7 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "models": [["a.png", "č d.png"], ["e.png", "f.png"]],
         "num_pairs": 10,
         "num_verified_pairs": 3,
+        "pair_levels": {"identity": 2, "asift": 1, "none": 7},
         "recipe": "default",
         "random_seed": 7,
         "versions": {"pycolmap": "4.2.1"},

@@ -56,10 +56,10 @@ def test_peak_memory_of_extraction_stays_under_1500_mb_on_12_megapixels(tmp_path
     cv2.imwrite(str(tmp_path / "large.jpg"), image)
     script = (
         "import resource, sys; from pathlib import Path\n"
-        "from colmap_affrect.extraction import extract_file\n"
+        "from colmap_affrect.extraction import prepare\n"
         "from colmap_affrect.recipes import load_recipe\n"
-        "features, size = extract_file(Path(sys.argv[1]), load_recipe('default').extraction)\n"
-        "assert size == (4000, 3000) and len(features) > 5000\n"
+        "extracted = prepare(load_recipe('default').extraction).extract_file(Path(sys.argv[1]))\n"
+        "assert extracted.image_size == (4000, 3000) and len(extracted.features) > 5000\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
     )
     output = subprocess.run(

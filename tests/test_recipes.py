@@ -82,7 +82,12 @@ def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> No
 
 def test_escalation_climbs_from_no_warps_to_all_tilts() -> None:
     levels = load_recipe("on-demand").extraction.rectifiers
-    assert [level.name for level in levels] == ["identity", "dense-shapes", "affnet-shapes", "asift"]
+    assert [level.name for level in levels] == [
+        "identity",
+        "dense-shapes",
+        "affnet-shapes",
+        "asift",
+    ]
 
 
 def test_choosing_a_profile_drops_the_options_of_the_other_one() -> None:

@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 from strategies import Array
 from synthetic import blobs, texture
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, is_inside
-from colmap_affrect.features.rootsift import extract_rootsift
-from colmap_affrect.features.second_moment import second_moment_shapes
+from colmap_affrect.features.rootsift import RootSift
+from colmap_affrect.features.second_moment import SecondMoment
 from colmap_affrect.geometry.affine import (
     ellipse_extents,
     lafs_from_keypoints,
@@ -53,9 +52,7 @@ SIGMA_PX = 4.6
 two octaves and gives up."""
 
 
-def extract(image: GrayImage, mask: NDArray[np.uint8] | None) -> LocalFeatures:
-    """Features with default options."""
-    return extract_rootsift(image, SiftOptions(), mask)
+PROFILE = RootSift(SiftOptions())
 
 
 def one_warp(
@@ -92,7 +89,7 @@ def test_extract_rectified_finds_blobs_of_a_tilted_plane_at_their_sub_pixel_plac
     xs, ys = np.meshgrid([90.0, 210.0, 330.0], [80.0, 165.0, 250.0])
     centers = np.stack([xs.ravel(), ys.ravel()], axis=1) + rng.uniform(-4, 4, (9, 2))
     image = blobs(SIZE, centers, SIGMA_PX * shape)
-    features = of_warps(extract_rectified(image, one_warp(tilt, angle_rad, SIZE), extract, 5000))
+    features = of_warps(extract_rectified(image, one_warp(tilt, angle_rad, SIZE), PROFILE, 5000))
     errors = keypoint_errors(features, centers)
     assert np.linalg.norm(errors, axis=1).max() < KEYPOINT_ERROR_PX
     assert np.abs(errors.mean(axis=0)).max() < BIAS_PX
@@ -105,7 +102,7 @@ def test_extract_rectified_frames_are_the_ellipses_of_the_blobs(
     shape = SIGMA_PX * np.linalg.inv(rectifying_affine(tilt, angle_rad))
     center = np.array([[211.3, 162.6]])
     image = blobs(SIZE, center, shape)
-    features = of_warps(extract_rectified(image, one_warp(tilt, angle_rad, SIZE), extract, 5000))
+    features = of_warps(extract_rectified(image, one_warp(tilt, angle_rad, SIZE), PROFILE, 5000))
     nearest = np.linalg.norm(features.keypoints - center, axis=1).argmin()
     found = features.lafs[nearest, :, :2] / MEASUREMENT_SIGMAS
     # A A^T does not depend on the orientation; a tenth in scale is a fifth here.
@@ -121,9 +118,9 @@ def test_extract_rectified_frames_are_the_ellipses_of_the_blobs(
 def test_extract_rectified_frame_of_an_elliptic_blob_has_its_axis_of_30_degrees() -> None:
     ellipse = rotation(np.deg2rad(30.0)) @ np.diag([12.0, 4.0])
     image = blobs(SIZE, [[210.2, 160.9]], ellipse)
-    grid = second_moment_shapes(image, SecondMomentOptions(min_gradient=0.3))
+    grid = SecondMoment(SecondMomentOptions(min_gradient=0.3)).grid(image)
     plan = plan_dense_shapes(grid, SIZE, DenseShapesOptions(min_region_frac=0.0))
-    features = of_warps(extract_rectified(image, plan, extract, 5000))
+    features = of_warps(extract_rectified(image, plan, PROFILE, 5000))
     near = np.linalg.norm(features.keypoints - [210.2, 160.9], axis=1) < 0.2
     assert near.any()
     # Of several warps, the one that shows the blob best has the strongest response.
@@ -146,7 +143,7 @@ def test_extract_rectified_rejects_ellipses_that_reach_beyond_the_image() -> Non
     outside = np.array([[0.6 * reach[0], 230.4], [width - 0.6 * reach[0], 80.1],
                         [310.2, 0.6 * reach[1]], [90.7, height - 0.6 * reach[1]]])  # fmt: skip
     image = blobs(SIZE, np.concatenate([inside, outside]), shape)
-    features = of_warps(extract_rectified(image, one_warp(tilt, angle_rad, SIZE), extract, 5000))
+    features = of_warps(extract_rectified(image, one_warp(tilt, angle_rad, SIZE), PROFILE, 5000))
     errors = np.linalg.norm(keypoint_errors(features, inside), axis=1)
     assert errors.max() < KEYPOINT_ERROR_PX
     assert np.linalg.norm(keypoint_errors(features, outside), axis=1).min() > 3.0
@@ -154,7 +151,7 @@ def test_extract_rectified_rejects_ellipses_that_reach_beyond_the_image() -> Non
 
 def test_extract_rectified_ellipses_of_warps_lie_inside_the_image() -> None:
     image = texture(SIZE, seed=21)
-    features = of_warps(extract_rectified(image, one_warp(2.5, 1.1, SIZE), extract, 5000))
+    features = of_warps(extract_rectified(image, one_warp(2.5, 1.1, SIZE), PROFILE, 5000))
     assert len(features) > 200
     assert is_inside(features.keypoints, SIZE, ellipse_extents(features.lafs[:, :, :2])).all()
 
@@ -167,7 +164,7 @@ def test_extract_rectified_keeps_centers_in_the_region_of_their_warp() -> None:
     first = one_warp(2.5, 0.6, SIZE, left).items[0]
     second = one_warp(4.0, 2.0, SIZE, lower_right).items[0]
     plan = RectificationPlan(SIZE, (first, second))
-    features = extract_rectified(image, plan, extract, 5000)
+    features = extract_rectified(image, plan, PROFILE, 5000)
     ids = features.rectification_ids
     assert (np.diff(ids) >= 0).all()
     assert set(ids.tolist()) == {0, 1, 2}
@@ -180,8 +177,8 @@ def test_extract_rectified_keeps_centers_in_the_region_of_their_warp() -> None:
 
 def test_extract_rectified_without_warps_returns_the_features_of_the_image() -> None:
     image = texture((200, 150), seed=23)
-    expected = extract(image, None)
-    actual = extract_rectified(image, RectificationPlan((200, 150), ()), extract, 5000)
+    expected = PROFILE.detect((image, None))
+    actual = extract_rectified(image, RectificationPlan((200, 150), ()), PROFILE, 5000)
     np.testing.assert_array_equal(actual.lafs, expected.lafs)
     np.testing.assert_array_equal(actual.descriptors, expected.descriptors)
     assert (actual.rectification_ids == 0).all()
@@ -197,8 +194,8 @@ def test_extract_rectified_keeps_the_strongest_features_of_all_warps() -> None:
             one_warp(3.0, 2.0, SIZE, columns >= 200).items[0],
         ),
     )
-    everything = of_warps(extract_rectified(image, plan, extract, 100_000))
-    some = of_warps(extract_rectified(image, plan, extract, 75))
+    everything = of_warps(extract_rectified(image, plan, PROFILE, 100_000))
+    some = of_warps(extract_rectified(image, plan, PROFILE, 75))
     assert len(some) == 75 < len(everything)
     assert_allclose(
         np.sort(some.responses), np.sort(everything.responses)[-75:], err_msg="not the strongest"
@@ -209,9 +206,9 @@ def test_extract_rectified_keeps_the_strongest_features_of_all_warps() -> None:
 
 def test_extract_rectified_replaces_features_of_the_image_that_a_warp_found_again() -> None:
     image = texture(SIZE, seed=25, finest_sigma_px=2.5)
-    original = extract(image, None)
+    original = PROFILE.detect((image, None))
     # A map next to the identity finds nearly all of them again.
-    union = extract_rectified(image, one_warp(1.01, 0.3, SIZE), extract, 100_000)
+    union = extract_rectified(image, one_warp(1.01, 0.3, SIZE), PROFILE, 100_000)
     kept = union.select(union.rectification_ids == 0)
     rectified = of_warps(union)
     deep = is_inside(original.keypoints, SIZE, 1.5 * ellipse_extents(original.lafs[:, :, :2]))
@@ -249,7 +246,7 @@ def test_found_again_uses_the_geometric_mean_of_elliptic_frames() -> None:
     rectified = features_at([(60.5, 40)], [4.0])
     lafs = rectified.lafs.copy()
     lafs[0, :, :2] = MEASUREMENT_SIGMAS * np.diag([8.0, 2.0])
-    assert found_again(original, rectified.with_frames(lafs, 1)).tolist() == [True]
+    assert found_again(original, rectified.with_frames(lafs)).tolist() == [True]
 
 
 @pytest.mark.parametrize(("count1", "count2"), [(0, 0), (0, 3), (3, 0)])
@@ -261,7 +258,7 @@ def test_found_again_without_features_finds_none(count1: int, count2: int) -> No
 @pytest.mark.parametrize("size", [(1, 1), (40, 1), (7, 90), (33, 21)])
 def test_extract_rectified_of_tiny_images_does_not_fail(size: tuple[int, int]) -> None:
     image = texture(size, seed=26)
-    features = extract_rectified(image, one_warp(3.0, 0.8, size), extract, 100)
+    features = extract_rectified(image, one_warp(3.0, 0.8, size), PROFILE, 100)
     assert features.inside(size).all()
 
 
@@ -298,9 +295,9 @@ def oblique_view(
 def rectified_features(image: GrayImage) -> LocalFeatures:
     """Features with the default rectifier."""
     size = (image.shape[1], image.shape[0])
-    grid = second_moment_shapes(image, SecondMomentOptions())
+    grid = SecondMoment(SecondMomentOptions()).grid(image)
     plan = plan_dense_shapes(grid, size, DenseShapesOptions())
-    return extract_rectified(image, plan, extract, SiftOptions().max_num_rectified_features)
+    return extract_rectified(image, plan, PROFILE, SiftOptions().max_num_rectified_features)
 
 
 def correct_matches(first: LocalFeatures, second: LocalFeatures, homography: Array) -> int:
@@ -323,8 +320,8 @@ def test_rectified_features_of_an_oblique_plane_match_more_often_than_plain_ones
     # Measured gains are about twice as large.
     frontal = texture((480, 400), seed=30, finest_sigma_px=2.0)
     oblique, homography = oblique_view(frontal, tilt_deg, (300, 400))
-    reference = extract(frontal, None)
-    plain = correct_matches(reference, extract(oblique, None), homography)
+    reference = PROFILE.detect((frontal, None))
+    plain = correct_matches(reference, PROFILE.detect((oblique, None)), homography)
     rectified = correct_matches(reference, rectified_features(oblique), homography)
     assert rectified > 3 * plain
     assert rectified - plain > min_gain
@@ -337,8 +334,8 @@ def test_extract_rectified_uses_regions_that_are_cropped_to_a_part_of_the_image(
     region[90:150, 150:200] = False
     whole = one_warp(2.5, 0.6, SIZE, region)
     cropped = replace(whole.items[0], region=region[90:230, 150:330], region_origin=(150, 90))
-    expected = extract_rectified(image, whole, extract, 5000)
-    actual = extract_rectified(image, RectificationPlan(SIZE, (cropped,)), extract, 5000)
+    expected = extract_rectified(image, whole, PROFILE, 5000)
+    actual = extract_rectified(image, RectificationPlan(SIZE, (cropped,)), PROFILE, 5000)
     assert len(of_warps(expected)) > 30
     np.testing.assert_array_equal(actual.lafs, expected.lafs)
 

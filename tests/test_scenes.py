@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.extraction import extract_file
+from colmap_affrect.extraction import prepare
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.matching.nearest import match_features, matchable
 from colmap_affrect.options import CameraOptions
@@ -64,7 +64,7 @@ def test_courtyard_report_is_within_bands(courtyard):
 def facade_view(recipe_name, view):
     recipe = load_recipe(recipe_name)
     path = next((SCENES / "facade" / "images").glob(f"view_{view}_*"))
-    features, _ = extract_file(path, recipe.extraction)
+    features = prepare(recipe.extraction).extract_file(path).features
     return matchable(features.descriptors, features.keypoints, recipe.matching)
 
 

@@ -157,8 +157,8 @@ def one_line(error: pytest.ExceptionInfo[StoreError]) -> str:
     ("attributes", "found"),
     [
         ({}, "another program"),
-        ({"format": "colmap_affrect/features", "format_version": 2}, "colmap_affrect/features 2"),
-        ({"format": "colmap_affrect/matches", "format_version": 1}, "colmap_affrect/matches 1"),
+        ({"format": "colmap_affrect/features", "format_version": 3}, "colmap_affrect/features 3"),
+        ({"format": "colmap_affrect/matches", "format_version": 2}, "colmap_affrect/matches 2"),
     ],
     ids=["foreign", "newer", "other kind"],
 )
@@ -303,7 +303,7 @@ def assert_holds_images(store: FeatureStore, least: int, most: int) -> None:
         assert_array_equal(lafs, np.tile(np.eye(2, 3), (1000 + index, 1, 1)) * (index + 1))
 
 
-@pytest.mark.parametrize(("deadly", "complete"), [(1, 0), (4, 0), (7, 1), (18, 2)])
+@pytest.mark.parametrize(("deadly", "complete"), [(1, 0), (4, 0), (8, 1), (21, 2)])
 def test_complete_groups_are_readable_after_a_kill_within_a_group(
     store: FeatureStore, deadly: int, complete: int
 ) -> None:

@@ -87,6 +87,7 @@ KEPT = {
     "pairs": ["features.h5"],
     "match": ["features.h5", "pairs.txt"],
     "verify": ["features.h5", "matches.h5", "pairs.txt"],
+    "escalate": ["database.db", "features.h5", "matches.h5", "pairs.txt"],
     "map": ["database.db", "features.h5", "matches.h5", "pairs.txt"],
 }
 

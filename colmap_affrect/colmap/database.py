@@ -126,7 +126,7 @@ def write_keypoints(
     database: pycolmap.Database,
     image_id: int,
     lafs: NDArray[np.floating],
-    level_ends: Sequence[int],
+    level_ends: Sequence[int] = (),
 ) -> None:
     """Write the frames of one image unless it has the keypoints already.
 

@@ -44,11 +44,14 @@ def resolve_device(name: str) -> torch.device:
     if not re.fullmatch(r"cpu|cuda(:\d+)?|mps", name):
         raise DeviceError(f"--device {name}: not one of auto, cpu, cuda, cuda:0, mps")
     device = torch.device(name)
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise DeviceError(f"--device {name}: torch finds no CUDA device; use --device cpu or auto")
-    if (device.index or 0) >= torch.cuda.device_count() and device.type == "cuda":
+    if device.type == "cuda":
         count = torch.cuda.device_count()
-        raise DeviceError(f"--device {name}: the highest is cuda:{count - 1}; use --device auto")
+        if not count:
+            raise DeviceError(
+                f"--device {name}: torch finds no CUDA device; use --device cpu or auto"
+            )
+        if (device.index or 0) >= count:
+            raise DeviceError(f"--device {name}: the last one is cuda:{count - 1}; use that")
     if device.type == "mps" and not torch.backends.mps.is_available():
         raise DeviceError(f"--device {name}: torch finds no MPS device; use --device cpu or auto")
     return device

@@ -30,6 +30,14 @@ def needed_weights(options: ExtractionOptions) -> tuple[str, ...]:
     return tuple(sorted(needed))
 
 
+def uses_networks(options: ExtractionOptions) -> bool:
+    """Tell whether a recipe runs on torch; a profile of another package may."""
+    return (
+        bool(needed_weights(options) or options.depth.model)
+        or type(options.features) is not SiftOptions
+    )
+
+
 def shape_sources(options: ExtractionOptions) -> set[str]:
     """Return the names of the shape sources that the rectifiers of a recipe read."""
     return {

@@ -174,17 +174,18 @@ class WeightStatus:
 
 def describe_weights(weights_path: Path | None = None) -> list[WeightStatus]:
     """Look for all files of weights, without downloading any."""
-    rows = []
-    for key, published in WEIGHT_FILES.items():
-        path = _find(key, weights_path)
-        comparable = path is not None and published.sha256
-        verified = file_sha256(path) == published.sha256 if path and comparable else None
-        rows.append(
-            WeightStatus(
-                key, published.file_name, published.used_for, published.licence, path, verified
-            )
-        )
-    return rows
+    return [_status(key, weights_path) for key in WEIGHT_FILES]
+
+
+def _status(key: str, weights_path: Path | None) -> WeightStatus:
+    published = WEIGHT_FILES[key]
+    path = _find(key, weights_path)
+    verified = None
+    if path is not None and published.sha256:
+        verified = file_sha256(path) == published.sha256
+    return WeightStatus(
+        key, published.file_name, published.used_for, published.licence, path, verified
+    )
 
 
 def file_sha256(path: Path) -> str:

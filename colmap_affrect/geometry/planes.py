@@ -261,7 +261,8 @@ def viewing_cosines(
     ray_from_pixel = np.linalg.inv(camera_matrix)
     columns, rows = np.arange(width), np.arange(height)[:, None]
     x, y, z = (form[0] * columns + form[1] * rows + form[2] for form in ray_from_pixel)
-    return np.asarray(-(normal[0] * x + normal[1] * y + normal[2] * z) / np.sqrt(x * x + y * y + z * z))
+    towards = -(normal[0] * x + normal[1] * y + normal[2] * z)
+    return np.asarray(towards / np.sqrt(x * x + y * y + z * z))
 
 
 def _cosines(

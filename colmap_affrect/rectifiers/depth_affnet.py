@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.tilts import cover_shapes
 from colmap_affrect.interfaces import Sources
 from colmap_affrect.options import DepthAffNetOptions
-from colmap_affrect.rectifiers.depth_planes import planar_segments
+from colmap_affrect.rectifiers.depth_planes import planar_segments, required_depth
 from colmap_affrect.rectifiers.regions import affine_rectification
 from colmap_affrect.types import Photograph, Rectification, RectificationPlan
 
@@ -22,9 +23,11 @@ class DepthAffNet:
 
     def __init__(self, options: DepthAffNetOptions, sources: Sources) -> None:
         """See :mod:`colmap_affrect.interfaces`."""
+        if sources.shapes is None:
+            raise OptionError(f"rectifier {options.name} needs a source of affine shapes")
         self.options = options
         self.shapes = sources.shapes
-        self.source = sources.depth
+        self.source = required_depth(sources)
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan the warps of each segment; one without tilted shapes has none.
@@ -32,8 +35,6 @@ class DepthAffNet:
         Raises:
             DepthError: when there is no usable depth map.
         """
-        assert self.shapes is not None
-        assert self.source is not None
         options = self.options
         segments = planar_segments(photograph, self.source.depth(photograph), options.planes)
         samples = self.shapes.samples(photograph.gray)

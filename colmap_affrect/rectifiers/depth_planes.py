@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.conventions import resized_from_original
+from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.planes import (
     cluster_normals,
     fronto_parallel_homography,
@@ -20,7 +21,7 @@ from colmap_affrect.geometry.planes import (
     viewing_cosines,
 )
 from colmap_affrect.imaging import connected_regions
-from colmap_affrect.interfaces import Sources
+from colmap_affrect.interfaces import DepthSource, Sources
 from colmap_affrect.options import DepthPlanesOptions, PlaneOptions
 from colmap_affrect.rectifiers.regions import Region, homography_rectification
 from colmap_affrect.types import Mask, Photograph, RectificationPlan
@@ -51,7 +52,7 @@ class DepthPlanes:
     def __init__(self, options: DepthPlanesOptions, sources: Sources) -> None:
         """See :mod:`colmap_affrect.interfaces`."""
         self.options = options
-        self.source = sources.depth
+        self.source = required_depth(sources)
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan one warp for each segment.
@@ -59,7 +60,6 @@ class DepthPlanes:
         Raises:
             DepthError: when there is no usable depth map.
         """
-        assert self.source is not None
         segments = planar_segments(photograph, self.source.depth(photograph), self.options.planes)
         items = tuple(
             homography_rectification(
@@ -73,6 +73,17 @@ class DepthPlanes:
         if self.options.keep_original == "outside":
             outside = ~_union(segments, photograph.size)
         return RectificationPlan(photograph.size, items, outside)
+
+
+def required_depth(sources: Sources) -> DepthSource:
+    """Return the depth source.
+
+    Raises:
+        OptionError: when there is none.
+    """
+    if sources.depth is None:
+        raise OptionError("planes need depth maps: give a folder of them or a depth network")
+    return sources.depth
 
 
 def planar_segments(
@@ -126,7 +137,7 @@ def _resampled(
         .clip(0, labels.shape[1 - axis] - 1)
         for axis, extent in enumerate(size)
     )
-    return labels[rows[:, None], columns]
+    return np.asarray(labels[rows[:, None], columns])
 
 
 def _union(segments: list[PlanarSegment], size: tuple[int, int]) -> Mask:

@@ -48,6 +48,7 @@ class InspectedLevel:
     Attributes:
         number: 0 for the level that every image gets.
         options: of its rectifier.
+        profile_name: of the features.
         photograph: at the size of processing; coordinates are px of it where nothing else is said.
         plan: of the rectifier.
         warning: why it was not rectified though it was to be; empty if all went well.
@@ -61,6 +62,7 @@ class InspectedLevel:
 
     number: int
     options: RectifierOptions
+    profile_name: str
     photograph: Photograph
     plan: RectificationPlan
     warning: str
@@ -99,6 +101,7 @@ def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int
     return InspectedLevel(
         number,
         extractor.options.rectifiers[number],
+        extractor.options.features.profile,
         photograph,
         plan,
         warning,
@@ -178,6 +181,7 @@ def describe_level(level: InspectedLevel) -> dict[str, Any]:
     return {
         "level": level.number,
         "rectifier": level.options.name,
+        "features": level.profile_name,
         "warning": level.warning,
         "original": {
             "features_found": len(level.found[0]) if 0 in level.found else 0,

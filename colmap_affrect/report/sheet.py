@@ -65,15 +65,15 @@ MAX_TILTS_WIDTH_PX = 880
 DEPTH_BOX_PX = ((INNER_PX - MARGIN_PX) // 2, 560)
 FEATURES_BOX_PX = (INNER_PX, 1000)
 """Largest width and height of the pictures."""
-MIN_COLUMN_PX = 520
-"""Room for the caption of a narrow picture that has another one at its right."""
+MIN_MAP_PX, MIN_DEPTH_PX = 520, 240
+"""Room for the captions of narrow pictures that have another one at their right."""
 
 TILE_TITLE_PX = 36
 TILE_GAP_PX = 14
-MIN_TILE_WIDTH_PX = 168
+MIN_TILE_WIDTH_PX = 190
 MAX_TILE_WIDTH_PX = (INNER_PX - TILE_GAP_PX) // 2
-MIN_TILE_HEIGHT_PX, MAX_TILE_HEIGHT_PX = 96, 420
-ALL_TILES_PX = INNER_PX * 700
+MIN_TILE_HEIGHT_PX, MAX_TILE_HEIGHT_PX = 72, 340
+ALL_TILES_PX = INNER_PX * 550
 """Area of all warps as they are shown, nearly."""
 MAX_NUM_TILES = 40
 
@@ -197,10 +197,11 @@ def _header(level: InspectedLevel, stored_size: Size) -> _Section:
     width, height = level.photograph.size
     stored = f" (stored: {stored_size[0]} x {stored_size[1]} px)"
     which = f"level {level.number} of escalation" if level.number else "level of every image"
+    shapes = f" ({level.options.shape_source})" if isinstance(level.options, CoverOptions) else ""
     steps = ", ".join(f"{step} {seconds:.2f} s" for step, seconds in level.seconds.items())
     about = [
         f"{width} x {height} px{stored * (level.photograph.size != stored_size)};"
-        f" {which}: rectifier {level.options.name}",
+        f" {which}: rectifier {level.options.name}{shapes}, features {level.profile_name}",
         f"{summary(level)}: {steps}",
     ]
     names = wrap(level.photograph.name, NAME_CHARS)
@@ -294,7 +295,7 @@ def fitted(size: Size, box: Size) -> Size:
 
 def _overview(level: InspectedLevel, colors: Sequence[Color]) -> _Section:
     map_size = fitted(level.photograph.size, MAP_BOX_PX)
-    left = MARGIN_PX + max(map_size[0], MIN_COLUMN_PX) + 2 * MARGIN_PX
+    left = MARGIN_PX + max(map_size[0], MIN_MAP_PX) + 2 * MARGIN_PX
     tilts_width = min(WIDTH_PX - MARGIN_PX - left, MAX_TILTS_WIDTH_PX)
     tilts_size = (tilts_width, round(tilts_width * HEIGHT_PER_WIDTH))
     rows = _legend_rows(level, colors)
@@ -448,7 +449,7 @@ def shape_colors(
 
 def _depth_and_normals(level: InspectedLevel, depth: NDArray[np.floating]) -> _Section:
     size = fitted(level.photograph.size, DEPTH_BOX_PX)
-    second_left = MARGIN_PX + max(size[0], MIN_COLUMN_PX) + MARGIN_PX
+    second_left = MARGIN_PX + max(size[0], MIN_DEPTH_PX) + MARGIN_PX
     size_of_depth = (depth.shape[1], depth.shape[0])
     shrunk, shrunk_from_depth = shrink_depth(depth, MAX_DEPTH_SIZE_PX)
     shrunk_from_image = shrunk_from_depth @ resized_from_original(

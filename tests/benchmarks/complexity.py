@@ -46,17 +46,13 @@ class ImageSet:
     depth_path: Path | None = None
 
 
-@dataclass
 class TimedProfile:
     """A feature profile that adds up its seconds."""
 
-    profile: FeatureProfile
-    seconds: float = 0.0
-
-    @property
-    def descriptor_size(self) -> int:
-        """D, as that of the profile."""
-        return self.profile.descriptor_size
+    def __init__(self, profile: FeatureProfile) -> None:
+        self.profile = profile
+        self.descriptor_size = profile.descriptor_size
+        self.seconds = 0.0
 
     def detect(self, view: View) -> LocalFeatures:
         """Detect as the profile does."""

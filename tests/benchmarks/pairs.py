@@ -113,37 +113,68 @@ class FeatureCache:
         return self.images[path, level]
 
 
+@dataclass(frozen=True)
+class Attempt:
+    """The matches of a pair at one level.
+
+    Attributes:
+        level: of escalation, from 0.
+        images: both, with their features.
+        points: (N, 2) pixel-centre px of the matches in each image.
+        verified_inliers: of COLMAP's two-view geometry; 0 if a run would not take it.
+        seconds: of matching.
+    """
+
+    level: int
+    images: tuple[TimedImage, TimedImage]
+    points: tuple[NDArray[np.floating], NDArray[np.floating]]
+    verified_inliers: int
+    seconds: float
+
+
+def attempt(pair: HomographyPair, cache: FeatureCache, level: int) -> Attempt:
+    """Match and verify a pair by the features of the levels 0 to ``level``."""
+    images = cache.image(pair.path1, level), cache.image(pair.path2, level)
+    start = time.perf_counter()
+    matches = match_features(
+        images[0].matchable, images[1].matchable, cache.method.recipe.matching
+    ).indices
+    seconds = time.perf_counter() - start
+    points = (
+        images[0].matchable.keypoints[matches[:, 0]],
+        images[1].matchable.keypoints[matches[:, 1]],
+    )
+    num_verified = verified_inliers(*points, images[0].size, images[1].size)
+    return Attempt(level, images, points, num_verified, seconds)
+
+
 def evaluate(pair: HomographyPair, cache: FeatureCache, threshold_px: float) -> Row:
     """Match a pair, level by level, and measure it against the truth."""
     rectifiers = cache.method.recipe.extraction.rectifiers
-    matching_s = 0.0
-    for level, rectifier in enumerate(rectifiers):
-        image1, image2 = cache.image(pair.path1, level), cache.image(pair.path2, level)
-        start = time.perf_counter()
-        matches = match_features(
-            image1.matchable, image2.matchable, cache.method.recipe.matching
-        ).indices
-        matching_s += time.perf_counter() - start
-        points1 = image1.matchable.keypoints[matches[:, 0]]
-        points2 = image2.matchable.keypoints[matches[:, 1]]
-        num_verified = verified_inliers(points1, points2, image1.size, image2.size)
-        if num_verified:
+    attempts: list[Attempt] = []
+    for level in range(len(rectifiers)):
+        attempts.append(attempt(pair, cache, level))
+        if attempts[-1].verified_inliers:
             break
-    row = {
-        "keypoints": [len(image.matchable.keypoints) for image in (image1, image2)],
-        "matches": len(matches),
-        "correct": int((transfer_errors(pair.truth, points1, points2) < CORRECT_PX).sum()),
-        "verified_inliers": num_verified,
-        "level": rectifier.name if num_verified else None,
-        "inliers": 0,
-        "error_px": None,
-        "seconds": {"features": image1.seconds + image2.seconds, "matching": matching_s},
-    }
-    estimate, num_inliers = estimate_homography(points1, points2, threshold_px)
+    last = attempts[-1]
+    sizes = last.images[0].size, last.images[1].size
+    estimate, num_inliers = estimate_homography(*last.points, threshold_px)
+    error_px = math.inf
     if estimate is not None:
-        error_px = homography_error(estimate, pair.truth, image1.size, image2.size)
-        row |= {"inliers": num_inliers, "error_px": error_px if math.isfinite(error_px) else None}
-    return row
+        error_px = homography_error(estimate, pair.truth, *sizes)
+    return {
+        "keypoints": [len(image.matchable.keypoints) for image in last.images],
+        "matches": len(last.points[0]),
+        "correct": int((transfer_errors(pair.truth, *last.points) < CORRECT_PX).sum()),
+        "verified_inliers": last.verified_inliers,
+        "level": rectifiers[last.level].name if last.verified_inliers else None,
+        "inliers": num_inliers,
+        "error_px": error_px if math.isfinite(error_px) else None,
+        "seconds": {
+            "features": sum(image.seconds for image in last.images),
+            "matching": sum(item.seconds for item in attempts),
+        },
+    }
 
 
 def verified_inliers(
@@ -193,7 +224,8 @@ def estimate_homography(
         maxIters=MAX_ITERATIONS,
         confidence=CONFIDENCE,
     )
-    return estimate, int(np.count_nonzero(inliers))
+    found = None if estimate is None else np.asarray(estimate, dtype=np.float64)
+    return found, int(np.count_nonzero(inliers))
 
 
 def table(set_name: str, rows: list[Row]) -> str:

@@ -22,7 +22,7 @@ from colmap_affrect.colmap.database import (
 )
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.errors import DatabaseError
-from colmap_affrect.features.rootsift import extract_rootsift
+from colmap_affrect.features.rootsift import RootSift
 from colmap_affrect.geometry.affine import lafs_from_keypoints, rotation, transform_frames
 from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
 from colmap_affrect.imaging import warp
@@ -185,7 +185,7 @@ def test_elliptic_blob_of_30_degrees_keeps_its_axis_in_the_database(
     corners = np.array([[0.0, 0.0], [219.0, 0.0], [0.0, 199.0], [219.0, 199.0]])
     matrix, canvas = fit_canvas(linear, corners, margin_px=0.0)
     plan = Rectification(matrix, canvas, np.ones(image.shape, bool), 2.0, np.deg2rad(60.0))
-    features = extract_rootsift(warp(image, plan), SiftOptions())
+    features = RootSift(SiftOptions()).detect((warp(image, plan), None))
     lafs = transform_frames(plan.image_from_rectified, features.lafs)
     best = np.linalg.norm(lafs[:, :, 2] - [110.3, 99.6], axis=1).argmin()
     laf = lafs[best : best + 1].copy()

@@ -16,7 +16,7 @@ from colmap_affrect.interfaces import Rectifier
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.types import Photograph, Rectification, RectificationPlan
 
-MODULE = '''
+MODULE = """
     from dataclasses import dataclass
 
     from colmap_affrect.geometry.canvas import fit_canvas, image_corners, rectifying_affine
@@ -41,7 +41,7 @@ MODULE = '''
             matrix, canvas = fit_canvas(linear, image_corners(photograph.size), 0.0)
             item = Rectification(matrix, canvas, None, self.options.tilt, 0.5)
             return RectificationPlan(photograph.size, (item,))
-'''
+"""
 
 
 class Skew:
@@ -50,9 +50,7 @@ class Skew:
     def plan(self, photograph: Photograph) -> RectificationPlan:
         linear = rectifying_affine(2.0, 0.5)
         matrix, canvas = fit_canvas(linear, image_corners(photograph.size), 0.0)
-        return RectificationPlan(
-            photograph.size, (Rectification(matrix, canvas, None, 2.0, 0.5),)
-        )
+        return RectificationPlan(photograph.size, (Rectification(matrix, canvas, None, 2.0, 0.5),))
 
 
 class TestSkew(RectifierContract):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from synthetic import texture
 
-from colmap_affrect.features.second_moment import second_moment_shapes
+from colmap_affrect.features.second_moment import SecondMoment
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.canvas import rectifying_affine
 from colmap_affrect.geometry.tilts import (
@@ -193,7 +193,7 @@ def test_plan_dense_shapes_leaves_out_parts_below_their_smallest_share() -> None
 @pytest.mark.parametrize("size", [(80, 61), (1, 1), (90, 1), (1, 90), (7, 9)])
 def test_plan_of_a_flat_image_has_no_warps(size: tuple[int, int]) -> None:
     image = np.full(size[::-1], 140, np.uint8)
-    grid = second_moment_shapes(image, SecondMomentOptions())
+    grid = SecondMoment(SecondMomentOptions()).grid(image)
     plan = plan_dense_shapes(grid, size, DenseShapesOptions())
     assert plan == RectificationPlan(size, ())
     assert plan.rectified_area_px == 0
@@ -203,13 +203,13 @@ def test_plan_of_a_flat_image_has_no_warps(size: tuple[int, int]) -> None:
 def test_plan_of_striped_images_of_odd_sizes_is_valid(size: tuple[int, int]) -> None:
     # A texture compressed along x by 4 has a tilt in every block.
     image = np.ascontiguousarray(texture((4 * size[0], size[1]), seed=8)[:, ::4])
-    grid = second_moment_shapes(image, SecondMomentOptions())
+    grid = SecondMoment(SecondMomentOptions()).grid(image)
     plan = plan_dense_shapes(grid, size, DenseShapesOptions(min_region_frac=0.0))
     check_invariants(plan, size)
 
 
 def test_plan_dense_shapes_of_isotropic_texture_needs_no_warp() -> None:
     image = texture((320, 240), seed=6, finest_sigma_px=2.0)
-    grid = second_moment_shapes(image, SecondMomentOptions())
+    grid = SecondMoment(SecondMomentOptions()).grid(image)
     plan = plan_dense_shapes(grid, (320, 240), DenseShapesOptions(min_region_frac=0.05))
     assert len(plan.items) == 0

@@ -1,0 +1,338 @@
+"""Files of weights: where they are looked for, downloads, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+import subprocess
+import sys
+import urllib.error
+from collections import OrderedDict
+from pathlib import Path
+from urllib.parse import urlparse
+
+import pytest
+import torch
+
+from colmap_affrect.errors import WeightsError
+from colmap_affrect.features import weights
+from colmap_affrect.features.weights import (
+    ENVIRONMENT_VARIABLE,
+    WEIGHT_FILES,
+    cache_folder,
+    describe_weights,
+    download_urls,
+    fetch,
+    file_sha256,
+    load_state_dict,
+    profile_weights,
+    resolve,
+)
+from colmap_affrect.options import DESCRIPTORS, AffNetHardNetOptions
+from colmap_affrect.progress import Progress
+
+SHARED_WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
+
+NAME = WEIGHT_FILES["hardnet"].file_name
+"""A file without a known sha256, so that any content does."""
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep away from the user's folders, and from the network."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
+
+    def fail(*_args, **_kwargs):
+        raise urllib.error.URLError("no network in tests")
+
+    monkeypatch.setattr(weights, "urlopen", fail)
+
+
+@pytest.fixture
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
+    """The three places in the order of the search, all there and empty."""
+    places = {
+        "given": tmp_path / "given",
+        "variable": tmp_path / "variable",
+        "cache": cache_folder(),
+    }
+    for folder in places.values():
+        folder.mkdir(parents=True)
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(places["variable"]))
+    return places
+
+
+class FakeServer:
+    """Answers by address: bytes, or an error; remembers what it was asked."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, answers: dict[str, bytes | Exception]):
+        self.answers, self.asked = answers, []
+        monkeypatch.setattr(weights, "urlopen", self.open)
+        monkeypatch.setattr(weights, "download_urls", lambda key: self.addresses[key])
+        self.addresses: dict[str, tuple[str, ...]] = {}
+
+    def open(self, request, timeout):
+        assert timeout > 0
+        self.asked.append(request.full_url)
+        answer = self.answers[request.full_url]
+        if isinstance(answer, Exception):
+            raise answer
+        response = io.BytesIO(answer)
+        response.headers = {"Content-Length": str(len(answer))}
+        return response
+
+
+# Places.
+
+
+def test_resolve_takes_the_first_place_that_has_the_file(folders: dict[str, Path]) -> None:
+    expected = []
+    for folder in reversed(folders.values()):
+        (folder / NAME).write_bytes(b"x")
+        expected.append(resolve(["hardnet"], folders["given"])["hardnet"].parent)
+    assert expected == list(reversed(folders.values()))
+
+
+def test_resolve_searches_on_when_the_given_folder_lacks_a_file(folders: dict[str, Path]) -> None:
+    (folders["given"] / "AffNet.pth").write_bytes(b"x")
+    (folders["cache"] / NAME).write_bytes(b"x")
+    assert resolve(["affnet", "hardnet"], folders["given"]) == {
+        "affnet": folders["given"] / "AffNet.pth",
+        "hardnet": folders["cache"] / NAME,
+    }
+
+
+def test_resolve_without_keys_needs_nothing() -> None:
+    assert resolve([]) == {}
+
+
+def test_resolve_with_a_path_that_is_no_folder_says_so(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"--weights .*nowhere: not a folder"):
+        resolve(["affnet"], tmp_path / "nowhere")
+
+
+def test_resolve_without_network_gives_one_line_that_says_everything(
+    folders: dict[str, Path],
+) -> None:
+    (folders["variable"] / NAME).write_bytes(b"x")
+    with pytest.raises(WeightsError) as caught:
+        resolve(["affnet", "orinet", "hardnet"], folders["given"])
+    message = str(caught.value)
+    assert "\n" not in message
+    assert "AffNet.pth, OriNet.pth;" in message
+    assert NAME not in message
+    for folder in folders.values():
+        assert str(folder) in message
+    for part in ("--weights", ENVIRONMENT_VARIABLE, "no network in tests", "put the files",
+                 "default, unrectified-rootsift"):  # fmt: skip
+        assert part in message
+
+
+def test_resolve_names_the_recipes_it_is_told(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"no weights: plain, simple$") as caught:
+        resolve(["mkd"], tmp_path, download=False, weightless_recipes=["plain", "simple"])
+    assert "downloads are off" in str(caught.value)
+    assert f"{ENVIRONMENT_VARIABLE} (not set)" in str(caught.value)
+
+
+# Downloads.
+
+
+def test_resolve_downloads_into_the_cache_from_the_first_address_that_works(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    server = FakeServer(monkeypatch, {"https://a/x": OSError("down"), "https://b/x": b"weights"})
+    server.addresses["hardnet"] = ("https://a/x", "https://b/x")
+    found = resolve(["hardnet"])
+    assert found == {"hardnet": cache_folder() / NAME}
+    assert found["hardnet"].read_bytes() == b"weights"
+    assert resolve(["hardnet"]) == found
+    assert server.asked == ["https://a/x", "https://b/x"]
+
+
+def test_resolve_keeps_what_it_downloaded_when_a_later_file_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    server = FakeServer(monkeypatch, {"https://a/1": b"one", "https://a/2": OSError("gone")})
+    server.addresses.update(hardnet=("https://a/1",), tfeat=("https://a/2",))
+    with pytest.raises(WeightsError, match="gone") as caught:
+        resolve(["hardnet", "tfeat"])
+    assert NAME not in str(caught.value)
+    assert [path.name for path in cache_folder().iterdir()] == [NAME]
+
+
+def test_download_of_another_content_than_published_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    server = FakeServer(monkeypatch, {"https://a/x": b"not AffNet"})
+    server.addresses["affnet"] = ("https://a/x",)
+    with pytest.raises(WeightsError, match="sha256"):
+        resolve(["affnet"])
+    assert list(cache_folder().iterdir()) == []
+
+
+def test_download_that_ends_early_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Truncating(FakeServer):
+        def open(self, request, timeout):
+            response = super().open(request, timeout)
+            response.headers = {"Content-Length": "1000"}
+            return response
+
+    server = Truncating(monkeypatch, {"https://a/x": b"half"})
+    server.addresses["hardnet"] = ("https://a/x",)
+    with pytest.raises(WeightsError, match="after 4 of 1000 bytes"):
+        resolve(["hardnet"])
+    assert list(cache_folder().iterdir()) == []
+
+
+def test_download_reports_progress_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(weights, "CHUNK_BYTES", 10)
+    server = FakeServer(monkeypatch, {"https://a/x": bytes(100)})
+    server.addresses["hardnet"] = ("https://a/x",)
+    stream = io.StringIO()
+    resolve(["hardnet"], progress=Progress(stream))
+    lines = stream.getvalue().splitlines()
+    assert lines[0] == f"{NAME}: 10/100 bytes"
+    assert lines[-1] == f"{NAME}: 100/100 bytes"
+
+
+def test_fetch_fills_a_folder_and_leaves_what_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = FakeServer(monkeypatch, {"https://a/x": b"new"})
+    server.addresses["tfeat"] = ("https://a/x",)
+    (tmp_path / NAME).write_bytes(b"old")
+    paths = fetch(["hardnet", "tfeat"], tmp_path)
+    assert [path.read_bytes() for path in paths.values()] == [b"old", b"new"]
+    assert {path.parent for path in paths.values()} == {tmp_path}
+
+
+def test_fetch_of_an_unknown_key_lists_the_known_ones() -> None:
+    with pytest.raises(WeightsError, match=r"unknown weights 'hardnett' \(known: affnet, orinet"):
+        fetch(["affnet", "hardnett"])
+
+
+# The table.
+
+
+def test_weight_files_hold_every_descriptor_and_keep_upstream_names() -> None:
+    assert set(DESCRIPTORS) <= set(WEIGHT_FILES)
+    for key, published in WEIGHT_FILES.items():
+        urls = download_urls(key)
+        assert {urlparse(url).scheme for url in urls} == {"https"}
+        assert Path(urlparse(urls[0]).path).name == published.file_name
+
+
+def test_profile_weights_are_those_of_the_parts_in_use() -> None:
+    assert profile_weights(AffNetHardNetOptions()) == ("affnet", "orinet", "hardnet")
+    options = AffNetHardNetOptions(affine_shape=False, descriptor="mkd", detector="keynet")
+    assert profile_weights(options) == ("orinet", "mkd", "keynet")
+
+
+def test_describe_weights_tells_found_verified_and_missing_files_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "AffNet.pth").write_bytes(b"published")
+    (tmp_path / "OriNet.pth").write_bytes(b"another")
+    (tmp_path / NAME).write_bytes(b"unknown")
+    published = weights.WeightFile(
+        "AffNet.pth", "shapes", "MIT", hashlib.sha256(b"published").hexdigest()
+    )
+    monkeypatch.setitem(WEIGHT_FILES, "affnet", published)
+    rows = {row.key: row for row in describe_weights(tmp_path)}
+    assert list(rows) == list(WEIGHT_FILES)
+    assert rows["affnet"].path == tmp_path / "AffNet.pth"
+    assert [rows[key].verified for key in ("affnet", "orinet", "hardnet", "mkd")] == [
+        True, False, None, None,
+    ]  # fmt: skip
+    assert rows["mkd"].path is None
+    assert (rows["affnet"].licence, rows["affnet"].used_for) == ("MIT", "shapes")
+
+
+def test_import_loads_neither_torch_nor_kornia() -> None:
+    script = (
+        "import sys\n"
+        "import colmap_affrect.features.dog, colmap_affrect.features.rootsift\n"
+        "import colmap_affrect.features.weights as weights\n"
+        "from pathlib import Path\n"
+        "folder = Path(sys.argv[1])\n"
+        "(folder / 'AffNet.pth').write_bytes(b'x')\n"
+        "weights.resolve(['affnet'], folder)\n"
+        "print(sorted({'torch', 'kornia'} & set(sys.modules)))\n"
+    )
+    output = subprocess.run(
+        [sys.executable, "-c", script, str(cache_folder().parent.parent.parent)],
+        check=True, capture_output=True, text=True, timeout=60,
+    ).stdout  # fmt: skip
+    assert output == "[]\n"
+
+
+# Reading.
+
+
+def test_load_state_dict_unwraps_a_checkpoint(tmp_path: Path) -> None:
+    state = OrderedDict(a=torch.arange(6.0).reshape(2, 3))
+    for name, content in (("plain", state), ("wrapped", {"epoch": 3, "state_dict": state})):
+        torch.save(content, tmp_path / name)
+        loaded = load_state_dict(tmp_path / name)
+        assert list(loaded) == ["a"]
+        assert torch.equal(loaded["a"], state["a"])
+
+
+class Payload:
+    """What runs code when it is unpickled."""
+
+    def __reduce__(self):
+        return (pytest.fail, ("a pickled object was loaded",))
+
+
+def test_load_state_dict_does_not_load_objects(tmp_path: Path) -> None:
+    torch.save({"state_dict": {"a": Payload()}}, tmp_path / "object.pth")
+    (tmp_path / "pickle.pth").write_bytes(pickle.dumps(Payload(), protocol=2))
+    for name in ("object.pth", "pickle.pth"):
+        with pytest.raises(WeightsError, match=rf"{name}: not a file of weights"):
+            load_state_dict(tmp_path / name)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.2, 0.5, 0.9, 0.99])
+def test_load_state_dict_of_a_truncated_file_names_it(
+    tmp_path: Path, share: float, zipped: bool
+) -> None:
+    path = tmp_path / "AffNet.pth"
+    torch.save({"a": torch.rand(40, 40)}, path, _use_new_zipfile_serialization=zipped)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(WeightsError, match=r"AffNet\.pth"):
+        load_state_dict(path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"<html>404</html>", b"\x80\x02garbage", bytes(300), b"PK\3\4"]
+)
+def test_load_state_dict_of_something_else_names_it(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "OriNet.pth"
+    path.write_bytes(content)
+    with pytest.raises(WeightsError, match=r"OriNet\.pth.*not a file of weights"):
+        load_state_dict(path)
+
+
+def test_load_state_dict_of_a_tensor_or_of_no_file_is_refused(tmp_path: Path) -> None:
+    torch.save(torch.rand(3), tmp_path / "tensor.pth")
+    with pytest.raises(WeightsError, match=r"tensor\.pth: holds no parameters by name"):
+        load_state_dict(tmp_path / "tensor.pth")
+    with pytest.raises(WeightsError, match=r"gone\.pth: cannot be read \(No such file"):
+        load_state_dict(tmp_path / "gone.pth")
+
+
+@pytest.mark.shared
+@pytest.mark.skipif(not SHARED_WEIGHTS.is_dir(), reason="the files of ../shared are not here")
+def test_published_files_have_the_sha256_of_the_table() -> None:
+    rows = [row for row in describe_weights(SHARED_WEIGHTS) if row.path]
+    assert {row.key for row in rows} >= {"affnet", "orinet", "hardtfeat"}
+    for row in rows:
+        assert row.verified in (True, None)
+        assert load_state_dict(row.path)
+    assert file_sha256(SHARED_WEIGHTS / "AffNet.pth") == WEIGHT_FILES["affnet"].sha256

@@ -1,0 +1,375 @@
+"""Planes from depth: normals of known scenes, clusters on the sphere, views from the front."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from planar_scenes import Room, angles_deg, corner_room, plane_coordinates, rays, unit
+from strategies import Array
+
+from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.planes import (
+    MAX_SLANT_COS,
+    WINDOW_SIGMA_PX,
+    PlaneClusters,
+    cluster_normals,
+    fronto_parallel_homography,
+    normals_from_depth,
+    orthogonalized,
+    shrink_depth,
+    spiral_points,
+    viewing_cosines,
+)
+
+EXACT_DEG = 1e-6
+"""Normals of exact depth of one plane: rounding only."""
+
+CAMERA = np.array([[210.0, 0.0, 61.0], [0.0, 250.0, 33.0], [0.0, 0.0, 1.0]])
+"""Pixels that are not square, principal point off the centre of a 90 x 70 image."""
+
+SIZE = (90, 70)
+
+
+def plane_depth(normal: Array, distance: float = 2.0) -> Array:
+    """(h, w) z-depth of one plane that the whole image sees."""
+    return Room(unit(normal)[None], np.array([distance]), CAMERA, SIZE).depth(SIZE)[0]
+
+
+@st.composite
+def visible_normals(draw: st.DrawFn, max_angle_deg: float = 80.0) -> Array:
+    """Unit normals that all pixels of the image of CAMERA see at less than an angle."""
+    normal = draw(st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 0.3)))
+    assume(np.linalg.norm(normal) > 0.1)
+    normal = unit(normal)
+    assume(viewing_cosines(normal, CAMERA, SIZE).min() > np.cos(np.deg2rad(max_angle_deg)))
+    return normal
+
+
+@settings(max_examples=30)
+@given(visible_normals(), st.floats(0.01, 100.0))
+def test_normals_of_a_plane_are_its_normal_to_the_last_pixel(normal: Array, unit_m: float) -> None:
+    normals = normals_from_depth(plane_depth(normal, unit_m), CAMERA)
+    assert normals.shape == (70, 90, 3)
+    assert angles_deg(normals, normal).max() < EXACT_DEG
+
+
+def test_normals_of_a_room_are_within_a_degree_away_from_its_creases() -> None:
+    room = corner_room()
+    size = (260, 165)  # another resolution, and even another aspect, than that of the image
+    depth, labels = room.depth(size)
+    normals = normals_from_depth(depth.astype(np.float32), room.camera_at(size))
+    errors = angles_deg(normals, room.normals[labels])
+    padded = np.pad(labels, 2, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (5, 5))
+    one_plane = (windows == labels[..., None, None]).all(axis=(2, 3))
+    assert one_plane.mean() > 0.9
+    assert errors[one_plane].max() < 1.0
+
+
+def test_normals_are_right_up_to_a_depth_discontinuity() -> None:
+    # A board before a wall, one side of it a column of pixels from the image border.
+    board, wall = unit([0.5, 0.2, -0.8]), unit([-0.3, 0.1, -1.0])
+    depth, normals = plane_depth(wall, 4.0), np.broadcast_to(wall, (70, 90, 3)).copy()
+    depth[20:50, 30:88] = plane_depth(board, 2.0)[20:50, 30:88]
+    normals[20:50, 30:88] = board
+    errors = angles_deg(normals_from_depth(depth, CAMERA), normals)
+    assert np.nanmax(errors) < EXACT_DEG
+    # What is seen only between the board and the image border has too few neighbours.
+    assert np.isnan(errors).mean() < 0.002
+
+
+def test_normals_are_unknown_where_a_plane_has_no_hold() -> None:
+    depth = plane_depth([0.3, 0.2, -0.9])
+    depth[:, 40:] = np.nan
+    depth[10, 60] = 2.0  # alone
+    depth[30, 50:80] = 2.0  # a row of pixels
+    known = np.isfinite(normals_from_depth(depth, CAMERA)).all(axis=2)
+    assert known[:, :40].all()
+    assert not known[:, 40:].any()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (30, 1), (2, 2), (3, 7)])
+def test_normals_of_tiny_maps_have_the_shape_of_the_map(shape: tuple[int, int]) -> None:
+    normals = normals_from_depth(np.full(shape, 3.0), CAMERA)
+    assert normals.shape == (*shape, 3)
+    expected = np.isfinite(normals).all() if min(shape) > 1 else np.isnan(normals).all()
+    assert expected
+
+
+def test_normals_are_weighted_least_squares_fits_of_inverse_depth() -> None:
+    rng = np.random.default_rng(3)
+    depth = plane_depth([0.4, -0.3, -0.8]) * (1.0 + 1e-3 * rng.standard_normal((70, 90)))
+    row, column = 41, 57
+    rows, columns = np.mgrid[row - 2 : row + 3, column - 2 : column + 3]
+    weights = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / (2 * WINDOW_SIGMA_PX**2))
+    directions = rays(CAMERA, np.arange(90), np.arange(70))[rows, columns].reshape(-1, 3)
+    root = np.sqrt(weights).reshape(-1, 1)  # weights enter the normal equations linearly
+    fitted, *_ = np.linalg.lstsq(root * directions, root[:, 0] / depth[rows, columns].ravel())
+    normal = normals_from_depth(depth, CAMERA)[row, column]
+    assert_allclose(normal, -unit(fitted), atol=1e-9)
+
+
+def test_normals_of_noisy_depth_are_unbiased() -> None:
+    # Noise of 0.05 % of the depth is 5 degrees in one window; a bias would stay in the mean.
+    normal = unit([0.55, 0.25, -0.8])
+    noise = np.random.default_rng(0).standard_normal((70, 90))
+    normals = normals_from_depth(plane_depth(normal) * (1.0 + 5e-4 * noise), CAMERA)
+    assert 1.0 < np.median(angles_deg(normals, normal)) < 10.0
+    assert angles_deg(unit(normals.mean(axis=(0, 1))), normal) < 1.0
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 1000))
+def test_normals_of_any_depth_face_the_camera(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth = 2.0 + rng.uniform(0, 0.05, (20, 30)).cumsum(axis=rng.integers(2))
+    normals = normals_from_depth(depth, CAMERA)
+    towards = -(normals * rays(CAMERA, np.arange(30), np.arange(20))).sum(axis=2)
+    known = np.isfinite(towards)
+    assert known.any()
+    assert (towards[known] > 0).all()
+    assert_allclose(np.linalg.norm(normals[known], axis=1), 1.0)
+
+
+def test_planes_seen_at_less_than_the_largest_slant_are_not_taken_for_discontinuities() -> None:
+    # Seen at 83.5 degrees in the middle of the image and at up to 84.5 in it.
+    camera = np.array([[2500.0, 0.0, 45.0], [0.0, 2600.0, 35.0], [0.0, 0.0, 1.0]])
+    normal = np.array([np.sin(np.deg2rad(83.5)), 0.0, -np.cos(np.deg2rad(83.5))])
+    assert viewing_cosines(normal, camera, SIZE).min() > MAX_SLANT_COS
+    depth, _ = Room(normal[None], np.array([1.0]), camera, SIZE).depth(SIZE)
+    assert angles_deg(normals_from_depth(depth, camera), normal).max() < EXACT_DEG
+
+
+def test_shrink_depth_keeps_planes_exact_and_says_where_pixels_went() -> None:
+    normal = unit([0.5, -0.4, -0.8])
+    shrunk, shrunk_from_depth = shrink_depth(plane_depth(normal), 31)
+    assert shrunk.shape == (23, 30)  # blocks of 3 x 3, the last row has no full ones
+    assert_allclose(project(shrunk_from_depth, np.array([[1.0, 1.0], [85.0, 67.0]])), [[0, 0], [28, 22]])  # fmt: skip
+    normals = normals_from_depth(shrunk, shrunk_from_depth @ CAMERA)
+    assert angles_deg(normals, normal).max() < EXACT_DEG
+
+
+def test_shrink_depth_leaves_small_maps_and_spreads_the_unknown() -> None:
+    depth = plane_depth([0.1, 0.2, -1.0])
+    same, identity = shrink_depth(depth, 90)
+    assert_allclose(same, depth)
+    assert_allclose(identity, np.eye(3))
+    depth[5, 7] = np.nan
+    shrunk, _ = shrink_depth(depth, 45)
+    assert np.argwhere(np.isnan(shrunk)).tolist() == [[2, 3]]
+
+
+@pytest.mark.parametrize("shape", [(1, 100), (100, 1), (7, 100)])
+def test_shrink_depth_of_thin_maps_keeps_them_thin(shape: tuple[int, int]) -> None:
+    shrunk, shrunk_from_depth = shrink_depth(np.full(shape, 2.0), 10)
+    expected = tuple(10 if extent == 100 else 1 for extent in shape)
+    assert shrunk.shape == expected
+    middle = np.array([[shape[1] - 1.0, shape[0] - 1.0]]) / 2.0
+    assert_allclose(project(shrunk_from_depth, middle)[0], [(n - 1) / 2 for n in expected[::-1]])
+
+
+@pytest.mark.parametrize("num_points", [10, 300, 500, 2000])
+def test_spiral_points_cover_the_sphere_evenly(num_points: int) -> None:
+    points = spiral_points(num_points)
+    assert points.shape == (num_points, 3)
+    assert_allclose(np.linalg.norm(points, axis=1), 1.0)
+    assert_allclose(points[:, 2].mean(), 0.0, atol=1e-12)
+    # In units of the side of a square with a point's share of the sphere.
+    share = np.sqrt(4.0 * np.pi / num_points)
+    cosines = points @ points.T - 3.0 * np.eye(num_points)
+    spacing = np.arccos(cosines.max(axis=1)) / share
+    assert 0.7 < spacing.min()
+    assert spacing.max() < 1.3
+    anywhere = unit(np.random.default_rng(1).standard_normal((3000, 3)))
+    assert np.arccos((anywhere @ points.T).max(axis=1)).max() / share < 1.1
+
+
+def scattered(center: Array, count: int, spread_deg: float, rng: np.random.Generator) -> Array:
+    """Unit normals about a direction."""
+    return unit(center + np.deg2rad(spread_deg) * rng.standard_normal((count, 3)))
+
+
+def clustered(normals: Array, **options: float) -> PlaneClusters:
+    """Clusters with the paper's values unless told otherwise."""
+    values = {
+        "num_candidates": 500,
+        "bin_angle_rad": np.deg2rad(35.0),
+        "min_separation_rad": np.deg2rad(87.5),
+        "max_num_planes": 3,
+        "min_votes_frac": 0.15,
+    }
+    return cluster_normals(normals, **{**values, **options})
+
+
+def three_planes() -> tuple[Array, Array, Array]:
+    """(40, 50, 3) normals of three planes and unknown ones, their labels by size, and the planes."""
+    rng = np.random.default_rng(5)
+    planes = corner_room().normals
+    parts = [scattered(planes[2], 900, 6.0, rng), scattered(planes[0], 600, 6.0, rng),
+             scattered(planes[1], 350, 6.0, rng), np.full((150, 3), np.nan)]  # fmt: skip
+    order = rng.permutation(2000)
+    labels = np.repeat([0, 1, 2, -1], [900, 600, 350, 150])[order]
+    return (
+        np.concatenate(parts)[order].reshape(40, 50, 3),
+        labels.reshape(40, 50),
+        planes[[2, 0, 1]],
+    )
+
+
+def test_cluster_normals_finds_planes_by_falling_size() -> None:
+    normals, labels, planes = three_planes()
+    clusters = clustered(normals)
+    assert angles_deg(clusters.normals, planes).max() < 1.0
+    np.testing.assert_array_equal(clusters.labels, labels)
+    assert clusters.labels.dtype == np.int32
+
+
+def test_cluster_normals_counts_votes_in_shares_of_all_pixels() -> None:
+    normals, labels, _ = three_planes()
+    clusters = clustered(normals, min_votes_frac=0.2)  # the third plane has 350 of 2000
+    assert len(clusters.normals) == 2
+    np.testing.assert_array_equal(clusters.labels, np.where(labels == 2, -1, labels))
+    assert len(clustered(normals, min_votes_frac=0.17).normals) == 3
+
+
+@pytest.mark.parametrize("limit", [1, 2, 3, 9])
+def test_cluster_normals_obeys_the_limit_on_planes(limit: int) -> None:
+    assert len(clustered(three_planes()[0], max_num_planes=limit).normals) == min(limit, 3)
+
+
+def test_cluster_normals_of_nothing_has_no_planes() -> None:
+    for normals in (np.full((3, 4, 3), np.nan), np.zeros((0, 4, 3))):
+        clusters = clustered(normals, orthogonal=True)
+        assert clusters.normals.shape == (0, 3)
+        assert (clusters.labels == -1).all()
+        assert clusters.labels.shape == normals.shape[:2]
+
+
+def test_cluster_normals_lets_the_rest_vote_again_after_each_choice() -> None:
+    # Candidates may be close: without a second vote a bin that is 20 degrees from the first
+    # plane, and still holds it, would win over the second plane.
+    rng = np.random.default_rng(2)
+    planes = unit([[0.0, 0.0, -1.0], [1.0, 0.0, -0.2]])
+    normals = np.concatenate(
+        [scattered(planes[0], 600, 4.0, rng), scattered(planes[1], 400, 4.0, rng)]
+    )
+    clusters = clustered(normals[None], min_separation_rad=np.deg2rad(20.0))
+    assert len(clusters.normals) == 2
+    assert angles_deg(clusters.normals, planes).max() < 1.0
+
+
+def test_cluster_normals_keeps_candidates_apart_that_are_nearer_than_the_separation() -> None:
+    rng = np.random.default_rng(2)
+    planes = unit([[0.0, 0.0, -1.0], [np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)]])
+    normals = np.concatenate(
+        [scattered(planes[0], 600, 4.0, rng), scattered(planes[1], 400, 4.0, rng)]
+    )
+    (normal,) = clustered(normals[None], bin_angle_rad=np.deg2rad(20.0)).normals
+    assert angles_deg(normal, planes[0]) < 1.0
+
+
+def test_cluster_normals_takes_opposite_normals_as_one_plane_only_if_told() -> None:
+    rng = np.random.default_rng(8)
+    right = unit([1.0, 0.1, -0.1])
+    normals = np.concatenate([scattered(right, 300, 5.0, rng), scattered(-right, 200, 5.0, rng)])
+    apart = clustered(normals[None])
+    assert angles_deg(apart.normals, np.stack([right, -right])).max() < 1.0
+    assert np.bincount(apart.labels[0]).tolist() == [300, 200]
+    together = clustered(normals[None], antipodal=True)
+    assert angles_deg(together.normals, right[None]).max() < 1.0
+    assert (together.labels == 0).all()
+
+
+def test_cluster_normals_labels_by_orthogonal_planes_if_told() -> None:
+    normals, labels, planes = three_planes()
+    clusters = clustered(normals, orthogonal=True)
+    assert_allclose(clusters.normals @ clusters.normals.T, np.eye(3), atol=1e-12)
+    assert angles_deg(clusters.normals, planes).max() < 1.0
+    np.testing.assert_array_equal(clusters.labels, labels)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_orthogonalized_normals_are_the_nearest_orthogonal_ones(count: int) -> None:
+    rng = np.random.default_rng(count)
+    skewed = scattered(corner_room().normals[:count], count, 8.0, rng)
+    result = orthogonalized(skewed)
+    assert_allclose(result @ result.T, np.eye(count), atol=1e-12)
+    cost = ((result - skewed) ** 2).sum()
+    for _ in range(200):
+        turned, _ = np.linalg.qr(np.eye(3) + 0.02 * rng.standard_normal((3, 3)))
+        turned *= np.sign(np.diag(turned))
+        assert ((result @ turned - skewed) ** 2).sum() >= cost - 1e-12
+
+
+def test_orthogonalized_keeps_both_sides_of_a_street_opposite() -> None:
+    street = unit([[1.0, 0.02, -0.1], [0.0, -1.0, -0.1], [-1.0, 0.05, -0.05], [0.0, 0.1, -1.0]])
+    result = orthogonalized(street)
+    assert_allclose(result[2], -result[0])
+    assert_allclose(result[[0, 1, 3]] @ result[[0, 1, 3]].T, np.eye(3), atol=1e-12)
+    assert angles_deg(result, street).max() < 6.0
+
+
+def test_orthogonalized_leaves_what_fits_to_no_axis() -> None:
+    odd = unit([1.0, 1.0, -1.0])
+    normals = np.concatenate([corner_room().normals, (corner_room().normals * odd).sum(0)[None]])
+    normals[3] = unit(corner_room().normals.sum(axis=0))  # 54.7 degrees from each axis
+    assert_allclose(orthogonalized(normals), normals, atol=1e-12)
+
+
+def test_fronto_parallel_homography_of_a_frontal_plane_is_the_identity() -> None:
+    homography = fronto_parallel_homography(np.array([0, 0, -1.0]), CAMERA)
+    assert_allclose(homography, np.eye(3), atol=1e-12)
+
+
+@given(visible_normals(), st.floats(0.0, np.pi), st.tuples(st.floats(0, 89), st.floats(0, 69)))
+def test_fronto_parallel_homography_shows_squares_of_the_plane_as_squares(
+    normal: Array, angle_rad: float, pixel: tuple[float, float]
+) -> None:
+    (ray,) = rays(CAMERA, np.array([pixel[0]]), np.array([pixel[1]]))[0]
+    center = -2.0 * ray / (ray @ normal)
+    right = unit(np.cross([0.1, 1.0, 0.2], normal))
+    down = np.cross(normal, right)
+    turns = angle_rad + np.pi / 2 * np.arange(4)
+    corners = center + 0.05 * (np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * down)
+    seen = corners @ CAMERA.T
+    frontal = project(fronto_parallel_homography(normal, CAMERA), seen[:, :2] / seen[:, 2:])
+    sides = np.diff(frontal, axis=0, append=frontal[:1]) / [CAMERA[0, 0], CAMERA[1, 1]]
+    lengths = np.linalg.norm(sides, axis=1)
+    assert_allclose(lengths, lengths.mean(), rtol=1e-6)
+    turned = sides[:, 0] * np.roll(sides, -1, 0)[:, 0] + sides[:, 1] * np.roll(sides, -1, 0)[:, 1]
+    assert np.abs(turned).max() < 1e-6 * lengths.mean() ** 2
+
+
+@given(visible_normals())
+def test_fronto_parallel_homography_is_positive_where_the_plane_is_seen(normal: Array) -> None:
+    homography = fronto_parallel_homography(normal, CAMERA)
+    assert_allclose(np.linalg.det(homography), 1.0)
+    rows, columns = np.indices(SIZE[::-1])
+    third = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ homography[2]
+    directions = rays(CAMERA, np.arange(90), np.arange(70))
+    assert_allclose(third, -directions @ normal, atol=1e-9)
+    cosines = viewing_cosines(normal, CAMERA, SIZE)
+    assert_allclose(cosines, third / np.linalg.norm(directions, axis=2), atol=1e-9)
+
+
+def test_fronto_parallel_homography_turns_no_further_than_needed() -> None:
+    # A wall seen from the side stays upright: verticals stay verticals.
+    homography = fronto_parallel_homography(unit([0.8, 0.0, -0.6]), CAMERA)
+    upright = project(homography, np.array([[61.0, 3.0], [61.0, 33.0], [61.0, 66.0]]))
+    assert_allclose(upright[:, 0], upright[0, 0])
+    assert (np.diff(upright[:, 1]) > 0).all()
+
+
+def test_plane_coordinates_of_the_scene_are_lengths_in_the_plane() -> None:
+    # The helper that other tests rely on.
+    rng = np.random.default_rng(0)
+    normal = unit([0.3, -0.5, -0.8])
+    points = rng.standard_normal((20, 3))
+    points -= ((points @ normal) + 2.0)[:, None] * normal
+    flat = plane_coordinates(normal, points)
+    assert_allclose(
+        np.linalg.norm(flat - flat[0], axis=1), np.linalg.norm(points - points[0], axis=1)
+    )

@@ -1,0 +1,489 @@
+"""What inspection writes: the plan as data, and sheets that show it at the right place."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+from synthetic import texture, write_image
+
+from colmap_affrect.errors import DepthError, ImageError
+from colmap_affrect.extraction import ImageExtractor
+from colmap_affrect.features.second_moment import SecondMoment
+from colmap_affrect.geometry.affine import lafs_from_keypoints, project
+from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
+from colmap_affrect.geometry.tilts import asift_covering, metrics_from_tilts, tilt_distance
+from colmap_affrect.interfaces import DepthSource, Sources
+from colmap_affrect.options import (
+    AffNetShapesOptions,
+    AsiftOptions,
+    DenseShapesOptions,
+    DepthPlanesOptions,
+    ExtractionOptions,
+    IdentityOptions,
+    RectifierOptions,
+    SecondMomentOptions,
+)
+from colmap_affrect.rectifiers.covers import AffNetShapes, plan_whole_image
+from colmap_affrect.rectifiers.dense_shapes import DenseShapes
+from colmap_affrect.report import sheet
+from colmap_affrect.report.inspection import inspect_image
+from colmap_affrect.report.levels import InspectedLevel, inspect_level, num_regions
+from colmap_affrect.report.sheet import (
+    HEAD_PX,
+    INNER_PX,
+    LINE_PX,
+    MARGIN_PX,
+    NAME_PX,
+    PALETTE,
+    TILE_TITLE_PX,
+    WIDTH_PX,
+    circle_origin,
+    fitted,
+    normal_colors,
+    printable,
+    ranges,
+    region_middle,
+    shape_colors,
+    tiles,
+    warp_colors,
+)
+from colmap_affrect.report.tilt_plot import ball_outline, plane_points
+from colmap_affrect.types import (
+    GrayImage,
+    LocalFeatures,
+    Photograph,
+    Rectification,
+    RectificationPlan,
+    ShapeSamples,
+    View,
+)
+
+SIZE = (300, 200)
+DISTANCE_ERROR = 1e-6
+"""Of log tilts: arccosh next to 1 halves the digits, not so here, where r is 1.3 or more."""
+GRAY_ERROR = 6
+"""Of drawn pixels: resampling and blending round to 8 bits."""
+
+
+class GridFeatures:
+    """A profile that finds a feature every ``step_px``, wherever the mask is set."""
+
+    descriptor_size = 3
+
+    def __init__(self, step_px: int = 20, radius_px: float = 12.0) -> None:
+        self.step_px, self.radius_px = step_px, radius_px
+
+    def detect(self, view: View) -> LocalFeatures:
+        image, mask = view
+        height, width = image.shape
+        rows, columns = np.mgrid[10 : height : self.step_px, 10 : width : self.step_px]
+        points = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
+        if mask is not None:
+            points = points[mask[rows.ravel(), columns.ravel()] > 0]
+        count = len(points)
+        lafs = lafs_from_keypoints(points, np.full(count, self.radius_px), np.zeros(count))
+        return LocalFeatures(
+            lafs, np.linspace(1, 2, count).astype(np.float32), np.zeros((count, 3), np.float32)
+        )
+
+    def describe(
+        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
+    ) -> list[LocalFeatures]:
+        assert len(images) == len(detected)
+        return list(detected)
+
+
+class NoFeatures(GridFeatures):
+    def detect(self, view: View) -> LocalFeatures:
+        return super().detect((view[0], np.zeros_like(view[0])))
+
+
+class Planned:
+    """A rectifier with a plan made beforehand."""
+
+    def __init__(self, plan: RectificationPlan) -> None:
+        self._plan = plan
+
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        assert photograph.size == self._plan.image_size
+        return self._plan
+
+
+class SlantedDepth:
+    """A plane whose depth grows to the right."""
+
+    def depth(self, photograph: Photograph) -> NDArray[np.float32]:
+        del photograph
+        depth = 1.0 / np.linspace(1.0, 0.5, 60, dtype=np.float32)
+        return np.tile(depth, (40, 1))
+
+
+class PlannedWithDepth(Planned):
+    depth: DepthSource | None = SlantedDepth()
+
+
+class WithoutDepth:
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        raise DepthError(f"{photograph.name}: no depth map below {'/very/long/folder' * 20}")
+
+
+def affine_warp(
+    tilt: float, angle: float, box: tuple[int, int, int, int], segment: int = 0
+) -> Rectification:
+    """Warp of a box (left, top, width, height)."""
+    left, top, width, height = box
+    corners = np.array([[left, top], [left + width - 1, top + height - 1]], dtype=float)
+    corners = np.array([[x, y] for x in corners[:, 0] for y in corners[:, 1]])
+    matrix, canvas = fit_canvas(rectifying_affine(tilt, angle), corners, 8.0)
+    region = np.ones((height, width), bool)
+    return Rectification(matrix, canvas, region, tilt, angle, (left, top), segment)
+
+
+def homography_warp(segment: int) -> Rectification:
+    homography = np.array([[1.3, 0.1, -150.0], [0.1, 1.2, -40.0], [1e-3, 2e-4, 1.0]])
+    region = np.zeros((70, 50), bool)
+    region[5:70, 10:45] = True
+    return Rectification(homography, (180, 160), region, 1.4, 0.25, (180, 90), segment)
+
+
+def extractor_of(
+    *plans: RectificationPlan, profile: GridFeatures | None = None, **options: Any
+) -> ImageExtractor:
+    """Extractor whose levels have these plans."""
+    levels = [AsiftOptions() if plan.items else IdentityOptions() for plan in plans]
+    return ImageExtractor(
+        ExtractionOptions(rectifier=levels[0], escalation=tuple(levels[1:]), **options),
+        profile or GridFeatures(),
+        tuple(Planned(plan) for plan in plans),
+    )
+
+
+def extractor_with(options: RectifierOptions, rectifier: Any) -> ImageExtractor:
+    return ImageExtractor(ExtractionOptions(rectifier=options), GridFeatures(), (rectifier,))
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    return write_image(tmp_path / "photo.png", texture(SIZE, 3))
+
+
+def inspected(extractor: ImageExtractor, path: Path) -> InspectedLevel:
+    return inspect_level(extractor, extractor.photograph(path)[0], 0)
+
+
+def read_sheet(path: Path) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB of a sheet of sane size that is not blank."""
+    image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+    assert image.shape[1] == WIDTH_PX
+    assert 300 < image.shape[0] < 6000
+    assert image.std() > 20.0
+    return np.asarray(image, dtype=np.uint8)
+
+
+# --- The plan as data
+
+
+def test_json_describes_a_known_plan(tmp_path: Path, photo: Path) -> None:
+    first, second = affine_warp(2.5, 0.6, (30, 20, 60, 45), 4), homography_warp(7)
+    third = affine_warp(1.9, 1.1, (30, 20, 60, 45), 4)
+    extractor = extractor_of(RectificationPlan(SIZE, (first, second, third)))
+    result = inspect_image(extractor, photo, tmp_path / "new" / "out", name="folder/photo.png")
+    assert result.plan_path == tmp_path / "new" / "out" / "photo-plan.json"
+    data = json.loads(result.plan_path.read_text(encoding="utf-8"))
+    assert data["image"] == "folder/photo.png"
+    assert data["size"] == data["stored_size"] == [300, 200]
+    assert data["options"]["rectifier"]["name"] == "asift"
+    (level,) = data["levels"]
+    warp1, warp2, warp3 = level["warps"]
+    assert (warp1["id"], warp1["segment"], warp1["tilt"]) == (1, 4, 2.5)
+    assert warp1["angle_deg"] == pytest.approx(np.rad2deg(0.6))
+    assert_allclose(warp1["rectified_from_image"], first.rectified_from_image)
+    assert warp1["canvas_size"] == list(first.canvas_size)
+    assert warp1["region"] == {
+        "bounding_box": [30, 20, 60, 45],
+        "area_px": 60 * 45,
+        "share": 60 * 45 / 60_000,
+    }
+    assert warp2["region"]["bounding_box"] == [190, 95, 35, 65]
+    assert warp2["region"]["area_px"] == 35 * 65
+    assert_allclose(warp2["rectified_from_image"], second.rectified_from_image)
+    assert warp3["id"] == 3
+    totals = level["totals"]
+    area = sum(item.canvas_area_px for item in (first, second, third))
+    assert totals["warped_area_mpx"] == pytest.approx(area / 1e6)
+    assert totals["warped_share"] == pytest.approx(area / 60_000)
+    assert (totals["warps"], totals["regions"], totals["warps_per_region"]) == (3, 2, 1.5)
+    kept = [warp["features_kept"] for warp in level["warps"]]
+    assert all(0 < kept[k] <= level["warps"][k]["features_found"] for k in range(3))
+    assert totals["keypoints"] == level["original"]["features_kept"] + sum(kept)
+    assert level["original"]["features_found"] == 15 * 10
+    assert set(level["seconds"]) == {"plan", "warp and choose", "detect", "describe"}
+    assert "3 warps" in result.summary()
+    assert str(result.plan_path) in result.summary()
+
+
+def test_sizes_are_those_of_processing(tmp_path: Path, photo: Path) -> None:
+    plan = RectificationPlan((150, 100), (affine_warp(2.0, 0.3, (10, 5, 60, 40)),))
+    result = inspect_image(extractor_of(plan, max_image_size_px=150), photo, tmp_path)
+    data = json.loads(result.plan_path.read_text(encoding="utf-8"))
+    assert (data["stored_size"], data["size"]) == ([300, 200], [150, 100])
+    assert data["levels"][0]["warps"][0]["region"]["share"] == pytest.approx(2400 / 15_000)
+
+
+def test_warps_of_the_whole_image_share_one_region() -> None:
+    plan = plan_whole_image(SIZE, asift_covering()[:5], AsiftOptions())
+    assert num_regions(plan) == 1
+    assert num_regions(RectificationPlan(SIZE)) == 0
+
+
+def test_each_level_has_a_sheet_and_an_entry(tmp_path: Path, photo: Path) -> None:
+    warps = (affine_warp(2.0, 0.3, (30, 20, 80, 60)),)
+    extractor = extractor_of(RectificationPlan(SIZE), RectificationPlan(SIZE, warps))
+    result = inspect_image(extractor, photo, tmp_path / "all")
+    names = [path.name for path in result.sheet_paths]
+    assert names == ["photo-inspection.png", "photo-inspection-level-1.png"]
+    data = json.loads(result.plan_path.read_text(encoding="utf-8"))
+    assert [level["level"] for level in data["levels"]] == [0, 1]
+    escalated = data["levels"][1]
+    assert escalated["original"] == {"features_found": 0, "features_kept": 0}
+    assert escalated["totals"]["keypoints"] == escalated["warps"][0]["features_kept"] > 0
+    one = inspect_image(extractor, photo, tmp_path / "one", level=1)
+    assert sorted(path.name for path in (tmp_path / "one").iterdir()) == [
+        "photo-inspection-level-1.png",
+        "photo-plan.json",
+    ]
+    assert len(one.lines) == 1
+
+
+def test_missing_depth_is_a_warning_as_in_extraction(tmp_path: Path, photo: Path) -> None:
+    extractor = extractor_with(DepthPlanesOptions(), WithoutDepth())
+    result = inspect_image(extractor, photo, tmp_path)
+    (level,) = json.loads(result.plan_path.read_text(encoding="utf-8"))["levels"]
+    assert level["warning"].startswith("not rectified: photo.png: no depth map")
+    assert level["totals"]["keypoints"] == 150
+    read_sheet(result.sheet_paths[0])
+
+
+def test_unreadable_image_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    (tmp_path / "broken.png").write_bytes(b"no image")
+    extractor = extractor_of(RectificationPlan(SIZE))
+    with pytest.raises(ImageError, match=r"broken\.png"):
+        inspect_image(extractor, tmp_path / "broken.png", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+# --- Sheets
+
+
+PLANS = {
+    "no warps": RectificationPlan(SIZE),
+    "homography": RectificationPlan(SIZE, (homography_warp(0),)),
+    "61 warps": plan_whole_image(
+        SIZE, np.concatenate([[[1.2, 0.7]], asift_covering()]), AsiftOptions(area_preserving=False)
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", PLANS)
+def test_sheet_of_plan(kind: str, tmp_path: Path, photo: Path) -> None:
+    result = inspect_image(extractor_of(PLANS[kind]), photo, tmp_path)
+    read_sheet(result.sheet_paths[0])
+
+
+def test_sheet_of_an_image_without_features(tmp_path: Path, photo: Path) -> None:
+    plan = RectificationPlan(SIZE, (affine_warp(2.0, 0.3, (30, 20, 80, 60)),))
+    result = inspect_image(extractor_of(plan, profile=NoFeatures()), photo, tmp_path)
+    read_sheet(result.sheet_paths[0])
+    (level,) = json.loads(result.plan_path.read_text(encoding="utf-8"))["levels"]
+    assert level["warps"][0]["features_found"] == level["totals"]["keypoints"] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "rectifier_class"),
+    [(DenseShapesOptions(), DenseShapes), (AffNetShapesOptions(), AffNetShapes)],
+)
+def test_sheet_of_a_rectifier_that_reads_shapes(
+    options: Any, rectifier_class: Any, tmp_path: Path, photo: Path
+) -> None:
+    stretched = cv2.resize(texture((100, 200), 3), SIZE)
+    write_image(photo, stretched)
+    rectifier = rectifier_class(options, Sources(SecondMoment(SecondMomentOptions())))
+    extractor = extractor_with(options, rectifier)
+    level = inspected(extractor, photo)
+    assert level.plan.items
+    assert level.shapes is not None
+    assert len(level.shapes.points) > 100
+    read_sheet(inspect_image(extractor, photo, tmp_path).sheet_paths[0])
+
+
+def test_sheet_of_a_rectifier_that_reads_depth(tmp_path: Path, photo: Path) -> None:
+    rectifier = PlannedWithDepth(RectificationPlan(SIZE, (homography_warp(0),)))
+    extractor = extractor_with(DepthPlanesOptions(), rectifier)
+    with_depth = inspect_image(extractor, photo, tmp_path / "with")
+    without = inspect_image(extractor_of(PLANS["homography"]), photo, tmp_path / "without")
+    heights = [read_sheet(result.sheet_paths[0]).shape[0] for result in (with_depth, without)]
+    assert heights[0] > heights[1]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (20, 31), (600, 33)])
+def test_sheet_of_small_and_flat_images(size: tuple[int, int], tmp_path: Path) -> None:
+    path = write_image(tmp_path / "flat.png", np.full(size[::-1], 90, np.uint8))
+    rectifier = DenseShapes(DenseShapesOptions(), Sources(SecondMoment(SecondMomentOptions())))
+    extractor = extractor_with(DenseShapesOptions(), rectifier)
+    read_sheet(inspect_image(extractor, path, tmp_path).sheet_paths[0])
+
+
+def test_names_of_every_kind_are_written_and_drawn(tmp_path: Path) -> None:
+    path = tmp_path / "a $x^{$ ü 漢字.png"
+    write_image(path, texture(SIZE, 3))
+    result = inspect_image(extractor_of(PLANS["no warps"]), path, tmp_path / "Ausgabe ä")
+    assert result.sheet_paths[0].name == "a $x^{$ ü 漢字-inspection.png"
+    read_sheet_bytes = np.fromfile(result.sheet_paths[0], dtype=np.uint8)
+    assert cv2.imdecode(read_sheet_bytes, cv2.IMREAD_COLOR).std() > 20.0
+    data = json.loads(result.plan_path.read_text(encoding="utf-8"))
+    assert data["image"] == "a $x^{$ ü 漢字.png"
+
+
+def test_characters_without_a_glyph_are_replaced() -> None:
+    assert printable("a ü Ж 漢") == "a ü Ж \N{REPLACEMENT CHARACTER}"
+
+
+def test_region_is_tinted_where_it_lies(tmp_path: Path) -> None:
+    path = write_image(tmp_path / "photo.png", np.full(SIZE[::-1], 100, np.uint8))
+    plan = RectificationPlan(SIZE, (affine_warp(2.0, 0.3, (150, 20, 120, 50)),))
+    result = inspect_image(extractor_of(plan, profile=NoFeatures()), path, tmp_path)
+    image = read_sheet(result.sheet_paths[0]).astype(int)
+    top = MARGIN_PX + NAME_PX + 2 * LINE_PX + MARGIN_PX + HEAD_PX
+    scale = fitted(SIZE, sheet.MAP_BOX_PX)[0] / SIZE[0]
+
+    def drawn(x: float, y: float) -> NDArray[np.int_]:
+        return np.asarray(image[round(top + scale * y), round(MARGIN_PX + scale * x)])
+
+    faded = 255 - 0.75 * (255 - 100)
+    color = np.array([int(PALETTE[0][k : k + 2], 16) for k in (1, 3, 5)])
+    for x, y in [(153, 23), (153, 67), (267, 23), (267, 67)]:
+        assert_allclose(drawn(x, y), (faded + color) / 2, atol=GRAY_ERROR)
+    for x, y in [(146, 40), (274, 40), (200, 16), (200, 74), (4, 4)]:
+        assert_allclose(drawn(x, y), faded, atol=GRAY_ERROR)
+
+
+def test_features_beyond_the_image_do_not_move_it(tmp_path: Path) -> None:
+    path = write_image(tmp_path / "photo.png", np.full(SIZE[::-1], 100, np.uint8))
+    # 6 sigma are 900 px, the 2 sigma that are drawn 300 px: far beyond the left and the top.
+    profile = GridFeatures(step_px=500, radius_px=900.0)
+    result = inspect_image(extractor_of(PLANS["no warps"], profile=profile), path, tmp_path)
+    image = read_sheet(result.sheet_paths[0]).astype(int)
+    bottom = image.shape[0] - MARGIN_PX
+    width, height = fitted(SIZE, sheet.FEATURES_BOX_PX)
+    faded = 255 - 0.5 * (255 - 100)
+    for row in (bottom - 3, bottom - height + 2):
+        for column in (MARGIN_PX + 2, MARGIN_PX + width - 3):
+            assert_allclose(image[row, column], faded, atol=GRAY_ERROR)
+
+
+# --- Parts
+
+
+@pytest.mark.parametrize("radius", [1.3, 1.7])
+@pytest.mark.parametrize(("tilt", "angle"), [(1.0, 0.0), (1.4, 0.2), (2.51, 0.05), (5.8, 2.9)])
+def test_outline_of_a_ball_lies_at_its_radius(tilt: float, angle: float, radius: float) -> None:
+    outline = ball_outline(tilt, angle, radius)
+    distances = [tilt_distance(tilt, angle, *point) for point in outline.tolist()]
+    assert_allclose(distances, np.log(radius), atol=DISTANCE_ERROR)
+    first, last = outline[[0, -1]]
+    assert_allclose(metrics_from_tilts(*first), metrics_from_tilts(*last), atol=1e-9)
+    assert np.abs(np.diff(outline[:, 1])).max() < 0.5  # goes on beyond [0, pi) without a jump
+    turns = (last[1] - first[1]) / np.pi
+    assert abs(turns) == pytest.approx(1.0 if tilt < radius else 0.0, abs=1e-9)
+
+
+def test_space_of_tilts_has_log_tilt_as_radius_and_phi_as_angle() -> None:
+    classes = np.array([[np.e, np.pi / 2], [np.e**2, 0.0], [1.0, 1.0]])
+    assert_allclose(plane_points(classes), [[0, 1], [2, 0], [0, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "item", [affine_warp(3.0, 0.4, (30, 20, 60, 45)), homography_warp(0)], ids=["affine", "plane"]
+)
+def test_ellipse_of_a_warp_becomes_a_circle(item: Rectification) -> None:
+    assert item.region is not None
+    middle = region_middle(item.region, item.region_origin)
+    radius_px = 1e-3  # so small that the homography is affine around it
+    ellipse = circle_origin(item, middle, radius_px).T
+    center = project(item.rectified_from_image, middle[None])
+    radii = np.linalg.norm(project(item.rectified_from_image, ellipse) - center, axis=1)
+    assert radii.std() / radii.mean() < 1e-4
+    x, y = (ellipse - middle).T
+    area = np.abs(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2
+    assert area == pytest.approx(np.pi * radius_px**2, rel=0.02)  # of a polygon of 24 sides
+
+
+def test_middle_of_a_bent_region_is_in_it() -> None:
+    region = np.ones((41, 31), bool)
+    region[:30, 5:] = False  # an L, whose centre of mass is outside
+    column, row = region_middle(region, (100, 50)).astype(int) - (100, 50)
+    assert region[row, column]
+
+
+def test_warps_of_a_segment_and_of_a_class_have_one_color() -> None:
+    regional = [affine_warp(tilt, 0.3, (9, 9, 20, 20), segment) for tilt, segment in
+                [(2.0, 5), (3.0, 5), (2.0, 1)]]  # fmt: skip
+    first, second, third = warp_colors(RectificationPlan(SIZE, tuple(regional)))
+    assert first == second != third
+    classes = np.array([[2.0, 0.3], [2.0, 0.4], [2.0, 0.3]])
+    first, second, third = warp_colors(plan_whole_image(SIZE, classes, AsiftOptions()))
+    assert first == third != second
+    many = warp_colors(PLANS["61 warps"])
+    assert len(many) == 61
+    assert len(set(many)) > 20
+
+
+def test_shapes_have_the_color_of_their_region(photo: Path) -> None:
+    items = (
+        affine_warp(2.0, 0.3, (30, 20, 60, 45), 0),
+        affine_warp(3.0, 0.3, (200, 20, 50, 45), 1),
+    )
+    level = inspected(extractor_of(RectificationPlan(SIZE, items)), photo)
+    shapes = ShapeSamples(
+        np.array([[40.0, 30.0], [220.0, 30.0], [120.0, 150.0]]),
+        metrics_from_tilts([1.0, 1.0, 1.0], 0.0),
+    )
+    colors = warp_colors(level.plan)
+    found = shape_colors(shapes, level, colors)
+    assert found[:2] == colors
+    assert found[2] not in colors
+
+
+def test_tiles_do_not_overlap_and_keep_their_aspect() -> None:
+    rng = np.random.default_rng(4)
+    sizes = [tuple(size) for size in rng.integers(30, 1500, (37, 2)).tolist()]
+    placed = tiles(sizes)
+    assert sorted(tile.index for tile in placed) == list(range(37))
+    taken = np.zeros((max(tile.top + tile.size[1] for tile in placed), INNER_PX), dtype=int)
+    for tile in placed:
+        width, height = tile.size
+        expected = sizes[tile.index][0] / sizes[tile.index][1]
+        assert width / height == pytest.approx(expected, rel=0.1)
+        assert tile.top >= TILE_TITLE_PX
+        assert tile.left + width <= INNER_PX
+        taken[tile.top - TILE_TITLE_PX : tile.top + height, tile.left : tile.left + width] += 1
+    assert taken.max() == 1
+
+
+def test_ranges_are_written_short() -> None:
+    assert ranges([4], 2) == "4"
+    assert ranges([1, 2, 3, 7, 8], 3) == "1-3, 7-8"
+    assert ranges([1, 3, 5, 7], 2) == "1, 3 ..."
+
+
+def test_normals_are_white_where_unknown() -> None:
+    normals = np.array([[[0.0, 0.0, -1.0], [np.nan] * 3, [1.0, 0.0, 0.0]]])
+    assert_array_equal(normal_colors(normals), [[[0.5, 0.5, 1.0], [1, 1, 1], [1.0, 0.5, 0.5]]])
