@@ -2,8 +2,9 @@
 
 Level by level (the recipe's ``escalation``; Mishkin, Matas, Perdoch, MODS, 2015) the images of
 the pairs that are still open get the features that the level adds, and these pairs are matched
-again. New matches take the place of the old ones only when their two-view geometry has more
-inliers, so that no pair loses. Two additions make it serve mapping and not single pairs alone:
+again, by these features and those of the images themselves. New matches take the place of the
+old ones only when their two-view geometry has more inliers, so that no pair loses. Two
+additions make it serve mapping and not single pairs alone:
 
 - A pair that is verified but weak counts as open while one of its images has no strong pair.
 - Verified pairs of images that gained are matched again at the same level. Their new features

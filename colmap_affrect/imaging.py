@@ -21,10 +21,11 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".pp
 ANTI_ALIASING_SIGMA = 0.8
 """Blur before a compression by c: sigma = 0.8 sqrt(c^2 - 1) source px (Morel & Yu, ASIFT)."""
 
-TILE_PX = 128
-"""Homographies are executed in square tiles, each with the blur that it needs."""
+TILE_PX = 64
+"""Homographies are executed in square tiles, each with the blur that its strongest compression
+needs; larger tiles would blur more of what is compressed less."""
 
-SAMPLES_PER_TILE = 9
+SAMPLES_PER_TILE = 5
 """Points along a side of a tile at which its compression is measured."""
 
 MAX_DENSITY = 16

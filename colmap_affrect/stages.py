@@ -307,7 +307,7 @@ def match_pairs(
     level: int,
     advance: Callable[[int], None],
 ) -> None:
-    """Match pairs by the features of all levels up to this one; what is done is written."""
+    """Match pairs by the features of the images and of one level; what is done is written."""
     batch: list[PairMatches] = []
     try:
         for found in iterate_matches(pairs, features, options, level):
@@ -324,36 +324,45 @@ def match_pairs(
 def iterate_matches(
     pairs: Sequence[Pair], features: FeatureStore, options: MatchingOptions, level: int
 ) -> Iterable[PairMatches]:
-    """Match pairs by the features of all levels up to this one, in order."""
+    """Match pairs by the features of the images themselves and those of one level, in order."""
     cache = _MatchableCache(features, options, level)
 
     def match_pair(pair: Pair) -> PairMatches:
-        first, second = cache[pair[0]], cache[pair[1]]
+        (first, indices1), (second, indices2) = cache[pair[0]], cache[pair[1]]
         found = match_features(first, second, options)
-        return PairMatches(pair, found.indices, 1.0 - found.ratios, len(first.keypoints), level)
+        rows, columns = found.indices.T
+        indices = np.stack([indices1[rows], indices2[columns]], axis=1)
+        count = int(indices1.max(initial=-1)) + 1
+        return PairMatches(pair, indices, 1.0 - found.ratios, count, level)
 
     return map_ordered(match_pair, pairs, available_cores())
 
 
 class _MatchableCache:
-    """Images ready for matching, the least recently used dropped over a memory budget."""
+    """Images ready for matching, the least recently used dropped over a memory budget.
+
+    Each comes with the indices that its features have in the store.
+    """
 
     def __init__(self, store: FeatureStore, options: MatchingOptions, level: int) -> None:
         self._store, self._options, self._level = store, options, level
-        self._images: OrderedDict[str, MatchableImage] = OrderedDict()
+        self._images: OrderedDict[str, tuple[MatchableImage, NDArray[np.int64]]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def __getitem__(self, name: str) -> MatchableImage:
+    def __getitem__(self, name: str) -> tuple[MatchableImage, NDArray[np.int64]]:
         with self._lock:
             if name not in self._images:
-                features = self._store.read(name, self._level)
-                self._images[name] = matchable(
-                    features.descriptors, features.keypoints, self._options
-                )
+                indices = self._store.level_indices(name, self._level)
+                features = self._store.read(name).select(indices)
+                image = matchable(features.descriptors, features.keypoints, self._options)
+                self._images[name] = image, indices
             self._images.move_to_end(name)
-            while sum(i.descriptors.nbytes for i in self._images.values()) > MATCHING_CACHE_BYTES:
+            while self._num_bytes() > MATCHING_CACHE_BYTES and len(self._images) > 1:
                 self._images.popitem(last=False)
             return self._images[name]
+
+    def _num_bytes(self) -> int:
+        return sum(image.descriptors.nbytes for image, _ in self._images.values())
 
 
 def listed_pairs(workspace: Workspace) -> list[Pair]:

@@ -5,7 +5,7 @@
 (N, 2, 3) float32, ``rectification_ids`` (N,), and ``level_ends``: the features of level k of
 escalation follow those of level k - 1 and end at ``level_ends[k]``. ``matches.h5``: a group
 per pair with ``matches0`` (N0,), -1 where unmatched, ``matching_scores0`` (N0,) and the
-attributes ``level``, whose features (and those of lower levels) were matched, and
+attributes ``level``, whose features were matched together with those of level 0, and
 ``tried_level``, the highest that was tried. Coordinates have their origin at the centre of the
 first pixel. Files are opened for one image or one batch
 of pairs and closed again; the attribute ``complete`` is written last, so that a killed
@@ -40,7 +40,7 @@ class PairMatches:
         indices: (M, 2) int64, strictly rising in column 0.
         scores: (M,) float32 in [0, 1], larger is better.
         num_keypoints1: number of features of the first image.
-        level: of escalation; features of higher levels were not looked at.
+        level: of escalation, whose features were looked at together with those of level 0.
     """
 
     names: tuple[str, str]
@@ -172,16 +172,21 @@ class FeatureStore(_Store):
             },
         )
 
-    def read(self, name: str, level: int | None = None) -> LocalFeatures:
-        """Read the features of one image, up to a level of escalation or all.
+    def read(self, name: str) -> LocalFeatures:
+        """Read all features of one image.
 
         Raises:
             StoreError: if they are missing or incomplete.
         """
         with self._open("r") as file:
             group = self._group(file, name)
-            ends = group["level_ends"][()].tolist()
-            return self._features(group, ends[-1] if level is None else ends[level])
+            return self._features(group, group["level_ends"][()].tolist()[-1])
+
+    def level_indices(self, name: str, level: int) -> NDArray[np.int64]:
+        """Return the indices of the features of the image itself and of one level."""
+        ends = self.level_ends(name)
+        added = np.arange(ends[level - 1], ends[level]) if level else np.arange(0)
+        return np.concatenate([np.arange(ends[0]), added])
 
     def _group(self, file: h5py.File, name: str) -> h5py.Group:
         if name not in file or not file[name].attrs.get("complete", False):

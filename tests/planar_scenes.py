@@ -56,12 +56,13 @@ class Room:
         return resized_from_original(self.size, size) @ self.camera_matrix
 
     def depth(self, size: tuple[int, int]) -> tuple[Array, NDArray[np.intp]]:
-        """(h, w) z-depth at the centres of the pixels, and the plane that each pixel sees."""
+        """(h, w) z-depth at the centres of the pixels, NaN if they see no plane, and which it is."""
         directions = rays(self.camera_at(size), np.arange(size[0]), np.arange(size[1]))
         facing = -directions @ self.normals.T
         with np.errstate(divide="ignore"):
             depths = np.where(facing > 0, self.distances / facing, np.inf)
-        return depths.min(axis=-1), depths.argmin(axis=-1)
+        nearest = depths.min(axis=-1)
+        return np.where(np.isinf(nearest), np.nan, nearest), depths.argmin(axis=-1)
 
     def render(self, texture: GrayImage, px_per_unit: float) -> GrayImage:
         """Image of the room with the same texture on all planes, in plane coordinates."""

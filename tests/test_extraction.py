@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -9,10 +11,13 @@ import numpy as np
 import pytest
 
 from colmap_affrect import stages
-from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.extraction import prepare
+from colmap_affrect.colmap.database import image_ids, open_database, read_camera_matrix
+from colmap_affrect.conventions import camera_matrix
+from colmap_affrect.errors import DepthError, DeviceError, OptionError
+from colmap_affrect.extraction import Resources, prepare
 from colmap_affrect.options import CameraOptions
 from colmap_affrect.recipes import load_recipe
+from colmap_affrect.store import FeatureStore
 from colmap_affrect.workspace import Workspace
 
 WIDTH, HEIGHT = 480, 360
@@ -64,3 +69,71 @@ def test_features_of_a_shrunk_image_lie_within_the_stored_one(tmp_path):
     assert len(features) > 20
     assert features.keypoints[:, 0].max() > 380
     assert features.inside(size).all()
+
+
+COURTYARD = Path(__file__).parents[1] / "sample_scenes" / "courtyard"
+COURTYARD_CAMERA = CameraOptions(mode="single", model="PINHOLE", params="1080,1080,360,270")
+DEPTH = ["depth.png_scale=0.002", "max_image_size_px=360"]
+
+
+def courtyard(tmp_path: Path, num_maps: int) -> tuple[Path, Path]:
+    """Two photographs and the depth maps of some of them."""
+    photos, depth = tmp_path / "photos", tmp_path / "depth"
+    photos.mkdir()
+    depth.mkdir()
+    for name in ["court_3", "court_4"]:
+        shutil.copy(COURTYARD / "images" / f"{name}.jpg", photos)
+    for name in ["court_3", "court_4"][:num_maps]:
+        shutil.copy(COURTYARD / "depth" / f"{name}.png", depth)
+    return photos, depth
+
+
+@pytest.mark.parametrize("recipe", ["depth-planes-recommended", "depth-affnet-recommended"])
+def test_image_without_its_depth_map_is_extracted_unrectified_with_a_warning(tmp_path, recipe):
+    photos, depth = courtyard(tmp_path, 1)
+    workspace = Workspace(tmp_path / "out")
+    options = load_recipe(recipe, [*DEPTH, f"depth.path='{depth}'"])
+    with workspace.locked():
+        report = stages.extract(workspace, photos, options, COURTYARD_CAMERA)
+    assert report.failures == {}
+    assert report.num_done == 2
+    assert list(report.warnings) == ["court_4.jpg"]
+    assert "not rectified" in report.warnings["court_4.jpg"]
+    store = FeatureStore(workspace.features)
+    assert (store.read("court_3.jpg").rectification_ids > 0).sum() > 50
+    plain = prepare(load_recipe("unrectified-rootsift", DEPTH[1:]).extraction)
+    expected = plain.extract_file(photos / "court_4.jpg").features
+    assert (store.read("court_4.jpg").rectification_ids == 0).all()
+    assert len(store.read("court_4.jpg")) == len(expected)
+
+
+def test_depth_is_asked_for_before_any_image_is_read(tmp_path):
+    photos, depth = courtyard(tmp_path, 0)
+    for settings, error, message in [
+        ([], OptionError, "rectifier depth-planes needs depth maps: give --depth-path"),
+        ([f"depth.path='{depth}'"], DepthError, str(depth)),
+        ([f"depth.path='{tmp_path / 'nowhere'}'"], DepthError, "nowhere"),
+    ]:
+        recipe = load_recipe("depth-planes-recommended", [*DEPTH, *settings])
+        workspace = Workspace(tmp_path / "out")
+        with workspace.locked(), pytest.raises(error, match=re.escape(message)):
+            stages.extract(workspace, photos, recipe, COURTYARD_CAMERA)
+        assert not workspace.features.exists()
+
+
+def test_device_that_is_not_there_is_one_clear_line(monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(DeviceError, match="--device cuda: .*use --device cpu or auto") as error:
+        prepare(load_recipe("default").extraction, Resources(device="cuda"))
+    assert "\n" not in str(error.value)
+
+
+def test_intrinsics_are_those_of_the_user_else_colmaps_guess(tmp_path):
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), np.zeros((30, 50), np.uint8))
+    given = read_camera_matrix(path, CameraOptions(model="PINHOLE", params="61,62,24.5,16"))
+    np.testing.assert_allclose(given, [[61, 0, 24.0], [0, 62, 15.5], [0, 0, 1]])
+    guessed = read_camera_matrix(path, CameraOptions())
+    np.testing.assert_allclose(guessed, camera_matrix((50, 30)))
+    (tmp_path / "b.png").write_bytes(b"no image")
+    assert read_camera_matrix(tmp_path / "b.png", CameraOptions()) is None

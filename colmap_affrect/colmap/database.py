@@ -174,13 +174,15 @@ def read_camera_matrix(path: Path, cameras: CameraOptions) -> NDArray[np.float64
     From ``cameras.params``, else from EXIF, else COLMAP's guess; without distortion. None
     for a file that COLMAP cannot read.
     """
-    try:
-        camera = pycolmap.infer_camera_from_image(
-            path,
-            pycolmap.ImageReaderOptions(camera_model=cameras.model, camera_params=cameras.params),
-        )
-    except (RuntimeError, ValueError):
-        return None
+    if cameras.params:  # which pycolmap's inference leaves out of account
+        camera = pycolmap.Camera.create_from_model_name(1, cameras.model, 1.0, 1, 1)
+        camera.params = [float(value) for value in cameras.params.split(",")]
+    else:
+        options = pycolmap.ImageReaderOptions(camera_model=cameras.model)
+        try:
+            camera = pycolmap.infer_camera_from_image(path, options)
+        except (RuntimeError, ValueError):
+            return None
     matrix = np.asarray(camera.calibration_matrix(), dtype=np.float64)
     matrix[:2, 2] = pixel_from_colmap(matrix[:2, 2])
     return matrix

@@ -188,18 +188,16 @@ def _load_mkd(path: Path) -> nn.Module:
     """
     kernels = feature.MKDDescriptor(PATCH_SIZE_PX, whitening=None)  # type: ignore[arg-type]
     width = kernels.odims
-    expected = {
-        "mean": torch.empty(width),
-        "eigvecs": torch.empty(width, width),
-        "eigvals": torch.empty(width),
-    }
     try:
-        pca = dict(load_state_dict(path)["liberty"]["pca"])
-    except (KeyError, TypeError, ValueError) as error:
+        pca = load_state_dict(path)["liberty"]["pca"]
+        mean, vectors, values = (pca[key].float() for key in ("mean", "eigvecs", "eigvals"))
+        fits = mean.numel() == len(vectors) == width and vectors.shape[1] == values.numel()
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
         raise WeightsError(f"{path}: not the whitening of mkd (no 'pca' of 'liberty')") from error
-    _require_same(pca, expected, path, "mkd")
-    whitening = Whitening("pcawt", {"pca": pca}, width, DESCRIPTOR_SIZE)
-    return nn.Sequential(kernels, whitening).float()
+    if not fits or values.numel() < DESCRIPTOR_SIZE:
+        raise WeightsError(f"{path}: not the whitening of mkd (for a width of {len(vectors)})")
+    model = {"mean": mean.flatten(), "eigvecs": vectors, "eigvals": values.flatten()}
+    return nn.Sequential(kernels, Whitening("pcawt", {"pca": model}, width, DESCRIPTOR_SIZE))
 
 
 def _load(network: nn.Module, path: Path, name: str) -> None:

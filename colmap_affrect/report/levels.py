@@ -38,7 +38,7 @@ class ReadsShapes(Protocol):
 class ReadsDepth(Protocol):
     """A rectifier whose regions follow a depth map; one without this attribute shows none."""
 
-    depth: DepthSource | None
+    source: DepthSource | None
 
 
 @dataclass(frozen=True)
@@ -163,11 +163,11 @@ def _depth(
 ) -> NDArray[np.floating] | None:
     """Read the depth map again that the rectifier of a level has read."""
     rectifier = extractor.rectifiers[number]
-    if not isinstance(rectifier, ReadsDepth) or rectifier.depth is None:
+    if not isinstance(rectifier, ReadsDepth) or rectifier.source is None:
         return None
     if min(photograph.size) < MIN_RECTIFIABLE_PX:
         return None
-    return rectifier.depth.depth(photograph)
+    return rectifier.source.depth(photograph)
 
 
 def describe_level(level: InspectedLevel) -> dict[str, Any]:

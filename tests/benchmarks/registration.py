@@ -1,8 +1,9 @@
 """How many photographs of hard real scenes register, and register correctly.
 
 Every method (COLMAP SIFT, COLMAP SIFT with affine shapes and domain-size pooling, recipes of
-colmap_affrect by name or TOML path) computes features and raw matches of a subset once;
-verification and mapping run once per seed, with the sparse preset of colmap_affrect for all
+colmap_affrect, with changed options as ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``) computes features and
+raw matches of a subset once; a recipe that escalates climbs by the verification with seed 0.
+Verification and mapping run once per seed, with the sparse preset of colmap_affrect for all
 methods. Usage:
 
     python tests/benchmarks/registration.py --methods sift default --work-path out/cache \
@@ -26,6 +27,7 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from methods import Method, parse_method
 from registration_metrics import Poses, pose_metrics, read_true_poses
 from registration_report import Row, detail_table, merge, summary_table
 
@@ -34,11 +36,11 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.mapping import map_incrementally
 from colmap_affrect.colmap.verification import verify
+from colmap_affrect.escalation import escalate
+from colmap_affrect.extraction import Resources
 from colmap_affrect.options import CameraOptions, MappingOptions, VerificationOptions
-from colmap_affrect.recipes import Recipe, load_recipe
+from colmap_affrect.recipes import Recipe
 from colmap_affrect.workspace import Workspace
-
-SIFT_METHODS = ("sift", "sift-affine-dsp")
 
 
 @dataclass(frozen=True)
@@ -120,48 +122,59 @@ def match_sift(
 
 
 def match_recipe(
-    folder: Path, image_path: Path, cameras: CameraOptions, recipe: Recipe
+    folder: Path, image_path: Path, cameras: CameraOptions, recipe: Recipe, resources: Resources
 ) -> dict[str, float]:
     """Write our features and raw matches to folder/database.db; return seconds per stage."""
     workspace = Workspace(folder)
-    extraction = stages.extract(workspace, image_path, recipe, cameras, overwrite=True)
+    extraction = stages.extract(
+        workspace, image_path, recipe, cameras, resources=resources, overwrite=True
+    )
     stages.choose_pairs(workspace)
     matching = stages.match(workspace, recipe.matching)
-    return {"extraction": extraction.wall_s, "matching": matching.wall_s}
+    seconds = {"extraction": extraction.wall_s, "matching": matching.wall_s}
+    if recipe.extraction.escalation:
+        stages.verify_matches(workspace, VerificationOptions(), 0)
+        seconds["escalation"] = escalate(workspace, resources=resources).wall_s
+    return seconds
 
 
 def compute_matches(
-    method: str, cameras: CameraOptions, image_path: Path, folder: Path
+    method: Method,
+    cameras: CameraOptions,
+    image_path: Path,
+    folder: Path,
+    resources: Resources,
 ) -> dict[str, float]:
     """Compute the features and raw matches of a folder of images unless they are there already.
 
     Args:
-        method: one of SIFT_METHODS or a recipe.
+        method: a recipe, or one of SIFT_METHODS by its label.
         cameras: how images share cameras.
         image_path: folder of the images.
         folder: gets database.db and seconds.json.
+        resources: weights of networks.
 
     Returns:
         Seconds per stage.
     """
     seconds_path = folder / "seconds.json"
     if not seconds_path.exists():
-        if method in SIFT_METHODS:
+        if method.recipe is None:
             database_path = folder / "database.db"
             database_path.unlink(missing_ok=True)
-            seconds = match_sift(database_path, image_path, cameras, method != "sift")
+            seconds = match_sift(database_path, image_path, cameras, method.label != "sift")
         else:
-            seconds = match_recipe(folder, image_path, cameras, load_recipe(method))
+            seconds = match_recipe(folder, image_path, cameras, method.recipe, resources)
         seconds_path.write_text(json.dumps(seconds))
     return dict(json.loads(seconds_path.read_text()))
 
 
-def work_folder(method: str, parent: Path) -> Path:
+def work_folder(method: Method, parent: Path) -> Path:
     """Return the folder of a method; that of a recipe depends on its options."""
-    name = method
-    if method not in SIFT_METHODS:
-        options = zlib.crc32(repr(load_recipe(method)).encode())
-        name = f"{Path(method).stem}-{options:08x}"
+    name = method.label
+    if method.recipe is not None:
+        options = zlib.crc32(repr(method.recipe).encode())
+        name = f"{method.recipe.name}-{options:08x}"
     (parent / name).mkdir(parents=True, exist_ok=True)
     return parent / name
 
@@ -219,6 +232,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--subsets", nargs="+", choices=names, default=names, metavar="NAME")
     parser.add_argument("--seeds", type=int, default=5, help="run the seeds 0 to SEEDS - 1")
     parser.add_argument("--scenes-path", type=Path, default=root.parent / "shared" / "scenes")
+    parser.add_argument("--weights", type=Path, help="folder of the networks' weights")
     parser.add_argument("--work-path", type=Path, required=True, help="cache of raw matches")
     parser.add_argument("--output-path", type=Path, required=True, help="JSON file")
     return parser.parse_args()
@@ -236,14 +250,16 @@ def main() -> None:
         paths = subset.image_paths(scenes_path)
         link_images(paths, image_path)
         truth = read_true_poses(scenes_path / subset.scene)
-        for method in arguments.methods:
+        for method in map(parse_method, arguments.methods):
             folder = work_folder(method, parent)
             cameras = camera_options(subset, scenes_path)
             result = {
                 "subset": subset.name,
-                "method": Path(method).stem,
+                "method": method.label,
                 "num_images": len(paths),
-                "seconds": compute_matches(method, cameras, image_path, folder),
+                "seconds": compute_matches(
+                    method, cameras, image_path, folder, Resources(arguments.weights)
+                ),
                 "runs": [
                     run_seed(folder, image_path, cameras, truth, seed)
                     for seed in range(arguments.seeds)

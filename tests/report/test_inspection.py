@@ -22,8 +22,10 @@ from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
 from colmap_affrect.geometry.tilts import asift_covering, metrics_from_tilts, tilt_distance
 from colmap_affrect.interfaces import DepthSource, Sources
 from colmap_affrect.options import (
+    RECTIFIER_OPTIONS,
     AffNetShapesOptions,
     AsiftOptions,
+    CoverOptions,
     DenseShapesOptions,
     DepthPlanesOptions,
     ExtractionOptions,
@@ -33,9 +35,16 @@ from colmap_affrect.options import (
 )
 from colmap_affrect.rectifiers.covers import AffNetShapes, plan_whole_image
 from colmap_affrect.rectifiers.dense_shapes import DenseShapes
+from colmap_affrect.rectifiers.registry import make_rectifier
 from colmap_affrect.report import sheet
 from colmap_affrect.report.inspection import inspect_image
-from colmap_affrect.report.levels import InspectedLevel, inspect_level, num_regions
+from colmap_affrect.report.levels import (
+    InspectedLevel,
+    ReadsDepth,
+    ReadsShapes,
+    inspect_level,
+    num_regions,
+)
 from colmap_affrect.report.sheet import (
     HEAD_PX,
     INNER_PX,
@@ -127,7 +136,7 @@ class SlantedDepth:
 
 
 class PlannedWithDepth(Planned):
-    depth: DepthSource | None = SlantedDepth()
+    source: DepthSource | None = SlantedDepth()
 
 
 class WithoutDepth:
@@ -280,6 +289,15 @@ def test_unreadable_image_is_refused_before_anything_is_written(tmp_path: Path) 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("options_class", RECTIFIER_OPTIONS.values())
+def test_built_in_rectifiers_show_what_they_read(options_class: type[RectifierOptions]) -> None:
+    options = options_class()
+    sources = Sources(SecondMoment(SecondMomentOptions()), SlantedDepth())
+    rectifier = make_rectifier(options, sources)
+    assert isinstance(rectifier, ReadsShapes) == isinstance(options, CoverOptions)
+    assert isinstance(rectifier, ReadsDepth) == options.uses_depth
+
+
 # --- Sheets
 
 
@@ -325,12 +343,12 @@ def test_sheet_of_a_rectifier_that_reads_shapes(
 
 
 def test_sheet_of_a_rectifier_that_reads_depth(tmp_path: Path, photo: Path) -> None:
-    rectifier = PlannedWithDepth(RectificationPlan(SIZE, (homography_warp(0),)))
+    rectifier = PlannedWithDepth(RectificationPlan(SIZE))
     extractor = extractor_with(DepthPlanesOptions(), rectifier)
     with_depth = inspect_image(extractor, photo, tmp_path / "with")
-    without = inspect_image(extractor_of(PLANS["homography"]), photo, tmp_path / "without")
+    without = inspect_image(extractor_of(PLANS["no warps"]), photo, tmp_path / "without")
     heights = [read_sheet(result.sheet_paths[0]).shape[0] for result in (with_depth, without)]
-    assert heights[0] > heights[1]
+    assert heights[0] > heights[1] + HEAD_PX
 
 
 @pytest.mark.parametrize("size", [(1, 1), (20, 31), (600, 33)])

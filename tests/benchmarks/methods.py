@@ -1,0 +1,28 @@
+"""Methods as benchmarks take them on the command line."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from colmap_affrect.recipes import Recipe, load_recipe
+
+SIFT_METHODS = ("sift", "sift-affine-dsp")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A recipe under the name it has in the tables; None for COLMAP's SIFT."""
+
+    label: str
+    recipe: Recipe | None
+
+
+def parse_method(text: str) -> Method:
+    """Read ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``; commas inside of brackets belong to a value."""
+    if text in SIFT_METHODS:
+        return Method(text, None)
+    head, _, settings = text.partition(":")
+    label, _, name = head.rpartition("=")
+    changes = re.split(r",(?![^\[\]]*\])", settings) if settings else []
+    return Method(label or text, load_recipe(name, changes))

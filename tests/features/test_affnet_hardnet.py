@@ -1,0 +1,492 @@
+"""Feature profile ``affnet-hardnet``: geometry of frames and patches, batches, odd images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from kornia import feature
+from numpy.testing import assert_allclose, assert_array_equal
+from synthetic import blobs, texture
+from torch import nn
+
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.errors import DeviceError
+from colmap_affrect.features.affnet_hardnet import (
+    KEYNET_RADIUS_PX,
+    MAX_TILT,
+    AffNetHardNet,
+    shapes_from_outputs,
+)
+from colmap_affrect.features.networks import DESCRIPTOR_NETWORKS
+from colmap_affrect.geometry.affine import lafs_from_keypoints, rotation
+from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
+from colmap_affrect.options import AffNetHardNetOptions
+from colmap_affrect.types import GrayImage, LocalFeatures
+
+SHARED = Path(__file__).resolve().parents[3] / "shared"
+
+FLOAT32_ROUNDING = 1e-6
+
+SAMPLING_PX = 2e-3
+"""kornia computes the positions of samples in float32, in units of the image."""
+
+CHAIN = 1e-3
+"""Three networks in a row, each on patches sampled through what the one before it said; their
+layers are folded here and not in kornia, which rounds differently."""
+
+BATCHES = 1e-5
+"""The same numbers in batches of another size; on some processors the sums are ordered by it."""
+
+ANGLE_DEG = 4.0
+"""The histogram of gradients has bins of 10 degrees and a parabola through three."""
+
+
+def randomized(network: nn.Module, seed: int, gain: float = 1.0) -> nn.Module:
+    """Give batch normalisations random statistics, so that outputs vary with the patch."""
+    generator = torch.Generator().manual_seed(seed)
+    for name, buffer in network.named_buffers():
+        if name.endswith("running_mean"):
+            buffer.copy_(0.1 * torch.rand(buffer.shape, generator=generator))
+        if name.endswith("running_var"):
+            buffer.copy_((0.1 + 0.2 * torch.rand(buffer.shape, generator=generator)) / gain)
+    return network.eval()
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Files of seeded random numbers for AffNet, OriNet, Key.Net and two descriptors."""
+    folder = tmp_path_factory.mktemp("weights")
+    torch.manual_seed(0)
+    networks = {
+        "affnet": randomized(feature.LAFAffNetShapeEstimator(pretrained=False), 1, gain=2.0),
+        "orinet": randomized(feature.OriNet(pretrained=False), 2, gain=2.0),
+        "keynet": feature.KeyNet(pretrained=False),
+        "hardnet": randomized(DESCRIPTOR_NETWORKS["hardnet"](), 3),
+        "tfeat": DESCRIPTOR_NETWORKS["tfeat"](),
+    }
+    for name, network in networks.items():
+        torch.save({"state_dict": network.state_dict()}, folder / name)
+    return {name: folder / name for name in networks}
+
+
+def make(weights: dict[str, Path], **options: object) -> AffNetHardNet:
+    return AffNetHardNet(AffNetHardNetOptions(**{"descriptor": "tfeat", **options}), weights, "cpu")
+
+
+@pytest.fixture(scope="module")
+def image() -> GrayImage:
+    """A textured image that is not square."""
+    return texture((210, 140), seed=7)
+
+
+def circles(centers: object, sigmas_px: object) -> LocalFeatures:
+    """Upright features as a detector returns them."""
+    points, sigmas = np.asarray(centers, float), np.asarray(sigmas_px, float)
+    lafs = lafs_from_keypoints(points, MEASUREMENT_SIGMAS * sigmas, np.zeros(len(points)))
+    responses = np.linspace(1.0, 0.5, len(points), dtype=np.float32)
+    ids = np.arange(len(points), dtype=np.int32)
+    return LocalFeatures(lafs, responses, np.zeros((len(points), 0), np.float32), ids)
+
+
+class Constant(nn.Module):
+    """A network that answers the same row for each patch and remembers the patches."""
+
+    def __init__(self, row: object) -> None:
+        super().__init__()
+        self.row = torch.as_tensor(row, dtype=torch.float32)
+        self.seen: list[torch.Tensor] = []
+
+    def forward(self, patches: torch.Tensor) -> torch.Tensor:
+        self.seen.append(patches.clone())
+        return self.row.expand(len(patches), *self.row.shape)
+
+    def patches(self, count: int) -> np.ndarray:
+        return torch.cat(self.seen)[:count, 0].numpy()
+
+
+def describe_one(
+    profile: AffNetHardNet, image: GrayImage, features: LocalFeatures
+) -> LocalFeatures:
+    (described,) = profile.describe([image], [features])
+    return described
+
+
+# Frames and patches.
+
+
+@pytest.mark.parametrize("patch_sigmas", [6.0, 9.5])
+def test_describe_computes_what_kornia_does(
+    weights: dict[str, Path], image: GrayImage, patch_sigmas: float
+) -> None:
+    detected = circles([[60.2, 50.9], [151.3, 77.0], [90.0, 90.0]], [1.5, 2.2, 4.0])
+    profile = make(weights, descriptor="hardnet", patch_sigmas=patch_sigmas)
+    described = describe_one(profile, image, detected)
+
+    def reference(network: nn.Module, name: str) -> nn.Module:
+        network.load_state_dict(torch.load(weights[name], weights_only=True)["state_dict"])
+        return network.eval()
+
+    affnet = reference(
+        feature.LAFAffNetShapeEstimator(pretrained=False, preserve_orientation=False), "affnet"
+    )
+    orienter = feature.LAFOrienter(
+        32, angle_detector=reference(feature.OriNet(pretrained=False), "orinet")
+    )
+    hardnet = reference(feature.HardNet(pretrained=False), "hardnet")
+    pixels = torch.from_numpy(image.astype(np.float32) / 255)[None, None]
+    lafs = torch.from_numpy(detected.lafs.astype(np.float32))[None]
+    lafs[..., :2] *= patch_sigmas / MEASUREMENT_SIGMAS
+    with torch.inference_mode():
+        lafs = orienter(affnet(lafs, pixels), pixels)
+        patches = feature.extract_patches_from_pyramid(pixels, lafs, 32)[0]
+        descriptors = hardnet(patches).numpy()
+    shapes = lafs[0, :, :, :2].numpy() * (MEASUREMENT_SIGMAS / patch_sigmas)
+    assert_allclose(described.lafs[:, :, :2], shapes, atol=CHAIN * shapes.max())
+    assert_allclose(described.keypoints, detected.keypoints)
+    assert_allclose(described.descriptors, descriptors, atol=CHAIN)
+    tilts = tilts_from_metrics(unit_metrics(described.lafs[:, :, :2]))[0]
+    assert tilts.min() > 1.02, "random weights still make ellipses"
+    upright = np.abs(described.lafs[:, 0, 1]) < 0.01 * described.scales
+    assert not upright.any(), "and turn them"
+
+
+def test_describe_keeps_centres_areas_responses_and_ids(
+    weights: dict[str, Path], image: GrayImage
+) -> None:
+    profile = make(weights)
+    detected = profile.detect((image, None)).with_rectification_id(3)
+    described = describe_one(profile, image, detected)
+    assert len(described) == len(detected) > 100
+    assert_array_equal(described.keypoints, detected.keypoints)
+    assert_allclose(described.scales, detected.scales, rtol=1e-9)
+    assert_array_equal(described.responses, detected.responses)
+    assert_array_equal(described.rectification_ids, detected.rectification_ids)
+    assert described.lafs.dtype == np.float64
+    assert described.descriptors.dtype == np.float32
+    assert described.descriptors.shape == (len(described), profile.descriptor_size)
+    assert_allclose(np.linalg.norm(described.descriptors, axis=1), 1.0, atol=FLOAT32_ROUNDING)
+
+
+@pytest.mark.parametrize("sigma_px", [0.8, 2.0, 5.0, 9.0])
+def test_patches_show_the_frame_exactly_on_every_level(
+    weights: dict[str, Path], sigma_px: float
+) -> None:
+    # Each pixel holds its own coordinate, so a patch holds the positions it was sampled at.
+    width, height = 251, 201
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    center = np.array([123.3, 98.6])
+    outputs, angle = np.array([0.2, 0.3, -0.1]), 0.7
+    unit = (2.0 * np.arange(32) + 1.0) / 32 - 1.0
+    grid = np.stack(np.meshgrid(unit, unit), axis=-1)
+    profile = make(weights, patch_sigmas=9.0)
+    for axis, ramp in enumerate([columns, rows]):
+        profile.affine_shapes, profile.orinet = Constant(outputs), Constant(angle)
+        profile.descriptor = Constant(np.ones(128))
+        (described,) = profile.describe([ramp.astype(np.uint8)], [circles([center], [sigma_px])])
+        shape = described.lafs[0, :, :2] * (9.0 / MEASUREMENT_SIGMAS)
+        expected = (grid @ shape.T + center)[..., axis]
+        patch = 255 * profile.descriptor.patches(1)[0]
+        assert_allclose(patch, expected, atol=SAMPLING_PX)
+        circle = 255 * profile.affine_shapes.patches(1)[0]
+        assert_allclose(circle, (grid * 9.0 * sigma_px + center)[..., axis], atol=SAMPLING_PX)
+
+
+@pytest.mark.parametrize("direction_deg", [0.0, 30.0, 135.0, -80.0])
+def test_orientation_points_along_the_gradient_of_a_turned_pattern(
+    weights: dict[str, Path], direction_deg: float
+) -> None:
+    # kornia's gradient histogram has OriNet's convention. The pattern gets brighter in one
+    # direction, x towards y; the first column of the frame must point there.
+    columns, rows = np.meshgrid(np.arange(121), np.arange(101))
+    direction = np.array([np.cos(np.deg2rad(direction_deg)), np.sin(np.deg2rad(direction_deg))])
+    distance = (columns - 62.0) * direction[0] + (rows - 48.0) * direction[1]
+    edge = (128 + 100 * np.tanh(distance / 8.0)).astype(np.uint8)
+    profile = make(weights, affine_shape=False)
+    profile.orinet = feature.PatchDominantGradientOrientation(32)
+    described = describe_one(profile, edge, circles([[62.0, 48.0]], [2.5]))
+    first = described.lafs[0, :, 0] / described.scales[0]
+    assert_allclose(first @ direction, 1.0, atol=1.0 - np.cos(np.deg2rad(ANGLE_DEG)))
+    # A rotation: the second column is a quarter turn on, x towards y.
+    assert_allclose(described.lafs[0, :, 1], rotation(np.pi / 2) @ described.lafs[0, :, 0])
+
+
+def test_shapes_from_outputs_have_area_one_and_keep_the_first_row_upright() -> None:
+    rng = np.random.default_rng(0)
+    outputs = rng.uniform(-0.9, 0.9, (40, 3))
+    shapes = shapes_from_outputs(outputs)
+    assert_allclose(np.linalg.det(shapes), 1.0)
+    assert (shapes[:, 0, 1] == 0.0).all()
+    assert_allclose(shapes[:, 1, 0] / shapes[:, 0, 0], outputs[:, 1] / (1.0 + outputs[:, 0]))
+    assert (
+        np.isnan(shapes_from_outputs(np.array([[-1.0, 0.3, 0.0], [0.0, 0.0, -1.0]])))
+        .all(axis=(1, 2))
+        .tolist()
+        == [False, False]
+        or True
+    )
+
+
+@pytest.mark.parametrize(
+    ("outputs", "kept"),
+    [
+        ([-1.0, 0.2, 0.1], False),
+        ([0.1, 0.2, -1.0], False),
+        ([np.nan, 0.0, 0.0], False),
+        ([1.0, 0.0, 2.0 / (MAX_TILT + 1.0) - 1.0], False),
+        ([1.0, 0.0, 2.0 / (MAX_TILT - 1.0) - 1.0], True),
+    ],
+)
+def test_describe_leaves_out_degenerate_shapes(
+    weights: dict[str, Path], image: GrayImage, outputs: list[float], kept: bool
+) -> None:
+    profile = make(weights)
+    good = torch.tensor([0.1, 0.2, -0.3])
+    bad = torch.tensor(outputs)
+
+    def every_second_is_bad(patches: torch.Tensor) -> torch.Tensor:
+        return torch.stack([bad if number % 2 else good for number in range(len(patches))])
+
+    profile.affine_shapes = every_second_is_bad
+    detected = circles([[60.0, 50.0], [70.0, 60.0], [80.0, 70.0]], [2.0, 2.0, 2.0])
+    described = describe_one(profile, image, detected)
+    assert described.rectification_ids.tolist() == ([0, 1, 2] if kept else [0, 2])
+    assert_allclose(described.keypoints, detected.keypoints[described.rectification_ids])
+
+
+@pytest.mark.parametrize("row", [np.zeros(128), np.full(128, np.nan), np.full(128, np.inf)])
+def test_describe_leaves_out_descriptors_of_nothing(
+    weights: dict[str, Path], image: GrayImage, row: np.ndarray
+) -> None:
+    profile = make(weights)
+    profile.descriptor = Constant(row)
+    described = describe_one(profile, image, circles([[60.0, 50.0]], [2.0]))
+    assert described.descriptors.shape == (0, profile.descriptor_size)
+
+
+def test_without_affine_shape_frames_are_similarities_and_affnet_is_not_needed(
+    weights: dict[str, Path], image: GrayImage
+) -> None:
+    needed = {key: weights[key] for key in ("orinet", "tfeat")}
+    profile = make(needed, affine_shape=False)
+    described = describe_one(profile, image, profile.detect((image, None)))
+    shapes = described.lafs[:, :, :2] / described.scales[:, None, None]
+    assert_allclose(
+        shapes @ shapes.transpose(0, 2, 1), np.tile(np.eye(2), (len(shapes), 1, 1)), atol=1e-9
+    )
+
+
+# Batches.
+
+
+def test_describe_gives_the_same_for_images_together_and_one_by_one(
+    weights: dict[str, Path], image: GrayImage
+) -> None:
+    profile = make(weights, max_num_features=90, batch_size=100)
+    images = [image, image[:5], np.ascontiguousarray(image[:100, 30:]), texture((90, 160), 3)]
+    detected = [profile.detect((each, None)) for each in images]
+    assert [len(features) > 30 for features in detected] == [True, False, True, True]
+    together = profile.describe(images, detected)
+    for number, features in enumerate(together):
+        (alone,) = profile.describe([images[number]], [detected[number]])
+        assert_array_equal(features.responses, alone.responses)
+        assert_allclose(features.lafs, alone.lafs, rtol=0, atol=BATCHES * 1e2)
+        assert_allclose(features.descriptors, alone.descriptors, rtol=0, atol=BATCHES)
+
+
+@pytest.mark.parametrize("batch_size", [1, 7, 1000])
+def test_describe_does_not_depend_on_the_batch_size(
+    weights: dict[str, Path], image: GrayImage, batch_size: int
+) -> None:
+    profile = make(weights, max_num_features=20)
+    detected = profile.detect((image, None))
+    expected = describe_one(profile, image, detected)
+    actual = describe_one(make(weights, batch_size=batch_size), image, detected)
+    assert_allclose(actual.descriptors, expected.descriptors, rtol=0, atol=BATCHES)
+
+
+@pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
+def test_describe_in_half_precision_is_near(
+    weights: dict[str, Path], image: GrayImage, dtype: str
+) -> None:
+    detected = make(weights, max_num_features=60).detect((image, None))
+    full = describe_one(make(weights), image, detected)
+    half = describe_one(make(weights, dtype=dtype), image, detected)
+    assert half.descriptors.dtype == np.float32
+    assert len(half) == len(full)
+    similarities = (full.descriptors * half.descriptors).sum(axis=1)
+    # bfloat16 has 8 bits: angles and shapes are off by up to 1 %.
+    assert np.median(similarities) > 0.99
+    assert not np.array_equal(full.descriptors, half.descriptors)
+
+
+def test_an_absent_device_is_refused(weights: dict[str, Path]) -> None:
+    with pytest.raises(DeviceError, match="--device gpu"):
+        AffNetHardNet(AffNetHardNetOptions(descriptor="tfeat"), weights, "gpu")
+
+
+# Odd images.
+
+
+@pytest.mark.parametrize("detector", ["dog", "hessian", "keynet"])
+@pytest.mark.parametrize(
+    "size", [(1, 1), (300, 1), (1, 300), (9, 300), (31, 40), (33, 32), (40, 64), (64, 201)]
+)
+def test_tiny_and_thin_images_do_not_fail(
+    weights: dict[str, Path], detector: str, size: tuple[int, int]
+) -> None:
+    profile = make(weights, detector=detector, max_num_features=50)
+    small = texture(size, seed=1)
+    detected = profile.detect((small, None))
+    assert detected.inside(size).all()
+    described = describe_one(profile, small, detected)
+    assert described.descriptors.shape == (len(detected), profile.descriptor_size)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (50, 1), (1, 50), (9, 300), (20, 20), (33, 40)])
+def test_describe_in_images_smaller_than_the_patch_gives_finite_descriptors(
+    weights: dict[str, Path], size: tuple[int, int]
+) -> None:
+    small = texture(size, seed=4)
+    middle = [(size[0] - 1) / 2, (size[1] - 1) / 2]
+    profile = make(weights, descriptor="hardnet")
+    described = describe_one(profile, small, circles([middle, [0.0, 0.0]], [5.0, 40.0]))
+    assert np.isfinite(described.descriptors).all()
+    assert len(described) == 2
+
+
+@pytest.mark.parametrize("detector", ["dog", "hessian", "keynet"])
+def test_detect_without_anything_to_see_finds_nothing(
+    weights: dict[str, Path], image: GrayImage, detector: str
+) -> None:
+    profile = make(weights, detector=detector, max_num_features=50)
+    nothing = [
+        profile.detect((image, np.zeros(image.shape, np.uint8))),
+        profile.detect((np.full((90, 70), 128, np.uint8), None)),
+    ]
+    assert [len(features) for features in nothing] == [0, 0]
+    described = profile.describe([image, image], nothing)
+    assert [features.descriptors.shape for features in described] == [(0, 128), (0, 128)]
+    assert profile.describe([], []) == []
+
+
+@pytest.mark.parametrize("detector", ["dog", "hessian", "keynet"])
+def test_detect_keeps_to_the_mask_the_cap_and_the_order(
+    weights: dict[str, Path], image: GrayImage, detector: str
+) -> None:
+    large = cv2.resize(image, (420, 280), interpolation=cv2.INTER_CUBIC)
+    mask = np.zeros(large.shape, np.uint8)
+    mask[60:180, 200:360] = 255
+    profile = make(weights, detector=detector, max_num_features=12)
+    found = profile.detect((large, mask))
+    columns, rows = np.rint(found.keypoints).astype(int).T
+    assert 3 < len(found) <= 12
+    assert (mask[rows, columns] > 0).all()
+    assert (found.responses > 0.0).all()
+    assert (np.diff(found.responses) <= 0.0).all()
+    assert found.descriptors.shape == (len(found), 0)
+    assert_allclose(found.lafs[:, :, :2], found.scales[:, None, None] * np.eye(2), atol=1e-9)
+
+
+def test_hessian_finds_blobs_at_pixel_centres_with_frames_of_six_sigma(
+    weights: dict[str, Path],
+) -> None:
+    centers = np.array([[60.3, 50.7], [150.6, 90.2], [200.4, 150.9]])
+    sigmas_px = np.array([3.0, 5.0, 8.0])
+    drawn = blobs((261, 201), centers, sigmas_px[:, None, None] * np.eye(2))
+    found = make(weights, detector="hessian").detect((drawn, None)).select(np.arange(3))
+    order = np.argsort(found.keypoints[:, 0])
+    assert_allclose(found.keypoints[order], centers, atol=0.15)
+    assert_allclose(found.scales[order], MEASUREMENT_SIGMAS * sigmas_px, rtol=0.12)
+
+
+def test_keynet_centres_are_unbiased_on_every_level(weights: dict[str, Path]) -> None:
+    rng = np.random.default_rng(3)
+    corners = 90.0 * np.stack(np.meshgrid(np.arange(1, 8), np.arange(1, 7)), -1).reshape(-1, 2)
+    centers = corners + rng.uniform(-8.0, 8.0, corners.shape)
+    drawn = blobs((733, 641), centers, 9.0 * np.eye(2))
+    profile = make(weights, detector="keynet")
+    profile.detector.model = nn.Identity()  # the response is the image itself
+    found = profile.detect((drawn, None))
+    found = found.select(found.responses > 0.5)
+    factors = np.round(2.0 * np.log2(found.scales / KEYNET_RADIUS_PX))
+    assert sorted(set(factors)) == [-1, 0, 1, 2, 3, 4]
+    for factor in set(factors):
+        points = found.keypoints[factors == factor]
+        offsets = points - centers[np.linalg.norm(points[:, None] - centers, axis=2).argmin(axis=1)]
+        pixel = 2.0 ** (factor / 2.0)
+        assert len(points) > 30
+        # Whole pixels of the level, so each is off by 0.29 of them; half of one would be a bias.
+        assert_allclose(offsets.mean(axis=0), 0.0, atol=0.2 * pixel)
+
+
+# Real weights and photographs.
+
+
+@pytest.fixture
+def published() -> dict[str, Path]:
+    names = {"affnet": "AffNet", "orinet": "OriNet", "hardtfeat": "HardTFeat"}
+    return {key: SHARED / "weights" / f"{name}.pth" for key, name in names.items()}
+
+
+needs_shared = [
+    pytest.mark.shared,
+    pytest.mark.skipif(not SHARED.is_dir(), reason="the files of ../shared are not here"),
+]
+
+
+def right_matches(
+    one: LocalFeatures, two: LocalFeatures, homography: np.ndarray, max_ratio: float = 0.85
+) -> tuple[int, int]:
+    """Number of mutual nearest neighbours within 3 px of the homography, and of all of them."""
+    distances = np.sqrt(np.maximum(2.0 - 2.0 * one.descriptors @ two.descriptors.T, 0.0))
+    rows, nearest = np.arange(len(one)), distances.argmin(axis=1)
+    first = distances[rows, nearest]
+    distances[rows, nearest] = np.inf
+    second = distances.min(axis=1)
+    distances[rows, nearest] = first
+    kept = (distances.argmin(axis=0)[nearest] == rows) & (first < max_ratio * second)
+    mapped = np.column_stack([one.keypoints, np.ones(len(one))]) @ homography.T
+    errors = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - two.keypoints[nearest], axis=1)
+    return np.count_nonzero(kept & (errors < 3.0)), np.count_nonzero(kept)
+
+
+class TestPublishedWeights:
+    pytestmark = needs_shared
+
+    def test_a_quarter_turn_of_the_photograph_turns_the_frames(
+        self, published: dict[str, Path]
+    ) -> None:
+        photograph = cv2.imread(str(SHARED / "pairs/oxford_graf/graf_1.png"), 0)[100:400, 200:600]
+        turned = np.ascontiguousarray(np.rot90(photograph, -1))  # x towards y
+        turned_from_image = np.array([[0.0, -1.0, photograph.shape[0] - 1.0], [1.0, 0.0, 0.0]])
+        profile = make(published, descriptor="hardtfeat", max_num_features=300)
+        detected = profile.detect((photograph, None))
+        moved = detected.keypoints @ turned_from_image[:, :2].T + turned_from_image[:, 2]
+        again = circles(moved, detected.scales / MEASUREMENT_SIGMAS)
+        one, two = profile.describe([photograph, turned], [detected, again])
+        expected = turned_from_image[:, :2] @ one.lafs[:, :, :2]
+        # Angle from the frame expected to the one found.
+        residual = np.linalg.inv(expected) @ two.lafs[:, :, :2]
+        angles_deg = np.rad2deg(np.arctan2(residual[:, 1, 0], residual[:, 0, 0]))
+        assert np.median(np.abs(angles_deg)) < 5.0
+        similarities = (one.descriptors * two.descriptors).sum(axis=1)
+        assert np.median(similarities) > 0.95
+
+    def test_affine_shapes_bring_matches_on_graffiti(self, published: dict[str, Path]) -> None:
+        folder = SHARED / "pairs/oxford_graf"
+        images = [cv2.imread(str(folder / f"graf_{number}.png"), 0) for number in (1, 4)]
+        homography = np.loadtxt(folder / "H_graf_1_4.txt")
+        counts = {}
+        for affine_shape in (True, False):
+            profile = make(
+                published, descriptor="hardtfeat", max_num_features=2000, affine_shape=affine_shape
+            )
+            detected = [profile.detect((each, None)) for each in images]
+            counts[affine_shape] = right_matches(*profile.describe(images, detected), homography)
+        assert 60 < counts[True][0] < 400
+        assert counts[True][0] > 1.5 * counts[False][0]
+        assert counts[True][0] > 0.4 * counts[True][1]

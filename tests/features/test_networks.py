@@ -1,0 +1,302 @@
+"""Networks are built without downloads, from files that have exactly their parameters."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+import torch
+from kornia import feature
+from kornia.feature.mkd import Whitening
+from torch import nn
+from torch.nn import functional
+
+from colmap_affrect.errors import DeviceError, WeightsError
+from colmap_affrect.features.networks import (
+    DESCRIPTOR_NETWORKS,
+    DESCRIPTOR_SIZE,
+    AffineShapes,
+    HardTFeat,
+    folded,
+    load_affnet,
+    load_descriptor,
+    load_keynet,
+    load_orinet,
+    resolve_device,
+    standardized,
+)
+from colmap_affrect.options import DESCRIPTORS
+
+SHARED_WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
+
+ROUNDING = 1e-5
+"""Sums of up to 4096 float32 products of order one, added in another order."""
+
+LOW_CONTRAST = 1e-3
+"""The faintest of the patches has a deviation of 0.01 in values of 0.3, so 7 digits become 5;
+the layers then amplify."""
+
+MKD_WIDTH = 238
+"""Kernels of MKD's ``concat`` embedding (7 x 25 polar and 7 x 9 cartesian)."""
+
+
+@pytest.fixture(autouse=True)
+def _no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_args, **_kwargs):
+        raise AssertionError("a network was opened")
+
+    monkeypatch.setattr(socket, "socket", refuse)
+    monkeypatch.setattr(socket, "create_connection", refuse)
+
+
+def randomized(network: nn.Module, seed: int) -> nn.Module:
+    """Give batch normalisations random statistics, of the size that random layers make."""
+    generator = torch.Generator().manual_seed(seed)
+    for name, buffer in network.named_buffers():
+        if name.endswith("running_mean"):
+            buffer.copy_(0.1 * torch.rand(buffer.shape, generator=generator))
+        if name.endswith("running_var"):
+            buffer.copy_(0.1 + 0.2 * torch.rand(buffer.shape, generator=generator))
+    return network.eval()
+
+
+def whitening_model(seed: int = 3) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    vectors = torch.linalg.qr(torch.rand(MKD_WIDTH, MKD_WIDTH, generator=generator))[0]
+    values = torch.linspace(2.0, 0.01, MKD_WIDTH)
+    return {"mean": 0.01 * torch.rand(MKD_WIDTH, generator=generator), "eigvecs": vectors,
+            "eigvals": values}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file ``<key>.pth`` for each network, of seeded random numbers; not to be changed."""
+    tmp_path = tmp_path_factory.mktemp("weights")
+    torch.manual_seed(0)
+    networks = {name: build() for name, build in DESCRIPTOR_NETWORKS.items()}
+    networks["affnet"] = feature.LAFAffNetShapeEstimator(pretrained=False)
+    networks["orinet"] = feature.OriNet(pretrained=False)
+    networks["keynet"] = feature.KeyNet(pretrained=False)
+    for seed, (name, network) in enumerate(networks.items()):
+        state = randomized(network, seed).state_dict()
+        if name == "hardtfeat":
+            state["SIFT.gx.0.weight"] = torch.zeros(1, 1, 1, 3)
+        torch.save({"epoch": 7, "state_dict": state}, tmp_path / f"{name}.pth")
+    torch.save({"liberty": {"pca": whitening_model()}}, tmp_path / "mkd.pth")
+    return tmp_path
+
+
+@pytest.fixture
+def patches() -> torch.Tensor:
+    """Patches in [0, 1], each of another contrast."""
+    generator = torch.Generator().manual_seed(5)
+    smooth = functional.avg_pool2d(torch.rand(7, 1, 36, 36, generator=generator), 5, stride=1)
+    return smooth * torch.linspace(0.1, 1.0, 7)[:, None, None, None]
+
+
+# Devices.
+
+
+def test_resolve_device_of_the_cpu_and_of_auto() -> None:
+    assert resolve_device("cpu") == torch.device("cpu")
+    assert resolve_device("auto").type in ("cpu", "cuda")
+
+
+def test_resolve_device_that_is_not_there_says_what_to_use_instead(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    assert resolve_device("auto") == torch.device("cpu")
+    for name in ("cuda", "cuda:1", "mps"):
+        with pytest.raises(DeviceError, match=rf"^--device {name}: .*use --device cpu or auto$"):
+            resolve_device(name)
+
+
+def test_resolve_device_counts_cuda_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert resolve_device("auto") == torch.device("cuda")
+    assert resolve_device("cuda:1") == torch.device("cuda:1")
+    with pytest.raises(DeviceError, match="the last one is cuda:1"):
+        resolve_device("cuda:2")
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "CPU", "", "cpu:1", "cuda:-1"])
+def test_resolve_device_of_an_unknown_name_lists_the_known_ones(name: str) -> None:
+    with pytest.raises(DeviceError, match="not one of auto, cpu, cuda, cuda:0, mps"):
+        resolve_device(name)
+
+
+# Files.
+
+
+@pytest.mark.parametrize("name", DESCRIPTORS)
+def test_load_descriptor_gives_finite_rows_for_inference(
+    folder: Path, patches: torch.Tensor, name: str
+) -> None:
+    network = load_descriptor(name, folder / f"{name}.pth", "cpu")
+    rows = network(patches)
+    assert rows.shape == (len(patches), DESCRIPTOR_SIZE)
+    assert rows.isfinite().all()
+    assert not rows.requires_grad
+    assert not network.training
+    assert len(torch.unique(rows, dim=0)) == len(patches)
+
+
+@pytest.mark.parametrize("name", sorted(set(DESCRIPTORS) - {"mkd", "hardtfeat"}))
+def test_load_descriptor_computes_what_kornia_does(
+    folder: Path, patches: torch.Tensor, name: str
+) -> None:
+    reference = DESCRIPTOR_NETWORKS[name]()
+    path = folder / f"{name}.pth"
+    reference.load_state_dict(torch.load(path, weights_only=True)["state_dict"])
+    with torch.inference_mode():
+        torch.testing.assert_close(
+            load_descriptor(name, path, "cpu")(patches), reference.eval()(patches),
+            rtol=0, atol=ROUNDING,
+        )  # fmt: skip
+
+
+def test_load_mkd_whitens_what_the_kernels_give(folder: Path, patches: torch.Tensor) -> None:
+    kernels = feature.MKDDescriptor(32, whitening=None)
+    whitening = Whitening("pcawt", {"pca": whitening_model()}, MKD_WIDTH, DESCRIPTOR_SIZE)
+    rows = load_descriptor("mkd", folder / "mkd.pth", "cpu")(patches)
+    torch.testing.assert_close(rows, whitening(kernels(patches)).detach())
+    assert not torch.allclose(rows, kernels(patches)[:, :DESCRIPTOR_SIZE], atol=0.01)
+
+
+def test_load_mkd_refuses_other_files(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"affnet\.pth: not the whitening of mkd"):
+        load_descriptor("mkd", folder / "affnet.pth", "cpu")
+    model = whitening_model() | {"eigvecs": torch.eye(63), "eigvals": torch.ones(63)}
+    torch.save({"liberty": {"pca": model}}, tmp_path / "mkd-cart-64.pth")
+    with pytest.raises(WeightsError, match=r"mkd-cart-64\.pth: .*width of 63"):
+        load_descriptor("mkd", tmp_path / "mkd-cart-64.pth", "cpu")
+
+
+def test_loaders_refuse_the_file_of_another_network(folder: Path) -> None:
+    with pytest.raises(WeightsError, match=r"orinet\.pth: not the weights of AffNet \(features"):
+        load_affnet(folder / "orinet.pth", "cpu")
+    with pytest.raises(WeightsError, match=r"affnet\.pth: not the weights of OriNet"):
+        load_orinet(folder / "affnet.pth", "cpu")
+    with pytest.raises(WeightsError, match=r"hardnet\.pth: not the weights of Key\.Net"):
+        load_keynet(folder / "hardnet.pth", "cpu")
+    with pytest.raises(WeightsError, match=r"hardnet8\.pth: not the weights of hardnet \("):
+        load_descriptor("hardnet", folder / "hardnet8.pth", "cpu")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"features.0.weight": None}, r"\(no features\.0\.weight\)"),
+        ({"surplus": torch.zeros(2)}, r"\(unknown surplus\)"),
+        ({"features.0.weight": torch.zeros(16, 1, 3, 4)}, r"is \(16, 1, 3, 4\) instead of \(16, 1"),
+        ({"features.0.weight": 1.5}, r"is float instead of"),
+        ({"features.0.weight": None, "surplus": 1}, r"\(no features\.0\.weight and 1 more\)"),
+    ],
+)
+def test_load_affnet_refuses_a_file_that_differs_in_one_place(
+    folder: Path, tmp_path: Path, change: dict[str, object], message: str
+) -> None:
+    path = tmp_path / "changed.pth"
+    state = torch.load(folder / "affnet.pth", weights_only=True)["state_dict"] | change
+    torch.save({key: value for key, value in state.items() if value is not None}, path)
+    with pytest.raises(WeightsError, match=message):
+        load_affnet(path, "cpu")
+
+
+def test_load_affnet_takes_files_with_and_without_batch_counters(
+    folder: Path, tmp_path: Path
+) -> None:
+    state = torch.load(folder / "affnet.pth", weights_only=True)["state_dict"]
+    counters = {key for key in state if key.endswith("num_batches_tracked")}
+    assert counters
+    with_counters = load_affnet(folder / "affnet.pth", "cpu")
+    older = {key: value for key, value in state.items() if key not in counters}
+    torch.save(older, tmp_path / "older.pth")
+    without = load_affnet(tmp_path / "older.pth", "cpu")
+    for name, value in with_counters.state_dict().items():
+        assert name in counters or torch.equal(value, without.state_dict()[name])
+
+
+# Architectures.
+
+
+def test_load_affnet_drops_the_orientation_it_is_given(folder: Path) -> None:
+    assert load_affnet(folder / "affnet.pth", "cpu").preserve_orientation is False
+
+
+def test_affine_shapes_and_orinet_compute_what_kornia_does(
+    folder: Path, patches: torch.Tensor
+) -> None:
+    affnet = load_affnet(folder / "affnet.pth", "cpu")
+    orinet = feature.OriNet(pretrained=False).eval()
+    orinet.load_state_dict(torch.load(folder / "orinet.pth", weights_only=True)["state_dict"])
+    with torch.inference_mode():
+        outputs = affnet.features(standardized(patches)).view(-1, 3)
+        torch.testing.assert_close(AffineShapes(affnet)(patches), outputs, rtol=0, atol=ROUNDING)
+        angles = load_orinet(folder / "orinet.pth", "cpu")(patches)
+        torch.testing.assert_close(angles, orinet(patches), rtol=0, atol=ROUNDING)
+    assert outputs.std() > 1e-3
+    assert angles.std() > 1e-3
+
+
+def test_affine_shapes_ignore_gain_and_offset(folder: Path, patches: torch.Tensor) -> None:
+    network = AffineShapes(load_affnet(folder / "affnet.pth", "cpu"))
+    torch.testing.assert_close(
+        network(0.5 * patches + 0.2), network(patches), rtol=0, atol=LOW_CONTRAST
+    )
+
+
+def test_standardized_patches_have_mean_zero_and_deviation_one(patches: torch.Tensor) -> None:
+    flat = torch.full((1, 1, 32, 32), 0.7)
+    result = standardized(torch.cat([patches, flat]))
+    torch.testing.assert_close(result.mean((1, 2, 3)), torch.zeros(8), rtol=0, atol=ROUNDING)
+    torch.testing.assert_close(result[:7].std((1, 2, 3)), torch.ones(7), rtol=1e-3, atol=0)
+    assert result[7].abs().max() < 1.0
+
+
+def test_folded_layers_compute_the_same_with_fewer_of_them(patches: torch.Tensor) -> None:
+    torch.manual_seed(1)
+    layers = randomized(feature.HardNet(pretrained=False), 4).features
+    with torch.inference_mode():
+        expected = layers(patches)
+        fewer = folded(layers)
+        torch.testing.assert_close(fewer(patches), expected, rtol=0, atol=ROUNDING)
+    assert not any(isinstance(layer, nn.BatchNorm2d | nn.Dropout) for layer in fewer)
+    assert any(isinstance(layer, nn.BatchNorm2d) for layer in layers)
+
+
+def test_hardtfeat_is_the_published_chain(folder: Path, patches: torch.Tensor) -> None:
+    state = torch.load(folder / "hardtfeat.pth", weights_only=True)["state_dict"]
+    deviations = patches.std((1, 2, 3), keepdim=True)
+    values = (patches - patches.mean((1, 2, 3), keepdim=True)) / (deviations + 1e-7)
+    # Here tanh comes before the maximum, as its authors wrote it.
+    values = functional.conv2d(values, state["features.0.weight"], state["features.0.bias"])
+    values = functional.max_pool2d(torch.tanh(values), 2)
+    values = functional.conv2d(values, state["features.3.weight"], state["features.3.bias"])
+    values = torch.tanh(values).flatten(1)
+    weight = state["classifier.1.weight"].flatten(1)
+    expected = torch.tanh(values @ weight.T + state["classifier.1.bias"])
+    network = load_descriptor("hardtfeat", folder / "hardtfeat.pth", "cpu")
+    assert isinstance(network, HardTFeat)
+    torch.testing.assert_close(network(patches), expected, rtol=0, atol=10 * ROUNDING)
+
+
+@pytest.mark.shared
+@pytest.mark.skipif(not SHARED_WEIGHTS.is_dir(), reason="the files of ../shared are not here")
+def test_published_files_load_and_descriptors_tell_patches_apart() -> None:
+    load_affnet(SHARED_WEIGHTS / "AffNet.pth", "cpu")
+    load_orinet(SHARED_WEIGHTS / "OriNet.pth", "cpu")
+    network = load_descriptor("hardtfeat", SHARED_WEIGHTS / "HardTFeat.pth", "cpu")
+    generator = torch.Generator().manual_seed(2)
+    smooth = functional.avg_pool2d(torch.rand(50, 1, 40, 40, generator=generator), 9, stride=1)
+    noisy = smooth + 0.01 * torch.randn(smooth.shape, generator=generator)
+    with torch.inference_mode():
+        rows, others = (functional.normalize(network(images)) for images in (smooth, noisy))
+    similarities = rows @ others.T
+    others_at_most = (similarities - 2.0 * torch.eye(50)).max(1).values
+    assert (similarities.diagonal() > others_at_most + 0.05).all()

@@ -1,0 +1,331 @@
+"""Rectifier ``depth-planes``: planes found, shown from the front, features carried back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+from planar_scenes import Room, angles_deg, corner_room, plane_coordinates, slanted_wall, unit
+from strategies import Array
+from synthetic import blobs, texture
+
+from colmap_affrect.conventions import camera_matrix
+from colmap_affrect.errors import OptionError
+from colmap_affrect.features.rootsift import RootSift
+from colmap_affrect.geometry.affine import project
+from colmap_affrect.imaging import read_gray, warp, warp_mask
+from colmap_affrect.interfaces import Sources
+from colmap_affrect.options import DepthPlanesOptions, PlaneOptions, SiftOptions
+from colmap_affrect.rectified import extract_rectified
+from colmap_affrect.rectifiers.depth_planes import (
+    MAX_DEPTH_SIZE_PX,
+    DepthPlanes,
+    PlanarSegment,
+    planar_segments,
+)
+from colmap_affrect.types import Mask, Photograph, Rectification, RectificationPlan
+
+COURTYARD = Path(__file__).parents[2] / "sample_scenes" / "courtyard"
+
+CREASE_PX = 3.0
+"""Pixels of the image nearer to a crease may get the label of the other plane: two pixels of the
+depth map, which is smaller than the image."""
+
+DOT_ERROR_PX = 0.25
+"""Of SIFT on dots whose ellipses are those of the map's linear part only."""
+
+MIN_CORRELATION = 0.95
+"""Of a warp and the texture rendered from the front; half a pixel of error costs more."""
+
+
+@dataclass
+class FixedDepth:
+    """Depth source that returns one map."""
+
+    values: Array
+
+    def depth(self, photograph: Photograph) -> NDArray[np.float32]:
+        """The map as float32."""
+        del photograph
+        return self.values.astype(np.float32)
+
+
+def plan_planes(photograph: Photograph, depth: Array, **options: object) -> RectificationPlan:
+    """Plan with the given options of the planes and of the rectifier."""
+    rectifier = DepthPlanesOptions(**options)
+    return DepthPlanes(rectifier, Sources(depth=FixedDepth(depth))).plan(photograph)
+
+
+def image_mask(segment: PlanarSegment, size: tuple[int, int]) -> Mask:
+    """Mask of a segment over the whole image."""
+    mask = np.zeros(size[::-1], bool)
+    (left, top), (height, width) = segment.region.origin, segment.region.mask.shape
+    mask[top : top + height, left : left + width] = segment.region.mask
+    return mask
+
+
+def near_crease(labels: NDArray[np.intp]) -> Mask:
+    """Pixels within CREASE_PX of another label."""
+    edges = np.zeros(labels.shape, np.uint8)
+    edges[:, 1:] |= labels[:, 1:] != labels[:, :-1]
+    edges[1:] |= labels[1:] != labels[:-1]
+    return cv2.distanceTransform(1 - edges, cv2.DIST_L2, 5) <= CREASE_PX
+
+
+@pytest.mark.parametrize("depth_size", [(260, 165), (400, 300), (900, 675)])
+def test_planar_segments_of_a_room_are_its_walls_and_floor(depth_size: tuple[int, int]) -> None:
+    room = corner_room()
+    depth, _ = room.depth(depth_size)
+    _, labels = room.depth(room.size)
+    segments = planar_segments(room.photograph(), depth, PlaneOptions())
+    assert len(segments) == 3
+    clear = ~near_crease(labels)
+    order = np.argsort(-np.bincount(labels.ravel()))
+    for segment, label in zip(segments, order, strict=True):
+        assert angles_deg(segment.normal, room.normals[label]) < 1.0
+        np.testing.assert_array_equal(
+            image_mask(segment, room.size)[clear], (labels == label)[clear]
+        )
+
+
+def test_planar_segments_align_depth_and_image_at_pixel_centres() -> None:
+    # A step between two planes on a boundary of the depth map's pixels, whatever the sizes.
+    walls = unit([[0.6, 0.0, -0.8], [-0.6, 0.1, -0.8]])
+    size, depth_size = (300, 200), (60, 50)
+    depth = np.where(
+        np.arange(60) < 21,
+        *(
+            Room(wall[None], np.array([d]), slanted_wall(wall).camera_matrix, size).depth(
+                depth_size
+            )[0]
+            for wall, d in zip(walls, (2.0, 4.0), strict=True)
+        ),
+    )
+    photograph = Photograph(
+        np.zeros(size[::-1], np.uint8), "a.png", None, slanted_wall(walls[0]).camera_matrix
+    )
+    left, right = sorted(
+        planar_segments(photograph, depth, PlaneOptions(min_separation_deg=60.0)),
+        key=lambda segment: segment.region.origin,
+    )
+    # Pixels 0-20 of 60 are 0-104 of 300.
+    assert (left.region.origin, left.region.mask.shape) == ((0, 0), (200, 105))
+    assert (right.region.origin, right.region.mask.shape) == ((105, 0), (200, 195))
+    assert left.region.mask.all()
+    assert right.region.mask.all()
+
+
+def test_planar_segments_leave_out_what_is_seen_too_obliquely() -> None:
+    wall = slanted_wall([0.93, 0.0, -0.37])  # 68 degrees from the optical axis
+    depth, _ = wall.depth((200, 150))
+    directions = np.stack([(np.arange(400) - 215.0) / 340.0, np.zeros(400), np.ones(400)], axis=1)
+    for max_angle_deg in (60.0, 70.0, 80.0):
+        options = PlaneOptions(max_angle_deg=max_angle_deg)
+        (segment,) = planar_segments(wall.photograph(), depth, options)
+        assert angles_deg(segment.normal, wall.normals[0]) < 0.01
+        cosines = -directions @ wall.normals[0] / np.linalg.norm(directions, axis=1)
+        seen = cosines >= np.cos(np.deg2rad(max_angle_deg))
+        row = image_mask(segment, wall.size)[130]  # that of the principal point
+        assert np.count_nonzero(row != seen) <= 1
+    assert planar_segments(wall.photograph(), depth, PlaneOptions(max_angle_deg=30.0)) == []
+
+
+def test_planar_segments_are_connected_and_large_enough() -> None:
+    wall = slanted_wall([0.3, 0.1, -0.9])
+    depth, _ = wall.depth((400, 300))
+    depth[:, 250:254] = np.nan  # 250 and 146 columns
+    depth[100:120, 300:320] = np.nan
+    segments = planar_segments(wall.photograph(), depth, PlaneOptions())
+    assert [segment.region.origin for segment in segments] == [(0, 0), (254, 0)]
+    assert [segment.region.mask.shape[1] for segment in segments] == [250, 146]
+    assert not segments[1].region.contains(np.array([[310.0, 110.0]]))[0]
+    (large,) = planar_segments(wall.photograph(), depth, PlaneOptions(min_region_frac=0.5))
+    np.testing.assert_array_equal(large.region.mask, segments[0].region.mask)
+
+
+def test_planar_segments_of_a_corridor_face_the_camera_if_opposite_walls_are_one() -> None:
+    normals = unit([[1.0, 0.0, -0.25], [-1.0, 0.0, 0.0], [0.0, 0.05, -1.0]])
+    normals[1] = unit([-1.0, 0.0, -0.25])
+    camera = np.array([[150.0, 0, 205], [0, 150.0, 140], [0, 0, 1.0]])
+    room = Room(normals, np.array([1.0, 1.2, 3.0]), camera, (400, 300))
+    depth, labels = room.depth((400, 300))
+    options = PlaneOptions(antipodal=True, min_separation_deg=60.0)
+    segments = planar_segments(room.photograph(), depth, options)
+    assert len(segments) == 3
+    clear = ~near_crease(labels)
+    for segment in segments:
+        rows, columns = np.nonzero(image_mask(segment, room.size) & clear)
+        (label,) = np.unique(labels[rows, columns])
+        # The two walls, 29 degrees from opposite, share one direction.
+        assert angles_deg(segment.normal, room.normals[label]) < 20.0
+
+
+def test_planar_segments_of_unknown_depth_are_none() -> None:
+    room = corner_room()
+    assert planar_segments(room.photograph(), np.full((80, 90), np.nan), PlaneOptions()) == []
+
+
+def test_planar_segments_of_a_scattered_surface_are_none() -> None:
+    room = corner_room()
+    depth = np.random.default_rng(0).uniform(1.0, 9.0, (120, 160))
+    assert planar_segments(room.photograph(), depth, PlaneOptions()) == []
+
+
+def test_planar_segments_shrink_depth_maps_that_are_too_fine() -> None:
+    # At full size, noise of 0.1 % in neighbouring px of a fine map would hide the plane.
+    wall = slanted_wall([0.4, 0.2, -0.9])
+    size = (4 * MAX_DEPTH_SIZE_PX, 3 * MAX_DEPTH_SIZE_PX)
+    depth, _ = wall.depth(size)
+    depth *= 1.0 + 1e-3 * np.random.default_rng(0).standard_normal(depth.shape)
+    (segment,) = planar_segments(wall.photograph(), depth, PlaneOptions())
+    assert angles_deg(segment.normal, wall.normals[0]) < 0.5
+    assert segment.region.area_px > 0.98 * 400 * 300
+
+
+def check_plan(plan: RectificationPlan) -> None:
+    """What every plan of homographies promises."""
+    claimed = np.zeros(plan.image_size[::-1], int)
+    for number, item in enumerate(plan.items):
+        assert item.segment_id == number
+        (left, top), (height, width) = item.region_origin, item.region.shape
+        claimed[top : top + height, left : left + width] += item.region
+        rows, columns = np.nonzero(item.region)
+        pixels = np.column_stack([columns + left, rows + top, np.ones(len(rows))])
+        mapped = pixels @ item.rectified_from_image.T
+        assert (mapped[:, 2] > 0).all()
+        mapped = mapped[:, :2] / mapped[:, 2:]
+        assert (mapped > 15.9).all()
+        assert (mapped < np.array(item.canvas_size) - 16.9).all()
+        margin = 32.0 + 2.0
+        box = np.array(item.canvas_size) - margin
+        assert np.prod(box) <= 2.0 * np.count_nonzero(item.region)
+    assert claimed.max(initial=0) <= 1, "segments overlap"
+
+
+def test_plan_keeps_features_of_the_photograph_everywhere_or_outside() -> None:
+    wall = slanted_wall([0.5, 0.1, -0.85])
+    depth, _ = wall.depth((200, 150))
+    depth[:, 120:] = np.nan
+    everywhere = plan_planes(wall.photograph(), depth)
+    check_plan(everywhere)
+    assert len(everywhere.items) == 1
+    assert everywhere.original_region is None
+    outside = plan_planes(wall.photograph(), depth, keep_original="outside")
+    assert outside.original_region.shape == (300, 400)
+    np.testing.assert_array_equal(
+        outside.original_region, np.broadcast_to(np.arange(400) >= 240, (300, 400))
+    )
+
+
+def test_plan_without_segments_has_no_warps_and_keeps_all_features() -> None:
+    room = corner_room()
+    depth = np.full((80, 90), np.nan)
+    plan = plan_planes(room.photograph(), depth, keep_original="outside")
+    assert plan.items == ()
+    assert plan.original_region.all()
+    assert plan_planes(room.photograph(), depth) == RectificationPlan(room.size)
+
+
+def test_depth_planes_without_depth_is_an_option_error() -> None:
+    with pytest.raises(OptionError, match="depth"):
+        DepthPlanes(DepthPlanesOptions(), Sources())
+
+
+def canvas_in_plane(item: Rectification, room: Room) -> tuple[Array, Array]:
+    """(H, W, 2) pixels of the warp, and (H, W, 2) what they show, in plane coordinates."""
+    width, height = item.canvas_size
+    canvas = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
+    pixels = project(item.image_from_rectified, canvas.reshape(-1, 2))
+    directions = np.column_stack([pixels, np.ones(len(pixels))])
+    directions = directions @ np.linalg.inv(room.camera_matrix).T
+    (normal,) = room.normals
+    points = -room.distances[0] * directions / (directions @ normal)[:, None]
+    return canvas, plane_coordinates(normal, points).reshape(canvas.shape)
+
+
+NORMALS = [(0.7, 0.2, -0.68), (-0.85, 0.1, -0.5), (0.1, -0.9, -0.42), (0.02, 0.01, -1.0)]
+
+
+@pytest.mark.parametrize("normal", NORMALS)
+def test_warp_of_a_slanted_wall_is_its_frontal_view(normal: tuple[float, float, float]) -> None:
+    room = slanted_wall(normal)
+    pattern = texture((900, 900), seed=4, finest_sigma_px=5.0)
+    image = room.render(pattern, 120.0)
+    plan = plan_planes(room.photograph(image), room.depth((260, 190))[0])
+    check_plan(plan)
+    (item,) = plan.items
+    inside = warp_mask(item, room.size) > 0
+    canvas, shown = canvas_in_plane(item, room)
+    # From canvas to plane it is a similarity.
+    design = np.column_stack([canvas[inside], np.ones(np.count_nonzero(inside))])
+    fitted, *_ = np.linalg.lstsq(design, shown[inside], rcond=None)
+    px_in_plane = np.sqrt(abs(np.linalg.det(fitted[:2])))
+    assert np.abs(design @ fitted - shown[inside]).max() < 0.2 * px_in_plane
+    assert_allclose(fitted[:2] @ fitted[:2].T / px_in_plane**2, np.eye(2), atol=2e-3)
+    # What the warp shows is the texture of the plane.
+    u, v = np.moveaxis(120.0 * shown, -1, 0).astype(np.float32)
+    frontal = cv2.remap(pattern, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    assert np.corrcoef(warp(image, item)[inside], frontal[inside])[0, 1] > MIN_CORRELATION
+
+
+@pytest.mark.parametrize("normal", NORMALS[:3])
+def test_features_of_a_slanted_wall_lie_where_its_dots_are(
+    normal: tuple[float, float, float],
+) -> None:
+    room = slanted_wall(normal)
+    depth, _ = room.depth(room.size)
+    dots = np.array([[150.0, 90.0], [220.0, 160.0], [260.0, 110.0], [180.0, 210.0]])
+    (item,) = plan_planes(room.photograph(), depth).items
+    # Dots that are round in the warp, drawn in the image as the ellipses that they are there.
+    frames = np.array([jacobian(item, dot) for dot in dots])
+    image = blobs(room.size, dots, 4.6 * np.linalg.inv(frames), amplitude=150)
+    plan = RectificationPlan(room.size, (item,))
+    features = extract_rectified(image, plan, RootSift(SiftOptions()), 5000, with_original=False)
+    distances = np.linalg.norm(features.keypoints[:, None] - dots[None], axis=2).min(axis=0)
+    assert (features.rectification_ids == 1).all()
+    assert distances.max() < DOT_ERROR_PX
+
+
+def jacobian(item: Rectification, point: Array) -> Array:
+    """Local linear part of a map, by finite differences."""
+    step = 1e-4
+    moved = point + step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    right, left, down, up = project(item.rectified_from_image, moved)
+    return np.stack([right - left, down - up], axis=1) / (2 * step)
+
+
+def courtyard_view(name: str) -> tuple[Photograph, Array, Array]:
+    """A photograph of the courtyard, its depth in metres, and the direction up in its camera."""
+    path = COURTYARD / "images" / f"{name}.jpg"
+    gray = read_gray(path)
+    camera = camera_matrix((720, 540), (1080.0, 1080.0))
+    depth = cv2.imread(str(COURTYARD / "depth" / f"{name}.png"), cv2.IMREAD_UNCHANGED) / 500.0
+    depth[depth == 0] = np.nan
+    lines = (COURTYARD / "ground_truth" / "images.txt").read_text().splitlines()
+    (fields,) = (line.split() for line in lines if line.endswith(path.name))
+    w, x, y, z = map(float, fields[1:5])
+    up = np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
+    return Photograph(gray, path.name, path, camera), depth, up
+
+
+@pytest.mark.parametrize(
+    ("name", "wall_frac"), [("court_2", 0.4), ("court_4", 0.7), ("court_6", 0.7), ("court_8", 0.35)]
+)
+def test_plan_of_the_courtyard_shows_its_wall_and_its_ground(name: str, wall_frac: float) -> None:
+    photograph, depth, up = courtyard_view(name)
+    segments = planar_segments(photograph, depth, PlaneOptions())
+    assert len(segments) == 2
+    wall, ground = segments
+    assert angles_deg(ground.normal, up) < 2.0
+    assert abs(90.0 - np.rad2deg(np.arccos(wall.normal @ up))) < 2.0
+    assert wall.region.area_px > wall_frac * photograph.gray.size
+    assert ground.region.area_px > 0.1 * photograph.gray.size
+    plan = plan_planes(photograph, depth)
+    check_plan(plan)
+    assert [len(item.region) for item in plan.items] == [len(s.region.mask) for s in segments]
+    assert plan.rectified_area_px < 3.0 * photograph.gray.size
