@@ -548,8 +548,7 @@ def _inspect(options: argparse.Namespace) -> int:
 
     recipe = _recipe(options, options.recipe)
     extractor = prepare(recipe.extraction, _resources(options), [options.image.name])
-    for path in inspect_image(extractor, options.image, options.output_path):
-        print(path)
+    print(inspect_image(extractor, options.image, options.output_path).summary())
     return EXIT_OK
 
 

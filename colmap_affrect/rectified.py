@@ -36,9 +36,8 @@ def extract_rectified(
 ) -> LocalFeatures:
     """Return the features of the image and of all planned warps, frames in image px.
 
-    Of the features in warps the ``max_num_rectified`` strongest are kept. A feature of the
-    image that the warp of a region found again gives way to it. Only what stays is described,
-    and all of it in one call.
+    Of the features in warps the ``max_num_rectified`` strongest are kept. Only what stays is
+    described, and all of it in one call.
 
     Args:
         image: (H, W) uint8.
@@ -57,13 +56,9 @@ def extract_rectified(
     keep = [_usable(*pair, plan) for pair in zip(carried, rectifications, strict=True)]
     warped = slice(1 if with_original else 0, None)
     _keep_strongest(keep[warped], carried[warped], max_num_rectified)
-    regional = [
-        features.select(kept)
-        for features, kept, rectification in zip(carried, keep, rectifications, strict=True)
-        if rectification is not None and rectification.region is not None
-    ]
-    if with_original and regional:
-        keep[0] &= ~found_again(carried[0], union(regional))
+    if with_original and plan.replaces_original and plan.items:
+        kept = [part.select(mask) for part, mask in zip(carried, keep, strict=True)]
+        keep[0] &= ~found_again(carried[0], union(kept[1:]))
     chosen = [features.select(kept) for features, kept in zip(detected, keep, strict=True)]
     described = profile.describe([view[0] for view in views], chosen)
     first_id = 0 if with_original else 1
@@ -123,11 +118,11 @@ def _keep_strongest(keep: list[Mask], features: list[LocalFeatures], limit: int)
 
 
 def found_again(original: LocalFeatures, rectified: LocalFeatures) -> Mask:
-    """Tell which features of the image itself a regional warp shows at the same place and scale.
+    """Tell which features of the image itself a warp shows at the same place and scale.
 
     Same means centres within half a sigma and scales within ``SAME_SCALE_RATIO`` in the
-    image, whatever the orientation. A region holds just those pixels whose shape is nearer
-    to the class of its warp than to the identity, so of the two the residual tilt of the
+    image, whatever the orientation. The region of a warp holds just those pixels whose shape
+    is nearer to its class than to the identity, so of the two the residual tilt of the
     rectified feature is the smaller one, and the one to keep.
     """
     scales1, scales2 = original.scales, rectified.scales

@@ -238,11 +238,15 @@ class RectificationPlan:
         items: the warps; may be empty.
         original_region: (H, W) bool, where features of the image itself are kept; None
             means everywhere.
+        replaces_original: a feature of the image itself gives way to one of a warp at the same
+            place and scale. For disjoint regions, each with the map that suits it best; where
+            several warps show the same place none of them is better than the image for sure.
     """
 
     image_size: tuple[int, int]
     items: tuple[Rectification, ...] = ()
     original_region: Mask | None = None
+    replaces_original: bool = False
 
     @property
     def rectified_area_px(self) -> int:

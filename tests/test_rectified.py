@@ -208,7 +208,8 @@ def test_extract_rectified_replaces_features_of_the_image_that_a_warp_found_agai
     image = texture(SIZE, seed=25, finest_sigma_px=2.5)
     original = PROFILE.detect((image, None))
     # A map next to the identity finds nearly all of them again.
-    union = extract_rectified(image, one_warp(1.01, 0.3, SIZE), PROFILE, 100_000)
+    plan = replace(one_warp(1.01, 0.3, SIZE), replaces_original=True)
+    union = extract_rectified(image, plan, PROFILE, 100_000)
     kept = union.select(union.rectification_ids == 0)
     rectified = of_warps(union)
     deep = is_inside(original.keypoints, SIZE, 1.5 * ellipse_extents(original.lafs[:, :, :2]))
@@ -218,6 +219,23 @@ def test_extract_rectified_replaces_features_of_the_image_that_a_warp_found_agai
     # None is lost without another one in its place.
     for laf in original.lafs[gone]:
         assert np.linalg.norm(rectified.keypoints - laf[:, 2], axis=1).min() < 4.0
+
+
+def test_extract_rectified_keeps_the_features_of_the_image_unless_the_plan_says_otherwise() -> None:
+    image = texture(SIZE, seed=25, finest_sigma_px=2.5)
+    original = PROFILE.detect((image, None))
+    plan = one_warp(1.01, 0.3, SIZE)
+    kept = extract_rectified(image, plan, PROFILE, 100_000)
+    assert_allclose(kept.lafs[kept.rectification_ids == 0], original.lafs)
+    left = np.zeros((SIZE[1], SIZE[0]), bool)
+    left[:, :150] = True
+    partly = extract_rectified(image, replace(plan, original_region=left), PROFILE, 100_000)
+    of_image = partly.select(partly.rectification_ids == 0)
+    assert (np.rint(of_image.keypoints[:, 0]) < 150).all()
+    assert len(of_image) == np.count_nonzero(np.rint(original.keypoints[:, 0]) < 150)
+    alone = extract_rectified(image, plan, PROFILE, 100_000, with_original=False)
+    assert_allclose(alone.lafs, kept.lafs[kept.rectification_ids == 1])
+    assert (alone.rectification_ids == 1).all()
 
 
 def features_at(places: list[tuple[float, float]], sigmas_px: list[float]) -> LocalFeatures:

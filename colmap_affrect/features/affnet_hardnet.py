@@ -50,6 +50,10 @@ MIN_DETECTABLE_PX = 32
 KEYNET_RADIUS_PX = 22.0
 """Radius of kornia's frames of Key.Net on the image itself, its measurement region."""
 
+MIN_RESPONSE = 1e-10
+"""kornia fills up to the number asked for with frames of response 0 at the origin. Its Hessian
+finds rounding errors of 1e-13 in flat images; a blob of one gray level has 1e-6."""
+
 MAX_TILT = 20.0
 """More is degenerate: AffNet has left its range, a patch would be less than 2 px of the image
 wide for a feature of sigma 1."""
@@ -57,9 +61,6 @@ wide for a feature of sigma 1."""
 BATCH_MULTIPLE = 64
 """Batches are filled up to multiples of this many patches. Measured on a CPU: other sizes change
 the last bits of the results, so that an image alone would differ from one among others."""
-
-MIN_LENGTH = 0.5
-"""Descriptors are longer once normalised; those of nothing are 0 or not a number."""
 
 
 class AffNetHardNet:
@@ -109,8 +110,8 @@ class AffNetHardNet:
             )
         frames = lafs[0].cpu().numpy().astype(np.float64)
         responses = strengths[0].cpu().numpy()
-        # kornia fills up to the number asked for with frames of response 0 at the origin.
-        frames, responses = frames[responses > 0.0], responses[responses > 0.0]
+        seen = responses > MIN_RESPONSE
+        frames, responses = frames[seen], responses[seen]
         centers, radii_px = frames[:, :, 2], np.sqrt(np.linalg.det(frames[:, :, :2]))
         if self.options.detector == "keynet":
             centers = _centers_from_keynet(centers, radii_px)
@@ -139,20 +140,25 @@ class AffNetHardNet:
         found = union(list(detected))
         with torch.inference_mode():
             shapes, descriptors = self._describe(_Patches(images, counts, self.device), found)
-        valid = _is_sound(shapes) & (np.linalg.norm(descriptors, axis=1) > MIN_LENGTH)
+        lengths = np.linalg.norm(descriptors, axis=1)
+        valid = _is_sound(shapes) & np.isfinite(lengths) & (lengths > 0.0)
         radii_px = found.scales
         described = []
         for part in np.split(np.arange(len(found)), np.cumsum(counts)[:-1]):
             kept = part[valid[part]]
             lafs = _frames(shapes[kept], radii_px[kept], found.keypoints[kept])
+            rows = descriptors[kept] / lengths[kept, None]
             ids = found.rectification_ids[kept]
-            described.append(LocalFeatures(lafs, found.responses[kept], descriptors[kept], ids))
+            described.append(LocalFeatures(lafs, found.responses[kept], rows, ids))
         return described
 
     def _describe(
         self, patches: _Patches, found: LocalFeatures
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Return (N, 2, 2) shapes of determinant 1 with orientation, and (N, 128) descriptors."""
+        """Return (N, 2, 2) shapes of determinant 1 with orientation, and (N, 128) descriptors.
+
+        The descriptors are of any length.
+        """
         half_widths_px = self.options.patch_sigmas / MEASUREMENT_SIGMAS * found.scales
         shapes = np.tile(np.eye(2), (len(found), 1, 1))
         if self.affine_shapes is not None:
@@ -163,8 +169,7 @@ class AffNetHardNet:
         shapes = shapes @ rotation(-self._run(self.orinet, unturned).astype(np.float64))
         turned = patches.sample(_frames(shapes, half_widths_px, found.keypoints))
         descriptors = self._run(self.descriptor, turned)
-        lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)
-        return shapes, descriptors / np.maximum(lengths, np.finfo(np.float32).tiny)
+        return shapes, descriptors
 
     def _run(self, network: nn.Module, patches: Tensor) -> NDArray[np.float32]:
         """Run a network on (N, 1, 32, 32) patches, in batches."""

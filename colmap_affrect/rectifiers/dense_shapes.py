@@ -72,7 +72,7 @@ def plan_dense_shapes(
             linear = rectifying_affine(tilt, angle, area_preserving=options.area_preserving)
             matrix, canvas, region, origin = _placed(linear, part, grid, image_size)
             items.append(Rectification(matrix, canvas, region, tilt, angle, origin, label))
-    return RectificationPlan(image_size, tuple(items))
+    return RectificationPlan(image_size, tuple(items), replaces_original=True)
 
 
 def _placed(
