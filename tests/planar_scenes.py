@@ -35,6 +35,14 @@ def rays(camera_matrix: Array, columns: Array, rows: Array) -> Array:
     return points @ np.linalg.inv(camera_matrix).T
 
 
+def look_up(texture: GrayImage, x: NDArray[np.floating], y: NDArray[np.floating]) -> GrayImage:
+    """Values of a texture at points of its pixel grid; its border is reflected once."""
+    height, width = texture.shape
+    x, y = np.clip(x, -width, 2 * width), np.clip(y, -height, 2 * height)
+    maps = x.astype(np.float32), y.astype(np.float32)
+    return cv2.remap(texture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+
+
 @dataclass(frozen=True)
 class Room:
     """Planes n . P = -d before a camera, of which each pixel sees the nearest.
@@ -56,7 +64,7 @@ class Room:
         return resized_from_original(self.size, size) @ self.camera_matrix
 
     def depth(self, size: tuple[int, int]) -> tuple[Array, NDArray[np.intp]]:
-        """(h, w) z-depth at the centres of the pixels, NaN if they see no plane, and which it is."""
+        """(h, w) z-depth at pixel centres, NaN where no plane is seen, and the plane's number."""
         directions = rays(self.camera_at(size), np.arange(size[0]), np.arange(size[1]))
         facing = -directions @ self.normals.T
         with np.errstate(divide="ignore"):
@@ -69,14 +77,12 @@ class Room:
         width, height = (SUPERSAMPLING * extent for extent in self.size)
         depth, labels = self.depth((width, height))
         directions = rays(self.camera_at((width, height)), np.arange(width), np.arange(height))
-        points = directions * depth[..., None]
+        points = directions * np.nan_to_num(depth)[..., None]
         maps = np.zeros((2, height, width), np.float32)
         for label, normal in enumerate(self.normals):
             seen = labels == label
             maps[:, seen] = px_per_unit * plane_coordinates(normal, points[seen]).T
-        dense = cv2.remap(
-            texture, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-        )
+        dense = look_up(texture, maps[0], maps[1])
         return np.asarray(cv2.resize(dense, self.size, interpolation=cv2.INTER_AREA))
 
     def photograph(self, image: GrayImage | None = None) -> Photograph:

@@ -17,6 +17,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from contracts.depth_contract import DepthContract
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -555,6 +556,20 @@ def model(transformers, tmp_path_factory):
 
 
 COURT_1 = courtyard_photograph("court_1.jpg")
+
+
+class TestMonocularDepth(DepthContract):
+    """The contract that every depth source keeps."""
+
+    @pytest.fixture(autouse=True)
+    def _model(self, model):
+        self.model = model
+
+    def make(self):
+        return MonocularDepth(self.model, None, "cpu")
+
+    def photograph(self):
+        return COURT_1
 
 
 def test_network_of_relative_inverse_depth(transformers, model):

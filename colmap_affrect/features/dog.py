@@ -33,8 +33,9 @@ def make_sift(options: DogOptions) -> cv2.SIFT:
 
 
 def is_searchable(image: GrayImage, mask: NDArray[np.uint8] | None) -> bool:
-    """Tell whether an image is large enough for OpenCV and its mask not empty."""
-    return min(image.shape) >= MIN_IMAGE_SIZE_PX and (mask is None or bool(mask.any()))
+    """Tell whether an image is large enough for OpenCV, not flat, and its mask not empty."""
+    large = min(image.shape) >= MIN_IMAGE_SIZE_PX
+    return large and bool(image.min() < image.max()) and (mask is None or bool(mask.any()))
 
 
 def by_falling_response(

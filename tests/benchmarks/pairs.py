@@ -41,7 +41,7 @@ from pair_data import SETS, HomographyPair, load_pairs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import two_view_options
-from colmap_affrect.conventions import colmap_from_pixel
+from colmap_affrect.conventions import DEFAULT_FOCAL_RATIO, colmap_from_pixel
 from colmap_affrect.extraction import ImageExtractor, Resources, prepare
 from colmap_affrect.matching.nearest import MatchableImage, match_features, matchable
 from colmap_affrect.options import VerificationOptions
@@ -190,9 +190,9 @@ def verified_inliers(
     """
     options = VerificationOptions()
     geometry = pycolmap.estimate_two_view_geometry(
-        unknown_camera(size1),
+        unknown_camera(1, size1),
         colmap_from_pixel(points1),
-        unknown_camera(size2),
+        unknown_camera(2, size2),
         colmap_from_pixel(points2),
         np.stack([np.arange(len(points1))] * 2, axis=1),
         two_view_options(options, SEED),
@@ -204,9 +204,13 @@ def verified_inliers(
     return count if count >= options.min_num_inliers else 0
 
 
-def unknown_camera(size: Size) -> pycolmap.Camera:
-    """Return what COLMAP assumes of an image without EXIF: a guess that it does not rely on."""
-    return pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.2 * max(size), *size)
+def unknown_camera(camera_id: int, size: Size) -> pycolmap.Camera:
+    """Return what COLMAP assumes of an image without EXIF: a camera of its own, of unknown focus.
+
+    The id matters: two images of one camera are verified in another way.
+    """
+    focal_px = DEFAULT_FOCAL_RATIO * max(size)
+    return pycolmap.Camera.create_from_model_name(camera_id, "SIMPLE_RADIAL", focal_px, *size)
 
 
 def estimate_homography(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
 from contracts.rectifier_contract import IMAGES
+from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import texture
 
 from colmap_affrect.interfaces import FeatureProfile

@@ -9,6 +9,7 @@ import pytest
 import torch
 from kornia import feature
 from kornia.feature.mkd import Whitening
+from random_weights import randomized
 from torch import nn
 from torch.nn import functional
 
@@ -48,17 +49,6 @@ def _no_network(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(socket, "socket", refuse)
     monkeypatch.setattr(socket, "create_connection", refuse)
-
-
-def randomized(network: nn.Module, seed: int) -> nn.Module:
-    """Give batch normalisations random statistics, of the size that random layers make."""
-    generator = torch.Generator().manual_seed(seed)
-    for name, buffer in network.named_buffers():
-        if name.endswith("running_mean"):
-            buffer.copy_(0.1 * torch.rand(buffer.shape, generator=generator))
-        if name.endswith("running_var"):
-            buffer.copy_(0.1 + 0.2 * torch.rand(buffer.shape, generator=generator))
-    return network.eval()
 
 
 def whitening_model(seed: int = 3) -> dict[str, torch.Tensor]:

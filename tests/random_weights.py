@@ -1,0 +1,37 @@
+"""Weights of seeded random numbers, in files as the published ones are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from kornia import feature
+from torch import nn
+
+from colmap_affrect.features.networks import DESCRIPTOR_NETWORKS
+
+
+def randomized(network: nn.Module, seed: int, gain: float = 1.0) -> nn.Module:
+    """Give batch normalisations random statistics, so that outputs vary with the patch."""
+    generator = torch.Generator().manual_seed(seed)
+    for name, buffer in network.named_buffers():
+        if name.endswith("running_mean"):
+            buffer.copy_(0.1 * torch.rand(buffer.shape, generator=generator))
+        if name.endswith("running_var"):
+            buffer.copy_((0.1 + 0.2 * torch.rand(buffer.shape, generator=generator)) / gain)
+    return network.eval()
+
+
+def write_random_weights(folder: Path) -> dict[str, Path]:
+    """Write files for AffNet, OriNet, Key.Net and two descriptors; return them by key."""
+    torch.manual_seed(0)
+    networks = {
+        "affnet": randomized(feature.LAFAffNetShapeEstimator(pretrained=False), 1),
+        "orinet": randomized(feature.OriNet(pretrained=False), 2, gain=2.0),
+        "keynet": feature.KeyNet(pretrained=False),
+        "hardnet": randomized(DESCRIPTOR_NETWORKS["hardnet"](), 3),
+        "tfeat": DESCRIPTOR_NETWORKS["tfeat"](),
+    }
+    for name, network in networks.items():
+        torch.save({"state_dict": network.state_dict()}, folder / name)
+    return {name: folder / name for name in networks}
