@@ -584,5 +584,6 @@ def _weights(options: argparse.Namespace) -> int:
         where = f"{row.path}{checks[row.verified]}" if row.path else "not found"
         print(f"{row.key:10s} {row.file_name:32s} {row.used_for}")
         print(f"{'':10s} {where}")
-        print(f"{'':10s} sha256 {WEIGHT_FILES[row.key].sha256 or 'not known'}; licence {row.licence or 'not stated'}")
+        sha256, licence = WEIGHT_FILES[row.key].sha256 or "not known", row.licence or "not stated"
+        print(f"{'':10s} sha256 {sha256}; licence {licence}")
     return EXIT_OK

@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.errors import OptionError
 from colmap_affrect.types import (
     GrayImage,
     LocalFeatures,
@@ -96,6 +97,26 @@ class Sources:
 
     shapes: ShapeSource | None = None
     depth: DepthSource | None = None
+
+    def required_shapes(self) -> ShapeSource:
+        """Return the shape source.
+
+        Raises:
+            OptionError: when there is none.
+        """
+        if self.shapes is None:
+            raise OptionError("the rectifier needs affine shapes: name a shape_source")
+        return self.shapes
+
+    def required_depth(self) -> DepthSource:
+        """Return the depth source.
+
+        Raises:
+            OptionError: when there is none.
+        """
+        if self.depth is None:
+            raise OptionError("the rectifier needs depth maps: give a folder or a depth network")
+        return self.depth
 
 
 class Rectifier(Protocol):

@@ -123,7 +123,7 @@ def test_depth_is_asked_for_before_any_image_is_read(tmp_path):
 
 def test_device_that_is_not_there_is_one_clear_line(monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(DeviceError, match="--device cuda: .*use --device cpu or auto") as error:
+    with pytest.raises(DeviceError, match=r"--device cuda: .*use --device cpu or auto") as error:
         prepare(load_recipe("default").extraction, Resources(device="cuda"))
     assert "\n" not in str(error.value)
 

@@ -29,7 +29,6 @@ SAME_AXIS_COS = np.cos(np.deg2rad(45.0))
 """Normals at most this far from the same line belong to one axis of an orthogonal frame."""
 
 SPIRAL_STEP = 3.6
-CANDIDATES_AT_ONCE = 64
 
 
 def shrink_depth(
@@ -277,12 +276,11 @@ def _votes(
     candidates: NDArray[np.float64], normals: NDArray[np.floating], bin_cos: float, antipodal: bool
 ) -> NDArray[np.int64]:
     """Count the normals near each candidate."""
-    return np.concatenate(
+    by_axis = np.asfortranarray(normals)  # several times faster than rows of three
+    return np.array(
         [
-            np.count_nonzero(_cosines(normals, part, antipodal) >= bin_cos, axis=0)
-            for part in np.split(
-                candidates, range(CANDIDATES_AT_ONCE, len(candidates), CANDIDATES_AT_ONCE)
-            )
+            np.count_nonzero(_cosines(by_axis, candidate[None], antipodal) >= bin_cos)
+            for candidate in candidates
         ]
     )
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.geometry.canvas import fit_canvas, image_corners, rectifying_affine
 from colmap_affrect.geometry.tilts import asift_covering, cover_shapes, near_optimal_covering
+from colmap_affrect.interfaces import Sources
 from colmap_affrect.options import (
     AffineWarpOptions,
     AffNetShapesOptions,
@@ -14,7 +15,6 @@ from colmap_affrect.options import (
     CoverOptions,
     IdentityOptions,
 )
-from colmap_affrect.interfaces import Sources
 from colmap_affrect.types import Photograph, Rectification, RectificationPlan, ShapeSamples
 
 COVERINGS = {"near-optimal": near_optimal_covering, "asift": asift_covering}
@@ -58,11 +58,10 @@ class AffNetShapes:
     def __init__(self, options: AffNetShapesOptions, sources: Sources) -> None:
         """See :mod:`colmap_affrect.interfaces`."""
         self.options = options
-        self.shapes = sources.shapes
+        self.shapes = sources.required_shapes()
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Warp the whole photograph by every covering map of its shapes."""
-        assert self.shapes is not None
         centers = covering_centers(self.shapes.samples(photograph.gray), self.options)
         return plan_whole_image(photograph.size, centers, self.options)
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
 from colmap_affrect.geometry.tilts import cover_shapes
 from colmap_affrect.imaging import connected_groups
-from colmap_affrect.options import DenseShapesOptions
 from colmap_affrect.interfaces import Sources
+from colmap_affrect.options import DenseShapesOptions
 from colmap_affrect.types import Mask, Photograph, Rectification, RectificationPlan, ShapeGrid
 
 MARGIN_PX = 16.0
@@ -30,11 +30,10 @@ class DenseShapes:
     def __init__(self, options: DenseShapesOptions, sources: Sources) -> None:
         """See :mod:`colmap_affrect.interfaces`."""
         self.options = options
-        self.shapes = sources.shapes
+        self.shapes = sources.required_shapes()
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan one warp for each place of each region."""
-        assert self.shapes is not None
         return plan_dense_shapes(self.shapes.grid(photograph.gray), photograph.size, self.options)
 
 

@@ -84,7 +84,7 @@ def test_rectifier_of_another_package_is_chosen_by_its_name() -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_options_of_another_package_are_checked_as_our_own() -> None:
-    with pytest.raises(OptionError, match="unknown option 'tlit' .did you mean 'tilt'"):
+    with pytest.raises(OptionError, match=r"unknown option 'tlit' .did you mean 'tilt'"):
         load_recipe("default", ["rectifier.name=skew", "rectifier.tlit=3.0"])
-    with pytest.raises(OptionError, match="unknown 'skev' .did you mean 'skew'"):
+    with pytest.raises(OptionError, match=r"unknown 'skev' .did you mean 'skew'"):
         load_recipe("default", ["rectifier.name=skev"])

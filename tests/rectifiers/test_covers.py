@@ -34,6 +34,7 @@ class FixedShapes:
         self.metrics = metrics_from_tilts(rows[:, 0], rows[:, 1])
 
     def samples(self, image: GrayImage) -> ShapeSamples:
+        del image
         return ShapeSamples(np.full((len(self.metrics), 2), 5.0), self.metrics)
 
     def grid(self, image: GrayImage) -> ShapeGrid:
