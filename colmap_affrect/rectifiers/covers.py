@@ -15,7 +15,7 @@ from colmap_affrect.options import (
     CoverOptions,
     IdentityOptions,
 )
-from colmap_affrect.types import Photograph, Rectification, RectificationPlan, ShapeSamples
+from colmap_affrect.types import Photograph, Rectification, RectificationPlan
 
 COVERINGS = {"near-optimal": near_optimal_covering, "asift": asift_covering}
 
@@ -62,15 +62,15 @@ class AffNetShapes:
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Warp the whole photograph by every covering map of its shapes."""
-        centers = covering_centers(self.shapes.samples(photograph.gray), self.options)
+        centers = covering_centers(self.shapes.samples(photograph.gray).metrics, self.options)
         return plan_whole_image(photograph.size, centers, self.options)
 
 
-def covering_centers(shapes: ShapeSamples, options: CoverOptions) -> NDArray[np.float64]:
-    """Return the (K, 2) rows (tilt, angle_rad) that cover the shapes, each with one vote."""
+def covering_centers(metrics: NDArray[np.floating], options: CoverOptions) -> NDArray[np.float64]:
+    """Return the (K, 2) rows (tilt, angle_rad) that cover (N, 3) metrics, each with one vote."""
     return cover_shapes(
-        shapes.metrics,
-        np.ones(len(shapes.metrics)),
+        metrics,
+        np.ones(len(metrics)),
         radius=options.tilt_radius,
         max_tilt=options.max_tilt,
         covered_frac=options.covered_frac,

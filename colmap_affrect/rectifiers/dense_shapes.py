@@ -6,17 +6,13 @@ The paper's DenseAffNet (Sec. 3) with an exchangeable shape source.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
 from colmap_affrect.geometry.tilts import cover_shapes
 from colmap_affrect.imaging import connected_groups
 from colmap_affrect.interfaces import Sources
 from colmap_affrect.options import DenseShapesOptions
+from colmap_affrect.rectifiers.regions import Region, affine_rectification
 from colmap_affrect.types import Mask, Photograph, Rectification, RectificationPlan, ShapeGrid
-
-MARGIN_PX = 16.0
-"""Surroundings of a region that its descriptors may see, in warp px."""
 
 GAP_BLOCKS = 5
 """Groups of blocks closer than this are warped together."""
@@ -68,29 +64,19 @@ def plan_dense_shapes(
         for part in connected_groups(blocks, GAP_BLOCKS):
             if np.count_nonzero(part) < options.min_part_frac * labels.size:
                 continue
-            linear = rectifying_affine(tilt, angle, area_preserving=options.area_preserving)
-            matrix, canvas, region, origin = _placed(linear, part, grid, image_size)
-            items.append(Rectification(matrix, canvas, region, tilt, angle, origin, label))
+            region = _region(part, grid, image_size)
+            items.append(
+                affine_rectification(
+                    region, tilt, angle, label, area_preserving=options.area_preserving
+                )
+            )
     return RectificationPlan(image_size, tuple(items), replaces_original=True)
 
 
-def _placed(
-    linear: NDArray[np.float64], blocks: Mask, grid: ShapeGrid, image_size: tuple[int, int]
-) -> tuple[NDArray[np.float64], tuple[int, int], Mask, tuple[int, int]]:
-    """Return map, canvas, region and its origin for the warp of some blocks of the grid."""
+def _region(blocks: Mask, grid: ShapeGrid, image_size: tuple[int, int]) -> Region:
+    """Return the pixels of an image of (width, height) that some blocks of the grid cover."""
     rows, columns = np.flatnonzero(blocks.any(axis=1)), np.flatnonzero(blocks.any(axis=0))
     crop = blocks[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     left, top = int(columns[0]) * grid.step_px, int(rows[0]) * grid.step_px
-    region = np.repeat(np.repeat(crop, grid.step_px, axis=0), grid.step_px, axis=1)
-    region = region[: image_size[1] - top, : image_size[0] - left]
-    outline = _outline(region) + np.array([left, top])
-    matrix, canvas_size = fit_canvas(linear, outline, MARGIN_PX)
-    return matrix, canvas_size, region, (left, top)
-
-
-def _outline(region: Mask) -> NDArray[np.float64]:
-    """Return (N, 2) pixel centres whose convex hull is that of the region."""
-    rows = np.flatnonzero(region.any(axis=1))
-    first = region[rows].argmax(axis=1)
-    last = region.shape[1] - 1 - region[rows, ::-1].argmax(axis=1)
-    return np.stack([np.concatenate([first, last]), np.concatenate([rows, rows])], 1).astype(float)
+    mask = np.repeat(np.repeat(crop, grid.step_px, axis=0), grid.step_px, axis=1)
+    return Region(mask[: image_size[1] - top, : image_size[0] - left], (left, top))

@@ -5,13 +5,10 @@ The paper's DepthAffNet (Sec. 3): segments as in ``depth-planes``, maps as in ``
 
 from __future__ import annotations
 
-import numpy as np
-
-from colmap_affrect.errors import OptionError
-from colmap_affrect.geometry.tilts import cover_shapes
 from colmap_affrect.interfaces import Sources
 from colmap_affrect.options import DepthAffNetOptions
-from colmap_affrect.rectifiers.depth_planes import planar_segments, required_depth
+from colmap_affrect.rectifiers.covers import covering_centers
+from colmap_affrect.rectifiers.depth_planes import planar_segments
 from colmap_affrect.rectifiers.regions import affine_rectification
 from colmap_affrect.types import Photograph, Rectification, RectificationPlan
 
@@ -23,11 +20,9 @@ class DepthAffNet:
 
     def __init__(self, options: DepthAffNetOptions, sources: Sources) -> None:
         """See :mod:`colmap_affrect.interfaces`."""
-        if sources.shapes is None:
-            raise OptionError(f"rectifier {options.name} needs a source of affine shapes")
         self.options = options
-        self.shapes = sources.shapes
-        self.source = required_depth(sources)
+        self.shapes = sources.required_shapes()
+        self.source = sources.required_depth()
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan the warps of each segment; one without tilted shapes has none.
@@ -40,19 +35,12 @@ class DepthAffNet:
         samples = self.shapes.samples(photograph.gray)
         items: list[Rectification] = []
         for number, segment in enumerate(segments):
-            metrics = samples.metrics[segment.region.contains(samples.points)]
-            cover = cover_shapes(
-                metrics,
-                np.ones(len(metrics)),
-                radius=options.tilt_radius,
-                max_tilt=options.max_tilt,
-                covered_frac=options.covered_frac,
-                max_num_centers=options.max_num_rectifications,
-            )
+            inside = segment.region.contains(samples.points)
+            centers = covering_centers(samples.metrics[inside], options)
             items += [
                 affine_rectification(
                     segment.region, tilt, angle, number, area_preserving=options.area_preserving
                 )
-                for tilt, angle in cover.centers.tolist()
+                for tilt, angle in centers.tolist()
             ]
         return RectificationPlan(photograph.size, tuple(items))

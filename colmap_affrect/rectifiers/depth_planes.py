@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.conventions import resized_from_original
-from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.planes import (
     cluster_normals,
     fronto_parallel_homography,
@@ -21,7 +20,7 @@ from colmap_affrect.geometry.planes import (
     viewing_cosines,
 )
 from colmap_affrect.imaging import connected_regions
-from colmap_affrect.interfaces import DepthSource, Sources
+from colmap_affrect.interfaces import Sources
 from colmap_affrect.options import DepthPlanesOptions, PlaneOptions
 from colmap_affrect.rectifiers.regions import Region, homography_rectification
 from colmap_affrect.types import Mask, Photograph, RectificationPlan
@@ -52,7 +51,7 @@ class DepthPlanes:
     def __init__(self, options: DepthPlanesOptions, sources: Sources) -> None:
         """See :mod:`colmap_affrect.interfaces`."""
         self.options = options
-        self.source = required_depth(sources)
+        self.source = sources.required_depth()
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan one warp for each segment.
@@ -73,17 +72,6 @@ class DepthPlanes:
         if self.options.keep_original == "outside":
             outside = ~_union(segments, photograph.size)
         return RectificationPlan(photograph.size, items, outside)
-
-
-def required_depth(sources: Sources) -> DepthSource:
-    """Return the depth source.
-
-    Raises:
-        OptionError: when there is none.
-    """
-    if sources.depth is None:
-        raise OptionError("planes need depth maps: give a folder of them or a depth network")
-    return sources.depth
 
 
 def planar_segments(

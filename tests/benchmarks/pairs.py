@@ -3,7 +3,8 @@
 A method is a recipe, by name or TOML path, with settings: ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``.
 Each image's features are computed once per method, and matched by the recipe's options. A match
 is correct if its transfer error in image 2 is below 3 px. The error of a homography (OpenCV's
-USAC_MAGSAC on all matches) is its mean over what image 2 shows of image 1, in px of image 2.
+USAC_MAGSAC on all matches; the median of five orders of the matches) is its mean over what image 2
+shows of image 1, in px of image 2.
 Recipes with escalation go from level to level, the features of level k being those of levels 0 to
 k together, until COLMAP's geometric verification succeeds, as in a run. Usage:
 
@@ -24,7 +25,7 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median_low
 from typing import Any
 
 import cv2
@@ -61,7 +62,8 @@ DEFAULT_METHODS = [
 ]
 CONFIDENCE = 0.9999
 MAX_ITERATIONS = 100_000
-SEED = 0
+NUM_ESTIMATES = 5
+VERIFICATION_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -158,18 +160,23 @@ def evaluate(pair: HomographyPair, cache: FeatureCache, threshold_px: float) -> 
             break
     last = attempts[-1]
     sizes = last.images[0].size, last.images[1].size
-    estimate, num_inliers = estimate_homography(*last.points, threshold_px)
-    error_px = math.inf
-    if estimate is not None:
-        error_px = homography_error(estimate, pair.truth, *sizes)
+    estimates = [
+        estimate_homography(*last.points, threshold_px, seed) for seed in range(NUM_ESTIMATES)
+    ]
+    errors_px = [
+        math.inf if estimate is None else homography_error(estimate, pair.truth, *sizes)
+        for estimate, _ in estimates
+    ]
+    finite_px = [error if math.isfinite(error) else None for error in sorted(errors_px)]
     return {
         "keypoints": [len(image.matchable.keypoints) for image in last.images],
         "matches": len(last.points[0]),
         "correct": int((transfer_errors(pair.truth, *last.points) < CORRECT_PX).sum()),
         "verified_inliers": last.verified_inliers,
         "level": rectifiers[last.level].name if last.verified_inliers else None,
-        "inliers": num_inliers,
-        "error_px": error_px if math.isfinite(error_px) else None,
+        "inliers": median_low(num_inliers for _, num_inliers in estimates),
+        "error_px": finite_px[NUM_ESTIMATES // 2],
+        "errors_px": finite_px,
         "seconds": {
             "features": sum(image.seconds for image in last.images),
             "matching": sum(item.seconds for item in attempts),
@@ -195,7 +202,7 @@ def verified_inliers(
         unknown_camera(2, size2),
         colmap_from_pixel(points2),
         np.stack([np.arange(len(points1))] * 2, axis=1),
-        two_view_options(options, SEED),
+        two_view_options(options, VERIFICATION_SEED),
     )
     kinds = pycolmap.TwoViewGeometryConfiguration
     if geometry.config in (kinds.UNDEFINED, kinds.DEGENERATE):
@@ -214,15 +221,18 @@ def unknown_camera(camera_id: int, size: Size) -> pycolmap.Camera:
 
 
 def estimate_homography(
-    points1: NDArray[np.floating], points2: NDArray[np.floating], threshold_px: float
+    points1: NDArray[np.floating], points2: NDArray[np.floating], threshold_px: float, seed: int
 ) -> tuple[NDArray[np.float64] | None, int]:
-    """Estimate a (3, 3) homography from (N, 2) matches; also return the number of inliers."""
+    """Estimate a (3, 3) homography from (N, 2) matches; also return the number of inliers.
+
+    OpenCV draws the same samples every time, so the seed decides the order of the matches.
+    """
     if len(points1) < 4:
         return None, 0
-    cv2.setRNGSeed(SEED)
+    order = np.random.default_rng(seed).permutation(len(points1))
     estimate, inliers = cv2.findHomography(
-        points1,
-        points2,
+        points1[order],
+        points2[order],
         cv2.USAC_MAGSAC,
         threshold_px,
         maxIters=MAX_ITERATIONS,

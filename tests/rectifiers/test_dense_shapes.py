@@ -19,7 +19,8 @@ from colmap_affrect.geometry.tilts import (
     unit_metrics,
 )
 from colmap_affrect.options import DenseShapesOptions, SecondMomentOptions
-from colmap_affrect.rectifiers.dense_shapes import MARGIN_PX, plan_dense_shapes
+from colmap_affrect.rectifiers.dense_shapes import plan_dense_shapes
+from colmap_affrect.rectifiers.regions import MARGIN_PX
 from colmap_affrect.types import Mask, Rectification, RectificationPlan, ShapeGrid
 
 STEP_PX = 4
