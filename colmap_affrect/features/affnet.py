@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import deepcopy
 from math import ceil
-from typing import cast
 
 import cv2
 import numpy as np
@@ -22,9 +21,9 @@ from kornia.feature import LAFAffNetShapeEstimator, extract_patches_from_pyramid
 from numpy.typing import NDArray
 from torch import nn
 from torch.nn.utils import convert_conv2d_weight_memory_format
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, grid_origin, resized_from_original
+from colmap_affrect.features.networks import folded, standardized
 from colmap_affrect.geometry.shapes import (
     STEP_PX,
     log_metrics,
@@ -183,10 +182,8 @@ class AffNet:
         )[0]
         outputs = torch.empty((len(patches), 3))
         for begin in range(0, len(patches), BATCH_SIZE):
-            batch = patches[begin : begin + BATCH_SIZE]
-            deviations, means = torch.std_mean(batch, dim=(1, 2, 3), keepdim=True)
-            normalised = (batch - means) / (deviations + 1e-6)
-            outputs[begin : begin + BATCH_SIZE] = self.layers(normalised)[:, :, 0, 0]
+            batch = standardized(patches[begin : begin + BATCH_SIZE])
+            outputs[begin : begin + BATCH_SIZE] = self.layers(batch)[:, :, 0, 0]
         return outputs
 
 
@@ -197,15 +194,10 @@ def fully_convolutional(network: LAFAffNetShapeEstimator) -> nn.Sequential:
     (ceil(H / 4) - 7) x (ceil(W / 4) - 7) cells; cell (i, j) has the patch whose first pixel is
     (4 j, 4 i).
     """
-    layers: list[nn.Module] = []
-    for layer in deepcopy(network.features).eval():
-        if isinstance(layer, nn.BatchNorm2d):
-            layers.append(fuse_conv_bn_eval(cast(nn.Conv2d, layers.pop()), layer))
-        elif isinstance(layer, nn.ReLU):
-            layers.append(nn.ReLU(inplace=True))
-        elif isinstance(layer, nn.Conv2d | nn.Tanh):
-            layers.append(layer)
-    return convert_conv2d_weight_memory_format(nn.Sequential(*layers).eval(), torch.channels_last)
+    kept = (nn.Conv2d, nn.BatchNorm2d, nn.ReLU, nn.Tanh)
+    layers = [layer for layer in deepcopy(network.features) if isinstance(layer, kept)]
+    sequence = folded(nn.Sequential(*layers)).eval()
+    return convert_conv2d_weight_memory_format(sequence, torch.channels_last)
 
 
 def _frames(outputs: torch.Tensor) -> NDArray[np.float64]:

@@ -177,7 +177,7 @@ def describe_level(level: InspectedLevel) -> dict[str, Any]:
     that of its area; a ``bounding_box`` is left, top, width, height.
     """
     plan = level.plan
-    regions = num_regions(plan)
+    regions = plan.num_regions
     return {
         "level": level.number,
         "rectifier": level.options.name,
@@ -218,17 +218,6 @@ def _describe_warp(level: InspectedLevel, warp_id: int, item: Rectification) -> 
         "features_found": len(level.found[warp_id]),
         "features_kept": len(level.kept_of(warp_id)),
     }
-
-
-def num_regions(plan: RectificationPlan) -> int:
-    """Count the different regions of a plan; warps of the whole image share one."""
-    regions = {
-        None
-        if item.region is None
-        else (item.region_origin, item.region.shape, item.region.tobytes())
-        for item in plan.items
-    }
-    return len(regions)
 
 
 def region_area_px(item: Rectification, image_size: tuple[int, int]) -> int:

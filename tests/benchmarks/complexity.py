@@ -27,7 +27,7 @@ from speed import describe_machine
 from colmap_affrect.extraction import ImageExtractor, Resources, prepare
 from colmap_affrect.interfaces import FeatureProfile
 from colmap_affrect.options import ExtractionOptions, IdentityOptions
-from colmap_affrect.types import GrayImage, LocalFeatures, RectificationPlan, View
+from colmap_affrect.types import GrayImage, LocalFeatures, View
 
 DEFAULT_METHODS = ["default", "affnet-shapes-recommended"]
 
@@ -102,17 +102,12 @@ def measure(path: Path, extractor: ImageExtractor) -> Cost:
     return Cost(
         plan.rectified_area_px / 1e6,
         len(features),
-        num_regions(plan),
+        plan.num_regions,
         len(plan.items),
         middle - start,
         execute_s - profile.seconds,
         profile.seconds,
     )
-
-
-def num_regions(plan: RectificationPlan) -> int:
-    """Count the segments of the image that a plan warps; whole images are one."""
-    return len({item.segment_id for item in plan.items})
 
 
 def mean_cost(costs: Sequence[Cost]) -> Cost:

@@ -43,7 +43,6 @@ from colmap_affrect.report.levels import (
     ReadsDepth,
     ReadsShapes,
     inspect_level,
-    num_regions,
 )
 from colmap_affrect.report.sheet import (
     HEAD_PX,
@@ -249,8 +248,8 @@ def test_sizes_are_those_of_processing(tmp_path: Path, photo: Path) -> None:
 
 def test_warps_of_the_whole_image_share_one_region() -> None:
     plan = plan_whole_image(SIZE, asift_covering()[:5], AsiftOptions())
-    assert num_regions(plan) == 1
-    assert num_regions(RectificationPlan(SIZE)) == 0
+    assert plan.num_regions == 1
+    assert RectificationPlan(SIZE).num_regions == 0
 
 
 def test_each_level_has_a_sheet_and_an_entry(tmp_path: Path, photo: Path) -> None:
