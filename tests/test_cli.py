@@ -18,7 +18,9 @@ from colmap_affrect import __version__
 from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.workspace import Workspace
 
-COMMANDS = ["run", "extract", "pairs", "match", "verify", "map", "recipes"]
+COMMANDS = [
+    "run", "extract", "pairs", "match", "verify", "escalate", "map", "inspect", "recipes", "weights",
+]  # fmt: skip
 TIMEOUT_S = 60
 
 
@@ -29,9 +31,14 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run_command(*arguments: object, python: tuple[str, ...] = ()) -> subprocess.CompletedProcess:
+def run_command(
+    *arguments: object, python: tuple[str, ...] = (), environment: dict[str, str] | None = None
+) -> subprocess.CompletedProcess:
     command = [sys.executable, *python, "-m", "colmap_affrect", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+        env={**os.environ, **(environment or {})},
+    )  # fmt: skip
 
 
 def run_arguments(photos: Path, out: Path) -> list[str]:
@@ -227,3 +234,54 @@ def test_terminal_gets_bars(photos: Path, tmp_path: Path) -> None:
     assert process.returncode == 0
     assert b"extract: 100%" in shown
     assert b"3/3" in shown
+
+
+FACADE = Path(__file__).parents[1] / "sample_scenes" / "facade" / "images" / "view_5_tilt70.jpg"
+
+
+def test_inspect_draws_a_sheet_and_writes_the_plan(tmp_path: Path) -> None:
+    out = tmp_path / "out č"
+    done = run_command("inspect", FACADE, "--output-path", out, "--set", "max_image_size_px=400")
+    assert (done.returncode, done.stderr) == (0, "")
+    plan = json.loads((out / "view_5_tilt70-plan.json").read_text(encoding="utf-8"))
+    assert plan["levels"][0]["warps"][0]["tilt"] > 1.7
+    sheet = out / "view_5_tilt70-inspection.png"
+    assert sheet.stat().st_size > 50_000
+    assert str(sheet) in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--device", "gpu"], "--device gpu: not one of auto, cpu, cuda"),
+        (["--recipe", "depth-planes-recommended"], "give --depth-path FOLDER, or --depth-model"),
+        (["--recipe", "depth-planes-recommended", "--depth-path", "nowhere"], "nowhere"),
+        (["--recipe", "dense-affnet", "--weights", "nowhere"], "nowhere: not a folder"),
+    ],
+)
+def test_what_is_missing_is_said_before_any_image_is_read(
+    tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    write_photographs(tmp_path / "photos", 2)
+    out = tmp_path / "out"
+    done = run_command("run", "--image-path", tmp_path / "photos", "--output-path", out, *arguments)
+    assert (done.returncode, done.stdout) == (1, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert message in line
+    assert not (out / "features.h5").exists()
+
+
+def test_missing_weights_are_one_error_with_the_way_out(tmp_path: Path) -> None:
+    write_photographs(tmp_path / "photos", 2)
+    empty = tmp_path / "weights"
+    empty.mkdir()
+    done = run_command(
+        "run", "--image-path", tmp_path / "photos", "--output-path", tmp_path / "out",
+        "--recipe", "dense-affnet", "--weights", empty,
+        environment={"TORCH_HOME": str(tmp_path / "torch"), "https_proxy": "http://127.0.0.1:9",
+                     "COLMAP_AFFRECT_WEIGHTS": ""},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (1, "")
+    for said in ("AffNet.pth", str(empty), "COLMAP_AFFRECT_WEIGHTS", "default"):
+        assert said in done.stderr
