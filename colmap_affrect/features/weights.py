@@ -28,7 +28,7 @@ from colmap_affrect.progress import SILENT, Progress
 
 ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
 
-WEIGHTLESS_RECIPES = ("default", "unrectified-rootsift")
+WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")
 """Recipes that need no weights: the way out when there is no network."""
 
 TIMEOUT_S = 30.0
