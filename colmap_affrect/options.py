@@ -181,7 +181,8 @@ class DenseShapesOptions(CoverOptions):
     min_region_frac: float = 0.02
     """Regions of a smaller share of the image are not warped."""
     min_part_frac: float = 0.002
-    """Scattered pieces of a region of a smaller share of the image are left out."""
+    """A region in several places is warped piece by piece, and pieces of a smaller share of the
+    image are left out. 0: all of a region in one warp (the paper)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -59,11 +59,7 @@ def plan_dense_shapes(
         blocks = (labels == label) & grid.textured
         if np.count_nonzero(blocks) < options.min_region_frac * labels.size:
             continue
-        # The canvas of a warp is the bounding box of its region: for a region in several
-        # places one canvas for each is far smaller than one for all.
-        for part in connected_groups(blocks, GAP_BLOCKS):
-            if np.count_nonzero(part) < options.min_part_frac * labels.size:
-                continue
+        for part in _parts(blocks, options.min_part_frac * labels.size):
             region = _region(part, grid, image_size)
             items.append(
                 affine_rectification(
@@ -71,6 +67,18 @@ def plan_dense_shapes(
                 )
             )
     return RectificationPlan(image_size, tuple(items), replaces_original=True)
+
+
+def _parts(blocks: Mask, min_num_blocks: float) -> list[Mask]:
+    """Split a region into its places that are large enough; not at all if any size is.
+
+    The canvas of a warp is the bounding box of its region: for a region in several places one
+    canvas for each is far smaller than one for all.
+    """
+    if not min_num_blocks:
+        return [blocks]
+    groups = connected_groups(blocks, GAP_BLOCKS)
+    return [group for group in groups if np.count_nonzero(group) >= min_num_blocks]
 
 
 def _region(blocks: Mask, grid: ShapeGrid, image_size: tuple[int, int]) -> Region:

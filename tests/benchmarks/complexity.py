@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean, median
 
-from pairs import Method, parse_method
+from methods import Method, parse_method
 from speed import describe_machine
 
 from colmap_affrect.extraction import ImageExtractor, Resources, prepare

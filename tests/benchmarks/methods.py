@@ -18,9 +18,12 @@ class Method:
     recipe: Recipe | None
 
 
-def parse_method(text: str) -> Method:
-    """Read ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``; commas inside of brackets belong to a value."""
-    if text in SIFT_METHODS:
+def parse_method(text: str, *, with_sift: bool = False) -> Method:
+    """Read ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``; commas inside of brackets belong to a value.
+
+    With ``with_sift`` also the names of COLMAP's SIFT.
+    """
+    if with_sift and text in SIFT_METHODS:
         return Method(text, None)
     head, _, settings = text.partition(":")
     label, _, name = head.rpartition("=")

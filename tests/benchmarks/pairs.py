@@ -5,8 +5,8 @@ Each image's features are computed once per method, and matched by the recipe's 
 is correct if its transfer error in image 2 is below 3 px. The error of a homography (OpenCV's
 USAC_MAGSAC on all matches; the median of five orders of the matches) is its mean over what image 2
 shows of image 1, in px of image 2.
-Recipes with escalation go from level to level, the features of level k being those of levels 0 to
-k together, until COLMAP's geometric verification succeeds, as in a run. Usage:
+Recipes with escalation go from level to level until COLMAP's geometric verification succeeds with
+enough inliers, and keep the level with most of them, as a run of the two images does. Usage:
 
     python tests/benchmarks/pairs.py --methods default on-demand \
         asift=asift-recommended:features.profile=rootsift --output-path out/pairs.json
@@ -20,7 +20,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import re
 import sys
 import time
 from dataclasses import dataclass, field
@@ -37,16 +36,17 @@ from homographies import (
     homography_error,
     transfer_errors,
 )
+from methods import Method, parse_method
 from numpy.typing import NDArray
 from pair_data import SETS, HomographyPair, load_pairs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import two_view_options
 from colmap_affrect.conventions import DEFAULT_FOCAL_RATIO, colmap_from_pixel
+from colmap_affrect.escalation import open_pairs
 from colmap_affrect.extraction import ImageExtractor, Resources, prepare
 from colmap_affrect.matching.nearest import MatchableImage, match_features, matchable
 from colmap_affrect.options import VerificationOptions
-from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.types import LocalFeatures, union
 
 Row = dict[str, Any]
@@ -64,22 +64,6 @@ CONFIDENCE = 0.9999
 MAX_ITERATIONS = 100_000
 NUM_ESTIMATES = 5
 VERIFICATION_SEED = 0
-
-
-@dataclass(frozen=True)
-class Method:
-    """A recipe under the name it has in the tables."""
-
-    label: str
-    recipe: Recipe
-
-
-def parse_method(text: str) -> Method:
-    """Read ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``; commas inside of brackets belong to a value."""
-    head, _, settings = text.partition(":")
-    label, _, name = head.rpartition("=")
-    changes = re.split(r",(?![^\[]*\])", settings) if settings else []
-    return Method(label or text, load_recipe(name, changes))
 
 
 @dataclass(frozen=True)
@@ -101,7 +85,7 @@ class FeatureCache:
     images: dict[tuple[Path, int], TimedImage] = field(default_factory=dict)
 
     def image(self, path: Path, level: int) -> TimedImage:
-        """Return the features of the levels 0 to ``level`` together, and the time of all."""
+        """Return the features of the image itself and of a level, and the time of all levels."""
         if (path, level) not in self.images:
             before = self.image(path, level - 1).seconds if level else 0.0
             start = time.perf_counter()
@@ -109,7 +93,7 @@ class FeatureCache:
             seconds = before + time.perf_counter() - start
             parts = self.levels.setdefault(path, [])
             parts.append(extracted.features)
-            features = union(parts)
+            features = union([parts[0], *parts[level:]]) if level else parts[0]
             ready = matchable(features.descriptors, features.keypoints, self.method.recipe.matching)
             self.images[path, level] = TimedImage(ready, extracted.image_size, seconds)
         return self.images[path, level]
@@ -135,7 +119,7 @@ class Attempt:
 
 
 def attempt(pair: HomographyPair, cache: FeatureCache, level: int) -> Attempt:
-    """Match and verify a pair by the features of the levels 0 to ``level``."""
+    """Match and verify a pair by the features of the images themselves and of a level."""
     images = cache.image(pair.path1, level), cache.image(pair.path2, level)
     start = time.perf_counter()
     matches = match_features(
@@ -151,14 +135,17 @@ def attempt(pair: HomographyPair, cache: FeatureCache, level: int) -> Attempt:
 
 
 def evaluate(pair: HomographyPair, cache: FeatureCache, threshold_px: float) -> Row:
-    """Match a pair, level by level, and measure it against the truth."""
-    rectifiers = cache.method.recipe.extraction.rectifiers
+    """Match a pair, level by level as a run would, and measure it against the truth."""
+    options = cache.method.recipe.extraction
+    rectifiers = options.rectifiers
     attempts: list[Attempt] = []
     for level in range(len(rectifiers)):
         attempts.append(attempt(pair, cache, level))
-        if attempts[-1].verified_inliers:
+        best = max(attempts, key=lambda item: item.verified_inliers)
+        counts = {("1", "2"): best.verified_inliers}
+        if not open_pairs(counts, options.escalation_strong_num_inliers):
             break
-    last = attempts[-1]
+    last = best if best.verified_inliers else attempts[-1]
     sizes = last.images[0].size, last.images[1].size
     estimates = [
         estimate_homography(*last.points, threshold_px, seed) for seed in range(NUM_ESTIMATES)
@@ -285,7 +272,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--sets", nargs="+", choices=SETS, default=SETS, metavar="SET")
     parser.add_argument("--pairs-path", type=Path, default=root.parent / "shared" / "pairs")
     parser.add_argument("--weights", type=Path, help="folder of the networks' weights")
-    parser.add_argument("--threshold-px", type=float, default=1.0, help="of USAC_MAGSAC")
+    parser.add_argument("--threshold-px", type=float, default=5.0, help="USAC_MAGSAC's largest noise")
     parser.add_argument("--output-path", type=Path, required=True, help="JSON file")
     return parser.parse_args()
 

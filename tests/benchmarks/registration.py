@@ -250,7 +250,8 @@ def main() -> None:
         paths = subset.image_paths(scenes_path)
         link_images(paths, image_path)
         truth = read_true_poses(scenes_path / subset.scene)
-        for method in map(parse_method, arguments.methods):
+        for text in arguments.methods:
+            method = parse_method(text, with_sift=True)
             folder = work_folder(method, parent)
             cameras = camera_options(subset, scenes_path)
             result = {

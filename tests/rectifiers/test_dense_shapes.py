@@ -214,3 +214,16 @@ def test_plan_dense_shapes_of_isotropic_texture_needs_no_warp() -> None:
     grid = SecondMoment(SecondMomentOptions()).grid(image)
     plan = plan_dense_shapes(grid, (320, 240), DenseShapesOptions(min_region_frac=0.05))
     assert len(plan.items) == 0
+
+
+def test_region_in_two_places_is_one_warp_if_pieces_of_any_size_count() -> None:
+    labels = np.zeros((40, 60), int)
+    labels[5:12, 4:14] = labels[30:36, 45:50] = 1
+    grid = shape_grid([(1.0, 0.0), (3.0, 0.7)], labels)
+    split = plan_dense_shapes(grid, (240, 160), DenseShapesOptions(min_part_frac=0.002))
+    whole = plan_dense_shapes(grid, (240, 160), DenseShapesOptions(min_part_frac=0.0))
+    assert (len(split.items), split.num_regions) == (2, 1)
+    assert (len(whole.items), whole.num_regions) == (1, 1)
+    both = sum(image_region(item, (240, 160)) for item in split.items)
+    assert_allclose(image_region(whole.items[0], (240, 160)), both)
+    assert whole.rectified_area_px > 2 * split.rectified_area_px
