@@ -220,8 +220,10 @@ def test_region_in_two_places_is_one_warp_if_pieces_of_any_size_count() -> None:
     labels = np.zeros((40, 60), int)
     labels[5:12, 4:14] = labels[30:36, 45:50] = 1
     grid = shape_grid([(1.0, 0.0), (3.0, 0.7)], labels)
-    split = plan_dense_shapes(grid, (240, 160), DenseShapesOptions(min_part_frac=0.002))
-    whole = plan_dense_shapes(grid, (240, 160), DenseShapesOptions(min_part_frac=0.0))
+    split = plan_dense_shapes(grid, (240, 160), DenseShapesOptions(covered_frac=1.0))
+    whole = plan_dense_shapes(
+        grid, (240, 160), DenseShapesOptions(covered_frac=1.0, min_part_frac=0.0)
+    )
     assert (len(split.items), split.num_regions) == (2, 1)
     assert (len(whole.items), whole.num_regions) == (1, 1)
     both = sum(image_region(item, (240, 160)) for item in split.items)
