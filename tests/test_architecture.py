@@ -60,10 +60,16 @@ HOMES = {
     "filelock": {"workspace"},
     "argparse": {"cli"},
     "torch": {
-        "features.affnet", "features.affnet_hardnet", "features.networks", "features.weights",
+        "features.affnet",
+        "features.affnet_hardnet",
+        "features.networks",
+        "features.weights",
     },
     "kornia": {
-        "features.affnet", "features.affnet_hardnet", "features.networks", "features.weights",
+        "features.affnet",
+        "features.affnet_hardnet",
+        "features.networks",
+        "features.weights",
     },
     "transformers": {"depth"},
     "matplotlib": {"report.sheet", "report.tilt_plot"},

@@ -216,9 +216,9 @@ def shapes_from_outputs(outputs: NDArray[np.floating]) -> NDArray[np.float64]:
 
     They are [[1 + o0, 0], [o1, 1 + o2]] up to scale; not a number where that has no area.
 
-    >>> shapes_from_outputs(np.array([[1.0, 0.5, -0.5]]))[0]
-    array([[2. , 0. ],
-           [0.5, 0.5]])
+    >>> shapes_from_outputs(np.array([[0.0, 3.0, 3.0]]))[0]
+    array([[0.5, 0. ],
+           [1.5, 2. ]])
     """
     shapes = np.zeros((len(outputs), 2, 2))
     shapes[:, 0, 0] = 1.0 + outputs[:, 0]

@@ -272,7 +272,9 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--sets", nargs="+", choices=SETS, default=SETS, metavar="SET")
     parser.add_argument("--pairs-path", type=Path, default=root.parent / "shared" / "pairs")
     parser.add_argument("--weights", type=Path, help="folder of the networks' weights")
-    parser.add_argument("--threshold-px", type=float, default=5.0, help="USAC_MAGSAC's largest noise")
+    parser.add_argument(
+        "--threshold-px", type=float, default=5.0, help="USAC_MAGSAC's largest noise"
+    )
     parser.add_argument("--output-path", type=Path, required=True, help="JSON file")
     return parser.parse_args()
 

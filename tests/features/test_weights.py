@@ -126,7 +126,7 @@ def test_resolve_without_network_gives_one_line_that_says_everything(
     for folder in folders.values():
         assert str(folder) in message
     for part in ("--weights", ENVIRONMENT_VARIABLE, "no network in tests", "put the files",
-                 "default, unrectified-rootsift"):  # fmt: skip
+                 "default, on-demand, unrectified-rootsift"):  # fmt: skip
         assert part in message
 
 
