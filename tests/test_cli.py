@@ -19,7 +19,8 @@ from colmap_affrect.recipes import load_recipe, recipe_names
 from colmap_affrect.workspace import Workspace
 
 COMMANDS = [
-    "run", "extract", "pairs", "match", "verify", "escalate", "map", "inspect", "recipes", "weights",
+    "run", "extract", "pairs", "match", "verify", "escalate", "map",
+    "inspect", "recipes", "weights",
 ]  # fmt: skip
 TIMEOUT_S = 60
 
