@@ -10,8 +10,11 @@ import cv2
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+from methods import parse_method
 from registration import SUBSETS, camera_options, compute_matches, link_images, run_seed
 from registration_metrics import read_true_poses
+
+from colmap_affrect.extraction import Resources
 
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 SUBSET_BY_NAME = {subset.name: subset for subset in SUBSETS}
@@ -22,29 +25,30 @@ pytestmark = [
 ]
 
 
-def correct_by_seed(name, tmp_path, num_seeds):
+def correct_by_seed(recipe, name, tmp_path, num_seeds):
     subset = SUBSET_BY_NAME[name]
     cameras = camera_options(subset, SCENES)
     images = tmp_path / "images"
     link_images(subset.image_paths(SCENES), images)
-    folder = tmp_path / "default"
+    folder = tmp_path / "work"
     folder.mkdir()
-    compute_matches("default", cameras, images, folder)
+    compute_matches(parse_method(recipe), cameras, images, folder, Resources())
     truth = read_true_poses(SCENES / subset.scene)
     return [run_seed(folder, images, cameras, truth, seed) for seed in range(num_seeds)]
 
 
 @pytest.mark.parametrize(
-    ("name", "min_correct", "median_error_deg"),
+    ("recipe", "name", "min_correct", "median_error_deg"),
     [
-        ("fountain 0,5,10", 3, 0.5),
-        ("herz 0,8,16,24", 4, 0.5),
-        ("kermit /2", 6, 2.0),
-        ("sacre_coeur /2", 5, 2.0),
+        ("default", "fountain 0,5,10", 3, 0.5),
+        ("default", "herz 0,8,16,24", 4, 0.5),
+        ("default", "kermit /2", 6, 2.0),
+        ("default", "sacre_coeur /2", 5, 2.0),
+        ("on-demand", "herz 0,8,16,24", 4, 0.5),
     ],
 )
-def test_sparse_subset_registers_correctly(name, min_correct, median_error_deg, tmp_path):
-    rows = correct_by_seed(name, tmp_path, num_seeds=5)
+def test_sparse_subset_registers_correctly(recipe, name, min_correct, median_error_deg, tmp_path):
+    rows = correct_by_seed(recipe, name, tmp_path, num_seeds=5)
     assert sum(row["correct"] >= min_correct for row in rows) >= 4
     errors = sorted(row["rotation_error_deg"] for row in rows)
     assert errors[2] < median_error_deg
