@@ -122,7 +122,11 @@ def match_sift(
 
 
 def match_recipe(
-    folder: Path, image_path: Path, cameras: CameraOptions, recipe: Recipe, resources: Resources
+    folder: Path,
+    image_path: Path,
+    cameras: CameraOptions,
+    recipe: Recipe,
+    resources: Resources | None = None,
 ) -> dict[str, float]:
     """Write our features and raw matches to folder/database.db; return seconds per stage."""
     workspace = Workspace(folder)
