@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from colmap_affrect.pipeline import RunOptions
     from colmap_affrect.recipes import Recipe
 
-    # The type of add_subparsers() has no public name.
+    # The types of add_subparsers() and of what takes arguments have no public names.
+    Container = argparse._ActionsContainer
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
 Function = Callable[[argparse.Namespace], int]
@@ -242,7 +243,7 @@ def _command(
     return command
 
 
-def _add_option(command: argparse.ArgumentParser, flag: str, **settings: Any) -> None:
+def _add_option(command: Container, flag: str, **settings: Any) -> None:
     """Add a long option, accepted with underscores too, as COLMAP writes them."""
     underscored = "--" + flag.removeprefix("--").replace("-", "_")
     flags = [flag, underscored] if underscored != flag else [flag]
@@ -334,16 +335,16 @@ def _add_resources(command: argparse.ArgumentParser) -> None:
 
 def _add_depth(command: argparse.ArgumentParser) -> None:
     source = command.add_mutually_exclusive_group()
-    source.add_argument(
+    _add_option(
+        source,
         "--depth-path",
-        "--depth_path",
         type=Path,
         metavar="FOLDER",
         help="depth maps named as the images: a/b.jpg has a/b.npy, .npz, .png, .exr or .h5",
     )
-    source.add_argument(
+    _add_option(
+        source,
         "--depth-model",
-        "--depth_model",
         metavar="NAME",
         help="monocular depth network: name or local folder for Hugging Face transformers",
     )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,10 @@ from colmap_affrect.features.registry import (
     make_profile,
     make_shape_source,
     needed_weights,
+    shape_sources,
     uses_networks,
 )
-from colmap_affrect.features.weights import file_sha256, resolve
+from colmap_affrect.features.weights import resolve
 from colmap_affrect.geometry.affine import transform_frames
 from colmap_affrect.imaging import read_gray, shrink_to
 from colmap_affrect.interfaces import Computing, FeatureProfile, Rectifier, Sources
@@ -73,11 +74,13 @@ class ImageExtractor:
         options: of the recipe.
         profile: detector and descriptor.
         rectifiers: one per level, that of every image first, then those of escalation.
+        weights: files of the networks by key.
     """
 
     options: ExtractionOptions
     profile: FeatureProfile
     rectifiers: tuple[Rectifier, ...]
+    weights: Mapping[str, Path] = field(default_factory=dict)
 
     def extract_file(
         self,
@@ -100,7 +103,9 @@ class ImageExtractor:
             ImageError: when the file cannot be read.
         """
         photograph, original_size = self.photograph(path, name, intrinsics)
-        plan, warning = self._plan_or_warn(photograph, level)
+        plan, warning = self.plan_or_warn(photograph, level)
+        if warning:
+            logger.warning("%s: %s", photograph.name, warning)
         features = self.execute(photograph.gray, plan, with_original=level == 0)
         if photograph.size != original_size:
             original_from_resized = np.linalg.inv(
@@ -140,11 +145,11 @@ class ImageExtractor:
         limit = self.options.features.max_num_rectified_features
         return extract_rectified(image, plan, self.profile, limit, with_original=with_original)
 
-    def _plan_or_warn(self, photograph: Photograph, level: int) -> tuple[RectificationPlan, str]:
+    def plan_or_warn(self, photograph: Photograph, level: int = 0) -> tuple[RectificationPlan, str]:
+        """Plan; without a usable depth map plan no warps and say why, else say nothing."""
         try:
             return self.plan(photograph, level), ""
         except DepthError as error:
-            logger.warning("%s: extracted without rectification: %s", photograph.name, error)
             return RectificationPlan(photograph.size), f"not rectified: {error}"
 
 
@@ -159,25 +164,11 @@ def extract_image(image: GrayImage, options: ExtractionOptions | None = None) ->
     return extractor.execute(image, extractor.plan(photograph))
 
 
-def recorded_weights(
-    options: ExtractionOptions,
-    resources: Resources | None = None,
-    progress: Progress = SILENT,
-) -> dict[str, str]:
-    """Find or download the weights that a recipe reads; return their sha256 by file name.
-
-    Raises:
-        WeightsError: when a file is neither found nor downloaded.
-    """
-    resources = resources or Resources()
-    found = resolve(needed_weights(options), resources.weights_path, progress=progress)
-    return {path.name: file_sha256(path) for path in found.values()}
-
-
 def prepare(
     options: ExtractionOptions,
     resources: Resources | None = None,
     image_names: Sequence[str] | None = None,
+    progress: Progress = SILENT,
 ) -> ImageExtractor:
     """Find everything a recipe needs, before any image is touched, and build its parts.
 
@@ -185,6 +176,7 @@ def prepare(
         options: of the recipe.
         resources: weights, device, cache.
         image_names: the images to come, to see whether there are depth maps for them.
+        progress: where to show downloads.
 
     Raises:
         WeightsError: when a file of weights is neither found nor downloaded.
@@ -193,7 +185,7 @@ def prepare(
         DepthError: when the folder of depth maps has none of the images.
     """
     resources = resources or Resources()
-    weights = resolve(needed_weights(options), resources.weights_path)
+    weights = resolve(needed_weights(options), resources.weights_path, progress=progress)
     computing = Computing(weights, _device(options, resources))
     profile = make_profile(options.features, computing)
     depth = None
@@ -207,13 +199,18 @@ def prepare(
             )
         if image_names is not None:
             depth.require_some(image_names)
-    rectifiers = []
-    for item in options.rectifiers:
-        shapes = None
-        if isinstance(item, CoverOptions):
-            shapes = make_shape_source(item.shape_source, options, computing)
-        rectifiers.append(make_rectifier(item, Sources(shapes, depth if item.uses_depth else None)))
-    return ImageExtractor(options, profile, tuple(rectifiers))
+    shapes = {name: make_shape_source(name, options, computing) for name in shape_sources(options)}
+    rectifiers = tuple(
+        make_rectifier(
+            item,
+            Sources(
+                shapes[item.shape_source] if isinstance(item, CoverOptions) else None,
+                depth if item.uses_depth else None,
+            ),
+        )
+        for item in options.rectifiers
+    )
+    return ImageExtractor(options, profile, rectifiers, weights)
 
 
 def _device(options: ExtractionOptions, resources: Resources) -> str:

@@ -18,7 +18,8 @@ from colmap_affrect.colmap.mapping import map_incrementally, read_models
 from colmap_affrect.colmap.verification import verified_pairs, verify
 from colmap_affrect.errors import ImageError, OptionError, StaleStoreError, StoreError
 from colmap_affrect.executor import available_cores, map_ordered
-from colmap_affrect.extraction import ImageExtractor, Resources, prepare, recorded_weights
+from colmap_affrect.extraction import ImageExtractor, Resources, prepare
+from colmap_affrect.features.weights import file_sha256
 from colmap_affrect.imaging import IMAGE_SUFFIXES, read_gray
 from colmap_affrect.matching.nearest import MatchableImage, match_features, matchable
 from colmap_affrect.matching.pairs import Pair, exhaustive_pairs, read_pairs, write_pairs
@@ -120,14 +121,14 @@ def extract(
     if cameras.mode in ("single", "per-folder"):
         known = {} if overwrite else FeatureStore(workspace.features).image_sizes()
         _refuse_mixed_sizes(image_path, names, cameras.mode, known)
+    extractor = make_extractor(workspace, recipe.extraction, resources, names, progress)
     options = {
         "image_path": str(image_path.resolve()),
         "image_list_path": str(image_list_path.resolve()) if image_list_path else "",
         "camera": cameras.to_mapping(),
         **recipe.extraction.to_mapping(),
-        "weights": recorded_weights(recipe.extraction, resources, progress),
+        "weights": {path.name: file_sha256(path) for path in extractor.weights.values()},
     }
-    extractor = make_extractor(workspace, recipe.extraction, resources, names)
     workspace.claim("extract", options, overwrite=overwrite, recipe=recipe.name)
     store = feature_store(workspace)
     done = store.complete(names)
@@ -168,10 +169,11 @@ def make_extractor(
     options: ExtractionOptions,
     resources: Resources | None,
     names: Sequence[str],
+    progress: Progress = SILENT,
 ) -> ImageExtractor:
     """Prepare a recipe for the images of a workspace, which keeps the depth maps of networks."""
     resources = replace(resources or Resources(), depth_cache_path=workspace.depth)
-    return prepare(options, resources, names)
+    return prepare(options, resources, names, progress)
 
 
 def intrinsics(

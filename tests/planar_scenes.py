@@ -17,6 +17,18 @@ SUPERSAMPLING = 3
 """Samples of the texture per pixel in x and in y."""
 
 
+@dataclass
+class FixedDepth:
+    """Depth source that returns one map."""
+
+    values: Array
+
+    def depth(self, photograph: Photograph) -> NDArray[np.float32]:
+        """The map as float32."""
+        del photograph
+        return self.values.astype(np.float32)
+
+
 def unit(vector: ArrayLike) -> Array:
     """Scale vectors to unit length."""
     vector = np.asarray(vector, dtype=float)

@@ -161,10 +161,8 @@ def test_warp_of_tiny_images_has_the_planned_size(size: tuple[int, int]) -> None
     assert warp(image, plan).shape == plan.canvas_size[::-1]
 
 
-def test_warp_mask_marks_the_pixels_whose_source_is_in_the_region() -> None:
-    region = np.zeros((45, 90), bool)
-    region[5:, 10:] = True
-    plan = replace(rectification(3.0, 0.5), region=region, region_origin=(20, 15))
+def num_inside_mask(plan: Rectification) -> int:
+    """Check the mask of a region of columns 30-109 and rows 20-59; count its inner pixels."""
     mask = warp_mask(plan, SIZE)
     assert mask.shape == plan.canvas_size[::-1]
     assert np.unique(mask).tolist() == [0, 255]
@@ -175,8 +173,15 @@ def test_warp_mask_marks_the_pixels_whose_source_is_in_the_region() -> None:
     surely_not = ((sources < low - slack) | (sources > high + slack)).any(axis=1)
     assert (mask.ravel()[surely] == 255).all()
     assert (mask.ravel()[surely_not] == 0).all()
-    assert surely.any()
     assert surely_not.any()
+    return int(surely.sum())
+
+
+def test_warp_mask_marks_the_pixels_whose_source_is_in_the_region() -> None:
+    region = np.zeros((45, 90), bool)
+    region[5:, 10:] = True
+    plan = replace(rectification(3.0, 0.5), region=region, region_origin=(20, 15))
+    assert num_inside_mask(plan) > 0
 
 
 def test_warp_mask_of_a_whole_image_marks_where_the_warp_shows_it() -> None:
@@ -358,17 +363,7 @@ def test_warp_mask_of_a_homography_marks_the_pixels_whose_source_is_in_the_regio
     region[5:, 10:] = True
     homography = turned_camera(35.0, 120.0, SIZE)
     plan = replace(perspective(homography, 1.6, SIZE), region=region, region_origin=(20, 15))
-    mask = warp_mask(plan, SIZE)
-    assert mask.shape == plan.canvas_size[::-1]
-    assert np.unique(mask).tolist() == [0, 255]
-    sources = project(plan.image_from_rectified, canvas_points(plan).reshape(-1, 2))
-    low, high = np.array([29.5, 19.5]), np.array([109.5, 59.5])
-    slack = 0.1  # of OpenCV's fixed-point coordinates
-    surely = ((sources > low + slack) & (sources < high - slack)).all(axis=1)
-    surely_not = ((sources < low - slack) | (sources > high + slack)).any(axis=1)
-    assert (mask.ravel()[surely] == 255).all()
-    assert (mask.ravel()[surely_not] == 0).all()
-    assert surely.sum() > 1000
+    assert num_inside_mask(plan) > 1000
 
 
 def test_warp_mask_is_zero_behind_the_camera() -> None:

@@ -46,11 +46,10 @@ class RootSift:
         return LocalFeatures(lafs, responses[best], described)
 
     def describe(
-        self,
-        images: Sequence[GrayImage],  # noqa: ARG002
-        detected: Sequence[LocalFeatures],
+        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
     ) -> list[LocalFeatures]:
         """Return the features as they are: :meth:`detect` has described them."""
+        del images
         return list(detected)
 
 

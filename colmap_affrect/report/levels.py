@@ -10,7 +10,6 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.errors import DepthError
 from colmap_affrect.extraction import MIN_RECTIFIABLE_PX, ImageExtractor
 from colmap_affrect.interfaces import DepthSource, FeatureProfile, ShapeSource
 from colmap_affrect.options import DenseShapesOptions, RectifierOptions
@@ -87,11 +86,7 @@ class InspectedLevel:
 def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int) -> InspectedLevel:
     """Carry out level ``number`` of a recipe as extraction does, and keep all that passes by."""
     start = perf_counter()
-    warning = ""
-    try:
-        plan = extractor.plan(photograph, number)
-    except DepthError as error:
-        plan, warning = RectificationPlan(photograph.size), f"not rectified: {error}"
+    plan, warning = extractor.plan_or_warn(photograph, number)
     planned = perf_counter()
     recorder = _Recorder(extractor.profile)
     recording = replace(extractor, profile=recorder)

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
-from planar_scenes import corner_room, slanted_wall
+from planar_scenes import FixedDepth, corner_room, slanted_wall
 from strategies import Array
 
 from colmap_affrect.errors import OptionError
@@ -19,19 +18,7 @@ from colmap_affrect.interfaces import Sources
 from colmap_affrect.options import DepthAffNetOptions, PlaneOptions
 from colmap_affrect.rectifiers.depth_affnet import DepthAffNet
 from colmap_affrect.rectifiers.depth_planes import PlanarSegment, planar_segments
-from colmap_affrect.types import GrayImage, Photograph, RectificationPlan, ShapeGrid, ShapeSamples
-
-
-@dataclass
-class FixedDepth:
-    """Depth source that returns one map."""
-
-    values: Array
-
-    def depth(self, photograph: Photograph) -> NDArray[np.float32]:
-        """The map as float32."""
-        del photograph
-        return self.values.astype(np.float32)
+from colmap_affrect.types import GrayImage, RectificationPlan, ShapeGrid, ShapeSamples
 
 
 @dataclass

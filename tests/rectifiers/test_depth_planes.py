@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -11,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from planar_scenes import (
+    FixedDepth,
     Room,
     angles_deg,
     corner_room,
@@ -49,18 +49,6 @@ DOT_ERROR_PX = 0.25
 
 MIN_CORRELATION = 0.95
 """Of a warp and the texture rendered from the front; half a pixel of error costs more."""
-
-
-@dataclass
-class FixedDepth:
-    """Depth source that returns one map."""
-
-    values: Array
-
-    def depth(self, photograph: Photograph) -> NDArray[np.float32]:
-        """The map as float32."""
-        del photograph
-        return self.values.astype(np.float32)
 
 
 def plan_planes(photograph: Photograph, depth: Array, **options: object) -> RectificationPlan:
