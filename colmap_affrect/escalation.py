@@ -174,7 +174,8 @@ class _Ladder:
         cameras = CameraOptions.from_mapping(record["camera"], str(self.workspace.config))
         path = Path(record["image_path"]) / name
         if self._extractor is None:
-            self._extractor = make_extractor(self.workspace, self.options, self._resources, [name])
+            names = self.features.names()
+            self._extractor = make_extractor(self.workspace, self.options, self._resources, names)
         matrix = intrinsics(path, self._extractor, cameras)
         for missing in range(len(self.features.level_ends(name)), level + 1):
             found = self._extractor.extract_file(path, name, matrix, missing)
