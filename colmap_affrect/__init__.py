@@ -29,9 +29,14 @@ _PUBLIC = {
     "ReconstructionReport": "colmap_affrect.outcomes",
     "RunOptions": "colmap_affrect.pipeline",
     "VerificationOptions": "colmap_affrect.options",
+    "MaskOptions": "colmap_affrect.options",
+    "extract_features": "colmap_affrect.dropin",
     "extract_image": "colmap_affrect.extraction",
     "load_recipe": "colmap_affrect.recipes",
+    "match_exhaustive": "colmap_affrect.dropin",
+    "match_image_pairs": "colmap_affrect.dropin",
     "run": "colmap_affrect.pipeline",
+    "verify": "colmap_affrect.dropin",
 }
 
 __all__ = [
@@ -40,14 +45,19 @@ __all__ = [
     "ExtractionOptions",
     "LocalFeatures",
     "MappingOptions",
+    "MaskOptions",
     "MatchingOptions",
     "ReconstructionReport",
     "RunOptions",
     "VerificationOptions",
     "__version__",
+    "extract_features",
     "extract_image",
     "load_recipe",
+    "match_exhaustive",
+    "match_image_pairs",
     "run",
+    "verify",
 ]
 
 

@@ -8,13 +8,20 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from colmap_affrect import __version__
-from colmap_affrect.errors import AffrectError
-from colmap_affrect.options import CameraOptions, VerificationOptions
+from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.options import (
+    MAPPERS,
+    PRESETS,
+    CameraOptions,
+    MappingOptions,
+    MaskOptions,
+    VerificationOptions,
+)
 from colmap_affrect.outcomes import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
@@ -53,6 +60,12 @@ examples:
       --depth-path depth
   colmap-affrect inspect photos/a.jpg --output-path out
   colmap-affrect weights fetch
+  colmap-affrect doctor out
+  colmap-affrect doctor database.db --image-path photos
+  colmap-affrect import-h5 --image-path photos --features-path features.h5 \\
+      --matches-path matches.h5 --database-path new.db
+  colmap-affrect export-h5 --database-path any.db --features-path features.h5 \\
+      --matches-path matches.h5
 
 Run a command again and it goes on where it stopped. Exit codes: 0 done, 1 failed (one line
 says why; also when images could not be read, see --max-failures), 2 wrong usage, 3 finished
@@ -64,21 +77,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     options = build_parser().parse_args(arguments)
     try:
-        if options.output_path is None:
+        if not hasattr(options, "verbose"):  # a command that only prints
             return int(options.function(options))
         with _logging(options):
             return int(options.function(options))
     except AffrectError as error:
         return _fail(str(error))
     except OSError as error:
-        return _fail(f"{error.filename or 'input/output'}: {error.strerror or error}")
+        return _fail(
+            f"{error.filename or 'input/output'}: {error.strerror or error}; when that is mended, "
+            "run the same command again: what was done before is kept"
+        )
     except KeyboardInterrupt:
         print("interrupted; run the same command again to go on", file=sys.stderr)
         return EXIT_INTERRUPTED
 
 
 def _fail(message: str) -> int:
-    print(f"error: {message}", file=sys.stderr)
+    """Print one line; odd characters, out of files perhaps, must not reach the terminal."""
+    shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
+    print(f"error: {''.join(shown)}", file=sys.stderr)
     return EXIT_FAILED
 
 
@@ -86,16 +104,18 @@ def _fail(message: str) -> int:
 def _logging(options: argparse.Namespace) -> Iterator[None]:
     """Log to the terminal and to ``run.log``, which also takes what C libraries print.
 
+    Commands without an output folder have no such log.
+
     COLMAP and image decoders write to file descriptor 2: it leads to the log while the
     command runs, and Python's ``sys.stderr`` to the terminal.
     """
-    log_path = Workspace(options.output_path).log
+    log_path = Workspace(options.output_path).log if options.output_path else Path(os.devnull)
     log_path.parent.mkdir(parents=True, exist_ok=True)
     python_stderr, terminal_fd = sys.stderr, os.dup(2)
     terminal = os.fdopen(terminal_fd, "w", buffering=1, encoding="utf-8", errors="replace")
-    with terminal, log_path.open("a", encoding="utf-8", buffering=1) as log:
+    with terminal, _quietly_closed(log_path.open("a", encoding="utf-8", buffering=1)) as log:
         level = logging.DEBUG if options.verbose else logging.WARNING
-        handlers = [logging.StreamHandler(terminal), logging.StreamHandler(log)]
+        handlers: list[logging.Handler] = [logging.StreamHandler(terminal), _LogHandler(log)]
         handlers[0].setLevel(logging.ERROR if options.quiet else level)
         handlers[0].setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
         handlers[1].setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
@@ -117,6 +137,22 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
                 logger.removeHandler(handler)
 
 
+class _LogHandler(logging.StreamHandler[TextIO]):
+    """Writes to ``run.log``; when that cannot be written the command goes on without."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Pass over what the disk has no room for."""
+
+
+@contextmanager
+def _quietly_closed(file: TextIO) -> Iterator[TextIO]:
+    try:
+        yield file
+    finally:
+        with suppress(OSError):
+            file.close()
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
     parser = argparse.ArgumentParser(
@@ -134,6 +170,8 @@ def build_parser() -> argparse.ArgumentParser:
     _add_resources(run)
     _add_depth(run)
     _add_pair_list(run)
+    _add_preset(run)
+    _add_mapper(run)
     _add_seed(run)
     _add_json(run)
 
@@ -150,6 +188,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_recipe(match, default=None)
 
     verify = _command(commands, "verify", _verify, "two-view geometries into database.db")
+    _add_preset(verify)
     _add_seed(verify)
 
     escalate = _command(
@@ -161,6 +200,8 @@ def build_parser() -> argparse.ArgumentParser:
     _add_resources(escalate)
 
     mapping = _command(commands, "map", _map, "COLMAP models into sparse/")
+    _add_preset(mapping)
+    _add_mapper(mapping)
     _add_seed(mapping)
     _add_json(mapping)
 
@@ -172,9 +213,106 @@ def build_parser() -> argparse.ArgumentParser:
         overwrites=False,
     )
     inspect.add_argument("image", type=Path, metavar="IMAGE", help="the photograph")
+    _add_masks(inspect)
     _add_recipe(inspect)
     _add_resources(inspect)
     _add_depth(inspect)
+
+    import_h5 = _listing(
+        commands,
+        "import-h5",
+        _import_h5,
+        "features and matches of hloc or deep-image-matching into a new COLMAP database",
+    )
+    _add_image_path(import_h5)
+    _add_h5_files(import_h5)
+    _add_option(
+        import_h5,
+        "--database-path",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="the database to make; must not exist",
+    )
+    _add_cameras(import_h5)
+    import_h5.add_argument(
+        "--layout",
+        choices=["auto", "hloc", "dim"],
+        default="auto",
+        help="of the files; dim is deep-image-matching's (default: auto, as matches are stored)",
+    )
+    _add_option(
+        import_h5,
+        "--pixel-origin",
+        choices=["center", "corner"],
+        default="center",
+        help="where (0, 0) is in the first pixel (default: center, as both programs have it)",
+    )
+    _add_option(
+        import_h5, "--skip-verification", action="store_true", help="no two-view geometries"
+    )
+    _add_seed(import_h5)
+    _add_volume(import_h5)
+
+    export_h5 = _listing(
+        commands,
+        "export-h5",
+        _export_h5,
+        "features and matches of an output folder or a database for hloc or deep-image-matching",
+    )
+    source = export_h5.add_mutually_exclusive_group(required=True)
+    _add_option(
+        source,
+        "--output-path",
+        dest="workspace_path",
+        type=Path,
+        metavar="PATH",
+        help="an output folder in which matching is done",
+    )
+    _add_option(
+        source,
+        "--database-path",
+        type=Path,
+        metavar="FILE",
+        help="or any COLMAP database; a copy of it is read",
+    )
+    _add_h5_files(export_h5)
+    export_h5.add_argument(
+        "--layout",
+        choices=["hloc", "dim"],
+        default="hloc",
+        help="of the files; dim is deep-image-matching's (default: hloc)",
+    )
+    export_h5.add_argument(
+        "--half", action="store_true", help="float16, which rounds coordinates to 1 px and more"
+    )
+    _add_volume(export_h5)
+
+    doctor = _listing(
+        commands,
+        "doctor",
+        _doctor,
+        "look for what is wrong with results or the installation, and say what to do about it",
+    )
+    doctor.add_argument(
+        "path", nargs="?", type=Path, metavar="PATH", help="output folder, or any COLMAP database"
+    )
+    _add_option(
+        doctor,
+        "--image-path",
+        type=Path,
+        metavar="PATH",
+        help="folder of the photographs, to compare their sizes with the cameras",
+    )
+    _add_option(
+        doctor,
+        "--weights",
+        type=Path,
+        metavar="FOLDER",
+        help="look for weights there first",
+    )
+    doctor.add_argument("--json", action="store_true", help="print JSON")
+    _add_volume(doctor)
 
     recipes = _listing(commands, "recipes", _recipes, "list the recipes and what they need")
     recipes.add_argument("name", nargs="?", help="print this recipe with all of its options")
@@ -237,10 +375,14 @@ def _command(
         command.add_argument(
             "--overwrite", action="store_true", help="discard the results of this and later stages"
         )
+    _add_volume(command)
+    return command
+
+
+def _add_volume(command: argparse.ArgumentParser) -> None:
     volume = command.add_mutually_exclusive_group()
     volume.add_argument("-q", "--quiet", action="store_true", help="errors and the result only")
     volume.add_argument("-v", "--verbose", action="store_true", help="every image, tracebacks")
-    return command
 
 
 def _add_option(command: Container, flag: str, **settings: Any) -> None:
@@ -250,7 +392,7 @@ def _add_option(command: Container, flag: str, **settings: Any) -> None:
     command.add_argument(*flags, **settings)
 
 
-def _add_images(command: argparse.ArgumentParser) -> None:
+def _add_image_path(command: argparse.ArgumentParser) -> None:
     _add_option(
         command,
         "--image-path",
@@ -259,6 +401,22 @@ def _add_images(command: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="folder of the photographs, searched with its sub-folders",
     )
+
+
+def _add_h5_files(command: argparse.ArgumentParser) -> None:
+    for content in ("features", "matches"):
+        _add_option(
+            command,
+            f"--{content}-path",
+            type=Path,
+            required=True,
+            metavar="FILE",
+            help=f"HDF5 file of {content}",
+        )
+
+
+def _add_images(command: argparse.ArgumentParser) -> None:
+    _add_image_path(command)
     _add_option(
         command,
         "--image-list-path",
@@ -266,6 +424,32 @@ def _add_images(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="names of the images to use, one per line, relative to --image-path",
     )
+    _add_masks(command)
+    _add_option(
+        command,
+        "--from-database",
+        type=Path,
+        metavar="FILE",
+        help="take images, cameras, rigs, frames and priors of this COLMAP database; it is copied",
+    )
+    _add_option(
+        command,
+        "--database-descriptors",
+        action="store_true",
+        help="descriptors into database.db too, as 8-bit SIFT, for COLMAP's own matchers",
+    )
+    _add_cameras(command)
+    _add_option(
+        command,
+        "--max-failures",
+        type=int,
+        default=0,
+        metavar="N",
+        help="exit code 1 if more images than this cannot be read (default: 0)",
+    )
+
+
+def _add_cameras(command: argparse.ArgumentParser) -> None:
     _add_option(
         command,
         "--camera-mode",
@@ -287,13 +471,22 @@ def _add_images(command: argparse.ArgumentParser) -> None:
         metavar="A,B,...",
         help="known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792.0,524.5",
     )
+
+
+def _add_masks(command: argparse.ArgumentParser) -> None:
     _add_option(
         command,
-        "--max-failures",
-        type=int,
-        default=0,
-        metavar="N",
-        help="exit code 1 if more images than this cannot be read (default: 0)",
+        "--mask-path",
+        type=Path,
+        metavar="FOLDER",
+        help="masks, black where features are not wanted: a/b.jpg has a/b.jpg.png or a/b.png",
+    )
+    _add_option(
+        command,
+        "--camera-mask-path",
+        type=Path,
+        metavar="FILE",
+        help="one mask for all images",
     )
 
 
@@ -366,6 +559,36 @@ def _add_pair_list(command: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_preset(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--preset",
+        default="sparse",
+        choices=PRESETS,
+        help="options of two-view geometry and mapping: ours for few photographs, or COLMAP's "
+        "defaults (default: sparse)",
+    )
+
+
+def _add_mapper(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--mapper",
+        default="incremental",
+        choices=MAPPERS,
+        help="COLMAP's incremental or global mapper (default: incremental)",
+    )
+    _add_option(
+        command,
+        "--mapper-options",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KEY=VALUE",
+        help="options of pycolmap's IncrementalPipelineOptions or GlobalPipelineOptions, e.g. "
+        "ba_refine_principal_point=true mapper.abs_pose_min_num_inliers=10; they win over the "
+        "preset. With num_threads other than 1 results vary from run to run",
+    )
+
+
 def _add_seed(command: argparse.ArgumentParser) -> None:
     _add_option(
         command,
@@ -400,8 +623,13 @@ def _run_options(options: argparse.Namespace) -> RunOptions:
     return RunOptions(
         recipe=_recipe(options, options.recipe),
         cameras=_cameras(options),
+        masks=_masks(options),
         match_list_path=options.match_list_path,
         image_list_path=options.image_list_path,
+        verification=VerificationOptions.preset(options.preset),
+        mapping=_mapping(options),
+        from_database=options.from_database,
+        database_descriptors=options.database_descriptors,
         random_seed=options.random_seed,
         resources=_resources(options),
     )
@@ -435,6 +663,22 @@ def _cameras(options: argparse.Namespace) -> CameraOptions:
     )
 
 
+def _mapping(options: argparse.Namespace) -> MappingOptions:
+    given = {}
+    for setting in options.mapper_options:
+        key, separator, value = setting.partition("=")
+        if not separator or not key.strip():
+            raise OptionError(f"--mapper-options {setting}: expected KEY=VALUE")
+        given[key.strip()] = value
+    return MappingOptions.preset(options.preset, mapper=options.mapper, mapper_options=given)
+
+
+def _masks(options: argparse.Namespace) -> MaskOptions:
+    paths = (options.mask_path, options.camera_mask_path)
+    folder, camera = (str(path.resolve()) if path else "" for path in paths)
+    return MaskOptions(path=folder, camera_path=camera)
+
+
 def _extract(options: argparse.Namespace) -> int:
     from colmap_affrect import stages
 
@@ -444,11 +688,15 @@ def _extract(options: argparse.Namespace) -> int:
             options.image_path,
             _recipe(options, options.recipe),
             _cameras(options),
+            masks=_masks(options),
             image_list_path=options.image_list_path,
+            from_database=options.from_database,
             resources=_resources(options),
             overwrite=options.overwrite,
             progress=_progress(options),
         )
+        if options.database_descriptors:
+            stages.write_descriptors(workspace)
     print(report.summary())
     return _exit_code(report.failures, options)
 
@@ -482,7 +730,7 @@ def _verify(options: argparse.Namespace) -> int:
     with Workspace(options.output_path).locked() as workspace:
         report = stages.verify_matches(
             workspace,
-            VerificationOptions(),
+            VerificationOptions.preset(options.preset),
             options.random_seed,
             overwrite=options.overwrite,
             progress=_progress(options),
@@ -508,18 +756,65 @@ def _escalate(options: argparse.Namespace) -> int:
 
 
 def _map(options: argparse.Namespace) -> int:
-    from colmap_affrect.options import MappingOptions
     from colmap_affrect.pipeline import map_and_report
 
     with Workspace(options.output_path).locked() as workspace:
         report = map_and_report(
             workspace,
-            MappingOptions(),
+            _mapping(options),
             options.random_seed,
             overwrite=options.overwrite,
             progress=_progress(options),
         )
     return _print_reconstruction(report, options)
+
+
+def _import_h5(options: argparse.Namespace) -> int:
+    from colmap_affrect.interchange import import_h5
+
+    report = import_h5(
+        options.image_path,
+        options.features_path,
+        options.matches_path,
+        options.database_path,
+        cameras=_cameras(options),
+        layout=options.layout,
+        pixel_origin=options.pixel_origin,
+        skip_verification=options.skip_verification,
+        random_seed=options.random_seed,
+        progress=_progress(options),
+    )
+    print(report.summary())
+    return EXIT_OK
+
+
+def _export_h5(options: argparse.Namespace) -> int:
+    from colmap_affrect.interchange import export_h5
+
+    report = export_h5(
+        options.features_path,
+        options.matches_path,
+        output_path=options.workspace_path,
+        database_path=options.database_path,
+        layout=options.layout,
+        half=options.half,
+        progress=_progress(options),
+    )
+    print(report.summary())
+    return EXIT_OK
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from colmap_affrect.doctor import diagnose
+
+    diagnosis = diagnose(
+        options.path,
+        image_path=options.image_path,
+        weights_path=options.weights,
+        progress=_progress(options),
+    )
+    print(diagnosis.to_json() if options.json else diagnosis.summary())
+    return EXIT_FAILED if diagnosis.num_errors else EXIT_OK
 
 
 def _progress(options: argparse.Namespace) -> Progress:
@@ -545,11 +840,15 @@ def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
 
 def _inspect(options: argparse.Namespace) -> int:
     from colmap_affrect.extraction import prepare
+    from colmap_affrect.photographs import Photographs
     from colmap_affrect.report.inspection import inspect_image
 
     recipe = _recipe(options, options.recipe)
+    photographs = Photographs(options.image.parent, CameraOptions(), _masks(options))
+    photographs.check()
+    mask = photographs.mask(options.image.name)
     extractor = prepare(recipe.extraction, _resources(options), [options.image.name])
-    print(inspect_image(extractor, options.image, options.output_path).summary())
+    print(inspect_image(extractor, options.image, options.output_path, mask=mask).summary())
     return EXIT_OK
 
 

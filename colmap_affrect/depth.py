@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import hashlib
 import threading
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import log
+from math import log, prod
 from pathlib import Path
 from posixpath import splitext
-from typing import Any
-from zipfile import BadZipFile
+from typing import IO, Any
+from zipfile import BadZipFile, ZipFile, is_zipfile
 
 import cv2
 import h5py
@@ -40,7 +41,10 @@ MIN_DISPARITY_FRAC = 0.01
 NETWORK_IMAGE_SIZE_PX = 1024
 """Longer side of what a network is given; most of them work at about 384 to 784 px."""
 
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, cv2.error)
+MAX_NUM_VALUES = 1 << 28
+"""Of a map; more is taken for damage."""
+
+_UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, zlib.error)
 
 
 class _Unusable(Exception):
@@ -316,7 +320,9 @@ def _read(path: Path) -> NDArray[np.float64]:
     """Read the (h, w) values of a file by its suffix."""
     try:
         values = _READERS[path.suffix](path)
-    except _UNREADABLE as error:
+    except _Unusable:
+        raise
+    except Exception as error:  # damaged files make readers fail in any way
         raise _Unusable("cannot be read; damaged, or not what its suffix says") from error
     if values.ndim != 2 or values.size == 0 or values.dtype.kind not in "fiu":
         raise _Unusable(
@@ -327,14 +333,35 @@ def _read(path: Path) -> NDArray[np.float64]:
 
 
 def _read_numpy(path: Path) -> NDArray[np.generic]:
-    with path.open("rb") as stream:  # np.load leaves a damaged file open that it is to open itself
-        loaded = np.load(stream, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return loaded
-        names = loaded.files
-        if "depth" not in names and len(names) != 1:
-            raise _Unusable(f"expected one array, or one named 'depth', found {_listed(names)}")
-        return np.asarray(loaded["depth" if "depth" in names else names[0]])
+    with path.open("rb") as stream:
+        if not is_zipfile(stream):
+            return _read_array(stream)
+        with ZipFile(stream) as archive:
+            files = {name.removesuffix(".npy"): name for name in archive.namelist()}
+            names = sorted(files)
+            if "depth" not in names and len(names) != 1:
+                raise _Unusable(f"expected one array, or one named 'depth', found {_listed(names)}")
+            with archive.open(files["depth" if "depth" in names else names[0]]) as member:
+                return _read_array(member)
+
+
+def _read_array(stream: IO[bytes]) -> NDArray[np.generic]:
+    """Read an array in the format of ``.npy``, never a pickle, when its header is sensible."""
+    stream.seek(0)
+    version = np.lib.format.read_magic(stream)
+    read_header = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }[version]
+    _require_readable_size(read_header(stream)[0])
+    stream.seek(0)
+    return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
+
+
+def _require_readable_size(shape: Sequence[int]) -> None:
+    """Refuse what a damaged or malicious header says before memory is taken for it."""
+    if prod(shape) > MAX_NUM_VALUES:
+        raise _Unusable(f"claims to be of shape {tuple(shape)}, too large for a depth map")
 
 
 def _read_hdf5(path: Path) -> NDArray[np.generic]:
@@ -352,11 +379,16 @@ def _read_hdf5(path: Path) -> NDArray[np.generic]:
                 "expected one dataset of two dimensions, or one named 'depth', found "
                 f"{_listed(maps)}"
             )
-        return np.asarray(datasets["depth" if "depth" in datasets else maps[0]][()])
+        chosen = datasets["depth" if "depth" in datasets else maps[0]]
+        _require_readable_size(chosen.shape)
+        return np.asarray(chosen[()])
 
 
 def _read_png(path: Path) -> NDArray[np.generic]:
-    values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    data = np.fromfile(path, np.uint8)
+    if data[:8].tobytes() == b"\x89PNG\r\n\x1a\n":
+        _require_readable_size(data[16:24].view(">u4").tolist())  # width and height
+    values = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if values is None:
         raise ValueError
     if values.dtype != np.uint16:

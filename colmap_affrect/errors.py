@@ -35,6 +35,10 @@ class WorkspaceError(AffrectError):
     """The output folder cannot be used: not writable, or in use by another run."""
 
 
+class MappingError(AffrectError):
+    """COLMAP's mapper ended with an error."""
+
+
 class DepthError(AffrectError):
     """The depth map of a photograph is missing or cannot be used."""
 
@@ -45,3 +49,7 @@ class WeightsError(AffrectError):
 
 class DeviceError(AffrectError):
     """The device asked for is not there."""
+
+
+class ComparisonError(AffrectError):
+    """Methods cannot be compared as asked."""

@@ -15,19 +15,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
 from colmap_affrect.extraction import ImageExtractor, Resources
 from colmap_affrect.matching.pairs import Pair
-from colmap_affrect.options import CameraOptions
 from colmap_affrect.outcomes import StageReport
+from colmap_affrect.photographs import Photographs
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.stages import (
     PAIRS_PER_WRITE,
     feature_store,
-    intrinsics,
     iterate_matches,
     listed_pairs,
     make_extractor,
@@ -170,15 +168,12 @@ class _Ladder:
 
     def _extend(self, name: str, level: int) -> None:
         """Add to an image the features of all levels that it lacks, up to this one."""
-        record = self.workspace.require("extract")
-        cameras = CameraOptions.from_mapping(record["camera"], str(self.workspace.config))
-        path = Path(record["image_path"]) / name
+        photographs = Photographs.recorded(self.workspace)
         if self._extractor is None:
             names = self.features.names()
             self._extractor = make_extractor(self.workspace, self.options, self._resources, names)
-        matrix = intrinsics(path, self._extractor, cameras)
         for missing in range(len(self.features.level_ends(name)), level + 1):
-            found = self._extractor.extract_file(path, name, matrix, missing)
+            found = photographs.extract(self._extractor, name, missing)
             self.features.extend(name, found.features)
 
     def _match_again(

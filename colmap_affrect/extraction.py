@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.conventions import camera_matrix, resized_from_original
 from colmap_affrect.depth import depth_source
-from colmap_affrect.errors import DepthError, OptionError
+from colmap_affrect.errors import DepthError, ImageError, OptionError
 from colmap_affrect.features.registry import (
     make_profile,
     make_shape_source,
@@ -22,13 +22,20 @@ from colmap_affrect.features.registry import (
 )
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.geometry.affine import transform_frames
-from colmap_affrect.imaging import read_gray, shrink_to
+from colmap_affrect.imaging import read_gray, shrink_mask, shrink_to
 from colmap_affrect.interfaces import Computing, FeatureProfile, Rectifier, Sources
 from colmap_affrect.options import CoverOptions, ExtractionOptions
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.rectified import extract_rectified
 from colmap_affrect.rectifiers.registry import make_rectifier
-from colmap_affrect.types import GrayImage, LocalFeatures, Photograph, RectificationPlan
+from colmap_affrect.types import (
+    GrayImage,
+    LocalFeatures,
+    Mask,
+    Photograph,
+    RectificationPlan,
+    in_mask,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -88,6 +95,7 @@ class ImageExtractor:
         name: str = "",
         intrinsics: NDArray[np.float64] | None = None,
         level: int = 0,
+        mask: Mask | None = None,
     ) -> ExtractedImage:
         """Read an image and extract its features.
 
@@ -98,35 +106,50 @@ class ImageExtractor:
                 COLMAP's guess of a focal length of 1.2 times the longer side.
             level: 0 for the features that every image gets; above that, only those that the
                 rectifier of this level of escalation adds.
+            mask: (H, W) bool of the stored image, where features may be; None means everywhere.
 
         Raises:
-            ImageError: when the file cannot be read.
+            ImageError: when the file cannot be read, or its mask has another size.
         """
-        photograph, original_size = self.photograph(path, name, intrinsics)
+        photograph, original_size = self.photograph(path, name, intrinsics, mask)
         plan, warning = self.plan_or_warn(photograph, level)
         if warning:
             logger.warning("%s: %s", photograph.name, warning)
-        features = self.execute(photograph.gray, plan, with_original=level == 0)
+        features = self.execute(
+            photograph.gray, plan, with_original=level == 0, mask=photograph.mask
+        )
         if photograph.size != original_size:
             original_from_resized = np.linalg.inv(
                 resized_from_original(original_size, photograph.size)
             )
             features = features.with_frames(transform_frames(original_from_resized, features.lafs))
-        return ExtractedImage(
-            features.select(features.inside(original_size)), original_size, warning
-        )
+        keep = features.inside(original_size)
+        if mask is not None:
+            keep &= in_mask(mask, features.keypoints)
+        return ExtractedImage(features.select(keep), original_size, warning)
 
     def photograph(
-        self, path: Path, name: str = "", intrinsics: NDArray[np.float64] | None = None
+        self,
+        path: Path,
+        name: str = "",
+        intrinsics: NDArray[np.float64] | None = None,
+        mask: Mask | None = None,
     ) -> tuple[Photograph, tuple[int, int]]:
         """Read an image at the size of processing; also return its stored (width, height)."""
         image = read_gray(path)
+        if mask is not None and mask.shape != image.shape:
+            raise ImageError(
+                f"{path}: is {image.shape[1]} x {image.shape[0]} px and its mask "
+                f"{mask.shape[1]} x {mask.shape[0]} px; they must have one size"
+            )
         original_size = (image.shape[1], image.shape[0])
         gray = shrink_to(image, self.options.max_image_size_px)
         size = (gray.shape[1], gray.shape[0])
         original_camera = camera_matrix(original_size) if intrinsics is None else intrinsics
         camera = resized_from_original(original_size, size) @ original_camera
-        return Photograph(gray, name or path.name, path, camera), original_size
+        if mask is not None:
+            mask = shrink_mask(mask, size)
+        return Photograph(gray, name or path.name, path, camera, mask), original_size
 
     def plan(self, photograph: Photograph, level: int = 0) -> RectificationPlan:
         """Decide which warps of a photograph to look at.
@@ -139,11 +162,18 @@ class ImageExtractor:
         return self.rectifiers[level].plan(photograph)
 
     def execute(
-        self, image: GrayImage, plan: RectificationPlan, *, with_original: bool = True
+        self,
+        image: GrayImage,
+        plan: RectificationPlan,
+        *,
+        with_original: bool = True,
+        mask: Mask | None = None,
     ) -> LocalFeatures:
         """Extract the features of a plan, frames in px of the (H, W) uint8 image."""
         limit = self.options.features.max_num_rectified_features
-        return extract_rectified(image, plan, self.profile, limit, with_original=with_original)
+        return extract_rectified(
+            image, plan, self.profile, limit, with_original=with_original, mask=mask
+        )
 
     def plan_or_warn(self, photograph: Photograph, level: int = 0) -> tuple[RectificationPlan, str]:
         """Plan; without a usable depth map plan no warps and say why, else say nothing."""

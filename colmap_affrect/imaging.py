@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from math import ceil, sqrt
 from pathlib import Path
@@ -13,10 +14,29 @@ from numpy.typing import NDArray
 from colmap_affrect.conventions import is_inside
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_frames
-from colmap_affrect.types import GrayImage, Mask, Rectification
+from colmap_affrect.types import ColorImage, GrayImage, Mask, Rectification
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
+IMAGE_SUFFIXES = (
+    ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".pbm", ".pgm", ".pnm",
+    ".ppm",
+)  # fmt: skip
 """Formats that both this package and pycolmap's wheel can read, lower case."""
+
+OTHER_IMAGE_SUFFIXES = (
+    ".webp", ".gif", ".avif", ".heic", ".heif", ".jp2", ".jxl", ".tga", ".exr", ".hdr", ".psd",
+    ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2",
+)  # fmt: skip
+"""Formats of photographs that one of the two cannot read, lower case."""
+
+FOREIGN_FORMATS = {
+    "WebP": rb"RIFF....WEBP",
+    "GIF": rb"GIF8",
+    "JPEG 2000": rb"\x00\x00\x00\x0cjP  |\xff\x4f\xff\x51",
+    "JPEG XL": rb"\x00\x00\x00\x0cJXL |\xff\x0a",
+    "AVIF or HEIF": rb"....ftyp(avi|hei|hev|mif|msf)",
+}
+"""Patterns of the first bytes of formats that OpenCV may read, whatever the suffix, and pycolmap's
+wheel does not."""
 
 ANTI_ALIASING_SIGMA = 0.8
 """Blur before a compression by c: sigma = 0.8 sqrt(c^2 - 1) source px (Morel & Yu, ASIFT)."""
@@ -38,24 +58,85 @@ def read_gray(path: Path) -> GrayImage:
     Raises:
         ImageError: when the file is missing, empty, or not an image.
     """
+    image = _decode(path)
+    if image.dtype == np.uint16:
+        image = image // 257
+    elif image.dtype != np.uint8:
+        image = np.nan_to_num(np.clip(image, 0.0, 1.0)) * 255.0
+    return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def read_mask(path: Path) -> Mask:
+    """Read a mask: black pixels are False, all others True (COLMAP's convention).
+
+    Raises:
+        ImageError: when the file is missing, empty, or not an image.
+    """
+    return np.asarray(_decode(path) != 0)
+
+
+def read_color(path: Path, max_size_px: int) -> ColorImage:
+    """Read an image in colour, as stored, its longer side shrunk to at most ``max_size_px``.
+
+    Raises:
+        ImageError: when the file is missing, empty, or not an image.
+    """
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return shrink_to(np.asarray(image[:, :, ::-1], dtype=np.uint8), max_size_px)
+
+
+def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
+    """Return an (H, W) or (H, W, 3) uint8 image as JPEG; quality is 0 to 100."""
+    return _encode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def encode_png(image: NDArray[np.uint8]) -> bytes:
+    """Return an (H, W), (H, W, 3) or, with opacity, (H, W, 4) uint8 image as PNG."""
+    return _encode(".png", image, [])
+
+
+def _encode(suffix: str, image: NDArray[np.uint8], settings: list[int]) -> bytes:
+    if image.ndim == 3:
+        image = image[:, :, [2, 1, 0, 3][: image.shape[2]]]
+    _, data = cv2.imencode(suffix, image, settings)
+    return data.tobytes()
+
+
+GRAY_AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+def _decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[np.generic]:
+    """Read an image, by default as gray in the type it is stored in."""
+    if path.exists() and not path.is_file():
+        raise ImageError(f"{path}: is not a file")
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
         raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(data, flags) if data.size else None
+    for name, pattern in FOREIGN_FORMATS.items():
+        if re.match(pattern, data[:16].tobytes(), re.DOTALL):
+            raise ImageError(
+                f"{path}: is a {name} file, a format that COLMAP cannot read; convert it to PNG or "
+                "JPEG"
+            )
+    try:
+        image = cv2.imdecode(data, flags) if data.size else None
+    except cv2.error:  # for one, of more pixels than OpenCV takes
+        image = None
     if image is None:
         raise ImageError(f"{path}: not a readable image (damaged, empty, or of an unknown format)")
-    if image.dtype == np.uint16:
-        image = image // 257
-    elif image.dtype != np.uint8:
-        image = np.clip(image, 0.0, 1.0) * 255.0
-    return np.ascontiguousarray(image, dtype=np.uint8)
+    return np.asarray(image)
 
 
-def shrink_to(image: GrayImage, max_size_px: int) -> GrayImage:
-    """Shrink an image, by area averaging, until its longer side is at most ``max_size_px``."""
-    height, width = image.shape
+def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:
+    """Resize an (H, W) mask to (width, height) px, each pixel from the nearest one."""
+    values = mask.astype(np.uint8)
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0)
+
+
+def shrink_to(image: NDArray[np.uint8], max_size_px: int) -> NDArray[np.uint8]:
+    """Shrink an (H, W) or (H, W, 3) image, by area averaging, until no side is longer."""
+    height, width = image.shape[:2]
     scale = max_size_px / max(width, height)
     if scale >= 1.0:
         return image
@@ -174,6 +255,11 @@ def _source_points(
     return x.astype(np.float32), y.astype(np.float32), ahead
 
 
+def mask_values(mask: Mask) -> NDArray[np.uint8]:
+    """Return an (H, W) mask as uint8, 255 inside and 0 outside."""
+    return mask.astype(np.uint8) * 255
+
+
 def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> NDArray[np.uint8]:
     """Carry the region of a rectification into its warp (nearest; 255 inside, 0 outside).
 
@@ -187,7 +273,7 @@ def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> NDAr
     region = rectification.region
     if region is None:
         region = np.ones(image_size[::-1], dtype=bool)
-    values = region.astype(np.uint8) * 255
+    values = mask_values(region)
     image_from_region = np.eye(3)
     image_from_region[:2, 2] = rectification.region_origin
     if rectification.is_affine:

@@ -50,6 +50,19 @@ class Options:
         """Return the options as nested dictionaries of plain values."""
         return dataclasses.asdict(self)
 
+    def __str__(self) -> str:
+        """Return one line for each option.
+
+        >>> print(MatchingOptions(max_ratio=0.8))
+        MatchingOptions
+          max_ratio = 0.8
+          ratio_both_ways = True
+          min_contrast_distance_px = 10.0
+          duplicate_radius_px = 2.0
+        """
+        lines = [f"  {key} = {value!r}" for key, value in flat(self.to_mapping()).items()]
+        return "\n".join([type(self).__name__, *lines])
+
     def _check(self, name: str, low: float, high: float) -> None:
         value = getattr(self, name)
         if not low <= value <= high:
@@ -63,6 +76,21 @@ class Options:
         value = getattr(self, name)
         if value not in choices:
             raise OptionError(f"{name}={value!r} is not one of {', '.join(choices)}")
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Join the keys of nested mappings by dots; tuples become lists.
+
+    >>> flat({"a": {"b": (1, 2)}, "c": 3})
+    {'a.b': [1, 2], 'c': 3}
+    """
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            found |= flat(value, f"{prefix}{key}.")
+        else:
+            found[prefix + key] = list(value) if isinstance(value, tuple) else value
+    return found
 
 
 def _suggestion(key: str, known: Mapping[str, Any]) -> str:
@@ -481,9 +509,22 @@ class MatchingOptions(Options):
         self._check("duplicate_radius_px", 0.01, 1000.0)
 
 
+PRESETS = ("sparse", "colmap")
+"""Names of the presets of verification and mapping: ours for few photographs, and COLMAP's."""
+CUSTOM = "custom"
+"""What options that are no preset are called."""
+
+MAPPERS = ("incremental", "global")
+
+
+def _check_preset(name: str) -> None:
+    if name not in PRESETS:
+        raise OptionError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class VerificationOptions(Options):
-    """Two-view geometry, the sparse preset (names as in pycolmap)."""
+    """Two-view geometry, by default the sparse preset (names as in pycolmap)."""
 
     max_error_px: float = 3.0
     min_num_inliers: int = 20
@@ -493,6 +534,15 @@ class VerificationOptions(Options):
     max_num_trials: int = 10000
     ransac_min_inlier_ratio: float = 0.10
 
+    COLMAP: ClassVar[Mapping[str, Any]] = {
+        "max_error_px": 4.0,
+        "min_num_inliers": 15,
+        "min_inlier_ratio": 0.0,
+        "max_num_trials": 10000,
+        "ransac_min_inlier_ratio": 0.25,
+    }
+    """The preset ``colmap``: COLMAP's own defaults."""
+
     def __post_init__(self) -> None:
         self._check("max_error_px", 0.01, 1000.0)
         self._check("min_num_inliers", 5, 1_000_000)
@@ -500,11 +550,25 @@ class VerificationOptions(Options):
         self._check("max_num_trials", 1, 100_000_000)
         self._check("ransac_min_inlier_ratio", 0.0, 1.0)
 
+    @classmethod
+    def preset(cls, name: str) -> Self:
+        """Return the options of a preset, ``sparse`` or ``colmap``."""
+        _check_preset(name)
+        return cls(**cls.COLMAP) if name == "colmap" else cls()
+
+    @property
+    def preset_name(self) -> str:
+        """Name of the preset that these options are, else ``custom``."""
+        return next((name for name in PRESETS if self == self.preset(name)), CUSTOM)
+
 
 @dataclass(frozen=True, kw_only=True)
 class MappingOptions(Options):
-    """Incremental mapping, the sparse preset (names as in pycolmap)."""
+    """Mapping, by default incremental with the sparse preset (names as in pycolmap)."""
 
+    mapper: str = "incremental"
+    """``incremental`` or ``global``, which uses the options that are not of first pairs (init)
+    and single poses (abs_pose) and tries once."""
     ignore_two_view_tracks: bool = False
     """COLMAP's True leaves sparse sets without a model: there most tracks have two views."""
     init_min_tri_angle_deg: float = 8.0
@@ -516,13 +580,59 @@ class MappingOptions(Options):
     keep_given_intrinsics: bool = True
     """Leave camera parameters that the user gave as they are; refining them on a few images
     of a sparse set moves them far away (measured: focal lengths of 1437 px to 1256 px)."""
+    mapper_options: dict[str, Any] = field(default_factory=dict)
+    """Other options of pycolmap's pipeline, by dotted key (``mapper.init_max_error``); they win
+    over those above."""
+
+    COLMAP: ClassVar[Mapping[str, Any]] = {
+        "ignore_two_view_tracks": True,
+        "init_min_tri_angle_deg": 16.0,
+        "init_min_num_inliers": 100,
+        "abs_pose_min_num_inliers": 30,
+        "min_model_size": 10,
+        "max_num_attempts": 1,
+        "keep_given_intrinsics": False,
+    }
+    """The preset ``colmap``: COLMAP's own defaults."""
+    COLMAP_GLOBAL: ClassVar[Mapping[str, Any]] = {**COLMAP, "min_model_size": 3}
+    """The same for global mapping."""
 
     def __post_init__(self) -> None:
+        self._check_choice("mapper", MAPPERS)
         self._check("init_min_tri_angle_deg", 0.0, 180.0)
         self._check("init_min_num_inliers", 1, 1_000_000)
         self._check("abs_pose_min_num_inliers", 3, 1_000_000)
         self._check("min_model_size", 2, 1_000_000)
         self._check("max_num_attempts", 1, 100)
+
+    @classmethod
+    def preset(
+        cls,
+        name: str,
+        *,
+        mapper: str = "incremental",
+        mapper_options: Mapping[str, Any] | None = None,
+    ) -> Self:
+        """Return the options of a preset, ``sparse`` or ``colmap``, for one of the mappers."""
+        _check_preset(name)
+        colmap = cls.COLMAP_GLOBAL if mapper == "global" else cls.COLMAP
+        values = colmap if name == "colmap" else {}
+        return cls(mapper=mapper, mapper_options=dict(mapper_options or {}), **values)
+
+    @property
+    def preset_name(self) -> str:
+        """Name of the preset that these options are, ``mapper_options`` apart, else ``custom``."""
+
+        def is_preset(name: str) -> bool:
+            options = self.preset(name, mapper=self.mapper, mapper_options=self.mapper_options)
+            return self == options
+
+        return next((name for name in PRESETS if is_preset(name)), CUSTOM)
+
+    @property
+    def num_attempts(self) -> int:
+        """How often mapping may be tried; global mapping has no first pair to choose anew."""
+        return 1 if self.mapper == "global" else self.max_num_attempts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -532,6 +642,22 @@ class CameraOptions(Options):
     mode: str = "auto"
     model: str = "SIMPLE_RADIAL"
     params: str = ""
+    default_focal_length_factor: float = 1.2
+    """Focal length in units of the longer side where EXIF has none."""
+    existing_camera_id: int = -1
+    """Camera of the database that all new images get; -1 makes cameras for them."""
 
     def __post_init__(self) -> None:
         self._check_choice("mode", ("auto", "single", "per-folder", "per-image"))
+        self._check("default_focal_length_factor", 0.01, 100.0)
+        self._check("existing_camera_id", -1, 2**31)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskOptions(Options):
+    """Where features may be, as COLMAP has it: nowhere that a mask is black."""
+
+    path: str = ""
+    """Folder with a mask for every image: a/b.jpg has a/b.jpg.png or a/b.png; empty for none."""
+    camera_path: str = ""
+    """One mask for all images; empty for none."""

@@ -7,6 +7,8 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+from colmap_affrect.options import MappingOptions, VerificationOptions
+
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
 
@@ -54,9 +56,13 @@ class ReconstructionReport:
 
     Attributes:
         status: ``ok`` (all images in one model), ``partial``, or ``no_model``.
-        unregistered: image name to reason: unreadable, no features, no verified pair, or
-            not registered.
+        unregistered: image name to reason: unreadable, no features, no verified pair, not
+            registered, or in another model.
         models: all models, largest first, as written to sparse/0, sparse/1, ...
+        verification: options of two-view geometry.
+        mapping: the mapper and its options.
+        differs_from_colmap: for verification and mapping, what pycolmap was given that is not
+            COLMAP's default, by pycolmap's dotted keys.
         pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
             and ``none``; empty for other recipes.
     """
@@ -70,6 +76,9 @@ class ReconstructionReport:
     recipe: str
     random_seed: int
     versions: dict[str, str]
+    verification: VerificationOptions
+    mapping: MappingOptions
+    differs_from_colmap: dict[str, dict[str, Any]]
     pair_levels: dict[str, int] = dataclasses.field(default_factory=dict)
 
     @property
@@ -78,6 +87,14 @@ class ReconstructionReport:
         if not self.models:
             return "no_model"
         return "partial" if self.unregistered else "ok"
+
+    @property
+    def preset(self) -> str:
+        """``sparse``, ``colmap`` or ``custom``; both names where verification's is another one."""
+        verification, mapping = self.verification.preset_name, self.mapping.preset_name
+        if verification == mapping:
+            return mapping
+        return f"{verification} for verification, {mapping} for mapping"
 
     @property
     def registered_names(self) -> tuple[str, ...]:
@@ -96,6 +113,8 @@ class ReconstructionReport:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of ``report.json``."""
+        mapping = self.mapping.to_mapping()
+        mapper, mapper_options = mapping.pop("mapper"), mapping.pop("mapper_options")
         largest = self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
         return {
             "status": self.status,
@@ -113,6 +132,12 @@ class ReconstructionReport:
             "pair_levels": self.pair_levels,
             "stages": [dataclasses.asdict(stage) for stage in self.stages],
             "recipe": self.recipe,
+            "preset": self.preset,
+            "mapper": mapper,
+            "mapper_options": mapper_options,
+            "verification": self.verification.to_mapping(),
+            "mapping": mapping,
+            "differs_from_colmap": self.differs_from_colmap,
             "random_seed": self.random_seed,
             "versions": self.versions,
         }
@@ -140,6 +165,9 @@ class ReconstructionReport:
         if len(self.models) > 1:
             sizes = ", ".join(str(len(model.registered_names)) for model in self.models)
             lines += [f"models      {len(self.models)}, of {sizes} images"]
+        given = [f"{key}={value}" for key, value in self.mapping.mapper_options.items()]
+        chosen = ", ".join([self.preset, f"{self.mapping.mapper} mapper", *given])
+        lines += [f"preset      {chosen}"]
         lines += [
             f"warning     {name}: {why}"
             for stage in self.stages

@@ -9,10 +9,13 @@ from importlib import metadata
 from pathlib import Path
 
 from colmap_affrect import stages
+from colmap_affrect.colmap.mapping import checked_mapping_options, mapping_differences
+from colmap_affrect.colmap.verification import verification_differences
 from colmap_affrect.escalation import escalate, pair_levels
 from colmap_affrect.extraction import Resources
-from colmap_affrect.options import CameraOptions, MappingOptions, VerificationOptions
-from colmap_affrect.outcomes import ReconstructionReport, StageReport
+from colmap_affrect.files import replace_text
+from colmap_affrect.options import CameraOptions, MappingOptions, MaskOptions, VerificationOptions
+from colmap_affrect.outcomes import ModelSummary, ReconstructionReport, StageReport
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.workspace import Workspace
@@ -30,16 +33,23 @@ class RunOptions:
         recipe: options of extraction and matching.
         match_list_path: list of the pairs to match; None for all pairs.
         image_list_path: list of the images to use; None for all below the folder.
+        from_database: COLMAP database whose images, cameras, rigs, frames and pose priors are
+            used; it stays as it is.
+        database_descriptors: also write descriptors into the database, as COLMAP's matchers
+            need them.
         random_seed: seed of verification and mapping.
         resources: weights and device of networks.
     """
 
     recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
     cameras: CameraOptions = field(default_factory=CameraOptions)
+    masks: MaskOptions = field(default_factory=MaskOptions)
     verification: VerificationOptions = field(default_factory=VerificationOptions)
     mapping: MappingOptions = field(default_factory=MappingOptions)
     match_list_path: Path | None = None
     image_list_path: Path | None = None
+    from_database: Path | None = None
+    database_descriptors: bool = False
     random_seed: int = 0
     resources: Resources = field(default_factory=Resources)
 
@@ -69,7 +79,8 @@ def run(
     """
     options = options or RunOptions()
     workspace = Workspace(output_path)
-    stages.list_images(image_path, options.image_list_path)
+    mapping = checked_mapping_options(options.mapping)
+    stages.images_to_use(image_path, options.image_list_path, options.from_database)
     with workspace.locked():
         reports = [
             stages.extract(
@@ -77,7 +88,9 @@ def run(
                 image_path,
                 options.recipe,
                 options.cameras,
+                masks=options.masks,
                 image_list_path=options.image_list_path,
+                from_database=options.from_database,
                 resources=options.resources,
                 overwrite=overwrite,
                 progress=progress,
@@ -90,8 +103,10 @@ def run(
         ]
         if options.recipe.extraction.escalation:
             reports.append(escalate(workspace, resources=options.resources, progress=progress))
+        if options.database_descriptors:
+            stages.write_descriptors(workspace)
         return map_and_report(
-            workspace, options.mapping, options.random_seed, earlier=reports, progress=progress
+            workspace, mapping, options.random_seed, earlier=reports, progress=progress
         )
 
 
@@ -105,15 +120,21 @@ def map_and_report(
     progress: Progress = SILENT,
 ) -> ReconstructionReport:
     """Map a verified workspace and write ``report.json``."""
+    options = checked_mapping_options(options)
     report, models = stages.map_images(
         workspace, options, random_seed, overwrite=overwrite, progress=progress
     )
     names = stages.recorded_images(workspace)
-    min_num_inliers = workspace.require("verify")["min_num_inliers"]
+    verification, verification_seed = workspace.verification_options()
+    min_num_inliers = verification.min_num_inliers
     registered = models[0].registered_names if models else ()
+    intrinsics_given = stages.intrinsics_given(workspace)
     result = ReconstructionReport(
         images_total=len(names),
-        unregistered=stages.reconstruction_problems(workspace, names, registered, min_num_inliers),
+        unregistered={
+            **stages.reconstruction_problems(workspace, names, registered, min_num_inliers),
+            **_in_other_models(models),
+        },
         models=tuple(models),
         num_pairs=stages.num_listed_pairs(workspace),
         num_verified_pairs=stages.num_verified_pairs(workspace, min_num_inliers),
@@ -121,10 +142,27 @@ def map_and_report(
         recipe=workspace.recipe(),
         random_seed=random_seed,
         versions=installed_versions(),
+        verification=verification,
+        mapping=options,
+        differs_from_colmap={
+            "verification": verification_differences(verification, verification_seed),
+            "mapping": mapping_differences(options, random_seed, intrinsics_given=intrinsics_given),
+        },
         pair_levels=pair_levels(workspace),
     )
-    workspace.report.write_text(result.to_json(), encoding="utf-8")
+    replace_text(workspace.report, result.to_json())
     return result
+
+
+def _in_other_models(models: Sequence[ModelSummary]) -> dict[str, str]:
+    """Tell of the images outside the largest model which other one has them."""
+    largest = models[0].registered_names if models else ()
+    return {
+        name: f"in another model, sparse/{index}"
+        for index, model in reversed(list(enumerate(models)))
+        for name in model.registered_names
+        if name not in largest
+    }
 
 
 def installed_versions() -> dict[str, str]:

@@ -68,7 +68,7 @@ def _read(name: str) -> dict[str, Any]:
         hint = f"did you mean '{close[0]}'? " if close else ""
         known = ", ".join(recipe_names())
         raise OptionError(f"unknown recipe '{name}': {hint}known are {known}") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # what tomllib raises on odd files
         raise OptionError(f"recipe {path}: cannot be read ({error})") from error
 
 
@@ -78,7 +78,7 @@ def _apply(values: dict[str, Any], setting: str) -> None:
         raise OptionError(f"--set {setting}: expected section.option=value")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         value = text.strip()
     *sections, option = key.strip().split(".")
     target: Any = values

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.geometry.affine import ellipse_extents, transform_frames
 from colmap_affrect.geometry.neighbors import neighbors_within
-from colmap_affrect.imaging import warp, warp_mask
+from colmap_affrect.imaging import mask_values, warp, warp_mask
 from colmap_affrect.interfaces import FeatureProfile
 from colmap_affrect.types import (
     GrayImage,
@@ -33,6 +35,7 @@ def extract_rectified(
     max_num_rectified: int,
     *,
     with_original: bool = True,
+    mask: Mask | None = None,
 ) -> LocalFeatures:
     """Return the features of the image and of all planned warps, frames in image px.
 
@@ -45,12 +48,13 @@ def extract_rectified(
         profile: detector and descriptor.
         max_num_rectified: bound on the features of all warps together.
         with_original: False leaves out the features of the image itself.
+        mask: (H, W) bool, where features may be; None means everywhere.
     """
     rectifications: list[Rectification | None] = [None] if with_original else []
     rectifications += plan.items
     if not rectifications:
         return LocalFeatures.empty(profile.descriptor_size)
-    views = [_view(image, rectification) for rectification in rectifications]
+    views = [_view(image, rectification, mask) for rectification in rectifications]
     detected = [profile.detect(view) for view in views]
     carried = [_carried(*pair) for pair in zip(detected, rectifications, strict=True)]
     keep = [_usable(*pair, plan) for pair in zip(carried, rectifications, strict=True)]
@@ -72,11 +76,15 @@ def extract_rectified(
     )
 
 
-def _view(image: GrayImage, rectification: Rectification | None) -> View:
+def _view(image: GrayImage, rectification: Rectification | None, mask: Mask | None) -> View:
     if rectification is None:
-        return image, None
+        return image, None if mask is None else mask_values(mask)
     size = (image.shape[1], image.shape[0])
-    return warp(image, rectification), warp_mask(rectification, size)
+    inside = warp_mask(rectification, size)
+    if mask is not None:
+        unmasked = replace(rectification, region=mask, region_origin=(0, 0))
+        inside = np.minimum(inside, warp_mask(unmasked, size))
+    return warp(image, rectification), inside
 
 
 def _carried(features: LocalFeatures, rectification: Rectification | None) -> LocalFeatures:

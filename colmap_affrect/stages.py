@@ -6,31 +6,41 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.mapping import map_incrementally, read_models
+from colmap_affrect.colmap.copies import copy_without_features, open_copy
+from colmap_affrect.colmap.mapping import map_database, read_models
 from colmap_affrect.colmap.verification import verified_pairs, verify
-from colmap_affrect.errors import ImageError, OptionError, StaleStoreError, StoreError
+from colmap_affrect.errors import DatabaseError, ImageError, OptionError, StaleStoreError
 from colmap_affrect.executor import available_cores, map_ordered
 from colmap_affrect.extraction import ImageExtractor, Resources, prepare
 from colmap_affrect.features.weights import file_sha256
-from colmap_affrect.imaging import IMAGE_SUFFIXES, read_gray
+from colmap_affrect.files import replace_text
 from colmap_affrect.matching.nearest import MatchableImage, match_features, matchable
 from colmap_affrect.matching.pairs import Pair, exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.options import (
     CameraOptions,
     ExtractionOptions,
     MappingOptions,
+    MaskOptions,
     MatchingOptions,
     VerificationOptions,
 )
 from colmap_affrect.outcomes import ModelSummary, StageReport
+from colmap_affrect.photographs import (
+    Photographs,
+    checked_names,
+    left_out,
+    list_images,
+    refuse_colliding_keys,
+    refuse_mixed_sizes,
+)
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.store import FeatureStore, MatchStore, PairMatches, pair_key
@@ -44,58 +54,29 @@ INPUTS = "inputs.sha256"
 MATCHING_CACHE_BYTES = 1 << 30
 
 
-def list_images(image_path: Path, image_list_path: Path | None = None) -> list[str]:
-    """Return the sorted names, relative to ``image_path``, of all images or of those listed.
-
-    Folders are searched through; hidden ones and files of other formats are passed over.
-
-    Raises:
-        ImageError: when there are none, or a listed one is missing.
-    """
-    if not image_path.is_dir():
-        raise ImageError(f"{image_path}: no such folder; give the folder of the photographs")
-    if image_list_path is not None:
-        return _listed_images(image_path, image_list_path)
-    paths = (path.relative_to(image_path) for path in image_path.rglob("*"))
-    names = sorted(
-        path.as_posix()
-        for path in paths
-        if path.suffix.lower() in IMAGE_SUFFIXES
-        and not any(part.startswith(".") for part in path.parts)
-        and not (image_path / path).is_dir()
-    )
-    if not names:
-        raise ImageError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)})")
-    for name in names:
-        if name != name.encode("utf-8", "replace").decode("utf-8"):
-            raise ImageError(f"{image_path}: the name {name!r} is not UTF-8; rename it")
-    return names
-
-
-def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
-    try:
-        lines = image_list_path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ImageError(f"{image_list_path}: cannot be read ({error})") from error
-    listed = (line.strip() for line in lines if line.strip() and not line.startswith("#"))
-    names = sorted({PurePosixPath(name).as_posix() for name in listed})
-    missing = [name for name in names if not _is_below(image_path, name)]
-    if missing or not names:
-        what = f"lists {missing[0]}, which is not in {image_path}" if missing else "is empty"
-        raise ImageError(f"{image_list_path}: {what}")
-    return names
-
-
 def recorded_images(workspace: Workspace) -> list[str]:
     """Return the names of all images that the extract stage was given."""
     record = workspace.require("extract")
     image_list = Path(record["image_list_path"]) if record["image_list_path"] else None
-    return list_images(Path(record["image_path"]), image_list)
+    database = workspace.database if record["from_database"] else None
+    return images_to_use(Path(record["image_path"]), image_list, database)
 
 
-def _is_below(image_path: Path, name: str) -> bool:
-    inside = ".." not in PurePosixPath(name).parts and not name.startswith("/")
-    return inside and (image_path / name).is_file()
+def images_to_use(
+    image_path: Path, image_list_path: Path | None, from_database: Path | None
+) -> list[str]:
+    """Return the images of a folder, of a list, or of a database; with both, those of the list."""
+    if from_database is None:
+        return list_images(image_path, image_list_path)
+    with open_copy(from_database) as database:
+        known = [image.name for image in database.read_all_images()]
+    if image_list_path is None:
+        return checked_names(image_path, known, str(from_database))
+    names = list_images(image_path, image_list_path)
+    unknown = sorted(set(names) - set(known))
+    if unknown:
+        raise ImageError(f"{image_list_path}: lists {unknown[0]}, which {from_database} has not")
+    return names
 
 
 def extract(
@@ -104,7 +85,10 @@ def extract(
     recipe: Recipe,
     cameras: CameraOptions,
     *,
+    masks: MaskOptions | None = None,
     image_list_path: Path | None = None,
+    image_names: Sequence[str] = (),
+    from_database: Path | None = None,
     resources: Resources | None = None,
     overwrite: bool = False,
     progress: Progress = SILENT,
@@ -113,33 +97,61 @@ def extract(
 
     An image that cannot be read is reported and passed over. One that cannot be rectified, for
     want of a depth map, is extracted as it is, with a warning.
+
+    Args:
+        workspace: where the results go.
+        image_path: folder of the images.
+        recipe: what to extract.
+        cameras: how images share cameras.
+        masks: where features may be; everywhere by default.
+        image_list_path: list of the images to use; None for all below the folder.
+        image_names: the images to look at now, in the place of a list on record.
+        from_database: database whose images, cameras, rigs, frames and pose priors are taken
+            over; it stays as it is.
+        resources: weights and device of networks.
+        overwrite: discard the results of this and later stages first.
+        progress: where to show progress.
     """
     start = time.perf_counter()
-    names = list_images(image_path, image_list_path)
-    _refuse_colliding_keys(names)
+    photographs = Photographs(image_path, cameras, masks or MaskOptions())
+    photographs.check()
+    names = images_to_use(image_path, image_list_path, from_database)
+    if image_names:
+        names = checked_names(image_path, image_names, "image_names")
+    refuse_colliding_keys(names)
     colmap_database.check_cameras(cameras)
+    if from_database and cameras != CameraOptions():
+        raise OptionError(
+            f"the cameras of {from_database} are used; leave out camera mode, model and parameters"
+        )
     if cameras.mode in ("single", "per-folder"):
         known = {} if overwrite else FeatureStore(workspace.features).image_sizes()
-        _refuse_mixed_sizes(image_path, names, cameras.mode, known)
+        refuse_mixed_sizes(image_path, names, cameras.mode, known)
     extractor = make_extractor(workspace, recipe.extraction, resources, names, progress)
     options = {
         "image_path": str(image_path.resolve()),
         "image_list_path": str(image_list_path.resolve()) if image_list_path else "",
+        "from_database": str(from_database.resolve()) if from_database else "",
         "camera": cameras.to_mapping(),
+        "masks": photographs.masks.to_mapping(),
         **recipe.extraction.to_mapping(),
         "weights": {path.name: file_sha256(path) for path in extractor.weights.values()},
     }
     workspace.claim("extract", options, overwrite=overwrite, recipe=recipe.name)
+    _start_database(workspace)
     store = feature_store(workspace)
     done = store.complete(names)
     missing = [name for name in names if name not in done]
-    failures, warnings = {}, {}
+    _refuse_foreign_features(workspace, missing)
+    photographs = Photographs.recorded(workspace)
+    failures: dict[str, str] = {}
+    warnings = {} if image_list_path or image_names or from_database else left_out(image_path)
+    for kind, what in warnings.items():
+        logger.warning("%s: %s", kind, what)
     with progress.stage("extract", len(missing), "images") as advance:
         for name in missing:
             try:
-                found = extractor.extract_file(
-                    image_path / name, name, intrinsics(image_path / name, extractor, cameras)
-                )
+                found = photographs.extract(extractor, name)
             except ImageError as error:
                 logger.warning("%s", error)
                 failures[name] = str(error)
@@ -152,7 +164,10 @@ def extract(
                 store.write(name, found.features, found.image_size)
             advance(1)
     if len(failures) == len(names):
-        raise ImageError(f"{image_path}: none of the {len(names)} images can be read")
+        raise ImageError(
+            f"{image_path}: none of the {len(names)} images can be used; the first: "
+            f"{failures[names[0]]}"
+        )
     failures |= write_images_and_keypoints(workspace, store)
     return StageReport(
         "extract",
@@ -162,6 +177,27 @@ def extract(
         failures,
         warnings,
     )
+
+
+def _start_database(workspace: Workspace) -> None:
+    """Make the database from the one that the extract stage was given, unless it is there."""
+    original = workspace.require("extract")["from_database"]
+    if original and not workspace.database.exists():
+        copy_without_features(Path(original), workspace.database)
+
+
+def _refuse_foreign_features(workspace: Workspace, names: Sequence[str]) -> None:
+    """Features of another program in a user's database are never replaced in place."""
+    if not (workspace.users_database and workspace.database.exists()):
+        return
+    ids = colmap_database.image_ids(workspace.database)
+    with colmap_database.open_database(workspace.database) as database:
+        foreign = [n for n in names if n in ids and database.exists_keypoints(ids[n])]
+    if foreign:
+        raise DatabaseError(
+            f"{workspace.database}: has other features of {foreign[0]}; they are not replaced, "
+            "start a new database from it (from_database, --from-database)"
+        )
 
 
 def make_extractor(
@@ -176,15 +212,6 @@ def make_extractor(
     return prepare(options, resources, names, progress)
 
 
-def intrinsics(
-    path: Path, extractor: ImageExtractor, cameras: CameraOptions
-) -> NDArray[np.float64] | None:
-    """Return the camera matrix of an image file if its rectification depends on it."""
-    if not any(rectifier.uses_depth for rectifier in extractor.options.rectifiers):
-        return None
-    return colmap_database.read_camera_matrix(path, cameras)
-
-
 def feature_store(workspace: Workspace) -> FeatureStore:
     """Return the features of a workspace; other options than recorded are refused."""
     return FeatureStore(workspace.features, workspace.options_digest("extract"))
@@ -195,49 +222,13 @@ def match_store(workspace: Workspace) -> MatchStore:
     return MatchStore(workspace.matches, workspace.options_digest("extract", "match"))
 
 
-def _refuse_colliding_keys(names: Sequence[str]) -> None:
-    """Hloc's pair keys turn '/' into '-': two names must not become the same."""
-    seen: dict[str, str] = {}
-    for name in names:
-        other = seen.setdefault(pair_key(name, ""), name)
-        if other != name:
-            raise StoreError(
-                f"{other} and {name} have the same key in hloc's match files, where '/' becomes "
-                "'-'; rename one of them"
-            )
-
-
-def _refuse_mixed_sizes(
-    image_path: Path, names: Sequence[str], mode: str, known: Mapping[str, tuple[int, int]]
-) -> None:
-    """COLMAP leaves out images of another size than the first one that shares their camera."""
-
-    def size_of(name: str) -> tuple[int, int] | None:
-        try:
-            return known.get(name) or read_gray(image_path / name).shape[::-1]
-        except ImageError:
-            return None
-
-    first: dict[PurePosixPath, tuple[str, tuple[int, int]]] = {}
-    for name, size in zip(names, map_ordered(size_of, names, available_cores()), strict=True):
-        if size is None:
-            continue
-        folder = PurePosixPath(name).parent if mode == "per-folder" else PurePosixPath()
-        other, expected = first.setdefault(folder, (name, size))
-        if size != expected:
-            raise OptionError(
-                f"--camera-mode {mode}: {other} is {expected[0]} x {expected[1]} px, {name} is "
-                f"{size[0]} x {size[1]} px; images that share a camera must have one size"
-            )
-
-
 def write_images_and_keypoints(workspace: Workspace, store: FeatureStore) -> dict[str, str]:
     """Bring the database up to date; return the images that COLMAP does not take, with reasons."""
-    record = workspace.require("extract")
-    cameras = CameraOptions.from_mapping(record["camera"], str(workspace.config))
+    _start_database(workspace)
+    photographs = Photographs.recorded(workspace)
     names = store.names()
     rejected = colmap_database.import_images(
-        workspace.database, Path(record["image_path"]), names, cameras
+        workspace.database, photographs.folder, names, photographs.cameras
     )
     ids = colmap_database.image_ids(workspace.database)
     with colmap_database.open_database(workspace.database) as database:
@@ -246,7 +237,25 @@ def write_images_and_keypoints(workspace: Workspace, store: FeatureStore) -> dic
                 colmap_database.write_keypoints(
                     database, ids[name], store.read_frames(name), store.level_ends(name)
                 )
-    return dict.fromkeys(rejected, f"COLMAP does not take it (camera mode {cameras.mode})")
+    reason = f"COLMAP does not take it (camera mode {photographs.cameras.mode})"
+    return dict.fromkeys(rejected, reason)
+
+
+def write_descriptors(workspace: Workspace) -> None:
+    """Write the descriptors of all images into the database as COLMAP's matchers take them."""
+    features = feature_store(workspace)
+    ids = colmap_database.image_ids(workspace.database)
+    names = [name for name in features.names() if name in ids]
+    counts = features.num_keypoints()
+    with colmap_database.open_database(workspace.database) as database:
+        written = {name: database.num_descriptors_for_image(ids[name]) for name in names}
+        if any(written[name] not in (0, counts[name]) for name in names):
+            database.clear_descriptors()  # of before an escalation; COLMAP cannot replace them
+            written = dict.fromkeys(names, 0)
+        for name in names:
+            if counts[name] and not written[name]:
+                descriptors = features.read(name).descriptors
+                colmap_database.write_descriptors(database, ids[name], descriptors)
 
 
 def choose_pairs(
@@ -267,6 +276,14 @@ def choose_pairs(
     _refuse_lost_pairs(workspace, pairs)
     write_pairs(workspace.pairs, pairs)
     return StageReport("pairs", time.perf_counter() - start, len(pairs))
+
+
+def add_pairs(workspace: Workspace, pairs: Sequence[Pair]) -> None:
+    """Add pairs to those that are matched already, as pycolmap's matchers do."""
+    workspace.claim("pairs", {"match_list_path": ""})
+    names = feature_store(workspace).names()
+    there = read_pairs(workspace.pairs, names) if workspace.pairs.exists() else []
+    write_pairs(workspace.pairs, sorted({*there, *pairs}))
 
 
 def _refuse_lost_pairs(workspace: Workspace, pairs: Sequence[Pair]) -> None:
@@ -427,7 +444,15 @@ def map_images(
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> tuple[StageReport, list[ModelSummary]]:
-    """Reconstruct; the models are mapped anew only when the verified pairs have changed."""
+    """Reconstruct; the models are mapped anew only when the verified pairs have changed.
+
+    Args:
+        workspace: verified.
+        options: with ``mapper_options`` checked (``colmap.mapping.checked_mapping_options``).
+        random_seed: seed of all random parts.
+        overwrite: discard the models that are there.
+        progress: where to show progress.
+    """
     start = time.perf_counter()
     workspace.require("verify")
     extracted = workspace.require("extract")
@@ -439,17 +464,22 @@ def map_images(
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     num_images = len(colmap_database.image_ids(workspace.database))
     with progress.stage("map", num_images, "images") as advance:
-        models = map_incrementally(
+        models = map_database(
             workspace.database,
             Path(extracted["image_path"]),
             workspace.sparse,
             options,
             random_seed,
-            intrinsics_given=bool(extracted["camera"]["params"]),
+            intrinsics_given=intrinsics_given(workspace),
             next_image=advance,
         )
-    (workspace.sparse / INPUTS).write_text(inputs)
+    replace_text(workspace.sparse / INPUTS, inputs)
     return StageReport("map", time.perf_counter() - start, len(models)), models
+
+
+def intrinsics_given(workspace: Workspace) -> bool:
+    """Tell whether the user gave the camera parameters."""
+    return bool(workspace.require("extract")["camera"]["params"])
 
 
 def num_listed_pairs(workspace: Workspace) -> int:

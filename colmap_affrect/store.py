@@ -7,13 +7,14 @@ escalation follow those of level k - 1 and end at ``level_ends[k]``. ``matches.h
 per pair with ``matches0`` (N0,), -1 where unmatched, ``matching_scores0`` (N0,) and the
 attributes ``level``, whose features were matched together with those of level 0, and
 ``tried_level``, the highest that was tried. Coordinates have their origin at the centre of the
-first pixel. Files are opened for one image or one batch
-of pairs and closed again; the attribute ``complete`` is written last, so that a killed
-run loses at most the group it was writing.
+first pixel. Files are opened for one image or one batch of pairs and closed again; what is
+written in between appears as a whole (:mod:`colmap_affrect.files`). A group without the attribute
+``complete``, of another program, does not count.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -25,6 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.errors import StaleStoreError, StoreError
+from colmap_affrect.files import (
+    FileTransaction,
+    apply_journal,
+    cannot_write,
+    journal_of,
+    replace_bytes,
+    uninterrupted,
+)
 from colmap_affrect.types import LocalFeatures, union
 
 FORMAT_VERSION = 2
@@ -62,28 +71,50 @@ class _Store:
 
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:
-        try:
-            if mode == "a" and not self.path.exists():
+        """Open to read ("r"), or to write ("a") all that the block changes or nothing.
+
+        HDF5 itself is only let at memory when writing: a full disk ends its process, and a kill
+        between two of its writes leaves a file that cannot be read.
+        """
+        if mode == "r":
+            with self._opened(None) as file:
+                yield file
+            return
+        with uninterrupted():
+            if not self.path.exists():
                 self._create()
-            file = h5py.File(self.path, "r+" if mode == "a" else mode)
-        except OSError as error:
+            with FileTransaction(self.path) as changes:
+                with self._opened(changes) as file:
+                    yield file
+                try:
+                    changes.commit()
+                except OSError as error:
+                    raise cannot_write(self.path, error) from error
+
+    @contextmanager
+    def _opened(self, changes: FileTransaction | None) -> Iterator[h5py.File]:
+        try:
+            if changes is None:
+                apply_journal(self.path)
+            with h5py.File(changes or self.path, "r+" if changes else "r") as file:
+                self._check_format(file)
+                yield file
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
             raise StoreError(
                 f"{self.path}: cannot be opened as HDF5 ({error}); if it is damaged or another "
                 "program has it open, close that program or run again with --overwrite"
             ) from error
-        with file:
-            self._check_format(file)
-            yield file
 
     def _create(self) -> None:
-        """Make the file without groups; under another name first, it is unreadable until closed."""
-        new = self.path.with_name(self.path.name + ".new")
-        with h5py.File(new, "w") as file:
+        """Make the file without groups."""
+        content = io.BytesIO()
+        with h5py.File(content, "w") as file:
             file.attrs["format"] = f"colmap_affrect/{self.kind}"
             file.attrs["format_version"] = FORMAT_VERSION
             file.attrs["pixel_origin"] = "center"
             file.attrs["options_digest"] = self.options_digest
-        new.replace(self.path)
+        journal_of(self.path).unlink(missing_ok=True)
+        replace_bytes(self.path, content.getvalue())
 
     def _check_format(self, file: h5py.File) -> None:
         known = file.attrs.get("format")
@@ -235,6 +266,19 @@ def pair_key(name1: str, name2: str) -> str:
     return f"{name1.replace('/', '-')}/{name2.replace('/', '-')}"
 
 
+def hloc_matches(pair: PairMatches) -> dict[str, NDArray[np.generic]]:
+    """Return the datasets that hloc has for a pair; in 32 bits where 16 do not suffice."""
+    matches0 = np.full(pair.num_keypoints1, -1, np.int64)
+    scores0 = np.zeros(pair.num_keypoints1, np.float16)
+    matches0[pair.indices[:, 0]] = pair.indices[:, 1]
+    scores0[pair.indices[:, 0]] = pair.scores
+    wide = matches0.max(initial=0) > MAX_INT16
+    return {
+        "matches0": matches0.astype(np.int32 if wide else np.int16),
+        "matching_scores0": scores0,
+    }
+
+
 class MatchStore(_Store):
     """Raw matches by pair of image names."""
 
@@ -244,17 +288,12 @@ class MatchStore(_Store):
         """Write a batch of pairs."""
         with self._open("a") as file:
             for pair in pairs:
-                matches0 = np.full(pair.num_keypoints1, -1, np.int64)
-                scores0 = np.zeros(pair.num_keypoints1, np.float16)
-                matches0[pair.indices[:, 0]] = pair.indices[:, 1]
-                scores0[pair.indices[:, 0]] = pair.scores
-                wide = matches0.max(initial=0) > MAX_INT16
-                datasets = {
-                    "matches0": matches0.astype(np.int32 if wide else np.int16),
-                    "matching_scores0": scores0,
-                }
                 self._write(
-                    file, pair_key(*pair.names), datasets, level=pair.level, tried_level=pair.level
+                    file,
+                    pair_key(*pair.names),
+                    hloc_matches(pair),
+                    level=pair.level,
+                    tried_level=pair.level,
                 )
 
     def mark_tried(self, pairs: Iterable[tuple[str, str]], level: int) -> None:
@@ -281,6 +320,14 @@ class MatchStore(_Store):
         Raises:
             StoreError: at a pair without matches.
         """
+        return (pair.indices for pair in self.read(pairs))
+
+    def read(self, pairs: Sequence[tuple[str, str]]) -> Iterator[PairMatches]:
+        """Yield the matches of each pair.
+
+        Raises:
+            StoreError: at a pair without matches.
+        """
         with self._open("r") as file:
             for name1, name2 in pairs:
                 key = pair_key(name1, name2)
@@ -288,4 +335,10 @@ class MatchStore(_Store):
                     raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
                 matches0 = file[key]["matches0"][()].astype(np.int64)
                 rows = np.flatnonzero(matches0 >= 0)
-                yield np.stack([rows, matches0[rows]], axis=1)
+                yield PairMatches(
+                    (name1, name2),
+                    np.stack([rows, matches0[rows]], axis=1),
+                    file[key]["matching_scores0"][()][rows].astype(np.float32),
+                    len(matches0),
+                    int(file[key].attrs["level"]),
+                )

@@ -13,6 +13,9 @@ from colmap_affrect.conventions import is_inside
 GrayImage = NDArray[np.uint8]
 """(H, W) gray values, 0.299 R + 0.587 G + 0.114 B."""
 
+ColorImage = NDArray[np.uint8]
+"""(H, W, 3) red, green, blue."""
+
 Mask = NDArray[np.bool_]
 View = tuple[GrayImage, NDArray[np.uint8] | None]
 """An image or a warp to find features in, and where (mask not 0; everywhere if it is None)."""
@@ -32,12 +35,14 @@ class Photograph:
         name: relative POSIX path below the image folder, the key of depth maps.
         path: the file; None for an image that was never one.
         camera_matrix: (3, 3) pinhole intrinsics in pixel-centre px of ``gray``.
+        mask: (H, W) bool, where features may be; None means everywhere.
     """
 
     gray: GrayImage
     name: str
     path: Path | None
     camera_matrix: NDArray[np.float64]
+    mask: Mask | None = None
 
     @property
     def size(self) -> tuple[int, int]:

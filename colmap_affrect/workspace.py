@@ -11,16 +11,17 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from filelock import FileLock, Timeout
 
 from colmap_affrect.errors import StaleStoreError, WorkspaceError
-from colmap_affrect.options import ExtractionOptions, MatchingOptions, VerificationOptions
+from colmap_affrect.files import replace_text
+from colmap_affrect.options import ExtractionOptions, MatchingOptions, VerificationOptions, flat
 
 logger = logging.getLogger(__name__)
 
-LOCAL = ("image_path", "image_list_path", "camera", "match_list_path")
+LOCAL = ("image_path", "image_list_path", "from_database", "camera", "match_list_path")
 CHOICES = (".name", ".profile")
 STAGES = ("extract", "pairs", "match", "verify", "escalate", "map")
 
@@ -32,9 +33,20 @@ class Workspace:
     ``config.toml`` records, by stage, the options that made what is there. A stage that
     is run again with the same options goes on where it stopped; with other options it
     refuses, and ``overwrite`` removes its results and those of the stages after it.
+
+    Attributes:
+        path: the folder.
+        users_database: database of the user that results go to instead of one in the folder;
+            never removed.
     """
 
     path: Path
+    users_database: Path | None = None
+
+    @classmethod
+    def beside(cls, database_path: Path) -> Self:
+        """Return the workspace of a user's database: ``x.affrect`` beside ``x.db``."""
+        return cls(database_path.with_suffix(".affrect"), database_path)
 
     @property
     def features(self) -> Path:
@@ -54,7 +66,7 @@ class Workspace:
     @property
     def database(self) -> Path:
         """COLMAP database."""
-        return self.path / "database.db"
+        return self.users_database or self.path / "database.db"
 
     @property
     def sparse(self) -> Path:
@@ -112,7 +124,7 @@ class Workspace:
             return {}
         try:
             return tomllib.loads(self.config.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise WorkspaceError(f"{self.config}: damaged ({error}); remove it") from error
 
     def recipe(self) -> str:
@@ -160,15 +172,19 @@ class Workspace:
             difference = _first_difference(known, options)
             if difference:
                 raise StaleStoreError(
-                    f"{self.path}: the {stage} stage was run there with {difference}; use "
-                    "--overwrite to redo it and the stages after it, or another --output-path"
+                    f"{self.path}: the {stage} stage was run there with {difference}; "
+                    f"{self._remedy}"
                 )
         record[stage] = dict(options)
         record["recipe"] = recipe or record.get("recipe", "")
         ordered = {name: record[name] for name in ("recipe", *STAGES) if name in record}
-        new = self.config.with_suffix(".new")
-        new.write_text(dump_toml(ordered), encoding="utf-8")
-        new.replace(self.config)
+        replace_text(self.config, dump_toml(ordered))
+
+    @property
+    def _remedy(self) -> str:
+        if self.users_database:
+            return "use a new database (from_database= takes over its images and cameras)"
+        return "use --overwrite to redo it and the stages after it, or another --output-path"
 
     def options_digest(self, *stages: str) -> str:
         """Return a sha256 of the recorded options of stages, those that decide the results.
@@ -200,7 +216,8 @@ class Workspace:
     def _refuse_foreign_results(self, record: Mapping[str, Any]) -> None:
         if "extract" in record:
             return
-        for path in (self.database, self.sparse, self.features, self.matches):
+        database = [] if self.users_database else [self.database]
+        for path in (*database, self.sparse, self.features, self.matches):
             if path.exists():
                 raise StaleStoreError(
                     f"{path}: exists and was not made here; it is left as it is, use "
@@ -230,22 +247,12 @@ class Workspace:
 
 
 def _first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    old, new = _flat(known), _flat(now)
+    old, new = flat(known), flat(now)
     # The name of a rectifier or profile first: with another name most other options differ too.
     for key in sorted(old.keys() | new.keys(), key=lambda key: (not key.endswith(CHOICES), key)):
         if old.get(key) != new.get(key):
             return f"{key}={old.get(key)!r}, and it is {new.get(key)!r} now"
     return ""
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = list(value) if isinstance(value, tuple) else value
-    return flat
 
 
 def dump_toml(values: Mapping[str, Any], prefix: str = "") -> str:

@@ -35,8 +35,10 @@ FACES = (
 cached_texture = cache(texture)
 
 
-def photograph(position: tuple[float, float, float], yaw_deg: float) -> GrayImage:
-    """Render the faces, each over those before it."""
+def photograph(
+    position: tuple[float, float, float], yaw_deg: float, first_seed: int = 0
+) -> GrayImage:
+    """Render the faces, each over those before it; another seed makes another room."""
     width, height = IMAGE_SIZE
     yaw = np.deg2rad(yaw_deg)
     world_to_camera = np.array(
@@ -44,7 +46,7 @@ def photograph(position: tuple[float, float, float], yaw_deg: float) -> GrayImag
     )
     camera = np.array([[FOCAL_PX, 0, width / 2 - 0.5], [0, FOCAL_PX, height / 2 - 0.5], [0, 0, 1]])
     image = np.full((height, width), 90, np.uint8)
-    for seed, (origin, edge1, edge2) in enumerate(FACES):
+    for seed, (origin, edge1, edge2) in enumerate(FACES, first_seed):
         plane = np.column_stack([edge1, edge2, np.subtract(origin, position)])
         image_from_texture = camera @ world_to_camera @ plane @ np.diag([1 / TEXTURE_PX] * 2 + [1])
         size = (TEXTURE_PX, TEXTURE_PX)
@@ -56,11 +58,12 @@ def photograph(position: tuple[float, float, float], yaw_deg: float) -> GrayImag
     return image
 
 
-def write_photographs(folder: Path, count: int = len(NAMES)) -> list[str]:
+def write_photographs(folder: Path, count: int = len(NAMES), first_seed: int = 0) -> list[str]:
     """Write the first ``count`` photographs below ``folder`` and return their names."""
     for index, name in enumerate(NAMES[:count]):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         shift = 0.55 * (index - 1.5)
-        write_image(path, photograph((shift, -0.1 * index, 0.1 * index), -5.0 * (index - 1.5)))
+        position = (shift, -0.1 * index, 0.1 * index)
+        write_image(path, photograph(position, -5.0 * (index - 1.5), first_seed))
     return NAMES[:count]

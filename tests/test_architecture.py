@@ -14,7 +14,7 @@ import colmap_affrect
 PACKAGE = Path(colmap_affrect.__file__).parent
 
 ROWS = [
-    {"conventions", "errors", "progress"},
+    {"children", "conventions", "errors", "files", "progress"},
     {
         "geometry.affine", "geometry.canvas", "geometry.neighbors", "geometry.planes",
         "geometry.shapes", "geometry.tilts",
@@ -32,9 +32,11 @@ ROWS = [
     {
         "rectified", "extraction", "store", "workspace",
         "matching.nearest", "matching.pairs",
-        "colmap", "colmap.database", "colmap.mapping", "colmap.running", "colmap.verification",
+        "colmap", "colmap.checks", "colmap.copies", "colmap.database",
+        "colmap.global_mapping", "colmap.mapping", "colmap.model_files", "colmap.native_options",
+        "colmap.running", "colmap.verification",
     },
-    {"pipeline", "escalation", "stages"},
+    {"doctor", "dropin", "pipeline", "escalation", "interchange", "photographs", "stages"},
     {"report.inspection", "report.levels", "report.sheet", "report.tilt_plot"},
     {"cli", "__main__"},
 ]  # fmt: skip
@@ -53,7 +55,7 @@ ARRAYS_ONLY = {"conventions", "errors"}
 
 HOMES = {
     "cv2": {"imaging", "depth", "features.affnet", "features.dog", "features.second_moment"},
-    "h5py": {"store", "depth"},
+    "h5py": {"store", "depth", "interchange"},
     "pycolmap": {"colmap"},
     "tqdm": {"progress"},
     "threadpoolctl": {"executor"},
@@ -74,13 +76,14 @@ HOMES = {
     "transformers": {"depth"},
     "matplotlib": {"report.sheet", "report.tilt_plot"},
     "scipy": set(),
-    "sqlite3": set(),
+    "sqlite3": {"colmap.checks", "colmap.copies"},
 }
 
 PUBLIC = [
     "AffrectError", "CameraOptions", "ExtractionOptions", "LocalFeatures", "MappingOptions",
-    "MatchingOptions", "ReconstructionReport", "RunOptions", "VerificationOptions", "__version__",
-    "extract_image", "load_recipe", "run",
+    "MaskOptions", "MatchingOptions", "ReconstructionReport", "RunOptions", "VerificationOptions",
+    "__version__", "extract_features", "extract_image", "load_recipe", "match_exhaustive",
+    "match_image_pairs", "run", "verify",
 ]  # fmt: skip
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import pty
+import shutil
 import signal
 import subprocess
 import sys
 import termios
+import time
 from pathlib import Path
 
 import pytest
@@ -20,7 +22,7 @@ from colmap_affrect.workspace import Workspace
 
 COMMANDS = [
     "run", "extract", "pairs", "match", "verify", "escalate", "map",
-    "inspect", "recipes", "weights",
+    "inspect", "recipes", "weights", "doctor",
 ]  # fmt: skip
 TIMEOUT_S = 60
 
@@ -57,7 +59,7 @@ def test_help_has_options_and_examples(command: list[str]) -> None:
     assert "Exit codes: 0 done" in done.stdout
     if not command:
         assert all(f"    {name} " in done.stdout for name in COMMANDS)
-    elif command[0] not in ("recipes", "weights"):
+    elif command[0] not in ("recipes", "weights", "doctor"):
         assert all(flag in done.stdout for flag in ("--output-path", "--quiet"))
         assert ("--overwrite" in done.stdout) == (command != ["inspect"])
 
@@ -211,6 +213,104 @@ def test_interrupt_ends_with_130_and_a_later_run_completes(
     done = run_command(*arguments, "-q")
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("registered  3 of 3 images")
+
+
+ENDLESS = {
+    "incremental": [
+        "ba_global_max_refinements=1000000000", "ba_global_max_refinement_change=0",
+    ],
+    "global": ["max_num_irls_iterations=1000000000", "irls_step_convergence_threshold=-1"],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def verified(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run with COLMAP's preset and its global mapper."""
+    out = tmp_path_factory.mktemp("verified") / "out"
+    done = run_command(
+        "run", *run_arguments(photos, out), "--recipe", "unrectified-rootsift", "-q",
+        "--preset", "colmap", "--mapper", "global",
+        "--mapper-options", "track_min_num_views_per_track=2", "multiple_models=false",
+        "--mapper-options", "mapper.bundle_adjustment.min_track_length=2",
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    return out
+
+
+def test_preset_mapper_and_its_options_are_in_the_report_and_on_record(verified: Path) -> None:
+    given = {
+        "mapper.track_min_num_views_per_track": 2,
+        "multiple_models": False,
+        "mapper.bundle_adjustment.min_track_length": 2,
+    }
+    report = json.loads((verified / "report.json").read_text(encoding="utf-8"))
+    assert report["images_registered"] == 3
+    assert (report["preset"], report["mapper"]) == ("colmap", "global")
+    assert report["mapper_options"] == given
+    assert report["verification"]["min_num_inliers"] == 15
+    assert report["mapping"]["min_model_size"] == 3
+    differs = report["differs_from_colmap"]
+    assert differs["verification"] == {"ransac.random_seed": 0}
+    assert {key: differs["mapping"].get(key) for key in given} == given
+    assert "mapper.retriangulation.ignore_two_view_tracks" not in differs["mapping"]
+    record = Workspace(verified).recorded()["map"]
+    assert record["mapper"] == "global"
+    assert record["mapper_options"]["mapper"]["bundle_adjustment"] == {"min_track_length": 2}
+    done = run_command(
+        "map", "--output-path", verified, "-q", "--preset", "colmap", "--mapper", "global"
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "min_track_length=2, and it is None now" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["--preset", "dense"], 2, "invalid choice: 'dense'"),
+        (["--mapper-options"], 2, "expected at least one argument"),
+        (["--mapper-options", "min_model_size"], 1, "min_model_size: expected KEY=VALUE"),
+        (["--mapper-options", "__import__('os')=1"], 1, "pycolmap has no such option"),
+    ],
+)
+def test_wrong_mapping_options_are_said_before_any_image_is_read(
+    tmp_path: Path, arguments: list[str], code: int, message: str
+) -> None:
+    out = tmp_path / "out"
+    done = run_command("run", "--image-path", tmp_path, "--output-path", out, *arguments)
+    assert (done.returncode, done.stdout) == (code, "")
+    assert message in done.stderr.splitlines()[-1]
+    assert not (out / "config.toml").exists()
+
+
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+def test_interrupted_mapping_ends_with_130_and_leaves_no_half_written_models(
+    verified: Path, tmp_path: Path, mapper: str
+) -> None:
+    out = Path(shutil.copytree(verified, tmp_path / "out"))
+    arguments = ["map", "--output-path", str(out), "--mapper", mapper, "--overwrite"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "colmap_affrect", *arguments, "--mapper-options", *ENDLESS[mapper]],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=_restore_interrupt,  # noqa: PLW1509  (nothing here uses threads)
+    ) as process:
+        if mapper == "incremental":
+            assert process.stderr.readline() == "map: 2/3 images\n"
+        while not (out / "sparse.partial" / "raw").exists():
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=TIMEOUT_S)
+    assert (process.returncode, stdout) == (130, "")
+    assert stderr == "interrupted; run the same command again to go on\n"
+    assert not list(out.glob("sparse*"))
+    assert not (out / "report.json").exists()
+    done = run_command(*arguments, "-q")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("registered  3 of 3 images\n")
+    preset = "colmap for verification, sparse for mapping"
+    assert f"preset      {preset}, {mapper} mapper\n" in done.stdout
 
 
 def test_terminal_gets_bars(photos: Path, tmp_path: Path) -> None:

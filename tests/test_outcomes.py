@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from colmap_affrect import outcomes
+from colmap_affrect.options import MappingOptions, VerificationOptions
 from colmap_affrect.outcomes import ModelSummary, ReconstructionReport, StageReport
 
 LARGE = ModelSummary(("a.png", "č d.png"), 120, 2.25, 0.512)
@@ -26,6 +27,9 @@ REPORT = ReconstructionReport(
     recipe="default",
     random_seed=7,
     versions={"pycolmap": "4.2.1"},
+    verification=VerificationOptions(),
+    mapping=MappingOptions(mapper_options={"mapper.init_max_error": 3.0}),
+    differs_from_colmap={"verification": {"min_num_inliers": 20}, "mapping": {}},
     pair_levels={"identity": 2, "asift": 1, "none": 7},
 )
 
@@ -50,6 +54,26 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "num_verified_pairs": 3,
         "pair_levels": {"identity": 2, "asift": 1, "none": 7},
         "recipe": "default",
+        "preset": "sparse",
+        "mapper": "incremental",
+        "mapper_options": {"mapper.init_max_error": 3.0},
+        "verification": {
+            "max_error_px": 3.0,
+            "min_num_inliers": 20,
+            "min_inlier_ratio": 0.1,
+            "max_num_trials": 10000,
+            "ransac_min_inlier_ratio": 0.1,
+        },
+        "mapping": {
+            "ignore_two_view_tracks": False,
+            "init_min_tri_angle_deg": 8.0,
+            "init_min_num_inliers": 50,
+            "abs_pose_min_num_inliers": 12,
+            "min_model_size": 2,
+            "max_num_attempts": 3,
+            "keep_given_intrinsics": True,
+        },
+        "differs_from_colmap": {"verification": {"min_num_inliers": 20}, "mapping": {}},
         "random_seed": 7,
         "versions": {"pycolmap": "4.2.1"},
     }
@@ -96,9 +120,31 @@ def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
         "2.25 images",
         "0.51 px",
         "2, of 2, 2 images",
+        "preset      sparse, incremental mapper, mapper.init_max_error=3.0\n",
         "extract 1.2  map 0.5",
     ):
         assert part in text
+
+
+@pytest.mark.parametrize(
+    ("verification", "mapping", "preset"),
+    [
+        (VerificationOptions(), MappingOptions(mapper="global"), "sparse"),
+        (VerificationOptions.preset("colmap"), MappingOptions.preset("colmap"), "colmap"),
+        (VerificationOptions(min_num_inliers=9), MappingOptions(max_num_attempts=2), "custom"),
+        (
+            VerificationOptions.preset("colmap"),
+            MappingOptions(),
+            "colmap for verification, sparse for mapping",
+        ),
+    ],
+)
+def test_preset_names_that_of_verification_where_it_is_another_one(
+    verification: VerificationOptions, mapping: MappingOptions, preset: str
+) -> None:
+    report = replace(REPORT, verification=verification, mapping=mapping)
+    assert report.preset == report.to_mapping()["preset"] == preset
+    assert f"preset      {preset}, {mapping.mapper} mapper\n" in report.summary()
 
 
 def test_failures_are_those_of_all_stages() -> None:

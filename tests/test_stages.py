@@ -31,6 +31,7 @@ from colmap_affrect.errors import DatabaseError, ImageError, StoreError
 from colmap_affrect.executor import map_ordered
 from colmap_affrect.options import CameraOptions, VerificationOptions
 from colmap_affrect.outcomes import ReconstructionReport
+from colmap_affrect.photographs import list_images
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.progress import NUM_PLAIN_LINES, SILENT, Progress
 from colmap_affrect.recipes import load_recipe
@@ -327,7 +328,10 @@ def test_folder_of_unreadable_images_only_is_one_clear_line(tmp_path: Path, call
         "run", "--image-path", tmp_path, "--output-path", tmp_path / "o", "-q"
     )
     assert (code, stdout) == (1, "")
-    assert stderr == [f"error: {tmp_path}: none of the 2 images can be read"]
+    assert stderr == [
+        f"error: {tmp_path}: none of the 2 images can be used; the first: {tmp_path / 'a.png'}: "
+        "not a readable image (damaged, empty, or of an unknown format)"
+    ]
 
 
 def test_blank_image_has_no_features_and_the_run_goes_on(
@@ -634,7 +638,7 @@ def test_list_images_finds_images_in_folders_and_passes_over_the_rest(tmp_path: 
     ):  # fmt: skip
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"")
-    assert stages.list_images(tmp_path) == [
+    assert list_images(tmp_path) == [
         "a b.png", "deep/er/č.tif", "folder.png/inside.bmp", "z.JPG",
     ]  # fmt: skip
 
@@ -646,13 +650,13 @@ def test_list_images_takes_those_of_a_list(tmp_path: Path) -> None:
     listed = tmp_path / "list.txt"
     text = "\ufeff# comment\nb c.png\n\n./deep//č.png\nb c.png\n"
     listed.write_text(text, encoding="utf-8")
-    assert stages.list_images(tmp_path, listed) == ["b c.png", "deep/č.png"]
+    assert list_images(tmp_path, listed) == ["b c.png", "deep/č.png"]
 
 
 def test_list_images_refuses_a_name_that_is_not_utf8(tmp_path: Path) -> None:
     Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.png")).write_bytes(b"")
     with pytest.raises(ImageError, match="is not UTF-8; rename it") as error:
-        stages.list_images(tmp_path)
+        list_images(tmp_path)
     str(error.value).encode("utf-8")
 
 
@@ -664,7 +668,7 @@ def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: s
     listed = tmp_path / "list.txt"
     listed.write_text(line.format(folder=folder))
     with pytest.raises(ImageError, match=r"list\.txt: (lists .* not in|is empty)"):
-        stages.list_images(folder, listed)
+        list_images(folder, listed)
 
 
 def test_map_ordered_keeps_the_order_and_bounds_what_is_in_flight() -> None:

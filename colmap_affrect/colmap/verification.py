@@ -8,10 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database import (
+    num_unverified_pairs,
+    open_database,
+    require_database_space,
+)
+from colmap_affrect.colmap.native_options import Plain, differences
 from colmap_affrect.colmap.running import run_cancellable
 from colmap_affrect.conventions import colmap_from_pixel
 from colmap_affrect.options import VerificationOptions
+
+REJECTED = (
+    pycolmap.TwoViewGeometryConfiguration.UNDEFINED,
+    pycolmap.TwoViewGeometryConfiguration.DEGENERATE,
+)
 
 
 def two_view_options(
@@ -30,12 +40,18 @@ def two_view_options(
     )
 
 
+def verification_differences(options: VerificationOptions, random_seed: int) -> dict[str, Plain]:
+    """Return where verification differs from COLMAP's defaults, by pycolmap's dotted keys."""
+    return differences(two_view_options(options, random_seed), pycolmap.TwoViewGeometryOptions())
+
+
 def verify(path: Path, options: VerificationOptions, random_seed: int) -> None:
     """Estimate the two-view geometry of every matched pair that has none yet.
 
     By ``pycolmap.geometric_verification``, which keeps the raw matches;
     ``pycolmap.verify_matches`` would match again and delete.
     """
+    require_database_space(path, num_unverified_pairs(path))
     run_cancellable(
         lambda token: pycolmap.geometric_verification(
             path,
@@ -87,7 +103,8 @@ class PairVerifier:
             indices.astype(np.uint32),
             self.options,
         )
-        return len(geometry.inlier_matches)
+        # Of a geometry that it rejects the estimator returns the inliers all the same.
+        return 0 if geometry.config in REJECTED else len(geometry.inlier_matches)
 
 
 def stored_keypoints(points: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from colmap_affrect.errors import PairListError
+from colmap_affrect.files import replace_text
 
 Pair = tuple[str, str]
 MAX_NAMES_IN_MESSAGE = 5
@@ -41,12 +42,16 @@ def read_pairs(path: Path, names: Sequence[str]) -> list[Pair]:
         if pair is None and (not line.strip() or line.lstrip().startswith("#")):
             continue
         if pair is None:
-            problems.append(f"line {number}: {line.strip()!r}{_suggestion(line, names)}")
+            problems.append((number, line))
         elif pair[0] != pair[1]:
             pairs[min(pair), max(pair)] = None
     if problems:
         more = len(problems) - MAX_NAMES_IN_MESSAGE
-        listed = "; ".join(problems[:MAX_NAMES_IN_MESSAGE]) + (f"; and {more} more" * (more > 0))
+        shown = (
+            f"line {number}: {line.strip()!r}{_suggestion(line, names)}"
+            for number, line in problems[:MAX_NAMES_IN_MESSAGE]
+        )
+        listed = "; ".join(shown) + (f"; and {more} more" * (more > 0))
         raise PairListError(f"{path}: names that are not among the images: {listed}")
     if not pairs:
         raise PairListError(f"{path}: holds no pair of two different images")
@@ -57,7 +62,7 @@ def write_pairs(path: Path, pairs: Sequence[Pair]) -> None:
     """Write 'name1 name2' lines; with a tab where a name contains white space."""
     blank = any(re.search(r"\s", name) for pair in pairs for name in pair)
     separator = "\t" if blank else " "
-    path.write_text("".join(f"{a}{separator}{b}\n" for a, b in pairs), encoding="utf-8")
+    replace_text(path, "".join(f"{a}{separator}{b}\n" for a, b in pairs))
 
 
 def _split(line: str, known: set[str]) -> Pair | None:

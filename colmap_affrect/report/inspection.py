@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from colmap_affrect.extraction import ImageExtractor
 from colmap_affrect.report.levels import describe_level, inspect_level, summary
 from colmap_affrect.report.sheet import draw_sheet
+from colmap_affrect.types import Mask
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ def inspect_image(
     *,
     name: str = "",
     intrinsics: NDArray[np.float64] | None = None,
+    mask: Mask | None = None,
     level: int | None = None,
 ) -> Inspection:
     """Carry out a recipe on one image and draw every step.
@@ -56,12 +58,13 @@ def inspect_image(
         name: key of its depth map; the file's name by default.
         intrinsics: (3, 3) camera matrix in pixel-centre px of the stored image; by default
             COLMAP's guess of a focal length of 1.2 times the longer side.
+        mask: (H, W) bool of the stored image, where features may be; None means everywhere.
         level: draw only this one; by default all of them.
 
     Raises:
         ImageError: when the file cannot be read.
     """
-    photograph, stored_size = extractor.photograph(path, name, intrinsics)
+    photograph, stored_size = extractor.photograph(path, name, intrinsics, mask)
     output_path.mkdir(parents=True, exist_ok=True)
     numbers = range(len(extractor.rectifiers)) if level is None else [level]
     sheet_paths, lines, descriptions = [], [], []

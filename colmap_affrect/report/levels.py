@@ -90,7 +90,9 @@ def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int
     planned = perf_counter()
     recorder = _Recorder(extractor.profile)
     recording = replace(extractor, profile=recorder)
-    features = recording.execute(photograph.gray, plan, with_original=number == 0)
+    features = recording.execute(
+        photograph.gray, plan, with_original=number == 0, mask=photograph.mask
+    )
     executed = perf_counter()
     first_id = 0 if number == 0 else 1
     return InspectedLevel(

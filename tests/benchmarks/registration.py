@@ -34,7 +34,7 @@ from registration_report import Row, detail_table, merge, summary_table
 from colmap_affrect import stages
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.mapping import map_incrementally
+from colmap_affrect.colmap.mapping import map_database
 from colmap_affrect.colmap.verification import verify
 from colmap_affrect.escalation import escalate
 from colmap_affrect.extraction import Resources
@@ -195,7 +195,7 @@ def run_seed(
         start = time.perf_counter()
         verify(database_path, VerificationOptions(), seed)
         middle = time.perf_counter()
-        models = map_incrementally(
+        models = map_database(
             database_path,
             image_path,
             sparse_path,

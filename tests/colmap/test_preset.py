@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database, write_keypoints, write_matches
-from colmap_affrect.colmap.mapping import pipeline_options
-from colmap_affrect.colmap.verification import two_view_options
+from colmap_affrect.colmap.mapping import global_options, mapping_differences, pipeline_options
+from colmap_affrect.colmap.native_options import flat_values
+from colmap_affrect.colmap.verification import two_view_options, verification_differences
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, pixel_from_colmap
-from colmap_affrect.options import MappingOptions, VerificationOptions
+from colmap_affrect.errors import OptionError
+from colmap_affrect.options import MAPPERS, PRESETS, MappingOptions, VerificationOptions
 
 SEED = 3
 
@@ -316,3 +318,107 @@ def test_pipeline_options_leave_given_intrinsics_alone_if_asked_to(
     assert passed.ba_refine_extra_params is refined
     assert passed.mapper.abs_pose_refine_focal_length is refined
     assert passed.mapper.abs_pose_refine_extra_params is refined
+
+
+SPARSE_VERIFICATION = {
+    "min_num_inliers": 20,
+    "min_inlier_ratio": 0.1,
+    "ransac.max_error": 3.0,
+    "ransac.min_inlier_ratio": 0.1,
+}
+SPARSE_MAPPING = {
+    "incremental": {
+        "min_model_size": 2,
+        "mapper.init_min_tri_angle": 8.0,
+        "mapper.init_min_num_inliers": 50,
+        "mapper.abs_pose_min_num_inliers": 12,
+        "triangulation.ignore_two_view_tracks": False,
+    },
+    "global": {
+        "min_model_size": 2,
+        "mapper.track_min_num_views_per_track": 2,
+        "mapper.global_positioning.min_num_view_per_track": 2,
+        "mapper.bundle_adjustment.min_track_length": 2,
+        "mapper.retriangulation.ignore_two_view_tracks": False,
+    },
+}
+FIXED_INTRINSICS = {
+    "incremental": {
+        "ba_refine_focal_length": False,
+        "ba_refine_extra_params": False,
+        "mapper.abs_pose_refine_focal_length": False,
+        "mapper.abs_pose_refine_extra_params": False,
+    },
+    "global": {
+        "mapper.bundle_adjustment.refine_focal_length": False,
+        "mapper.bundle_adjustment.refine_extra_params": False,
+    },
+}
+NATIVE = {
+    "incremental": pycolmap.IncrementalPipelineOptions,
+    "global": pycolmap.GlobalPipelineOptions,
+}
+
+
+def repeatable(mapper: str) -> dict[str, int]:
+    """What makes results repeatable: all seeds and numbers of threads that pycolmap has."""
+    names = {"num_threads": 1, "random_seed": SEED}
+    keys = flat_values(NATIVE[mapper]())
+    return {key: names[key.split(".")[-1]] for key in keys if key.split(".")[-1] in names}
+
+
+@pytest.mark.parametrize("intrinsics_given", [False, True])
+@pytest.mark.parametrize("mapper", MAPPERS)
+def test_sparse_preset_is_the_default_and_differs_from_colmap_in_exactly_this(
+    mapper: str, intrinsics_given: bool
+) -> None:
+    assert VerificationOptions.preset("sparse") == VerificationOptions()
+    assert MappingOptions.preset("sparse") == MappingOptions()
+    assert verification_differences(VerificationOptions(), SEED) == {
+        **SPARSE_VERIFICATION,
+        "ransac.random_seed": SEED,
+    }
+    options = MappingOptions.preset("sparse", mapper=mapper)
+    differs = mapping_differences(options, SEED, intrinsics_given=intrinsics_given)
+    fixed = FIXED_INTRINSICS[mapper] if intrinsics_given else {}
+    assert differs == {**SPARSE_MAPPING[mapper], **fixed, **repeatable(mapper)}
+
+
+@pytest.mark.parametrize("intrinsics_given", [False, True])
+@pytest.mark.parametrize("mapper", MAPPERS)
+def test_colmap_preset_is_what_pycolmap_has_by_default(mapper: str, intrinsics_given: bool) -> None:
+    verification = VerificationOptions.preset("colmap")
+    assert verification_differences(verification, SEED) == {"ransac.random_seed": SEED}
+    options = MappingOptions.preset("colmap", mapper=mapper)
+    differs = mapping_differences(options, SEED, intrinsics_given=intrinsics_given)
+    assert differs == repeatable(mapper)
+    assert options.num_attempts == 1
+
+
+def test_differences_are_those_of_the_options_that_pycolmap_is_given() -> None:
+    for mapper, translate in zip(MAPPERS, (pipeline_options, global_options), strict=True):
+        options = MappingOptions.preset("sparse", mapper=mapper)
+        native = flat_values(translate(options, SEED, intrinsics_given=True))
+        default = flat_values(NATIVE[mapper]())
+        differs = mapping_differences(options, SEED, intrinsics_given=True)
+        for key, value in native.items():
+            assert np.array_equal(value, differs.get(key, default[key])), key
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_preset_knows_its_name(name: str) -> None:
+    assert VerificationOptions.preset(name).preset_name == name
+    for mapper in MAPPERS:
+        options = MappingOptions.preset(name, mapper=mapper, mapper_options={"min_model_size": 4})
+        assert options.preset_name == name
+        changed = MappingOptions(**{**options.to_mapping(), "init_min_num_inliers": 51})
+        assert changed.preset_name == "custom"
+    assert VerificationOptions(min_num_inliers=21).preset_name == "custom"
+
+
+def test_unknown_preset_and_mapper_are_refused() -> None:
+    for make in (VerificationOptions.preset, MappingOptions.preset):
+        with pytest.raises(OptionError, match="preset 'dense' is not one of sparse, colmap"):
+            make("dense")
+    with pytest.raises(OptionError, match="mapper='glomap' is not one of incremental, global"):
+        MappingOptions(mapper="glomap")

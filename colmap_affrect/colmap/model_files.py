@@ -1,0 +1,129 @@
+"""The binary files of a COLMAP model, walked through without building the model.
+
+pycolmap's reader never ends, or takes all memory, on some damaged files. Here every record is
+followed to the end of its file, which damage seldom leaves in its place.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.errors import StoreError
+
+SENSOR_BYTES = 8
+"""Type and id of a sensor."""
+
+POSE_BYTES = 7 * 8
+"""Quaternion and translation."""
+
+
+class _Reader:
+    """Steps through little-endian data."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+        self.position = 0
+
+    def skip(self, num_bytes: int) -> None:
+        self.position += num_bytes
+        if self.position > len(self.data):
+            raise EOFError
+
+    def number(self, code: str) -> int:
+        """Read an unsigned number: B, I or Q of :mod:`struct`."""
+        start = self.position
+        self.skip(struct.calcsize(code))
+        (value,) = struct.unpack_from(f"<{code}", self.data, start)
+        return int(value)
+
+    def text(self) -> str:
+        """Read a text that ends with a 0."""
+        end = self.data.find(b"\0", self.position)
+        if end < 0:
+            raise EOFError
+        text = self.data[self.position : end].decode("utf-8", "replace")
+        self.position = end + 1
+        return text
+
+
+def registered_names(model_path: Path) -> list[str]:
+    """Return the sorted names of the images of a model, when all its files are whole.
+
+    Raises:
+        StoreError: when a file is missing or damaged.
+    """
+    names: list[str] = []
+    for file_name, walk in RECORDS.items():
+        path = model_path / file_name
+        try:
+            reader = _Reader(path.read_bytes())
+        except OSError as error:
+            raise StoreError(f"{path}: cannot be read ({error.strerror})") from error
+        try:
+            for _ in range(reader.number("Q")):
+                name = walk(reader)
+                if name:
+                    names.append(name)
+        except EOFError as error:
+            raise StoreError(f"{path}: damaged, it ends within a record") from error
+        if reader.position != len(reader.data):
+            raise StoreError(f"{path}: damaged, something follows its last record")
+    return sorted(names)
+
+
+def _walk_camera(reader: _Reader) -> None:
+    reader.skip(4)
+    model = reader.number("I")
+    reader.skip(16 + 8 * _num_params().get(model, 0))
+
+
+@cache
+def _num_params() -> dict[int, int]:
+    """Return the number of parameters of each camera model by COLMAP's number of it."""
+    models = [model for model in pycolmap.CameraModelId.__members__.values() if model.value >= 0]
+    return {
+        model.value: len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
+        for model in models
+    }
+
+
+def _walk_rig(reader: _Reader) -> None:
+    reader.skip(4)
+    num_sensors = reader.number("I")
+    if num_sensors:
+        reader.skip(SENSOR_BYTES)  # the one that the others are given relative to
+    for _ in range(num_sensors - 1):
+        reader.skip(SENSOR_BYTES)
+        if reader.number("B"):
+            reader.skip(POSE_BYTES)
+
+
+def _walk_frame(reader: _Reader) -> None:
+    reader.skip(8 + POSE_BYTES)
+    reader.skip(reader.number("I") * (SENSOR_BYTES + 8))
+
+
+def _walk_image(reader: _Reader) -> str:
+    reader.skip(4 + POSE_BYTES + 4)
+    name = reader.text()
+    reader.skip(reader.number("Q") * 24)
+    return name
+
+
+def _walk_point(reader: _Reader) -> None:
+    reader.skip(8 + 3 * 8 + 3 + 8)
+    reader.skip(reader.number("Q") * 8)
+
+
+RECORDS: dict[str, Callable[[_Reader], str | None]] = {
+    "cameras.bin": _walk_camera,
+    "rigs.bin": _walk_rig,
+    "frames.bin": _walk_frame,
+    "images.bin": _walk_image,
+    "points3D.bin": _walk_point,
+}
+"""The files of a model, and what steps over one record of each."""

@@ -1,0 +1,108 @@
+"""Methods by name: COLMAP's SIFT, and recipes with or without changed options."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+
+from colmap_affrect.errors import OptionError
+from colmap_affrect.recipes import Recipe, load_recipe, recipe_names
+
+SIFT, SIFT_AFFINE_DSP = "sift", "sift-affine-dsp"
+SIFT_SUMMARIES = {
+    SIFT: "COLMAP's SIFT with its default options",
+    SIFT_AFFINE_DSP: "COLMAP's SIFT with affine shapes and domain-size pooling",
+}
+DEFAULT_METHODS = (SIFT, SIFT_AFFINE_DSP, "unrectified-rootsift", "default", "on-demand")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A recipe under the name it has in the results; None for COLMAP's SIFT."""
+
+    label: str
+    recipe: Recipe | None
+
+    @property
+    def summary(self) -> str:
+        """One line for people."""
+        return self.recipe.summary if self.recipe else SIFT_SUMMARIES[self.label]
+
+    @property
+    def climbs(self) -> bool:
+        """Whether pairs that fail verification are matched again."""
+        return bool(self.recipe and self.recipe.extraction.escalation)
+
+    @property
+    def folder_name(self) -> str:
+        """Name of the folder of its results, different for every label."""
+        plain = re.sub(r"[^\w-]+", "_", self.label)
+        if plain == self.label:
+            return plain
+        return f"{plain}-{zlib.crc32(self.label.encode()):08x}"
+
+
+def parse_methods(texts: Iterable[str], depth_settings: Sequence[str] = ()) -> tuple[Method, ...]:
+    """Read methods, each as :func:`parse_method` takes them, several separated by commas.
+
+    What follows a colon belongs to the last method of its text.
+
+    >>> [method.label for method in parse_methods(["sift,a=default:matching.max_ratio=0.8"])]
+    ['sift', 'a']
+
+    Raises:
+        OptionError: for an unknown method or option, or two methods with one name.
+    """
+    methods: list[Method] = []
+    for text in texts:
+        head, colon, settings = text.partition(":")
+        *names, last = (name.strip() for name in head.split(","))
+        methods += [parse_method(name, depth_settings) for name in names if name]
+        if last:
+            methods.append(parse_method(last + colon + settings, depth_settings))
+    if not methods:
+        raise OptionError(f"--methods: none given; known are {_known()}")
+    labels = [method.label for method in methods]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise OptionError(
+                f"--methods: two are called '{label}'; give one another name, "
+                "as in NAME=RECIPE:section.option=value"
+            )
+    return tuple(methods)
+
+
+def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
+    """Read ``sift``, ``sift-affine-dsp`` or ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``.
+
+    Commas inside of brackets belong to a value. The recipe is a name or the path of a TOML file.
+
+    Args:
+        text: the method.
+        depth_settings: settings for recipes that use depth only.
+
+    Raises:
+        OptionError: for an unknown method or option.
+    """
+    if text in SIFT_SUMMARIES:
+        return Method(text, None)
+    head, _, settings = text.partition(":")
+    label, _, name = head.rpartition("=")
+    if not name.endswith(".toml") and name not in recipe_names():
+        close = difflib.get_close_matches(name, [*SIFT_SUMMARIES, *recipe_names()], n=1)
+        hint = f"did you mean '{close[0]}'? " if close else ""
+        raise OptionError(f"unknown method '{name}': {hint}known are {_known()}")
+    changes = re.split(r",(?![^\[\]]*\])", settings) if settings else []
+    recipe = load_recipe(name, changes)
+    if any(rectifier.uses_depth for rectifier in recipe.extraction.rectifiers):
+        recipe = load_recipe(name, [*changes, *depth_settings])
+    default_label = text.replace(name, PurePath(name).stem) if name.endswith(".toml") else text
+    return Method(label or default_label, replace(recipe, name=name))
+
+
+def _known() -> str:
+    return ", ".join([*SIFT_SUMMARIES, *recipe_names(), "or the path of a recipe in TOML"])

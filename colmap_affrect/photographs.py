@@ -1,0 +1,250 @@
+"""The photographs of a run: which there are, their cameras, masks and features."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap.database import ImageCamera, read_camera_matrix, read_cameras
+from colmap_affrect.errors import ImageError, OptionError, StoreError
+from colmap_affrect.executor import available_cores, map_ordered
+from colmap_affrect.extraction import ExtractedImage, ImageExtractor
+from colmap_affrect.imaging import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES, read_gray, read_mask
+from colmap_affrect.options import CameraOptions, MaskOptions
+from colmap_affrect.store import pair_key
+from colmap_affrect.types import Mask
+from colmap_affrect.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """Where the images of a run are, and what is known of them beside.
+
+    Attributes:
+        folder: of the images.
+        cameras: of the images that the database does not have yet.
+        masks: where features may be.
+        known: cameras of the images that the database has, by image name.
+    """
+
+    folder: Path
+    cameras: CameraOptions
+    masks: MaskOptions = field(default_factory=MaskOptions)
+    known: Mapping[str, ImageCamera] = field(default_factory=dict)
+
+    @classmethod
+    def recorded(cls, workspace: Workspace) -> Self:
+        """Return those that the extract stage of a workspace was given."""
+        record = workspace.require("extract")
+        where = str(workspace.config)
+        return cls(
+            Path(record["image_path"]),
+            CameraOptions.from_mapping(record["camera"], where),
+            MaskOptions.from_mapping(record["masks"], where),
+            read_cameras(workspace.database) if workspace.database.exists() else {},
+        )
+
+    def check(self) -> None:
+        """Refuse masks that are not there at all.
+
+        Raises:
+            OptionError: naming the option.
+        """
+        if self.masks.path and not Path(self.masks.path).is_dir():
+            raise OptionError(f"--mask-path {self.masks.path}: no such folder")
+        if self.masks.camera_path and not Path(self.masks.camera_path).is_file():
+            raise OptionError(f"--camera-mask-path {self.masks.camera_path}: no such file")
+
+    def extract(self, extractor: ImageExtractor, name: str, level: int = 0) -> ExtractedImage:
+        """Extract the features of one image; see :meth:`ImageExtractor.extract_file`.
+
+        Raises:
+            ImageError: when the image or its mask cannot be read, or has another size than the
+                camera or mask that belongs to it.
+        """
+        path = self.folder / name
+        found = extractor.extract_file(
+            path, name, self._intrinsics(name, extractor), level, self.mask(name)
+        )
+        if name in self.known and self.known[name].size != found.image_size:
+            width, height = self.known[name].size
+            raise ImageError(
+                f"{path}: is {found.image_size[0]} x {found.image_size[1]} px, and its camera in "
+                f"the database {width} x {height} px; give the images that the database is of"
+            )
+        return found
+
+    def _intrinsics(self, name: str, extractor: ImageExtractor) -> NDArray[np.float64] | None:
+        """Return the camera matrix of an image if its rectification depends on it."""
+        if not any(rectifier.uses_depth for rectifier in extractor.options.rectifiers):
+            return None
+        if name in self.known:
+            return self.known[name].matrix
+        return read_camera_matrix(self.folder / name, self.cameras)
+
+    def mask(self, name: str) -> Mask | None:
+        """Return the (H, W) mask of an image, None where there are no masks.
+
+        Raises:
+            ImageError: when a mask is missing or cannot be read.
+        """
+        masks = []
+        if self.masks.path:
+            masks.append(read_mask(self._mask_path(name)))
+        if self.masks.camera_path:
+            masks.append(read_mask(Path(self.masks.camera_path)))
+        if len({mask.shape for mask in masks}) > 1:
+            raise ImageError(f"{self.folder / name}: its mask and the camera mask differ in size")
+        return np.logical_and.reduce(masks) if masks else None
+
+    def _mask_path(self, name: str) -> Path:
+        folder = Path(self.masks.path)
+        paths = [folder / f"{name}.png", (folder / name).with_suffix(".png")]
+        for path in paths:
+            if path.is_file():
+                return path
+        raise ImageError(
+            f"{self.folder / name}: has no mask {paths[0]}; make one (black is left out), or "
+            "leave out --mask-path"
+        )
+
+
+def list_images(image_path: Path, image_list_path: Path | None = None) -> list[str]:
+    """Return the sorted names, relative to ``image_path``, of all images or of those listed.
+
+    Folders are searched through; hidden ones and files of other formats are passed over (see
+    :func:`left_out`).
+
+    Raises:
+        ImageError: when there are none, or a listed one is missing.
+    """
+    if not image_path.is_dir():
+        raise ImageError(f"{image_path}: no such folder; give the folder of the photographs")
+    if image_list_path is not None:
+        return _listed_images(image_path, image_list_path)
+    names = [name for name in _visible_files(image_path) if _suffix(name) in IMAGE_SUFFIXES]
+    if not names:
+        others = "".join(f"; {kind}: {what}" for kind, what in left_out(image_path).items())
+        raise ImageError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}")
+    for name in names:
+        _check_name(name, image_path)
+    return names
+
+
+def left_out(image_path: Path) -> dict[str, str]:
+    """Tell by ``*.suffix`` which photographs in a folder are passed over for their format."""
+    found: dict[str, list[str]] = {}
+    for name in _visible_files(image_path):
+        if _suffix(name) in OTHER_IMAGE_SUFFIXES:
+            found.setdefault(f"*{_suffix(name)}", []).append(name)
+    return {
+        kind: f"{len(names)} left out, such as {names[0]}: COLMAP or OpenCV cannot read this "
+        "format; convert to PNG or JPEG"
+        for kind, names in found.items()
+    }
+
+
+def _visible_files(folder: Path) -> list[str]:
+    """Return the sorted names, relative to a folder, of all files that are not hidden."""
+    paths = (path.relative_to(folder) for path in folder.rglob("*"))
+    return sorted(
+        path.as_posix()
+        for path in paths
+        if not any(part.startswith(".") for part in path.parts) and not (folder / path).is_dir()
+    )
+
+
+def _suffix(name: str) -> str:
+    return PurePosixPath(name).suffix.lower()
+
+
+def _check_name(name: str, where: Path) -> None:
+    """Refuse a name that a list of images, one a line, cannot hold."""
+    if name != name.encode("utf-8", "replace").decode("utf-8"):
+        raise ImageError(f"{where}: the name {name!r} is not UTF-8; rename it")
+    if any(unicodedata.category(character) in ("Cc", "Zl", "Zp") for character in name):
+        raise ImageError(
+            f"{where}: the name {name!r} has a line break, tab or other control character, which "
+            "lists of images cannot hold; rename it"
+        )
+
+
+def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
+    try:
+        lines = image_list_path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ImageError(f"{image_list_path}: cannot be read ({error})") from error
+    listed = [
+        line if _is_below(image_path, line) else line.strip()  # a name may begin with a space or #
+        for line in lines
+        if _is_below(image_path, line) or (line.strip() and not line.startswith("#"))
+    ]
+    if not listed:
+        raise ImageError(f"{image_list_path}: is empty")
+    return checked_names(image_path, listed, str(image_list_path))
+
+
+def checked_names(image_path: Path, names: Sequence[str], where: str) -> list[str]:
+    """Return the sorted names of images below a folder, each once.
+
+    Raises:
+        ImageError: for a name that is not there, or that leads out of the folder.
+    """
+    found = sorted({PurePosixPath(name).as_posix() for name in names})
+    missing = [name for name in found if not _is_below(image_path, name)]
+    for name in found:
+        _check_name(name, image_path)
+    if missing:
+        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
+        raise ImageError(f"{where}: lists {missing[0]}{more}, which is not in {image_path}")
+    return found
+
+
+def _is_below(image_path: Path, name: str) -> bool:
+    inside = ".." not in PurePosixPath(name).parts and not name.startswith("/")
+    try:
+        return inside and (image_path / name).is_file()
+    except OSError:  # for one, of a name that is too long
+        return False
+
+
+def refuse_colliding_keys(names: Sequence[str]) -> None:
+    """Hloc's pair keys turn '/' into '-': two names must not become the same."""
+    seen: dict[str, str] = {}
+    for name in names:
+        other = seen.setdefault(pair_key(name, ""), name)
+        if other != name:
+            raise StoreError(
+                f"{other} and {name} have the same key in hloc's match files, where '/' becomes "
+                "'-'; rename one of them"
+            )
+
+
+def refuse_mixed_sizes(
+    image_path: Path, names: Sequence[str], mode: str, known: Mapping[str, tuple[int, int]]
+) -> None:
+    """COLMAP leaves out images of another size than the first one that shares their camera."""
+
+    def size_of(name: str) -> tuple[int, int] | None:
+        try:
+            return known.get(name) or read_gray(image_path / name).shape[::-1]
+        except ImageError:
+            return None
+
+    first: dict[PurePosixPath, tuple[str, tuple[int, int]]] = {}
+    for name, size in zip(names, map_ordered(size_of, names, available_cores()), strict=True):
+        if size is None:
+            continue
+        folder = PurePosixPath(name).parent if mode == "per-folder" else PurePosixPath()
+        other, expected = first.setdefault(folder, (name, size))
+        if size != expected:
+            raise OptionError(
+                f"--camera-mode {mode}: {other} is {expected[0]} x {expected[1]} px, {name} is "
+                f"{size[0]} x {size[1]} px; images that share a camera must have one size"
+            )

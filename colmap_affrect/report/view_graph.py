@@ -1,0 +1,169 @@
+"""Which photographs match which: view graph and matrix of verified inliers, as parts of a page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import log, sqrt
+
+import networkx
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.comparison.results import Pair
+from colmap_affrect.report.pictures import Picture, base64_text
+
+CLASS_STARTS = (1, 30, 60, 120, 240, 480)
+"""Smallest number of inliers of each class."""
+
+CLASS_COLORS = ("#e3b341", "#f08c3c", "#e2604f", "#cf4080", "#a14bb5", "#6f60dd")
+"""Of few to many inliers; all stand out from white and from nearly black."""
+
+CLASS_WIDTHS = (1.2, 2.0, 3.0, 4.2, 5.6, 7.2)
+"""Of the edges, in units of the graph."""
+
+GRAPH_SIZE = (640.0, 460.0)
+MAX_NUM_THUMBNAILS = 60
+"""With more photographs the nodes are dots, and the matrix is an image."""
+
+MAX_NODE, MIN_NODE, DOT = 84.0, 24.0, 9.0
+"""Sides of nodes in units of the graph."""
+
+GRAVITY = 0.05
+"""Weight that holds parts of the graph together that have no edge between them."""
+
+MAX_NUM_EDGES = 4000
+
+
+def inlier_class(num_inliers: int) -> int:
+    """Return the class of a number of inliers.
+
+    >>> [inlier_class(count) for count in (1, 29, 30, 10_000)]
+    [0, 0, 1, 5]
+    """
+    return sum(num_inliers >= start for start in CLASS_STARTS) - 1
+
+
+def class_labels() -> list[str]:
+    """Return the range of each class.
+
+    >>> class_labels()[0], class_labels()[-1]
+    ('1–29', '480 or more')
+    """
+    ends = [f"–{start - 1}" for start in CLASS_STARTS[1:]]
+    return [f"{start}{end}" for start, end in zip(CLASS_STARTS, [*ends, " or more"], strict=True)]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the photographs are in the view graphs of all methods.
+
+    Attributes:
+        centers: (N, 2) in ``GRAPH_SIZE``.
+        node_size: side of a node.
+    """
+
+    centers: NDArray[np.float64]
+    node_size: float
+
+
+def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layout:
+    """Place photographs so that those which share many inliers in any graph are close."""
+    count = len(names)
+    size = DOT
+    if count <= MAX_NUM_THUMBNAILS:
+        size = min(MAX_NODE, max(MIN_NODE, 0.45 * sqrt(GRAPH_SIZE[0] * GRAPH_SIZE[1] / count)))
+    graph = networkx.Graph()
+    graph.add_nodes_from(names)
+    for pairs in graphs:
+        for pair, inliers in pairs.items():
+            known = graph.get_edge_data(*pair, default={"weight": 0.0})["weight"]
+            graph.add_edge(*pair, weight=max(known, log(1 + inliers)))
+    graph.add_weighted_edges_from((name, None, GRAVITY) for name in names)
+    places = networkx.spring_layout(graph, seed=0, iterations=200 if count < 100 else 60)
+    centers = np.array([places[name] for name in names])
+    room = np.array(GRAPH_SIZE) - size
+    extent = np.maximum(np.ptp(centers, axis=0), 1e-9)
+    centers = (centers - centers.min(axis=0)) / extent * room + size / 2
+    return Layout(_apart(centers, size), size)
+
+
+def _apart(centers: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+    """Push squares of a side apart until none overlap, or nearly."""
+    low, high = size / 2, np.array(GRAPH_SIZE) - size / 2
+    rows, columns = np.triu_indices(len(centers), 1)
+    for _ in range(200):
+        offsets = centers[columns] - centers[rows]
+        gaps = 1.08 * size - np.abs(offsets).max(axis=1)
+        close = gaps > 0
+        if not close.any():
+            break
+        lengths = np.maximum(np.linalg.norm(offsets[close], axis=1), 1e-6)
+        push = offsets[close] / lengths[:, None] * (gaps[close, None] / 2 + 1e-3)
+        moved = centers.copy()
+        np.add.at(moved, columns[close], push)
+        np.add.at(moved, rows[close], -push)
+        centers = np.clip(moved, low, high)
+    return centers
+
+
+def edge_paths(
+    names: Sequence[str], layout: Layout, pair_inliers: Mapping[Pair, int]
+) -> list[tuple[int, str]]:
+    """Return (class, SVG path of all its edges), few inliers first; at most ``MAX_NUM_EDGES``."""
+    index = {name: number for number, name in enumerate(names)}
+    parts: dict[int, list[str]] = {}
+    strongest = sorted(pair_inliers, key=lambda pair: -pair_inliers[pair])[:MAX_NUM_EDGES]
+    for name1, name2 in strongest:
+        (x1, y1), (x2, y2) = layout.centers[[index[name1], index[name2]]]
+        line = f"M{x1:.0f} {y1:.0f}L{x2:.0f} {y2:.0f}"
+        parts.setdefault(inlier_class(pair_inliers[name1, name2]), []).append(line)
+    return [(number, "".join(parts[number])) for number in sorted(parts)]
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """Verified inliers of all pairs of one method.
+
+    Attributes:
+        counts: (N * N) uint16, row by row, little-endian, as base64.
+        cells: (class, SVG path of its cells of side 1); empty where there is an image.
+        image: the matrix as an image of N x N px, for many photographs.
+        labels: (row, column, count, class) to write into cells, for few photographs.
+    """
+
+    counts: str
+    cells: list[tuple[int, str]]
+    image: Picture | None
+    labels: list[tuple[int, int, int, int]]
+
+
+MAX_NUM_LABELLED = 14
+"""Photographs up to which the numbers are written into the cells."""
+
+
+def matrix(names: Sequence[str], pair_inliers: Mapping[Pair, int]) -> Matrix:
+    """Make the symmetric matrix of inliers of pairs."""
+    index = {name: number for number, name in enumerate(names)}
+    counts = np.zeros((len(names), len(names)), dtype="<u2")
+    for (name1, name2), inliers in pair_inliers.items():
+        row, column = index[name1], index[name2]
+        counts[row, column] = counts[column, row] = min(inliers, np.iinfo(np.uint16).max)
+    text = base64_text(counts.tobytes())
+    classes = np.searchsorted(CLASS_STARTS, counts, side="right") - 1
+    if len(names) > MAX_NUM_THUMBNAILS:
+        palette = [[*bytes.fromhex(color[1:]), 255] for color in CLASS_COLORS]
+        colors = np.array([*palette, [0, 0, 0, 0]], np.uint8)
+        return Matrix(text, [], Picture.png(colors[classes]), [])
+    cells = [
+        (
+            number,
+            "".join(f"M{column} {row}h1v1h-1z" for row, column in np.argwhere(classes == number)),
+        )
+        for number in np.unique(classes[classes >= 0]).tolist()
+    ]
+    labels = [
+        (row, column, int(counts[row, column]), int(classes[row, column]))
+        for row, column in np.argwhere(counts).tolist()
+    ]
+    return Matrix(text, cells, None, labels if len(names) <= MAX_NUM_LABELLED else [])

@@ -1,0 +1,130 @@
+"""Descriptors in the database as COLMAP's own matchers take them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from small_scene import write_photographs
+
+import colmap_affrect
+from colmap_affrect.cli import main
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import (
+    colmap_descriptors,
+    image_ids,
+    open_database,
+    write_descriptors,
+)
+from colmap_affrect.errors import DatabaseError
+from colmap_affrect.store import FeatureStore
+
+MAX_RATIO = 0.8
+Matches = set[tuple[int, int]]
+
+
+def float_matches(first: NDArray[np.float32], second: NDArray[np.float32]) -> Matches:
+    """Mutual nearest neighbours whose angles pass COLMAP's ratio test in both directions."""
+    angles = np.arccos(np.clip(first @ second.T, -1.0, 1.0))
+
+    def nearest(rows: NDArray[np.float32]) -> NDArray[np.int64]:
+        order = np.argsort(rows, axis=1)[:, :2]
+        best, other = np.take_along_axis(rows, order, axis=1).T
+        return np.where(best < MAX_RATIO * other, order[:, 0], -1)
+
+    forward, backward = nearest(angles), nearest(angles.T)
+    return {(i, j) for i, j in enumerate(forward.tolist()) if j >= 0 and backward[j] == i}
+
+
+def colmap_matches(path: Path) -> Matches:
+    """What COLMAP's exact matcher finds between images 1 and 2."""
+    options = pycolmap.FeatureMatchingOptions(skip_geometric_verification=True, use_gpu=False)
+    options.sift.cpu_brute_force_matcher = True
+    options.sift.max_ratio = MAX_RATIO
+    pycolmap.match_exhaustive(path, matching_options=options)
+    with open_database(path) as database:
+        return {(int(i), int(j)) for i, j in database.read_matches(1, 2)}
+
+
+def test_colmap_matches_what_float_descriptors_match(tmp_path: Path) -> None:
+    write_photographs(tmp_path / "photos", 2)
+    path = tmp_path / "a.db"
+    colmap_affrect.extract_features(path, tmp_path / "photos", database_descriptors=True)
+    store = FeatureStore(tmp_path / "a.affrect" / "features.h5")
+    first, second = (store.read(name).descriptors for name in sorted(image_ids(path)))
+    expected, found = float_matches(first, second), colmap_matches(path)
+    assert len(expected) > 500
+    assert len(expected & found) >= 0.95 * len(expected)
+    assert len(found - expected) <= 0.05 * len(expected)
+
+
+def test_signed_descriptors_of_networks_are_matched_too(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+
+    def unit(rows: NDArray[np.float64]) -> NDArray[np.float32]:
+        return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+    first = unit(rng.normal(size=(1500, 128)))
+    cosines = rng.uniform(0.5, 0.95, (1500, 1))
+    noise = unit(rng.normal(size=(1500, 128)))
+    second = unit(cosines * first + np.sqrt(1.0 - cosines**2) * noise)
+    second[900:] = unit(rng.normal(size=(600, 128)))
+    path = tmp_path / "a.db"
+    with open_database(path) as database:
+        camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 300.0, 320, 240)
+        database.write_camera(camera)
+        for number, rows in enumerate((first, second), start=1):
+            image = pycolmap.Image(name=f"{number}.png", camera_id=1)
+            database.write_image(image)
+            database.write_keypoints(number, np.full((len(rows), 2), 5.0, np.float32))
+            write_descriptors(database, number, rows)
+    expected, found = float_matches(first, second), colmap_matches(path)
+    assert len(expected) > 600
+    assert len(expected & found) >= 0.95 * len(expected)
+
+
+def test_rows_have_the_length_that_colmap_expects() -> None:
+    rng = np.random.default_rng(0)
+    for rows in (rng.normal(size=(40, 128)), rng.exponential(size=(40, 128))):
+        encoded = colmap_descriptors(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+        lengths = np.linalg.norm(encoded.astype(float), axis=1)
+        np.testing.assert_allclose(lengths, 512.0, atol=4.0)
+
+
+def test_positive_descriptors_keep_their_values() -> None:
+    row = np.zeros((1, 128))
+    row[0, :3] = 0.3, 0.4, 0.1
+    row[0, 3:] = np.sqrt((1.0 - 0.26) / 125)
+    assert colmap_descriptors(row)[0, :3].tolist() == [154, 205, 51]
+
+
+def test_no_features_and_zero_rows_are_no_trouble() -> None:
+    assert colmap_descriptors(np.zeros((0, 128))).shape == (0, 128)
+    assert not colmap_descriptors(np.zeros((2, 128))).any()
+
+
+def test_descriptors_of_another_size_are_refused() -> None:
+    with pytest.raises(DatabaseError, match=r"64 elements.*leave out --database-descriptors"):
+        colmap_descriptors(np.ones((3, 64)))
+
+
+def test_descriptors_of_before_an_escalation_are_written_anew(tmp_path: Path) -> None:
+    write_photographs(tmp_path / "photos", 2)
+    arguments = ["--image-path", str(tmp_path / "photos"), "--output-path", str(tmp_path / "out")]
+    chosen = ["--recipe", "on-demand", "--database-descriptors", "-q"]
+    assert main(["extract", *arguments, *chosen]) == 0
+    path = tmp_path / "out" / "database.db"
+    with open_database(path) as database:
+        before = database.num_descriptors_for_image(1)
+        assert before == database.num_keypoints_for_image(1)
+    store = FeatureStore(tmp_path / "out" / "features.h5")
+    for name in store.names():
+        store.extend(name, store.read(name))
+    assert main(["extract", *arguments, *chosen]) == 0
+    with open_database(path) as database:
+        for image_id in (1, 2):
+            count = database.num_keypoints_for_image(image_id)
+            assert database.num_descriptors_for_image(image_id) == count
+        assert database.num_descriptors_for_image(1) == 2 * before

@@ -1,0 +1,402 @@
+"""Mapping: what is passed on to pycolmap, its two mappers, several models, and interruptions."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from enum import Enum
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from small_scene import INTRINSICS, NAMES, write_photographs
+
+from colmap_affrect.colmap import mapping, pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.global_mapping import map_globally
+from colmap_affrect.colmap.mapping import (
+    checked_mapping_options,
+    global_options,
+    map_database,
+    mapping_differences,
+    pipeline_options,
+)
+from colmap_affrect.colmap.native_options import differences, flat_values, resolve, set_values
+from colmap_affrect.errors import MappingError, OptionError
+from colmap_affrect.options import MAPPERS, PRESETS, CameraOptions, MappingOptions
+from colmap_affrect.outcomes import ModelSummary
+from colmap_affrect.pipeline import RunOptions, map_and_report, run
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.workspace import Workspace
+
+FLAG = "--mapper-options"
+SEED = 3
+TIMEOUT_S = 60
+
+ROTATION_ERROR_DEG = 0.05
+"""Keypoints are exact; what is left are float32 coordinates and the optimiser's tolerance."""
+
+
+class Backend(Enum):
+    """Stands for an enumeration of pycolmap."""
+
+    CERES = 1
+
+
+def options_of(mapper: str) -> object:
+    if mapper == "global":
+        return pycolmap.GlobalPipelineOptions()
+    return pycolmap.IncrementalPipelineOptions()
+
+
+@pytest.mark.parametrize(
+    ("mapper", "key", "value", "full_key", "resolved"),
+    [
+        ("incremental", "mapper.init_max_error", "3", "mapper.init_max_error", 3.0),
+        ("incremental", "init_max_error", "2.5e0", "mapper.init_max_error", 2.5),
+        ("incremental", "init_max_error", 3, "mapper.init_max_error", 3.0),
+        ("incremental", "num_threads", "-1", "num_threads", -1),
+        ("incremental", "mapper.num_threads", 4, "mapper.num_threads", 4),
+        ("incremental", "ba_refine_principal_point", "True", "ba_refine_principal_point", True),
+        ("incremental", "ba_refine_principal_point", "0", "ba_refine_principal_point", False),
+        ("incremental", "ba_refine_principal_point", True, "ba_refine_principal_point", True),
+        ("incremental", "ba_gpu_index", "0,1", "ba_gpu_index", "0,1"),
+        ("incremental", "ba_local_backend", "ceres", "ba_local_backend", "CERES"),
+        ("incremental", "ba_local_backend", Backend.CERES, "ba_local_backend", "CERES"),
+        ("incremental", "snapshot_path", "a b/č", "snapshot_path", "a b/č"),
+        ("incremental", "snapshot_path", Path("a b"), "snapshot_path", "a b"),
+        (
+            "global",
+            "max_num_l1_iterations",
+            "7",
+            "mapper.rotation_averaging.max_num_l1_iterations",
+            7,
+        ),
+        (
+            "global",
+            "linear_solver_type",
+            "DENSE_SCHUR",
+            "mapper.bundle_adjustment.ceres.solver_options.linear_solver_type",
+            "DENSE_SCHUR",
+        ),
+    ],
+)
+def test_option_is_converted_to_pycolmaps_type_and_taken_by_pycolmap(
+    mapper: str, key: str, value: object, full_key: str, resolved: object
+) -> None:
+    found = resolve(options_of(mapper), {key: value}, FLAG)
+    assert found == {full_key: resolved}
+    assert type(found[full_key]) is type(resolved)
+    assert resolve(options_of(mapper), found, FLAG) == found
+    native = options_of(mapper)
+    set_values(native, found)
+    taken = flat_values(native)[full_key]
+    if isinstance(resolved, str) and not isinstance(taken, str):
+        taken = str(taken) if isinstance(taken, Path) else taken.name
+    assert taken == resolved
+
+
+@pytest.mark.parametrize(
+    ("mapper", "key", "value", "message"),
+    [
+        ("incremental", "mapper.init_max_eror", "3", "did you mean 'mapper.init_max_error'"),
+        ("incremental", "init_max_eror", "3", "did you mean 'mapper.init_max_error'"),
+        ("incremental", "zzzzzz", "3", "zzzzzz: pycolmap has no such option"),
+        ("incremental", "mapper", "3", "mapper: pycolmap has no such option"),
+        ("incremental", "__class__", "3", "pycolmap has no such option"),
+        ("incremental", "", "3", "pycolmap has no such option"),
+        (
+            "incremental",
+            "max_extra_paramx",
+            "3",
+            "did you mean 'max_extra_param'",
+        ),
+        (
+            "global",
+            "gpu_index",
+            "0",
+            "several sections; give mapper.global_positioning.gpu_index or mapper.bundle_adjust",
+        ),
+        ("incremental", "min_model_size", "2.5", "min_model_size=2.5: expected int"),
+        ("incremental", "min_model_size", True, "min_model_size=True: expected int"),
+        ("incremental", "min_model_size", "9" * 11, "outside the range of int"),
+        ("incremental", "init_max_error", "wide", "init_max_error=wide: expected float"),
+        ("incremental", "init_max_error", False, "expected float"),
+        ("incremental", "init_max_error", "nan", "expected float (a finite number)"),
+        ("incremental", "init_max_error", "-inf", "expected float (a finite number)"),
+        ("incremental", "multiple_models", "yes", "expected bool (true or false)"),
+        ("incremental", "multiple_models", 1, "expected bool (true or false)"),
+        ("incremental", "ba_gpu_index", 0, "expected str"),
+        ("incremental", "snapshot_path", 1.5, "expected path"),
+        ("incremental", "ba_local_backend", "GPU", "expected one of CERES, CASPAR"),
+        ("incremental", "ba_local_backend", 1, "expected one of CERES, CASPAR"),
+        ("incremental", "constant_cameras", "1", "of type set"),
+        ("incremental", "image_names", "a.png", "of type list"),
+        ("global", "gravity_dir", "1", "of type ndarray"),
+        ("incremental", "image_path", "x", "it is the one that extract was given"),
+        ("global", "mapper.image_path", "x", "it is the one that extract was given"),
+        ("incremental", "random_seed", "1", "use --random-seed"),
+        ("incremental", "mapper.random_seed", "1", "use --random-seed"),
+        ("global", "mapper.retriangulation.random_seed", "1", "use --random-seed"),
+    ],
+)
+def test_option_that_pycolmap_does_not_take_is_one_clear_line(
+    mapper: str, key: str, value: object, message: str
+) -> None:
+    with pytest.raises(OptionError) as error:
+        resolve(options_of(mapper), {key: value}, FLAG)
+    text = str(error.value)
+    assert text.startswith(f"{FLAG} {key}")
+    assert message in text
+    assert "\n" not in text
+
+
+@given(
+    key=st.sampled_from(sorted(flat_values(pycolmap.IncrementalPipelineOptions())))
+    | st.text(max_size=12),
+    value=st.text(max_size=12) | st.floats() | st.integers() | st.booleans() | st.none(),
+)
+def test_any_option_is_taken_or_refused_with_our_error(key: str, value: object) -> None:
+    try:
+        found = resolve(pycolmap.IncrementalPipelineOptions(), {key: value}, FLAG)
+    except OptionError:
+        return
+    assert json.loads(json.dumps(found)) == found
+
+
+@pytest.mark.parametrize("mapper", MAPPERS)
+def test_differences_say_all_that_another_process_must_know(mapper: str) -> None:
+    options = MappingOptions(
+        mapper=mapper, mapper_options={"min_num_matches": 16, "ignore_watermarks": True}
+    )
+    translate = global_options if mapper == "global" else pipeline_options
+    told = mapping_differences(options, SEED, intrinsics_given=True)
+    native = options_of(mapper)
+    set_values(native, json.loads(json.dumps(told)))
+    ours = translate(options, SEED, intrinsics_given=True)
+    assert differences(native, ours) == {}
+    assert (told["min_num_matches"], told["ignore_watermarks"]) == (16, True)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_mapper_options_win_over_the_preset(preset: str) -> None:
+    given = {"min_model_size": "4", "init_min_num_inliers": "33", "ignore_two_view_tracks": "1"}
+    options = checked_mapping_options(MappingOptions.preset(preset, mapper_options=given))
+    native = pipeline_options(options, SEED, intrinsics_given=False)
+    assert (native.min_model_size, native.mapper.init_min_num_inliers) == (4, 33)
+    assert native.triangulation.ignore_two_view_tracks is True
+    assert native.random_seed == SEED
+    assert options.preset_name == preset
+    given = {"min_model_size": 5, "track_min_num_views_per_track": 4}
+    options = checked_mapping_options(
+        MappingOptions.preset(preset, mapper="global", mapper_options=given)
+    )
+    native = global_options(options, SEED, intrinsics_given=False)
+    assert (native.min_model_size, native.mapper.track_min_num_views_per_track) == (5, 4)
+
+
+def test_values_that_colmap_does_not_accept_are_named() -> None:
+    options = MappingOptions(mapper_options={"init_min_num_inliers": -4, "min_num_matches": 16})
+    with pytest.raises(OptionError, match=r"mapper\.init_min_num_inliers=-4 .*does not accept"):
+        checked_mapping_options(options)
+
+
+def test_global_mapper_that_is_not_there_is_one_clear_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delattr(pycolmap, "global_mapping")
+    with pytest.raises(OptionError, match=r"--mapper global: pycolmap 4\S+ has no global mapper"):
+        checked_mapping_options(MappingOptions(mapper="global"))
+    checked_mapping_options(MappingOptions())
+
+
+def synthesize(path: Path, num_images: int, num_points: int = 150) -> pycolmap.Reconstruction:
+    """Let COLMAP make a verified database; return the truth."""
+    pycolmap.set_random_seed(SEED)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_frames_per_rig=num_images, num_points3D=num_points
+    )
+    with open_database(path) as database:
+        return pycolmap.synthesize_dataset(options, database)
+
+
+def reconstruct(path: Path, options: MappingOptions) -> tuple[list[ModelSummary], int]:
+    """Map into path/../sparse; return the models and the number of images shown."""
+    shown = []
+    models = map_database(
+        path,
+        path.parent,
+        path.parent / "sparse",
+        options,
+        SEED,
+        intrinsics_given=True,
+        next_image=shown.append,
+    )
+    assert not (path.parent / "sparse.partial").exists()
+    return models, sum(shown)
+
+
+def test_global_mapper_registers_all_images_in_place_and_repeatably(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    truth = synthesize(path, 5)
+    files = []
+    for _ in range(2):
+        (model,), num_shown = reconstruct(path, MappingOptions(mapper="global"))
+        assert len(model.registered_names) == num_shown == 5
+        files.append((tmp_path / "sparse" / "0" / "images.bin").read_bytes())
+    assert files[0] == files[1]
+    found = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    for id1, id2 in combinations(sorted(found.reg_image_ids()), 2):
+        relative = [
+            scene.images[id2].cam_from_world().rotation
+            * scene.images[id1].cam_from_world().rotation.inverse()
+            for scene in (found, truth)
+        ]
+        angle = np.rad2deg((relative[0] * relative[1].inverse()).angle())
+        assert angle < ROTATION_ERROR_DEG
+
+
+def test_global_mapper_has_a_model_of_two_images_by_our_preset_only(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, 2, 400)
+    (model,), num_shown = reconstruct(path, MappingOptions(mapper="global"))
+    assert len(model.registered_names) == num_shown == 2
+    assert reconstruct(path, MappingOptions.preset("colmap", mapper="global")) == ([], 0)
+    assert list((tmp_path / "sparse").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("mapper", "key", "message"),
+    [
+        ("incremental", "ba_global_function_tolerance", r"incremental mapper failed: .*tolerance"),
+        ("global", "function_tolerance", r"global mapper failed \(exit code 1\): .*tolerance"),
+    ],
+)
+def test_mapper_that_fails_is_one_clear_line_and_leaves_nothing(
+    tmp_path: Path, mapper: str, key: str, message: str
+) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, 3)
+    options = MappingOptions(mapper=mapper, mapper_options={key: -1})
+    with pytest.raises(MappingError, match=message) as error:
+        reconstruct(path, checked_mapping_options(options))
+    assert "\n" not in str(error.value)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
+
+
+def test_global_mapper_that_dies_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "database.db").write_bytes(b"no database" * 100)
+    with pytest.raises(MappingError, match=r"^COLMAP's global mapper failed \(exit code -?\d+\)"):
+        map_globally(tmp_path / "database.db", tmp_path, tmp_path, {})
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_mapping_that_is_stopped_leaves_nothing_and_can_be_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
+) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, 3)
+
+    def fail(_: Path, __: Path, output_path: Path, **___: object) -> None:
+        (output_path / "0").mkdir()
+        (output_path / "0" / "images.bin").write_bytes(b"half")
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(mapping.pycolmap, "incremental_mapping", fail)
+        with pytest.raises(error):
+            reconstruct(path, MappingOptions())
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
+    (model,), _ = reconstruct(path, MappingOptions())
+    assert len(model.registered_names) == 3
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from colmap_affrect.colmap.global_mapping import map_globally
+out = Path(sys.argv[1])
+print("begin", flush=True)
+endless = {"max_num_irls_iterations": 2**31 - 1, "irls_step_convergence_threshold": -1.0}
+values = {f"mapper.rotation_averaging.{key}": value for key, value in endless.items()}
+map_globally(out / "database.db", out, out, values)
+"""
+
+
+def processes_that_name(text: str) -> list[str]:
+    """Command lines of the processes with a text among their arguments."""
+    commands = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            command = path.read_bytes().decode(errors="replace")
+        except OSError:
+            continue
+        if text in command and "global_mapping" in command.split("{")[0]:
+            commands.append(command)
+    return commands
+
+
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_global_mapper_ends_with_the_process_that_started_it(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    synthesize(tmp_path / "database.db", 5)
+    with subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # noqa: PLW1509
+    ) as process:
+        assert process.stdout.readline() == b"begin\n"
+        deadline = time.monotonic() + TIMEOUT_S
+        while not (running := processes_that_name(f'"{tmp_path}"')):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        assert len(running) == 1
+        os.kill(process.pid, number)
+        process.wait(timeout=TIMEOUT_S)
+    assert process.returncode == -number
+    while processes_that_name(f'"{tmp_path}"'):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def two_places(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """A run on two photographs of one room and three of another."""
+    photos = tmp_path_factory.mktemp("photos")
+    write_photographs(photos / "here", 2)
+    write_photographs(photos / "there", 3, first_seed=10)
+    options = RunOptions(
+        recipe=load_recipe("unrectified-rootsift"),
+        cameras=CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS),
+    )
+    out = tmp_path_factory.mktemp("places") / "out"
+    run(photos, out, options)
+    return Workspace(out)
+
+
+@pytest.mark.parametrize("mapper", MAPPERS)
+def test_two_places_make_two_models_the_largest_first(two_places: Workspace, mapper: str) -> None:
+    options = MappingOptions(mapper=mapper)
+    report = map_and_report(two_places, options, SEED, overwrite=True)
+    large = tuple(sorted(f"there/{name}" for name in NAMES[:3]))
+    small = tuple(sorted(f"here/{name}" for name in NAMES[:2]))
+    assert [model.registered_names for model in report.models] == [large, small]
+    assert report.status == "partial"
+    assert report.unregistered == dict.fromkeys(small, "in another model, sparse/1")
+    assert "models      2, of 3, 2 images" in report.summary()
+    assert report.to_mapping()["models"] == [list(large), list(small)]
+    folders = sorted(path for path in two_places.sparse.iterdir() if path.is_dir())
+    assert [folder.name for folder in folders] == ["0", "1"]
+    for folder, names in zip(folders, (large, small), strict=True):
+        model = pycolmap.Reconstruction(folder)
+        assert sorted(model.images[i].name for i in model.reg_image_ids()) == list(names)

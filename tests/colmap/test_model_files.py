@@ -1,0 +1,83 @@
+"""Files of COLMAP models are followed to their ends, whole or damaged."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import RECORDS, registered_names
+from colmap_affrect.errors import StoreError
+
+
+@pytest.fixture(scope="module")
+def model() -> pycolmap.Reconstruction:
+    """A model with a rig of two cameras."""
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=2, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=20
+    )
+    return pycolmap.synthesize_dataset(options)
+
+
+@pytest.fixture
+def model_path(model: pycolmap.Reconstruction, tmp_path: Path) -> Path:
+    path = tmp_path / "0"
+    path.mkdir()
+    model.write(path)
+    return path
+
+
+def test_names_are_those_that_pycolmap_reads(
+    model: pycolmap.Reconstruction, model_path: Path
+) -> None:
+    expected = sorted(model.images[image_id].name for image_id in model.reg_image_ids())
+    assert len(expected) == 12
+    assert registered_names(model_path) == expected
+
+
+@pytest.mark.parametrize("camera_model", ["SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "FOV"])
+def test_cameras_of_several_models_are_stepped_over(tmp_path: Path, camera_model: str) -> None:
+    camera = pycolmap.Camera.create_from_model_name(3, camera_model, 100.0, 90, 60)
+    model = pycolmap.Reconstruction()
+    model.add_camera(camera)
+    model.write(tmp_path)
+    assert registered_names(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", sorted(RECORDS))
+def test_missing_cut_and_lengthened_files_are_errors_that_name_them(
+    model_path: Path, name: str
+) -> None:
+    path = model_path / name
+    data = path.read_bytes()
+    rng = random.Random(1)
+    for length in [0, 7, len(data) - 1, *(rng.randrange(len(data)) for _ in range(20))]:
+        path.write_bytes(data[:length])
+        with pytest.raises(StoreError, match=rf"{name}: damaged, it ends within a record"):
+            registered_names(model_path)
+    path.write_bytes(data + b"x")
+    with pytest.raises(StoreError, match=rf"{name}: damaged, something follows"):
+        registered_names(model_path)
+    path.unlink()
+    with pytest.raises(StoreError, match=rf"{name}: cannot be read"):
+        registered_names(model_path)
+
+
+def test_changed_bytes_are_an_error_or_pass_but_nothing_else(model_path: Path) -> None:
+    rng = random.Random(2)
+    num_errors = 0
+    for _ in range(100):
+        path = model_path / rng.choice(sorted(RECORDS))
+        data = path.read_bytes()
+        changed = bytearray(data)
+        for _ in range(20):
+            changed[rng.randrange(min(300, len(data)))] = rng.randrange(256)
+        path.write_bytes(changed)
+        try:
+            registered_names(model_path)
+        except StoreError:
+            num_errors += 1
+        path.write_bytes(data)
+    assert num_errors > 50

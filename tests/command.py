@@ -1,0 +1,55 @@
+"""The command line for tests: arguments for the small scene, and how a command ended."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from small_scene import INTRINSICS
+
+CAMERA = ["--camera-mode", "per-image", "--camera-model", "PINHOLE", "--camera-params", INTRINSICS]
+FAST = ["--recipe", "unrectified-rootsift", *CAMERA]
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended: exit code, what it printed, the lines of stderr."""
+
+    code: int
+    stdout: str
+    stderr: list[str]
+
+    @property
+    def errors(self) -> list[str]:
+        """Lines that say why the command failed."""
+        return [line for line in self.stderr if line.startswith("error: ")]
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The report that --json printed."""
+        report: dict[str, Any] = json.loads(self.stdout)
+        return report
+
+
+Call = Callable[..., Ended]
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    """Start the command line in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "colmap_affrect", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run_in_process_of_its_own(*arguments: object) -> Ended:
+    """Run the command line in a process of its own."""
+    with start(*arguments) as process:
+        stdout, stderr = process.communicate(timeout=120)
+    return Ended(process.returncode, stdout, stderr.splitlines())

@@ -1,0 +1,50 @@
+"""What the tests of this folder share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from command import FAST, Call, Ended
+from small_scene import write_photographs
+
+from colmap_affrect.cli import main
+
+
+@pytest.fixture
+def call(capfd: pytest.CaptureFixture[str]) -> Call:
+    """Run the command line here."""
+
+    def run_command(*arguments: object) -> Ended:
+        capfd.readouterr()
+        code = main([str(argument) for argument in arguments])
+        captured = capfd.readouterr()
+        return Ended(code, captured.out, captured.err.splitlines())
+
+    return run_command
+
+
+@pytest.fixture
+def run_images(call: Call, tmp_path: Path) -> Call:
+    """Run all stages on a folder, with fast features and the scene's cameras, report as JSON."""
+
+    def run(images: Path, *arguments: object) -> Ended:
+        fixed = ["--image-path", images, "--output-path", tmp_path / "out", "--json"]
+        return call("run", *fixed, *(arguments or FAST))
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def small_photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The four photographs of the small scene; nothing may be changed there."""
+    folder = tmp_path_factory.mktemp("small scene")
+    write_photographs(folder)
+    return folder
+
+
+@pytest.fixture
+def trio(tmp_path: Path) -> Path:
+    """Three photographs in a folder of their own, to be mixed with others."""
+    write_photographs(tmp_path / "trio", 3)
+    return tmp_path / "trio"

@@ -1,0 +1,275 @@
+"""Random and damaged input of all readers: only our errors, nothing executed, little memory.
+
+10,000 inputs: lists of pairs and images, recipes, options of --set, depth maps. Half of them are
+random bytes, half are valid ones with a few changes.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import random
+import struct
+import tracemalloc
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from synthetic import write_image
+
+from colmap_affrect.conventions import camera_matrix
+from colmap_affrect.depth import DepthFiles
+from colmap_affrect.errors import AffrectError, DepthError
+from colmap_affrect.matching.pairs import read_pairs
+from colmap_affrect.options import DepthOptions
+from colmap_affrect.photographs import list_images
+from colmap_affrect.recipes import load_recipe, recipe_folder, recipe_names
+from colmap_affrect.types import Photograph
+
+NAMES = ["a.png", "b c.png", "side/č.png", "side/d,e.png", "# f.png"]
+
+PAIRS = "# pairs\na.png b c.png\nside/č.png\ta.png\na.png,side/d,e.png\n# f.png a.png\n"
+IMAGES = "# images\na.png\nb c.png\n\nside/č.png\n./side//d,e.png\n# f.png\n"
+
+PIECES = [
+    b"", b"\0", b"\n", b"\r\n", b"\t", b" ", b"#", b",", b"..", b"/", b"\\", b'"', b"'", b"'''",
+    b"[", b"]" * 3, b"[[", b"{", b"}", b"=", b"-", b"9" * 30, b"1e999", b"nan", b"-inf", b"true",
+    b"0x", b"1979-05-27", b"\xff\xfe", b"\xef\xbb\xbf", b"\xe2\x80\xa8", b"\xc2\x85", b"\x1b[31m",
+    b"%s", b"{0}", b"a" * 300, "🏛".encode(), b"\xed\xa0\x80", b"../" * 20, b"/dev/zero", b"depth",
+    b"\xff" * 8, b"\x7f\xff\xff\xff", b"[" * 3000,
+]  # fmt: skip
+
+
+def damaged(valid: bytes, chance: random.Random) -> bytes:
+    """Change a few places, or make up something as long."""
+    if chance.random() < 0.5:
+        return chance.randbytes(chance.choice([0, 1, 7, 60, len(valid)]))
+    data = bytearray(valid)
+    for _ in range(chance.randint(1, 4)):
+        start = chance.randrange(len(data) + 1)
+        end = min(len(data), start + chance.choice([0, 1, 1, 4, 40]))
+        kind = chance.randrange(5)
+        if kind == 0 and start < len(data):
+            data[start] ^= 1 << chance.randrange(8)
+        elif kind == 1:
+            data[start:end] = chance.choice(PIECES)
+        elif kind == 2:
+            data[start:end] = chance.randbytes(end - start)
+        elif kind == 3:
+            data[start:start] = data[end : end + chance.randrange(200)]
+        else:
+            del data[start : chance.choice([end, len(data)])]
+    return bytes(data)
+
+
+def write_anew(path: Path, data: bytes) -> None:
+    """Write a file; cutting the old one to nothing first takes ten times as long."""
+    path.unlink(missing_ok=True)
+    path.write_bytes(data)
+
+
+def fuzz(
+    valid: list[bytes], count: int, seed: int, read: Callable[[bytes], object]
+) -> tuple[int, int]:
+    """Read damaged input; return how many inputs were taken and how many refused."""
+    chance = random.Random(seed)
+    taken = refused = 0
+    for _ in range(count):
+        data = damaged(chance.choice(valid), chance)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                read(data)
+        except AffrectError as error:
+            refused += bool(str(error))
+        except Exception as error:
+            raise AssertionError(f"{error!r} for {data[:500]!r}") from error
+        else:
+            taken += 1
+    assert taken + refused == count
+    return taken, refused
+
+
+def test_lists_of_pairs(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.txt"
+
+    def read(data: bytes) -> None:
+        write_anew(path, data)
+        for pair in read_pairs(path, NAMES):
+            assert set(pair) <= set(NAMES)
+
+    taken, refused = fuzz([PAIRS.encode()], 3000, 1, read)
+    assert min(taken, refused) > 50
+
+
+def test_lists_of_images(tmp_path: Path) -> None:
+    photos, path = tmp_path / "photos", tmp_path / "list.txt"
+    for name in NAMES:
+        (photos / name).parent.mkdir(parents=True, exist_ok=True)
+        (photos / name).write_bytes(b"")
+
+    def read(data: bytes) -> None:
+        write_anew(path, data)
+        assert set(list_images(photos, path)) <= set(NAMES)
+
+    taken, refused = fuzz([IMAGES.encode()], 2500, 2, read)
+    assert min(taken, refused) > 50
+
+
+def test_recipe_files(tmp_path: Path) -> None:
+    path = tmp_path / "recipe.toml"
+
+    def read(data: bytes) -> None:
+        write_anew(path, data)
+        load_recipe(str(path))
+
+    valid = [(recipe_folder() / f"{name}.toml").read_bytes() for name in recipe_names()]
+    taken, refused = fuzz(valid, 2000, 3, read)
+    assert min(taken, refused) > 50
+
+
+SETTINGS = [
+    "rectifier.tilt_radius=1.8", "features.profile=affnet-hardnet", "rectifier.name='asift'",
+    "max_image_size_px=900", "matching.max_ratio=0.8", "escalation=[]", "depth.path='x'",
+    "features.sigma_px=[1.0, 2]", "summary=1", "rectifier=3", "matching.max_ratio.x=1",
+]  # fmt: skip
+
+
+def test_settings_of_the_command_line() -> None:
+    def read(data: bytes) -> None:
+        load_recipe("default", [data.decode("utf-8", "surrogateescape").replace("\0", "")])
+
+    taken, refused = fuzz([text.encode() for text in SETTINGS], 1000, 4, read)
+    assert min(taken, refused) > 20
+
+
+MAP = np.arange(1.0, 25.0).reshape(4, 6) ** 1.5
+
+
+def map_bytes(suffix: str) -> bytes:
+    """A valid depth map of 6 x 4 px."""
+    content = io.BytesIO()
+    if suffix == ".npy":
+        np.save(content, MAP)
+    elif suffix == ".npz":
+        np.savez_compressed(content, depth=MAP, other=MAP[:2])
+    else:
+        with h5py.File(content, "w") as file:
+            file.create_dataset("depth", data=MAP, chunks=(2, 3), compression="gzip")
+            file["folder/other"] = MAP.astype(np.float32)
+    return content.getvalue()
+
+
+def png_bytes(folder: Path) -> bytes:
+    return write_image(folder / "map.png", MAP.astype(np.uint16)).read_bytes()
+
+
+def depth_reader(folder: Path, suffix: str) -> Callable[[bytes], object]:
+    """Return a function that reads bytes as the depth map of an image of 6 x 4 px."""
+    gray = np.zeros((4, 6), np.uint8)
+    photograph = Photograph(gray, "a.jpg", folder / "a.jpg", camera_matrix((6, 4)))
+    source = DepthFiles(DepthOptions(path=str(folder)))
+
+    def read(data: bytes) -> object:
+        write_anew(folder / f"a{suffix}", data)
+        depth = source.depth(photograph)
+        assert depth.dtype == np.float32
+        assert not (depth <= 0).any()
+        return depth
+
+    return read
+
+
+@pytest.mark.parametrize(
+    ("suffix", "count"), [(".npy", 500), (".npz", 400), (".png", 300), (".h5", 200), (".exr", 100)]
+)
+def test_depth_maps(tmp_path: Path, suffix: str, count: int, capfd: pytest.CaptureFixture) -> None:
+    (tmp_path / "maps").mkdir()
+    read = depth_reader(tmp_path / "maps", suffix)
+    pixels = b"\x76\x2f\x31\x01\x02\x00\x00\x00channels\0chlist\0" + bytes(60)
+    valid = {".png": png_bytes(tmp_path), ".exr": pixels}.get(suffix) or map_bytes(suffix)
+    if suffix != ".exr":
+        read(valid)
+    _, refused = fuzz([valid], count, 5, read)
+    assert refused > count // 3
+    capfd.readouterr()  # what decoders have to say
+
+
+def npy_header(shape: str, descr: str = "'<f8'") -> bytes:
+    text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
+
+
+def zipped(content: bytes, name: str = "depth.npy") -> bytes:
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(name, content)
+    return archive.getvalue()
+
+
+def huge_png() -> bytes:
+    header = b"IHDR" + struct.pack(">IIBBBBB", 30_000, 30_000, 16, 0, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    return b"\x89PNG\r\n\x1a\n" + chunk
+
+
+def huge_hdf5() -> bytes:
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        file.create_dataset("depth", (200_000, 300_000), "f4", chunks=(1000, 1000))
+    return content.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("suffix", "data"),
+    [
+        (".npy", npy_header("(40000, 60000)")),
+        (".npy", npy_header("(1000000000, 1000000000)")),
+        (".npy", npy_header("(4, -6)")),
+        (".npz", zipped(npy_header("(40000, 60000)"))),
+        (".npz", zipped(npy_header("(40000, 60000)") + bytes(60_000_000))),
+        (".png", huge_png()),
+        (".h5", huge_hdf5()),
+    ],
+)
+def test_header_of_a_huge_map_takes_no_memory(tmp_path: Path, suffix: str, data: bytes) -> None:
+    read = depth_reader(tmp_path, suffix)
+    tracemalloc.start()
+    try:
+        with pytest.raises(DepthError, match=r"too large for a depth map|cannot be read"):
+            read(data)
+        assert tracemalloc.get_traced_memory()[1] < 3_000_000
+    finally:
+        tracemalloc.stop()
+
+
+class Malicious:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple:
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz"])
+def test_pickles_are_never_loaded(tmp_path: Path, suffix: str) -> None:
+    evidence = tmp_path / "executed"
+    attack = np.array([[Malicious(evidence)]], dtype=object)
+    content = io.BytesIO()
+    np.save(content, attack, allow_pickle=True)
+    contents = [content.getvalue(), pickle.dumps(attack)]
+    (tmp_path / "maps").mkdir()
+    read = depth_reader(tmp_path / "maps", suffix)
+    for data in contents:
+        with pytest.raises(DepthError, match="cannot be read"):
+            read(zipped(data) if suffix == ".npz" else data)
+    assert not evidence.exists()
+    pickle.loads(contents[1])
+    assert evidence.exists(), "the attack of this test does not work"

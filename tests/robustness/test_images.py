@@ -1,0 +1,391 @@
+"""Images of all kinds beside good ones, through the whole chain.
+
+Which test covers which required behaviour of images (others are in the folder's other files):
+
+corrupt or truncated         test_bad_images_are_reported_and_the_others_registered
+0 bytes, text as image       test_stages: test_unreadable_image_is_reported_and_the_run_goes_on
+.txt, hidden, .git           test_stages: test_list_images_finds_images_in_folders_...
+GIF, WebP by suffix          test_formats_that_colmap_cannot_read_are_reported
+  under another suffix       test_format_is_told_by_content_and_not_by_suffix
+  nothing else               test_folder_of_other_formats_only_names_them
+gray, 16 bit, RGBA, CMYK,
+  palette, bilevel, float    test_pixels_of_all_kinds_register; test_imaging: test_read_gray_*
+EXIF orientation 0 to 8      test_exif_orientation_is_not_applied
+blank                        test_stages: test_blank_image_has_no_features_and_the_run_goes_on
+1 image                      test_one_image_is_no_model
+2 images                     test_two_images_make_a_model
+1 x 1, < 32 px, 1 px high    test_tiny_images_are_no_obstacle
+100 megapixels               test_hundred_megapixels_fit_into_little_memory (slow)
+same names in folders        test_same_names_in_folders_are_different_images;
+                             test_stages: test_names_with_the_same_key_are_refused
+same bytes twice             test_same_photograph_twice_registers_both
+spaces, NFC and NFD, '#'     test_names_of_all_kinds_go_through
+line breaks in names         test_name_that_lists_cannot_hold_is_refused
+not UTF-8                    test_stages: test_list_images_refuses_a_name_that_is_not_utf8
+name that is also a folder   cannot be on disk; a file that became a folder between two runs:
+                             test_file_that_became_a_folder_of_images
+one camera, mixed sizes      test_stages: test_images_of_different_sizes_cannot_share_a_camera
+wrong masks                  test_photographs
+read-only image folder       test_read_only_image_folder_is_left_as_it_is
+too many pixels, no file     test_bad_images_are_reported_and_the_others_registered
+not finite                   test_float_pixels_that_are_not_finite_are_black_or_white
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import unicodedata
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import PIL.Image
+import pytest
+from command import CAMERA, FAST, Ended, run_in_process_of_its_own
+from numpy.testing import assert_array_equal
+from results import database_content
+from small_scene import IMAGE_SIZE, NAMES, photograph, write_photographs
+from synthetic import write_image
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.imaging import FOREIGN_FORMATS, IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES, read_gray
+from colmap_affrect.store import FeatureStore
+
+TRIO = sorted(NAMES[:3])
+
+
+def fifth_photograph() -> np.ndarray:
+    """One more photograph of the small scene, (240, 320) uint8."""
+    return photograph((0.8, -0.3, 0.3), -7.5)
+
+
+def jpeg_with_orientation(image: np.ndarray, orientation: int) -> bytes:
+    """JPEG whose EXIF segment holds nothing but the orientation tag."""
+    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+    entry = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
+    segment = b"Exif\x00\x00II*\x00" + struct.pack("<IH", 8, 1) + entry + bytes(4)
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
+
+
+FORMATS = {"WEBP": "WebP", "GIF": "GIF", "AVIF": "AVIF or HEIF", "JPEG2000": "JPEG 2000"}
+"""Formats that COLMAP cannot read, as Pillow and as we call them."""
+
+
+def write_bad_images(folder: Path) -> None:
+    """Put all kinds of bad images beside good ones."""
+    photo = PIL.Image.fromarray(fifth_photograph())
+    data = cv2.imencode(".jpg", fifth_photograph())[1].tobytes()
+    png = (folder / "a.png").read_bytes()
+    (folder / "half.jpg").write_bytes(data[: len(data) // 2])
+    (folder / "start.jpg").write_bytes(data[:200])
+    noise = np.random.default_rng(0).bytes(len(data) - 1400)
+    (folder / "noise.jpg").write_bytes(data[:700] + noise + data[-700:])
+    (folder / "half.png").write_bytes(png[: len(png) // 2])
+    (folder / "0 empty.jpg").write_bytes(b"")
+    (folder / "gone.png").symlink_to(folder / "nowhere.png")
+    os.mkfifo(folder / "pipe.jpg")
+    # The header says 40000 x 40000 px, more than OpenCV takes; it raises instead of returning.
+    header = b"IHDR" + struct.pack(">IIBBBBB", 40_000, 40_000, 8, 0, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    (folder / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)
+    for kind in FORMATS:
+        photo.save(folder / f"{kind}.jpg", format=kind)
+    photo.save(folder / "x.webp")
+    photo.save(folder / "side" / "y.WebP", format="webp")
+    photo.save(folder / "z.gif")
+
+
+def state(folder: Path) -> dict[str, tuple[bytes, int]]:
+    """Content and time of all files and folders of a tree."""
+    return {
+        str(path): (path.read_bytes() if path.is_file() else b"", path.lstat().st_mtime_ns)
+        for path in [folder, *folder.rglob("*")]
+    }
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """A run of three good images among bad ones, in folders that may not be written to."""
+
+    photos: Path
+    out: Path
+    ended: Ended
+    changed: bool
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> Mixed:
+    base = tmp_path_factory.mktemp("mixed")
+    photos, out = base / "photos", base / "out"
+    write_photographs(photos, 3)
+    write_bad_images(photos)
+    before = state(photos)
+    folders = [photos, photos / "side"]
+    for folder in folders:
+        folder.chmod(0o555)  # does not stop root, but then the times of the folders tell
+    try:
+        ended = run_in_process_of_its_own(
+            "run", "--image-path", photos, "--output-path", out, "--json", *FAST
+        )
+    finally:
+        for folder in folders:
+            folder.chmod(0o755)
+    return Mixed(photos, out, ended, state(photos) != before)
+
+
+def test_bad_images_are_reported_and_the_others_registered(mixed: Mixed) -> None:
+    failures = mixed.ended.report["stages"][0]["failures"]
+    surely = {"start.jpg", "0 empty.jpg", "gone.png", "pipe.jpg", "bomb.png"}
+    surely |= {f"{kind}.jpg" for kind in FORMATS}
+    # Decoders differ in what they make of data that ends early.
+    assert surely <= set(failures) <= surely | {"half.jpg", "half.png", "noise.jpg"}
+    assert set(TRIO) <= set(mixed.ended.report["registered_names"])
+    assert mixed.ended.code == 1
+    assert len(mixed.ended.errors) == 1
+    assert all(name in mixed.ended.errors[0] for name in failures)
+
+
+def test_good_images_have_the_features_that_they_have_alone(mixed: Mixed, trio, run_images) -> None:
+    assert run_images(trio).code == 0
+    alone = database_content(trio.parent / "out" / "database.db")["keypoints"]
+    among = database_content(mixed.out / "database.db")["keypoints"]
+    assert {name: among[name] for name in alone} == alone
+
+
+def test_formats_that_colmap_cannot_read_are_reported(mixed: Mixed) -> None:
+    warnings = mixed.ended.report["stages"][0]["warnings"]
+    assert set(warnings) == {"*.webp", "*.gif"}
+    assert warnings["*.webp"].startswith("2 left out, such as side/y.WebP: ")
+    assert "convert to PNG or JPEG" in warnings["*.gif"]
+    assert any("*.gif: 1 left out, such as z.gif" in line for line in mixed.ended.stderr)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_format_is_told_by_content_and_not_by_suffix(mixed: Mixed, kind: str) -> None:
+    assert FORMATS[kind] in FOREIGN_FORMATS
+    why = mixed.ended.report["stages"][0]["failures"][f"{kind}.jpg"]
+    assert f"{kind}.jpg: is a {FORMATS[kind]} file, a format that COLMAP cannot read; conv" in why
+    # So it is in truth, or the rule would keep good images out.
+    assert pycolmap.Bitmap.read(mixed.photos / f"{kind}.jpg", as_rgb=False) is None
+
+
+def test_read_only_image_folder_is_left_as_it_is(mixed: Mixed) -> None:
+    assert not mixed.changed
+
+
+def test_folder_of_other_formats_only_names_them(tmp_path, run_images) -> None:
+    (tmp_path / "photos").mkdir()
+    PIL.Image.fromarray(fifth_photograph()).save(tmp_path / "photos" / "x.webp")
+    ended = run_images(tmp_path / "photos")
+    assert (ended.code, ended.stdout, len(ended.stderr)) == (1, "", 1)
+    assert "holds no images" in ended.stderr[0]
+    assert "*.webp: 1 left out, such as x.webp" in ended.stderr[0]
+
+
+@pytest.mark.parametrize("suffix", IMAGE_SUFFIXES)
+def test_formats_that_are_taken_are_read_alike_by_colmap(tmp_path, suffix) -> None:
+    mode = {".ppm": "RGB", ".pbm": "1"}.get(suffix, "L")
+    PIL.Image.fromarray(fifth_photograph()).convert(mode).save(tmp_path / f"x{suffix}")
+    theirs = pycolmap.Bitmap.read(tmp_path / f"x{suffix}", as_rgb=False).to_array()
+    ours = read_gray(tmp_path / f"x{suffix}")
+    np.testing.assert_allclose(ours.astype(int), theirs.squeeze(), atol=3)
+    assert suffix not in OTHER_IMAGE_SUFFIXES
+
+
+def test_pixels_of_all_kinds_register(trio, run_images, tmp_path) -> None:
+    gray = fifth_photograph()
+    image = PIL.Image.fromarray(gray)
+    image.convert("RGBA").save(trio / "rgba.png")
+    image.convert("LA").save(trio / "gray-alpha.png")
+    image.convert("CMYK").save(trio / "cmyk.jpg", quality=95)
+    image.convert("P").save(trio / "palette.png")
+    image.convert("RGB").quantize(64).save(trio / "palette.tif")
+    image.convert("1").save(trio / "bilevel.png")
+    write_image(trio / "deep.png", gray.astype(np.uint16) * 257)
+    write_image(trio / "deep.tif", gray.astype(np.uint16) * 257)
+    write_image(trio / "float.tif", gray.astype(np.float32) / 255)
+    image.save(trio / "progressive.jpg", progressive=True, quality=95)
+    added = sorted({path.name for path in trio.iterdir() if path.is_file()} - set(NAMES))
+    assert len(added) == 10
+    pairs = tmp_path / "pairs.txt"  # each with the trio only: copies of one image prove nothing
+    lines = [f"{one}\t{name}\n" for one in TRIO for name in TRIO if one < name]
+    lines += [f"{name}\t{one}\n" for one in TRIO[:2] for name in added]
+    pairs.write_text("".join(lines), encoding="utf-8")
+    ended = run_images(trio, *FAST, "--match-list-path", pairs)
+    assert ended.code == 0, ended.stderr
+    missing = set(ended.report["unregistered"])
+    assert missing <= {"bilevel.png"}, missing  # dithered: hardly the same texture
+    assert FeatureStore(tmp_path / "out" / "features.h5").num_keypoints()["bilevel.png"] > 100
+
+
+def test_exif_orientation_is_not_applied(tmp_path, run_images) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for orientation in range(9):
+        data = jpeg_with_orientation(fifth_photograph(), orientation)
+        (photos / f"{orientation}.jpg").write_bytes(data)
+    with PIL.Image.open(photos / "6.jpg") as image:
+        assert image.getexif()[0x0112] == 6, "the EXIF bytes of this test are not understood"
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("1.jpg 6.jpg\n")
+    ended = run_images(photos, *FAST, "--match-list-path", pairs)
+    assert not ended.report["stages"][0]["failures"]
+    database = tmp_path / "out" / "database.db"
+    keypoints = database_content(database)["keypoints"]
+    assert len(keypoints) == 9
+    assert set(keypoints.values()) == {keypoints["1.jpg"]}
+    with open_database(database) as opened:
+        sizes = {(camera.width, camera.height) for camera in opened.read_all_cameras()}
+    assert sizes == {IMAGE_SIZE}
+    assert set(FeatureStore(tmp_path / "out" / "features.h5").image_sizes().values()) == sizes
+
+
+def test_one_image_is_no_model(tmp_path, run_images) -> None:
+    write_photographs(tmp_path / "photos", 1)
+    ended = run_images(tmp_path / "photos")
+    assert ended.code == 3
+    assert ended.errors == [
+        f"error: one image cannot make a model; see {tmp_path / 'out' / 'report.json'}"
+    ]
+    assert ended.report["status"] == "no_model"
+
+
+def test_two_images_make_a_model(tmp_path, run_images) -> None:
+    write_photographs(tmp_path / "photos", 2)
+    ended = run_images(tmp_path / "photos")
+    assert ended.code == 0, ended.stderr
+    assert ended.report["registered_names"] == NAMES[:2]
+    assert ended.report["points3D"] > 100
+
+
+def test_tiny_images_are_no_obstacle(trio, run_images) -> None:
+    gray = fifth_photograph()
+    sizes = {"1x1": (1, 1), "1 high": (1, 320), "1 wide": (240, 1), "7": (7, 7), "31": (31, 31)}
+    for name, (height, width) in sizes.items():
+        write_image(trio / f"{name}.png", gray[100 : 100 + height, :width])
+    write_image(trio / "flat strip.png", np.full((2, 4000), 9, np.uint8))
+    ended = run_images(trio, "--recipe", "default", *CAMERA)
+    assert ended.code == 0, ended.stderr
+    assert ended.report["registered_names"] == TRIO
+    assert set(ended.report["unregistered"]) == {f"{name}.png" for name in [*sizes, "flat strip"]}
+    assert set(ended.report["unregistered"].values()) <= {"no features", "no verified pair"}
+
+
+PEAK_MEMORY = """
+import resource, sys
+from colmap_affrect.cli import main
+code = main(sys.argv[1:])
+print("peak", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+sys.exit(code)
+"""
+BYTES_PER_PIXEL = 10
+"""Of the largest image: the file, gray, and what COLMAP decodes; measured were 9."""
+
+
+@pytest.mark.slow
+def test_hundred_megapixels_fit_into_little_memory(trio, tmp_path) -> None:
+    def run_and_measure(out: str) -> tuple[str, float]:
+        arguments = ["run", "--image-path", trio, "--output-path", tmp_path / out, *FAST]
+        done = subprocess.run(
+            [sys.executable, "-c", PEAK_MEMORY, *map(str, arguments)],
+            capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        *summary, peak = done.stdout.splitlines()
+        return summary[0], int(peak.split()[1]) * 1024
+
+    _, usual = run_and_measure("small")
+    size = (12000, 8500)
+    large = cv2.resize(fifth_photograph(), size, interpolation=cv2.INTER_CUBIC)
+    write_image(trio / "large.png", large)
+    del large
+    registered, peak = run_and_measure("large")
+    assert registered == "registered  3 of 4 images" or registered == "registered  4 of 4 images"
+    assert peak - usual < BYTES_PER_PIXEL * size[0] * size[1]
+    keypoints = FeatureStore(tmp_path / "large" / "features.h5").read("large.png").keypoints
+    assert len(keypoints) > 500
+    assert keypoints.max(axis=0)[0] > 10_000  # in px of the stored image
+
+
+def test_same_names_in_folders_are_different_images(tmp_path, run_images) -> None:
+    photos = tmp_path / "photos"
+    for index, folder in enumerate(["left", "right", "left/deep"]):
+        shift = 0.55 * (index - 1.5)
+        (photos / folder).mkdir(parents=True, exist_ok=True)
+        write_image(photos / folder / "1.png", photograph((shift, -0.1 * index, 0.0), 0.0))
+    ended = run_images(photos)
+    assert ended.code == 0, ended.stderr
+    assert ended.report["registered_names"] == ["left/1.png", "left/deep/1.png", "right/1.png"]
+    keypoints = database_content(tmp_path / "out" / "database.db")["keypoints"]
+    assert len(set(keypoints.values())) == 3
+
+
+def test_same_photograph_twice_registers_both(trio, run_images) -> None:
+    (trio / "copy.png").write_bytes((trio / "a.png").read_bytes())
+    ended = run_images(trio)
+    assert ended.code == 0, ended.stderr
+    assert ended.report["registered_names"] == sorted([*TRIO, "copy.png"])
+
+
+def test_names_of_all_kinds_go_through(tmp_path, run_images, call) -> None:
+    accented = "ž é.png"
+    names = [
+        "# first.png",
+        " leading space.png",
+        unicodedata.normalize("NFC", accented),
+        unicodedata.normalize("NFD", accented),
+        "back\\slash/a,b 'c'  \"d\" %41 $HOME *.png.\u56fe\U0001f3db.png",
+    ]
+    assert len(set(names)) == 5
+    photos = tmp_path / "photos"
+    for index, name in enumerate(names):
+        (photos / name).parent.mkdir(parents=True, exist_ok=True)
+        shift = 0.3 * (index - 2)
+        write_image(tmp_path / "one.png", photograph((shift, -0.05 * index, 0.0), 0.0))
+        (tmp_path / "one.png").rename(photos / name)
+    ended = run_images(photos)
+    assert ended.code == 0, ended.stderr
+    assert ended.report["registered_names"] == sorted(names)
+    listed = tmp_path / "list.txt"
+    listed.write_text("# a comment\n" + "".join(f"{name}\n" for name in names), encoding="utf-8")
+    again = ["--output-path", tmp_path / "again"]
+    images = ["--image-path", photos, "--image-list-path", listed]
+    assert call("extract", *again, *images, *FAST).code == 0
+    assert FeatureStore(tmp_path / "again" / "features.h5").names() == sorted(names)
+    # The list of pairs that the run wrote is one that it reads.
+    ended = call("pairs", *again, "--match-list-path", tmp_path / "out" / "pairs.txt")
+    assert ended.stdout.startswith("pairs: 10 done")
+
+
+@pytest.mark.parametrize("character", ["\n", "\r", "\t", "\x0b", "\x85", "\u2028", "\x1c"])
+def test_name_that_lists_cannot_hold_is_refused(trio, run_images, character) -> None:
+    (trio / f"a{character}b.png").write_bytes((trio / "a.png").read_bytes())
+    ended = run_images(trio)
+    assert (ended.code, ended.stdout, len(ended.stderr)) == (1, "", 1)
+    assert repr(f"a{character}b.png") in ended.stderr[0]
+    assert "rename it" in ended.stderr[0]
+
+
+def test_file_that_became_a_folder_of_images(trio, call, tmp_path) -> None:
+    arguments = ["extract", "--image-path", trio, "--output-path", tmp_path / "out", *FAST]
+    (trio / "x.png").write_bytes((trio / "a.png").read_bytes())
+    assert call(*arguments).code == 0
+    (trio / "x.png").unlink()
+    (trio / "x.png").mkdir()
+    (trio / "x.png" / "keypoints.png").write_bytes((trio / "a.png").read_bytes())
+    assert call(*arguments).code == 0
+    with h5py.File(tmp_path / "out" / "features.h5", "r") as file:
+        inside = file["x.png/keypoints.png/keypoints"][()]
+        assert_array_equal(inside, file["a.png/keypoints"][()])
+
+
+def test_float_pixels_that_are_not_finite_are_black_or_white(tmp_path) -> None:
+    values = np.array([[np.nan, np.inf, -np.inf, 0.5]], np.float32)
+    assert read_gray(write_image(tmp_path / "x.tif", values)).tolist() == [[0, 255, 0, 127]]

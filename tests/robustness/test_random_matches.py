@@ -1,0 +1,68 @@
+"""Random correspondences must not become edges of the view graph.
+
+That COLMAP's defaults accept such pairs is shown in tests/colmap/test_preset.py.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database, write_keypoints, write_matches
+from colmap_affrect.colmap.verification import PairVerifier, verified_pairs, verify
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.options import VerificationOptions
+
+SIZE = (1600, 1200)
+COUNTS = (200, 1000, 5000)
+NUM_TRIALS = 50
+
+
+def random_pairs(path: Path, count: int, num_pairs: int, *, prior: bool) -> None:
+    """Write pairs of images with so many uniformly random correspondences each."""
+    rng = np.random.default_rng([count, prior])
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.2 * SIZE[0], *SIZE)
+    camera.has_prior_focal_length = prior
+    lafs = np.tile(MEASUREMENT_SIGMAS * np.eye(2, 3), (count, 1, 1))
+    with open_database(path) as database:
+        database.write_camera(camera, use_camera_id=True)
+        for image_id in range(1, 2 * num_pairs + 1):
+            image = pycolmap.Image(name=f"{image_id}.png", image_id=image_id, camera_id=1)
+            database.write_image(image, use_image_id=True)
+            lafs[:, :, 2] = rng.uniform(0, np.subtract(SIZE, 1), (count, 2))
+            write_keypoints(database, image_id, lafs)
+            if image_id % 2 == 0:
+                same = np.stack([np.arange(count)] * 2, axis=1)
+                write_matches(database, image_id - 1, image_id, same)
+
+
+def accepted(path: Path, seed: int) -> dict[tuple[int, int], int]:
+    verify(path, VerificationOptions(), seed)
+    return verified_pairs(path, 1)
+
+
+@pytest.mark.parametrize("prior", [False, True], ids=["no prior", "prior"])
+@pytest.mark.parametrize("count", COUNTS[:2])  # 5000 take seconds
+def test_random_matches_are_rejected(tmp_path: Path, count: int, prior: bool) -> None:
+    random_pairs(tmp_path / "database.db", count, 1, prior=prior)
+    assert accepted(tmp_path / "database.db", 0) == {}
+
+
+def test_random_matches_are_no_inliers_for_escalation(tmp_path: Path) -> None:
+    random_pairs(tmp_path / "database.db", 1000, 1, prior=False)
+    with open_database(tmp_path / "database.db") as database:
+        points = [database.read_keypoints(i)[:, :2] - np.float32(0.5) for i in (1, 2)]
+        indices = database.read_matches(1, 2)
+    verifier = PairVerifier(tmp_path / "database.db", VerificationOptions(), 0)
+    assert verifier.num_inliers(("1.png", "2.png"), tuple(points), indices) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("prior", [False, True], ids=["no prior", "prior"])
+@pytest.mark.parametrize("count", COUNTS)
+def test_random_matches_are_rejected_fifty_times(tmp_path: Path, count: int, prior: bool) -> None:
+    random_pairs(tmp_path / "database.db", count, NUM_TRIALS, prior=prior)
+    assert accepted(tmp_path / "database.db", 1) == {}
