@@ -39,6 +39,8 @@ from colmap_affrect.workspace import Workspace
 
 AnyOptions = TypeVar("AnyOptions", bound=Options)
 PathLike = Path | str
+GivenMatching = MatchingOptions | Mapping[str, Any] | None
+GivenVerification = VerificationOptions | pycolmap.TwoViewGeometryOptions | Mapping[str, Any] | None
 
 CUSTOM = "custom"
 """Name on record of options that are no recipe."""
@@ -101,12 +103,9 @@ def extract_features(
 
 def match_exhaustive(
     database_path: PathLike,
-    matching_options: MatchingOptions | Mapping[str, Any] | None = None,
+    matching_options: GivenMatching = None,
     pairing_options: pycolmap.ExhaustivePairingOptions | None = None,  # noqa: ARG001
-    verification_options: VerificationOptions
-    | pycolmap.TwoViewGeometryOptions
-    | Mapping[str, Any]
-    | None = None,
+    verification_options: GivenVerification = None,
     device: pycolmap.Device | str = "auto",
     *,
     random_seed: int = 0,
@@ -136,12 +135,9 @@ def match_exhaustive(
 
 def match_image_pairs(
     database_path: PathLike,
-    matching_options: MatchingOptions | Mapping[str, Any] | None = None,
+    matching_options: GivenMatching = None,
     pairing_options: pycolmap.ImportedPairingOptions | Mapping[str, Any] | None = None,
-    verification_options: VerificationOptions
-    | pycolmap.TwoViewGeometryOptions
-    | Mapping[str, Any]
-    | None = None,
+    verification_options: GivenVerification = None,
     device: pycolmap.Device | str = "auto",
     *,
     random_seed: int = 0,
@@ -175,10 +171,7 @@ def match_image_pairs(
 
 def verify(
     database_path: PathLike,
-    options: VerificationOptions
-    | pycolmap.TwoViewGeometryOptions
-    | Mapping[str, Any]
-    | None = None,
+    options: GivenVerification = None,
     *,
     random_seed: int = 0,
 ) -> None:
@@ -199,7 +192,7 @@ def verify(
 def _match(
     workspace: Workspace,
     pairs: Sequence[Pair],
-    matching_options: MatchingOptions | Mapping[str, Any] | None,
+    matching_options: GivenMatching,
     verification: VerificationOptions,
     random_seed: int,
     resources: Resources,

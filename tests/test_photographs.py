@@ -8,10 +8,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.ExifTags
+import PIL.Image
 import pytest
 from small_scene import IMAGE_SIZE, photograph
 from synthetic import texture, write_image
 
+import colmap_affrect
 from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import ImageError, OptionError
@@ -180,8 +183,37 @@ def test_image_with_a_wrong_mask_is_reported_and_the_others_go_on(
 
 def test_missing_folder_of_masks_is_one_clear_line(tmp_path: Path) -> None:
     masks = MaskOptions(path=str(tmp_path / "nowhere"))
-    with pytest.raises(OptionError, match="--mask-path .*nowhere: no such folder"):
+    with pytest.raises(OptionError, match=r"--mask-path .*nowhere: no such folder"):
         Photographs(tmp_path, CameraOptions(), masks).check()
     masks = MaskOptions(camera_path=str(tmp_path / "nothing.png"))
-    with pytest.raises(OptionError, match="--camera-mask-path .*nothing.png: no such file"):
+    with pytest.raises(OptionError, match=r"--camera-mask-path .*nothing\.png: no such file"):
         Photographs(tmp_path, CameraOptions(), masks).check()
+
+
+def test_gps_position_and_focal_length_of_exif_are_taken_over(tmp_path: Path) -> None:
+    exif = PIL.Image.Exif()
+    exif.get_ifd(PIL.ExifTags.IFD.Exif)[PIL.ExifTags.Base.FocalLengthIn35mmFilm] = 50
+    exif.get_ifd(PIL.ExifTags.IFD.GPSInfo).update(
+        {
+            PIL.ExifTags.GPS.GPSLatitudeRef: "S",
+            PIL.ExifTags.GPS.GPSLatitude: (33.0, 51.0, 36.0),
+            PIL.ExifTags.GPS.GPSLongitudeRef: "E",
+            PIL.ExifTags.GPS.GPSLongitude: (151.0, 12.0, 0.0),
+            PIL.ExifTags.GPS.GPSAltitudeRef: b"\0",
+            PIL.ExifTags.GPS.GPSAltitude: 40.0,
+        }
+    )
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    PIL.Image.fromarray(texture((240, 160), 1)).save(photos / "a.jpg", exif=exif)
+    path = tmp_path / "a.db"
+    colmap_affrect.extract_features(path, photos)
+    colmap_affrect.extract_features(tmp_path / "b.db", photos, from_database=path)
+    for copy in (path, tmp_path / "b.db"):
+        with pycolmap.Database.open(copy) as database:
+            (prior,) = database.read_all_pose_priors()
+            np.testing.assert_allclose(prior.position, [-33.86, 151.2, 40.0], atol=1e-6)
+            (camera,) = database.read_all_cameras()
+            assert camera.has_prior_focal_length
+            # 35 mm film has a diagonal of 43.27 mm.
+            assert camera.focal_length == pytest.approx(50 / 43.27 * np.hypot(240, 160), rel=1e-3)
