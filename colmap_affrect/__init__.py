@@ -22,6 +22,8 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 _PUBLIC = {
     "AffrectError": "colmap_affrect.errors",
     "CameraOptions": "colmap_affrect.options",
+    "CompareOptions": "colmap_affrect.comparison.compare",
+    "Comparison": "colmap_affrect.comparison.results",
     "ExtractionOptions": "colmap_affrect.options",
     "LocalFeatures": "colmap_affrect.types",
     "MappingOptions": "colmap_affrect.options",
@@ -30,6 +32,7 @@ _PUBLIC = {
     "RunOptions": "colmap_affrect.pipeline",
     "VerificationOptions": "colmap_affrect.options",
     "MaskOptions": "colmap_affrect.options",
+    "compare": "colmap_affrect.comparison.compare",
     "extract_features": "colmap_affrect.dropin",
     "extract_image": "colmap_affrect.extraction",
     "load_recipe": "colmap_affrect.recipes",
@@ -42,6 +45,8 @@ _PUBLIC = {
 __all__ = [
     "AffrectError",
     "CameraOptions",
+    "CompareOptions",
+    "Comparison",
     "ExtractionOptions",
     "LocalFeatures",
     "MappingOptions",
@@ -51,6 +56,7 @@ __all__ = [
     "RunOptions",
     "VerificationOptions",
     "__version__",
+    "compare",
     "extract_features",
     "extract_image",
     "load_recipe",

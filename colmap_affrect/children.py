@@ -38,7 +38,7 @@ def child(
         stderr=stderr,
         env={**os.environ, "PYTHONPATH": search_path},
         start_new_session=True,  # else Ctrl-C would reach it too
-        text=True,
+        encoding="utf-8",
         errors="replace",
     ) as process:
         try:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from colmap_affrect import __version__
+from colmap_affrect.comparison.methods import DEFAULT_METHODS
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.options import (
     MAPPERS,
@@ -33,6 +34,7 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.workspace import Workspace
 
 if TYPE_CHECKING:
+    from colmap_affrect.comparison.results import Comparison
     from colmap_affrect.extraction import Resources
     from colmap_affrect.pipeline import RunOptions
     from colmap_affrect.recipes import Recipe
@@ -58,6 +60,8 @@ examples:
   colmap-affrect run --image-path photos --output-path out --recipe on-demand
   colmap-affrect run --image-path photos --output-path out --recipe depth-planes-recommended \\
       --depth-path depth
+  colmap-affrect compare --image-path photos --output-path out
+  colmap-affrect compare --image-path photos --output-path out --methods sift,default --seeds 0
   colmap-affrect inspect photos/a.jpg --output-path out
   colmap-affrect weights fetch
   colmap-affrect doctor out
@@ -166,6 +170,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     run = _command(commands, "run", _run, "all stages: photographs in, COLMAP model out")
     _add_images(run)
+    _add_database_descriptors(run)
     _add_recipe(run)
     _add_resources(run)
     _add_depth(run)
@@ -177,6 +182,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     extract = _command(commands, "extract", _extract, "features into features.h5 and database.db")
     _add_images(extract)
+    _add_database_descriptors(extract)
     _add_recipe(extract)
     _add_resources(extract)
     _add_depth(extract)
@@ -204,6 +210,44 @@ def build_parser() -> argparse.ArgumentParser:
     _add_mapper(mapping)
     _add_seed(mapping)
     _add_json(mapping)
+
+    compare = _command(
+        commands,
+        "compare",
+        _compare,
+        "how many photographs, and which, COLMAP's SIFT and recipes register; with pictures",
+    )
+    _add_images(compare)
+    _add_option(
+        compare,
+        "--methods",
+        nargs="+",
+        default=DEFAULT_METHODS,
+        metavar="A,B,...",
+        help="sift, sift-affine-dsp, recipes by name or path; NAME=RECIPE:section.option=value "
+        f"changes options (default: {','.join(DEFAULT_METHODS)})",
+    )
+    _add_option(
+        compare,
+        "--seeds",
+        type=_numbers,
+        default=(0, 1, 2),
+        metavar="N,...",
+        help="seeds of verification and mapping, which run once for each (default: 0,1,2)",
+    )
+    _add_option(
+        compare,
+        "--ground-truth-path",
+        type=Path,
+        metavar="MODEL",
+        help="folder of a COLMAP model with true poses of the photographs, in any frame",
+    )
+    _add_resources(compare)
+    _add_depth(compare)
+    _add_pair_list(compare)
+    _add_preset(compare)
+    _add_mapper(compare)
+    compare.add_argument("--json", action="store_true", help="print comparison.json, no summary")
 
     inspect = _command(
         commands,
@@ -432,12 +476,6 @@ def _add_images(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="take images, cameras, rigs, frames and priors of this COLMAP database; it is copied",
     )
-    _add_option(
-        command,
-        "--database-descriptors",
-        action="store_true",
-        help="descriptors into database.db too, as 8-bit SIFT, for COLMAP's own matchers",
-    )
     _add_cameras(command)
     _add_option(
         command,
@@ -447,6 +485,22 @@ def _add_images(command: argparse.ArgumentParser) -> None:
         metavar="N",
         help="exit code 1 if more images than this cannot be read (default: 0)",
     )
+
+
+def _add_database_descriptors(command: argparse.ArgumentParser) -> None:
+    _add_option(
+        command,
+        "--database-descriptors",
+        action="store_true",
+        help="descriptors into database.db too, as 8-bit SIFT, for COLMAP's own matchers",
+    )
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(number) for number in text.split(","))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text}: not whole numbers with commas") from error
 
 
 def _add_cameras(command: argparse.ArgumentParser) -> None:
@@ -767,6 +821,47 @@ def _map(options: argparse.Namespace) -> int:
             progress=_progress(options),
         )
     return _print_reconstruction(report, options)
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from colmap_affrect.comparison.compare import CompareOptions, compare
+    from colmap_affrect.comparison.methods import parse_methods
+
+    comparison = compare(
+        options.image_path,
+        options.output_path,
+        CompareOptions(
+            methods=parse_methods(options.methods, _depth_settings(options)),
+            seeds=options.seeds,
+            cameras=_cameras(options),
+            masks=_masks(options),
+            verification=VerificationOptions.preset(options.preset),
+            mapping=_mapping(options),
+            match_list_path=options.match_list_path,
+            image_list_path=options.image_list_path,
+            from_database=options.from_database,
+            ground_truth_path=options.ground_truth_path,
+            resources=_resources(options),
+        ),
+        overwrite=options.overwrite,
+        progress=SILENT if options.quiet else Progress(sys.stderr, num_plain_lines=1),
+    )
+    print(comparison.to_json() if options.json else comparison.summary())
+    if not options.json:
+        print(f"\npictures: {options.output_path / 'report.html'}")
+    return _comparison_exit_code(comparison, options)
+
+
+def _comparison_exit_code(comparison: Comparison, options: argparse.Namespace) -> int:
+    failed = [method.name for method in comparison.methods if method.failed]
+    if failed:
+        where = options.output_path / "comparison.json"
+        return _fail(f"failed: {', '.join(failed)}; {where} says why")
+    if not any(seed.model_names for method in comparison.methods for seed in method.seeds):
+        print("error: no method found a model", file=sys.stderr)
+        return EXIT_NO_MODEL
+    failures = {name: why for m in comparison.methods for name, why in m.failures.items()}
+    return _exit_code(failures, options)
 
 
 def _import_h5(options: argparse.Namespace) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import shutil
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from math import ceil
 from pathlib import Path
+from typing import BinaryIO
 
 from colmap_affrect.errors import WorkspaceError
 
@@ -50,14 +52,22 @@ def require_space(path: Path, num_bytes: int) -> None:
     scratch = path.with_name(path.name + ".new")
     try:
         with scratch.open("wb") as file:
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, num_bytes)
-            elif shutil.disk_usage(path.parent).free < num_bytes:
-                raise OSError("no space left on device")
+            _allocate(file, num_bytes)
     except OSError as error:
         raise cannot_write(path, error) from error
     finally:
         scratch.unlink(missing_ok=True)
+
+
+def _allocate(file: BinaryIO, num_bytes: int) -> None:
+    """Give a file blocks of the disk; where that cannot be done see whether there are enough."""
+    try:
+        os.posix_fallocate(file.fileno(), 0, num_bytes)
+    except (AttributeError, OSError) as error:
+        if getattr(error, "errno", None) not in (None, errno.EINVAL, errno.EOPNOTSUPP):
+            raise
+        if shutil.disk_usage(Path(file.name).parent).free < num_bytes:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
 
 
 def cannot_write(path: Path, error: Exception) -> WorkspaceError:

@@ -17,9 +17,16 @@ NUM_PLAIN_LINES = 10
 class Progress:
     """Where progress goes; the library is silent unless it is given one of these."""
 
-    def __init__(self, stream: TextIO | None = None) -> None:
-        """Write to ``stream``; None means silence."""
-        self._stream = stream
+    def __init__(
+        self, stream: TextIO | None = None, num_plain_lines: int = NUM_PLAIN_LINES
+    ) -> None:
+        """Write to ``stream``; None means silence.
+
+        Args:
+            stream: where bars or lines go.
+            num_plain_lines: at most so many lines for a stage where there is no terminal.
+        """
+        self._stream, self._num_plain_lines = stream, num_plain_lines
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
@@ -30,7 +37,9 @@ class Progress:
             with tqdm(total=total, desc=name, unit=unit, file=self._stream) as bar:
                 yield lambda count: _update(bar, count)
         else:
-            yield _PlainLines(self._stream, name, total, unit)
+            lines = _PlainLines(self._stream, name, total, unit, self._num_plain_lines)
+            yield lines
+            lines.finish()
 
 
 SILENT = Progress()
@@ -45,15 +54,24 @@ def _ignore(count: int) -> None:
 
 
 class _PlainLines:
-    """At most ``NUM_PLAIN_LINES`` lines over the whole stage."""
+    """A few lines, evenly over the whole stage."""
 
-    def __init__(self, stream: TextIO, name: str, total: int, unit: str) -> None:
+    def __init__(self, stream: TextIO, name: str, total: int, unit: str, num_lines: int) -> None:
         self._stream, self._name, self._total, self._unit = stream, name, total, unit
+        self._num_lines = num_lines
         self._done = self._printed = 0
 
     def __call__(self, count: int) -> None:
         self._done += count
-        tenth = self._done * NUM_PLAIN_LINES // self._total
-        if tenth > self._printed:
-            self._printed = tenth
-            print(f"{self._name}: {self._done}/{self._total} {self._unit}", file=self._stream)
+        part = self._done * self._num_lines // self._total
+        if part > self._printed:
+            self._printed = part
+            self._print()
+
+    def finish(self) -> None:
+        """Say how far it came if nothing was said before."""
+        if not self._printed:
+            self._print()
+
+    def _print(self) -> None:
+        print(f"{self._name}: {self._done}/{self._total} {self._unit}", file=self._stream)

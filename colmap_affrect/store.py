@@ -260,6 +260,11 @@ class FeatureStore(_Store):
         with self._open("r") as file:
             return np.asarray(file[name]["lafs"][()])
 
+    def read_rectification_ids(self, name: str) -> NDArray[np.int32]:
+        """Read the (N,) warps that the features of one image come from."""
+        with self._open("r") as file:
+            return np.asarray(self._group(file, name)["rectification_ids"][()])
+
 
 def pair_key(name1: str, name2: str) -> str:
     """Return hloc's group name of a pair: '/' becomes '-', the two joined by '/'."""

@@ -169,7 +169,7 @@ class Workspace:
             self._discard(record, stage)
         known = record.get(stage)
         if known is not None:
-            difference = _first_difference(known, options)
+            difference = first_difference(known, options)
             if difference:
                 raise StaleStoreError(
                     f"{self.path}: the {stage} stage was run there with {difference}; "
@@ -246,7 +246,8 @@ class Workspace:
                 path.unlink(missing_ok=True)
 
 
-def _first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+def first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Say where options on record differ from those given now; empty if they do not."""
     old, new = flat(known), flat(now)
     # The name of a rectifier or profile first: with another name most other options differ too.
     for key in sorted(old.keys() | new.keys(), key=lambda key: (not key.endswith(CHOICES), key)):

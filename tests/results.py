@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
+from command import start
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
@@ -71,3 +76,48 @@ def model_names(workspace: Workspace) -> list[list[str]]:
         sorted(model.images[image_id].name for image_id in model.reg_image_ids())
         for model in models
     ]
+
+
+@dataclass(frozen=True)
+class Undisturbed:
+    """A run that nothing disturbed.
+
+    Attributes:
+        out: its output folder.
+        results: what it left.
+        worked_s: seconds from the first line in its log to its end.
+    """
+
+    out: Path
+    results: dict[str, Any]
+    worked_s: float
+
+
+def run_arguments(photos: Path, out: Path, options: Sequence[object]) -> list[str]:
+    """Arguments of a run that prints its summary only."""
+    paths = ["run", "--image-path", photos, "--output-path", out, "-q"]
+    return [str(argument) for argument in (*paths, *options)]
+
+
+def run_undisturbed(photos: Path, out: Path, options: Sequence[object]) -> Undisturbed:
+    """Run in a process of its own, and measure the time that can be disturbed."""
+    with start(*run_arguments(photos, out, options)) as process:
+        wait_until_at_work(process, out)
+        begun = time.monotonic()
+        process.communicate(timeout=300)
+        worked_s = time.monotonic() - begun
+    assert process.returncode == 0
+    return Undisturbed(out, results(out), worked_s)
+
+
+def log_size(out: Path) -> int:
+    """Bytes that are in the log of an output folder."""
+    log = Workspace(out).log
+    return log.stat().st_size if log.exists() else 0
+
+
+def wait_until_at_work(process: subprocess.Popen[str], out: Path) -> None:
+    """Wait until a run has written into the log."""
+    before = log_size(out)
+    while log_size(out) == before and process.poll() is None:
+        time.sleep(0.005)

@@ -37,14 +37,23 @@ ROWS = [
         "colmap.running", "colmap.verification",
     },
     {"doctor", "dropin", "pipeline", "escalation", "interchange", "photographs", "stages"},
-    {"report.inspection", "report.levels", "report.sheet", "report.tilt_plot"},
+    {
+        "comparison.methods", "comparison.metrics", "comparison.request", "comparison.results",
+        "comparison.sift", "comparison.tables", "comparison.verdict", "comparison.worker",
+    },
+    {
+        "report.inspection", "report.levels", "report.match_plots", "report.page",
+        "report.pictures", "report.scene", "report.sheet", "report.tilt_plot",
+        "report.view_graph", "report.warp_views",
+    },
+    {"comparison.compare"},
     {"cli", "__main__"},
 ]  # fmt: skip
 """A module imports from its own row and from those above it in this list."""
 
 ROW_OF = {module: number for number, row in enumerate(ROWS) for module in row}
 
-FREE = {"geometry", "features", "rectifiers", "matching", "report", ""}
+FREE = {"geometry", "features", "rectifiers", "matching", "comparison", "report", ""}
 """Packages whose __init__ holds no code, and the top one, which loads its names when used."""
 
 WITHIN_ROW_5 = {("extraction", "rectified")}
@@ -75,15 +84,17 @@ HOMES = {
     },
     "transformers": {"depth"},
     "matplotlib": {"report.sheet", "report.tilt_plot"},
+    "jinja2": {"report.page"},
+    "networkx": {"report.view_graph"},
     "scipy": set(),
     "sqlite3": {"colmap.checks", "colmap.copies"},
 }
 
 PUBLIC = [
-    "AffrectError", "CameraOptions", "ExtractionOptions", "LocalFeatures", "MappingOptions",
-    "MaskOptions", "MatchingOptions", "ReconstructionReport", "RunOptions", "VerificationOptions",
-    "__version__", "extract_features", "extract_image", "load_recipe", "match_exhaustive",
-    "match_image_pairs", "run", "verify",
+    "AffrectError", "CameraOptions", "CompareOptions", "Comparison", "ExtractionOptions",
+    "LocalFeatures", "MappingOptions", "MaskOptions", "MatchingOptions", "ReconstructionReport",
+    "RunOptions", "VerificationOptions", "__version__", "compare", "extract_features",
+    "extract_image", "load_recipe", "match_exhaustive", "match_image_pairs", "run", "verify",
 ]  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from colmap_affrect.workspace import Workspace
 
 COMMANDS = [
     "run", "extract", "pairs", "match", "verify", "escalate", "map",
-    "inspect", "recipes", "weights", "doctor",
+    "compare", "inspect", "recipes", "weights", "doctor",
 ]  # fmt: skip
 TIMEOUT_S = 60
 

@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import write_image
 
+from colmap_affrect.comparison.metrics import read_poses
 from colmap_affrect.conventions import pixel_from_colmap
 from colmap_affrect.depth import (
     NETWORK_IMAGE_SIZE_PX,
@@ -35,9 +36,6 @@ from colmap_affrect.errors import DepthError, ImageError
 from colmap_affrect.imaging import read_gray
 from colmap_affrect.options import DepthOptions
 from colmap_affrect.types import Photograph
-
-sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
-from registration_metrics import read_true_poses
 
 COURTYARD = Path(__file__).parents[1] / "sample_scenes" / "courtyard"
 PNG_METRES = 0.002
@@ -419,7 +417,7 @@ def world_points(depth, camera_matrix, pose):
 def test_paving_of_the_courtyard_is_the_plane_z_0_of_the_world(number):
     name = f"court_{number}.jpg"
     image = courtyard_photograph(name)
-    pose = read_true_poses(COURTYARD)[name]
+    pose = read_poses(COURTYARD / "ground_truth")[name]
     options = {"path": COURTYARD / "depth", "png_scale": PNG_METRES}
     depth = source(**options).depth(image)
     assert depth.shape == (540, 720)

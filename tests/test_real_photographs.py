@@ -10,10 +10,16 @@ import cv2
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
-from methods import parse_method
-from registration import SUBSETS, camera_options, compute_matches, link_images, run_seed
-from registration_metrics import read_true_poses
+from registration import (
+    SUBSETS,
+    camera_options,
+    compute_matches,
+    link_images,
+    read_true_poses,
+    run_seed,
+)
 
+from colmap_affrect.comparison.methods import parse_method
 from colmap_affrect.extraction import Resources
 
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"

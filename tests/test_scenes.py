@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import functools
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from colmap_affrect.colmap import pycolmap
+from colmap_affrect.comparison.metrics import pose_scores, read_poses
 from colmap_affrect.extraction import prepare
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.matching.nearest import match_features, matchable
 from colmap_affrect.options import CameraOptions
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.recipes import load_recipe
-
-sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
-from registration_metrics import pose_metrics, read_true_poses
 
 SCENES = Path(__file__).parents[1] / "sample_scenes"
 COURTYARD_CAMERA = CameraOptions(mode="single", model="PINHOLE", params="1080,1080,360,270")
@@ -30,22 +26,17 @@ def courtyard(tmp_path_factory):
     """The default recipe on the courtyard with its intrinsics: report and poses by name."""
     output = tmp_path_factory.mktemp("courtyard")
     report = run(SCENES / "courtyard" / "images", output, RunOptions(cameras=COURTYARD_CAMERA))
-    model = pycolmap.Reconstruction(output / "sparse" / "0")
-    poses = {}
-    for image in model.images.values():
-        matrix = image.cam_from_world().matrix()
-        poses[image.name] = (matrix[:, :3], matrix[:, 3])
-    return report, poses
+    return report, read_poses(output / "sparse" / "0")
 
 
 def test_courtyard_registers_every_photograph_where_it_stands(courtyard):
     _, poses = courtyard
-    truth = read_true_poses(SCENES / "courtyard")
-    num_correct, rotation_error_deg = pose_metrics(poses, truth)
+    truth = read_poses(SCENES / "courtyard" / "ground_truth")
+    scores = pose_scores(poses, truth, list(truth))
     assert len(truth) == 9
-    assert num_correct == 9
+    assert len(scores.correct_names) == 9
     # Exactly 0 would mean that the ground truth leaked into the run.
-    assert 1e-4 < rotation_error_deg < 0.3
+    assert 1e-4 < scores.median_rotation_error_deg < 0.3
 
 
 def test_courtyard_report_is_within_bands(courtyard):

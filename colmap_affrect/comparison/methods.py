@@ -6,7 +6,7 @@ import difflib
 import re
 import zlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import PurePath
 
 from colmap_affrect.errors import OptionError
@@ -64,6 +64,15 @@ def parse_methods(texts: Iterable[str], depth_settings: Sequence[str] = ()) -> t
         methods += [parse_method(name, depth_settings) for name in names if name]
         if last:
             methods.append(parse_method(last + colon + settings, depth_settings))
+    return unique_methods(methods)
+
+
+def unique_methods(methods: Sequence[Method]) -> tuple[Method, ...]:
+    """Refuse no methods, and two with one name.
+
+    Raises:
+        OptionError: naming them.
+    """
     if not methods:
         raise OptionError(f"--methods: none given; known are {_known()}")
     labels = [method.label for method in methods]
@@ -92,6 +101,8 @@ def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
         return Method(text, None)
     head, _, settings = text.partition(":")
     label, _, name = head.rpartition("=")
+    if label in SIFT_SUMMARIES:
+        raise OptionError(f"--methods {text}: '{label}' is COLMAP's; choose another name")
     if not name.endswith(".toml") and name not in recipe_names():
         close = difflib.get_close_matches(name, [*SIFT_SUMMARIES, *recipe_names()], n=1)
         hint = f"did you mean '{close[0]}'? " if close else ""
@@ -101,7 +112,7 @@ def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
     if any(rectifier.uses_depth for rectifier in recipe.extraction.rectifiers):
         recipe = load_recipe(name, [*changes, *depth_settings])
     default_label = text.replace(name, PurePath(name).stem) if name.endswith(".toml") else text
-    return Method(label or default_label, replace(recipe, name=name))
+    return Method(label or default_label, recipe)
 
 
 def _known() -> str:

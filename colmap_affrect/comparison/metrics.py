@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,7 +138,8 @@ def position_errors(estimated: Poses, truth: Poses) -> dict[str, float]:
     Centres that are far off do not pull at the alignment.
 
     Returns:
-        Distances by name in units of the ground truth; empty with fewer than three images.
+        Distances by name in units of the ground truth; empty with fewer than three images, or
+        when the centres are on one line, which leaves the similarity open.
     """
     names = sorted(estimated.keys() & truth.keys())
     if len(names) < MIN_IMAGES_TO_ALIGN:
@@ -147,7 +149,7 @@ def position_errors(estimated: Poses, truth: Poses) -> dict[str, float]:
         for poses in (estimated, truth)
     )
     extent = float(np.linalg.norm(np.ptp(true_centres, axis=0)))
-    robust = pycolmap.estimate_sim3d_robust(
+    robust: Any = pycolmap.estimate_sim3d_robust(  # its stub says Sim3d, it is a dictionary
         centres,
         true_centres,
         pycolmap.RANSACOptions(max_error=MAX_ALIGNMENT_ERROR * extent, random_seed=0),

@@ -6,9 +6,15 @@ single seeds, in one place each, so that terminal, page, JSON and CSV cannot dis
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from statistics import fmean, median
 from typing import Any, Self
+
+from colmap_affrect.comparison import tables
+from colmap_affrect.comparison.verdict import verdict
+from colmap_affrect.errors import StoreError
 
 Pair = tuple[str, str]
 """Names of two images, sorted."""
@@ -51,7 +57,7 @@ class PoseScores:
         auc: area under the curve of pairs whose larger error is below a threshold, up to
             1, 3, 5 and 10 degrees, by threshold; 0 to 1.
         median_position_error: of camera centres after similarity alignment, in units of the
-            ground truth; None with fewer than three images.
+            ground truth; None with fewer than three images, or all on one line.
     """
 
     correct_names: tuple[str, ...]
@@ -59,6 +65,42 @@ class PoseScores:
     num_pairs: int
     auc: Mapping[float, float]
     median_position_error: float | None
+
+    @property
+    def median_rotation_error_deg(self) -> float | None:
+        """Of the pairs of registered images; None without pairs."""
+        errors = [rotation for rotation, _ in self.pair_errors_deg.values()]
+        return median(errors) if errors else None
+
+    @property
+    def median_direction_error_deg(self) -> float | None:
+        """Of the translations of the pairs of registered images; None without pairs."""
+        errors = [direction for _, direction in self.pair_errors_deg.values()]
+        return median(errors) if errors else None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            "correct_names": list(self.correct_names),
+            "num_pairs": self.num_pairs,
+            "auc": {f"{limit:g}": value for limit, value in self.auc.items()},
+            "median_rotation_error_deg": self.median_rotation_error_deg,
+            "median_direction_error_deg": self.median_direction_error_deg,
+            "median_position_error": self.median_position_error,
+            "pair_errors_deg": [[*pair, *errors] for pair, errors in self.pair_errors_deg.items()],
+        }
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build from :meth:`to_mapping`."""
+        return cls(
+            tuple(values["correct_names"]),
+            {(a, b): (rotation, direction) for a, b, rotation, direction
+             in values["pair_errors_deg"]},
+            values["num_pairs"],
+            {float(limit): value for limit, value in values["auc"].items()},
+            values["median_position_error"],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -76,6 +118,7 @@ class SeedResult:
         pair_inliers: verified pairs and their numbers of inliers.
         scores: against ground truth; None where there is none.
         wall_s: seconds of ``verify`` and ``map``.
+        num_observations: observed points of each image of the largest model.
     """
 
     seed: int
@@ -88,11 +131,65 @@ class SeedResult:
     pair_inliers: Mapping[Pair, int]
     scores: PoseScores | None
     wall_s: Mapping[str, float]
+    num_observations: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def registered_names(self) -> tuple[str, ...]:
         """Images of the largest model."""
         return self.model_names[0] if self.model_names else ()
+
+    @property
+    def correct_names(self) -> tuple[str, ...]:
+        """Images registered correctly; without ground truth those registered."""
+        return self.registered_names if self.scores is None else self.scores.correct_names
+
+    @property
+    def num_inliers(self) -> int:
+        """Inliers of all verified pairs."""
+        return sum(self.pair_inliers.values())
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            "seed": self.seed,
+            **{key: measure(self) for key, measure in MEASURES.items()},
+            "models": [list(names) for names in self.model_names],
+            "model_path": self.model_path,
+            "num_observations": dict(self.num_observations),
+            "pair_inliers": _pair_rows(self.pair_inliers),
+            "scores": self.scores.to_mapping() if self.scores else None,
+            "wall_s": dict(self.wall_s),
+        }
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build from :meth:`to_mapping`."""
+        return cls(
+            seed=values["seed"],
+            model_names=tuple(tuple(names) for names in values["models"]),
+            model_path=values["model_path"],
+            num_points3D=values["points3D"],
+            mean_track_length=values["mean_track_length"],
+            mean_observations=values["mean_observations"],
+            mean_reprojection_error_px=values["mean_reprojection_error_px"],
+            pair_inliers=_pair_mapping(values["pair_inliers"]),
+            scores=PoseScores.from_mapping(values["scores"]) if values["scores"] else None,
+            wall_s=values["wall_s"],
+            num_observations=values["num_observations"],
+        )
+
+
+MEASURES: dict[str, Callable[[SeedResult], float]] = {
+    "registered": lambda seed: len(seed.registered_names),
+    "num_models": lambda seed: len(seed.model_names),
+    "verified_pairs": lambda seed: len(seed.pair_inliers),
+    "inliers": lambda seed: seed.num_inliers,
+    "points3D": lambda seed: seed.num_points3D,
+    "mean_track_length": lambda seed: seed.mean_track_length,
+    "mean_observations": lambda seed: seed.mean_observations,
+    "mean_reprojection_error_px": lambda seed: seed.mean_reprojection_error_px,
+}
+"""Numbers of every seed, by their names in JSON and CSV."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +208,9 @@ class MethodResult:
         options: all options of the method.
         folder: its results, relative to the folder of the comparison.
         failed: why it failed as a whole; empty if it did not.
+        unstable_names: images whose poses contradict each other from seed to seed.
+        disagreements: by the name of another method, the images that both register with the
+            first seed in poses that contradict each other.
     """
 
     name: str
@@ -124,6 +224,8 @@ class MethodResult:
     options: Mapping[str, Any] = field(default_factory=dict)
     folder: str = ""
     failed: str = ""
+    unstable_names: tuple[str, ...] = ()
+    disagreements: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def registered(self) -> Span:
@@ -139,12 +241,97 @@ class MethodResult:
     @property
     def usually_registered(self) -> frozenset[str]:
         """Images that more than half of the seeds register."""
-        names = {name for seed in self.seeds for name in seed.registered_names}
-        return frozenset(
-            name
-            for name in names
-            if 2 * sum(name in seed.registered_names for seed in self.seeds) > len(self.seeds)
+        return _usual([seed.registered_names for seed in self.seeds])
+
+    @property
+    def usually_correct(self) -> frozenset[str]:
+        """Images that more than half of the seeds register correctly.
+
+        Without ground truth, register.
+        """
+        return _usual([seed.correct_names for seed in self.seeds])
+
+    @property
+    def stage_seconds(self) -> dict[str, float]:
+        """Seconds of every stage; of those that run once per seed, the mean."""
+        stages = dict.fromkeys(stage for seed in self.seeds for stage in seed.wall_s)
+        means = {stage: fmean(seed.wall_s[stage] for seed in self.seeds) for stage in stages}
+        return {**self.wall_s, **means}
+
+    @property
+    def total_s(self) -> float:
+        """Seconds from photographs to one model."""
+        return sum(self.stage_seconds.values())
+
+    def span(self, measure: str) -> Span:
+        """Return one of ``MEASURES`` over the seeds."""
+        return Span.of(MEASURES[measure](seed) for seed in self.seeds)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for JSON; without seeds where the method failed."""
+        shared = {
+            "summary": self.summary,
+            "failures": dict(self.failures),
+            "options": dict(self.options),
+            "folder": self.folder,
+        }
+        if self.failed:
+            return {"failed": self.failed, **shared}
+        return {
+            **{key: asdict(self.span(key)) for key in MEASURES},
+            "correct": asdict(self.correct) if self.correct else None,
+            "registered_names": {str(s.seed): list(s.registered_names) for s in self.seeds},
+            "wall_s": self.stage_seconds,
+            "total_s": self.total_s,
+            "peak_memory_bytes": self.peak_memory_bytes,
+            "unstable_names": list(self.unstable_names),
+            "disagreements": {name: list(these) for name, these in self.disagreements.items()},
+            "num_keypoints": dict(self.num_keypoints),
+            "raw_matches": _pair_rows(self.raw_matches),
+            **shared,
+            "seeds": [seed.to_mapping() for seed in self.seeds],
+        }
+
+    @classmethod
+    def from_mapping(cls, name: str, values: Mapping[str, Any]) -> Self:
+        """Build from :meth:`to_mapping`."""
+        seeds = tuple(SeedResult.from_mapping(seed) for seed in values.get("seeds", ()))
+        of_seeds = {stage for seed in seeds for stage in seed.wall_s}
+        wall_s = values.get("wall_s", {})
+        return cls(
+            name=name,
+            summary=values["summary"],
+            num_keypoints=values.get("num_keypoints", {}),
+            raw_matches=_pair_mapping(values.get("raw_matches", ())),
+            seeds=seeds,
+            wall_s={stage: wall_s[stage] for stage in wall_s if stage not in of_seeds},
+            peak_memory_bytes=values.get("peak_memory_bytes", 0),
+            failures=values["failures"],
+            options=values["options"],
+            folder=values["folder"],
+            failed=values.get("failed", ""),
+            unstable_names=tuple(values.get("unstable_names", ())),
+            disagreements={
+                other: tuple(names) for other, names in values.get("disagreements", {}).items()
+            },
         )
+
+
+def _usual(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
+    """Return the names that more than half of the seeds have."""
+    counts: dict[str, int] = {}
+    for names in names_of_seeds:
+        for name in names:
+            counts[name] = counts.get(name, 0) + 1
+    return frozenset(name for name, count in counts.items() if 2 * count > len(names_of_seeds))
+
+
+def _pair_rows(values: Mapping[Pair, int]) -> list[list[Any]]:
+    return [[*pair, value] for pair, value in sorted(values.items())]
+
+
+def _pair_mapping(rows: Iterable[Sequence[Any]]) -> dict[Pair, int]:
+    return {(first, second): value for first, second, value in rows}
 
 
 @dataclass(frozen=True)
@@ -188,3 +375,65 @@ class Comparison:
         """Images that no method usually registers."""
         registered = frozenset[str]().union(*(m.usually_registered for m in self.finished))
         return tuple(name for name in self.image_names if name not in registered)
+
+    @property
+    def has_ground_truth(self) -> bool:
+        """Whether models were measured against ground truth."""
+        return any(seed.scores for method in self.finished for seed in method.seeds)
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """What was gained or lost, at what cost, and what is doubtful: paragraphs of text."""
+        return verdict(self)
+
+    def summary(self) -> str:
+        """Return a table and the verdict for the terminal."""
+        return tables.summary(self)
+
+    def to_csv(self) -> str:
+        """Return ``comparison.csv``: a row for each method and seed."""
+        return tables.csv_text(self)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the content of ``comparison.json``."""
+        return {
+            "verdict": list(self.verdict),
+            "images_total": len(self.image_names),
+            "only_registered_by": self.only_registered_by,
+            "registered_by_none": list(self.registered_by_none),
+            "methods": {method.name: method.to_mapping() for method in self.methods},
+            "seeds": list(self.seeds),
+            "image_path": self.image_path,
+            "image_names": list(self.image_names),
+            "num_pairs": self.num_pairs,
+            "settings": dict(self.settings),
+            "versions": dict(self.versions),
+        }
+
+    def to_json(self) -> str:
+        """Return ``comparison.json`` as text."""
+        return json.dumps(self.to_mapping(), indent=2, ensure_ascii=False) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Read ``comparison.json``.
+
+        Raises:
+            StoreError: when it is damaged or something else.
+        """
+        try:
+            values = json.loads(text)
+            return cls(
+                image_names=tuple(values["image_names"]),
+                image_path=values["image_path"],
+                methods=tuple(
+                    MethodResult.from_mapping(name, method)
+                    for name, method in values["methods"].items()
+                ),
+                seeds=tuple(values["seeds"]),
+                num_pairs=values["num_pairs"],
+                settings=values["settings"],
+                versions=values["versions"],
+            )
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise StoreError(f"not the result of a comparison ({error!r})") from error

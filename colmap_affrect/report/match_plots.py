@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from math import log
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,9 @@ from colmap_affrect.workspace import Workspace
 
 MAX_NUM_PAIRS = 6
 MAX_PAIRS_OF_IMAGE = 2
-MAX_NUM_LINES = 400
+MAX_NUM_LINES = 150
+FEW_INLIERS = 20
+
 PLOT_HEIGHT, GAP = 300.0, 8.0
 """Of two photographs side by side, in units of the plot."""
 
@@ -43,6 +46,15 @@ def inliers_of(method: MethodResult, pair: Pair) -> int:
     return method.seeds[0].pair_inliers.get(pair, 0) if method.seeds else 0
 
 
+def contrast(counts: Sequence[int]) -> float:
+    """Tell how much numbers of inliers differ: by a ratio, in which few count as hardly any.
+
+    >>> contrast([0, 200]) > contrast([1000, 2000]) > contrast([0, 10]) > contrast([7, 7])
+    True
+    """
+    return log((max(counts) + FEW_INLIERS) / (min(counts) + FEW_INLIERS))
+
+
 def choose_pairs(comparison: Comparison, rectifying: Collection[str]) -> list[ChosenPair]:
     """Return the pairs with the largest differences, each image in at most two of them.
 
@@ -65,8 +77,8 @@ def choose_pairs(comparison: Comparison, rectifying: Collection[str]) -> list[Ch
             return ChosenPair(pair, max(plain, key=key), max(warped, key=key))
         return ChosenPair(pair, min(everyone, key=key), max(everyone, key=key))
 
-    def difference(item: ChosenPair) -> int:
-        return abs(inliers_of(item.after, item.names) - inliers_of(item.before, item.names))
+    def difference(item: ChosenPair) -> float:
+        return contrast([inliers_of(item.before, item.names), inliers_of(item.after, item.names)])
 
     pairs = sorted({pair for m in everyone for seed in m.seeds[:1] for pair in seed.pair_inliers})
     ranked = sorted(map(chosen, pairs), key=lambda item: -difference(item))
@@ -173,8 +185,11 @@ InlierEnds = tuple[Pair, NDArray[np.float64], NDArray[np.bool_]]
 def _read_inliers(
     method: MethodResult, pairs: Sequence[Pair], output_path: Path
 ) -> list[InlierEnds]:
-    """Return of pairs the (M, 2, 2) ends of inliers, as shares of the images' sides, and (M,)
-    whether a feature is from a warp.
+    """Read the inliers of pairs.
+
+    Returns:
+        For each pair the (M, 2, 2) ends of its inliers, (x, y) in both images as shares of their
+        sides, and (M,) whether one of the two features is from a warp.
     """
     if not pairs:
         return []

@@ -29,8 +29,9 @@ MAX_NUM_THUMBNAILS = 60
 MAX_NODE, MIN_NODE, DOT = 84.0, 24.0, 9.0
 """Sides of nodes in units of the graph."""
 
-GRAVITY = 0.05
-"""Weight that holds parts of the graph together that have no edge between them."""
+MIDDLE, GRAVITY = "", 0.05
+"""A node and the weight of its edges to all others: they hold parts of the graph
+together that have no edge between them."""
 
 MAX_NUM_EDGES = 4000
 
@@ -48,9 +49,9 @@ def class_labels() -> list[str]:
     """Return the range of each class.
 
     >>> class_labels()[0], class_labels()[-1]
-    ('1–29', '480 or more')
+    ('1-29', '480 or more')
     """
-    ends = [f"–{start - 1}" for start in CLASS_STARTS[1:]]
+    ends = [f"-{start - 1}" for start in CLASS_STARTS[1:]]
     return [f"{start}{end}" for start, end in zip(CLASS_STARTS, [*ends, " or more"], strict=True)]
 
 
@@ -79,7 +80,7 @@ def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layou
         for pair, inliers in pairs.items():
             known = graph.get_edge_data(*pair, default={"weight": 0.0})["weight"]
             graph.add_edge(*pair, weight=max(known, log(1 + inliers)))
-    graph.add_weighted_edges_from((name, None, GRAVITY) for name in names)
+    graph.add_weighted_edges_from((name, MIDDLE, GRAVITY) for name in names)
     places = networkx.spring_layout(graph, seed=0, iterations=200 if count < 100 else 60)
     centers = np.array([places[name] for name in names])
     room = np.array(GRAPH_SIZE) - size

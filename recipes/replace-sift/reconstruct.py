@@ -9,8 +9,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import colmap_affrect  # before pycolmap, or after it: both work
 import pycolmap
+
+import colmap_affrect  # before pycolmap, or after it: both work
 
 
 def main() -> None:

@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean, median
 
-from methods import Method, parse_method
 from speed import describe_machine
 
+from colmap_affrect.comparison.methods import Method, parse_method
 from colmap_affrect.extraction import ImageExtractor, Resources, prepare
 from colmap_affrect.interfaces import FeatureProfile
 from colmap_affrect.options import ExtractionOptions, IdentityOptions

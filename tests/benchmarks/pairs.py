@@ -36,12 +36,12 @@ from homographies import (
     homography_error,
     transfer_errors,
 )
-from methods import Method, parse_method
 from numpy.typing import NDArray
 from pair_data import SETS, HomographyPair, load_pairs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import two_view_options
+from colmap_affrect.comparison.methods import Method, parse_method
 from colmap_affrect.conventions import DEFAULT_FOCAL_RATIO, colmap_from_pixel
 from colmap_affrect.escalation import open_pairs
 from colmap_affrect.extraction import ImageExtractor, Resources, prepare

@@ -27,18 +27,26 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from methods import Method, parse_method
-from registration_metrics import Poses, pose_metrics, read_true_poses
 from registration_report import Row, detail_table, merge, summary_table
 
 from colmap_affrect import stages
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database import import_images, open_database
 from colmap_affrect.colmap.mapping import map_database
 from colmap_affrect.colmap.verification import verify
+from colmap_affrect.comparison.methods import SIFT, Method, parse_method
+from colmap_affrect.comparison.metrics import Poses, model_poses, pose_scores, read_poses
+from colmap_affrect.comparison.sift import extract_sift, match_sift
 from colmap_affrect.escalation import escalate
 from colmap_affrect.extraction import Resources
-from colmap_affrect.options import CameraOptions, MappingOptions, VerificationOptions
+from colmap_affrect.matching.pairs import exhaustive_pairs
+from colmap_affrect.options import (
+    CameraOptions,
+    MappingOptions,
+    MaskOptions,
+    VerificationOptions,
+)
+from colmap_affrect.photographs import list_images
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.workspace import Workspace
 
@@ -96,28 +104,16 @@ def link_images(paths: list[Path], image_path: Path) -> None:
         link.symlink_to(path.resolve())
 
 
-def match_sift(
+def compute_sift(
     database_path: Path, image_path: Path, cameras: CameraOptions, affine: bool
 ) -> dict[str, float]:
     """Write COLMAP SIFT features and raw matches to a database; return seconds per stage."""
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.sift.estimate_affine_shape = affine
-    extraction.sift.domain_size_pooling = affine
+    names = list_images(image_path)
+    import_images(database_path, image_path, names, cameras)
     start = time.perf_counter()
-    pycolmap.extract_features(
-        database_path,
-        image_path,
-        camera_mode=getattr(pycolmap.CameraMode, cameras.mode.upper()),
-        reader_options=pycolmap.ImageReaderOptions(
-            camera_model=cameras.model, camera_params=cameras.params
-        ),
-        extraction_options=extraction,
-    )
+    extract_sift(database_path, image_path, names, MaskOptions(), affine=affine)
     middle = time.perf_counter()
-    pycolmap.match_exhaustive(
-        database_path,
-        matching_options=pycolmap.FeatureMatchingOptions(skip_geometric_verification=True),
-    )
+    match_sift(database_path, exhaustive_pairs(names), database_path.with_suffix(".pairs.txt"))
     return {"extraction": middle - start, "matching": time.perf_counter() - middle}
 
 
@@ -152,7 +148,7 @@ def compute_matches(
     """Compute the features and raw matches of a folder of images unless they are there already.
 
     Args:
-        method: a recipe, or one of SIFT_METHODS by its label.
+        method: a recipe, or COLMAP's SIFT.
         cameras: how images share cameras.
         image_path: folder of the images.
         folder: gets database.db and seconds.json.
@@ -166,7 +162,7 @@ def compute_matches(
         if method.recipe is None:
             database_path = folder / "database.db"
             database_path.unlink(missing_ok=True)
-            seconds = match_sift(database_path, image_path, cameras, method.label != "sift")
+            seconds = compute_sift(database_path, image_path, cameras, method.label != SIFT)
         else:
             seconds = match_recipe(folder, image_path, cameras, method.recipe, resources)
         seconds_path.write_text(json.dumps(seconds))
@@ -213,18 +209,22 @@ def run_seed(
 
 def model_metrics(model: pycolmap.Reconstruction, truth: Poses) -> Row:
     """Measure one model."""
-    images = [model.image(image_id) for image_id in model.reg_image_ids()]
-    matrices = {image.name: image.cam_from_world().matrix() for image in images}
-    estimated = {name: (matrix[:, :3], matrix[:, 3]) for name, matrix in matrices.items()}
-    num_correct, rotation_error_deg = pose_metrics(estimated, truth)
+    estimated = model_poses(model)
+    scores = pose_scores(estimated, truth, list(estimated))
     return {
         "registered": len(estimated),
-        "correct": num_correct,
-        "rotation_error_deg": rotation_error_deg,
+        "correct": len(scores.correct_names),
+        "rotation_error_deg": scores.median_rotation_error_deg,
         "points": model.num_points3D(),
         "track_length": model.compute_mean_track_length(),
         "reprojection_error": model.compute_mean_reprojection_error(),
     }
+
+
+def read_true_poses(scene_path: Path) -> Poses | None:
+    """Read (pseudo) ground truth; None where there is none."""
+    folders = [scene_path / name for name in ("ground_truth", "pseudo_ground_truth")]
+    return next((read_poses(folder) for folder in folders if folder.exists()), None)
 
 
 def parse_arguments() -> argparse.Namespace:
@@ -255,7 +255,7 @@ def main() -> None:
         link_images(paths, image_path)
         truth = read_true_poses(scenes_path / subset.scene)
         for text in arguments.methods:
-            method = parse_method(text, with_sift=True)
+            method = parse_method(text)
             folder = work_folder(method, parent)
             cameras = camera_options(subset, scenes_path)
             result = {

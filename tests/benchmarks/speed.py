@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-from registration import link_images, match_recipe, match_sift
+from registration import compute_sift, link_images, match_recipe
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.executor import available_cores
@@ -74,7 +74,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as scratch:
             image_path = Path(scratch) / "images"
             link_images(paths, image_path)
-            sift.append(match_sift(Path(scratch) / "sift.db", image_path, cameras, affine=False))
+            sift.append(compute_sift(Path(scratch) / "sift.db", image_path, cameras, affine=False))
             sift_peak = sift_peak or peak_memory_mib()
             (Path(scratch) / "ours").mkdir()
             ours.append(match_recipe(Path(scratch) / "ours", image_path, cameras, recipe))

@@ -1,14 +1,26 @@
-"""Tests of the metrics of the registration benchmark with hand-made poses."""
+"""Camera poses against ground truth: hand-made poses with known errors."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from registration_metrics import Poses, pose_from_text, pose_metrics, relative_pose_errors
-from registration_report import Row, detail_table, merge, span, summary_table
 
-SECONDS = {"extraction": 3.0, "matching": 3.0, "verification": 1.0, "mapping": 1.0}
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.comparison.metrics import (
+    Poses,
+    area_under_curve,
+    correct_images,
+    disagreeing_images,
+    pair_errors,
+    pose_scores,
+    position_errors,
+    read_poses,
+    relative_pose_errors,
+)
+from colmap_affrect.errors import ComparisonError
 
 
 def rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
@@ -37,13 +49,8 @@ def moved(poses: Poses, name: str, centre: tuple[float, float, float]) -> Poses:
     return {**poses, name: (poses[name][0], -poses[name][0] @ np.array(centre))}
 
 
-def test_pose_from_text_agrees_with_rodrigues() -> None:
-    half = np.radians(70) / 2
-    vector = np.sin(half) * np.array([1, 2, 3]) / np.sqrt(14)
-    fields = [repr(float(v)) for v in (np.cos(half), *vector, 4, 5, 6)]
-    matrix, translation = pose_from_text(fields)
-    np.testing.assert_allclose(matrix, rotation((1, 2, 3), 70), atol=1e-12)
-    np.testing.assert_array_equal(translation, [4, 5, 6])
+def num_correct(estimated: Poses, truth: Poses) -> int:
+    return len(correct_images(pair_errors(estimated, truth)))
 
 
 def test_similarity_of_the_world_changes_nothing(truth: Poses) -> None:
@@ -52,9 +59,12 @@ def test_similarity_of_the_world_changes_nothing(truth: Poses) -> None:
         name: (matrix @ world, matrix @ shift + scale * translation)
         for name, (matrix, translation) in truth.items()
     }
-    num_correct, rotation_error = pose_metrics(estimated, truth)
-    assert num_correct == 5
-    assert rotation_error == pytest.approx(0, abs=1e-6)
+    scores = pose_scores(estimated, truth, list(truth))
+    assert scores.correct_names == tuple(truth)
+    assert scores.median_rotation_error_deg == pytest.approx(0, abs=1e-6)
+    assert scores.median_direction_error_deg == pytest.approx(0, abs=1e-6)
+    assert scores.median_position_error == pytest.approx(0, abs=1e-9)
+    assert scores.auc == pytest.approx({1: 1, 3: 1, 5: 1, 10: 1}, abs=1e-6)
 
 
 @pytest.mark.parametrize("degrees", [1.0, 90.0, 179.0])
@@ -68,51 +78,96 @@ def test_injected_direction_is_measured() -> None:
     truth = {"a": (np.eye(3), np.zeros(3)), "b": (np.eye(3), np.array([1.0, 0, 0]))}
     estimated = {**truth, "b": (np.eye(3), np.array([0.0, 2.0, 0]))}
     assert relative_pose_errors(estimated, truth, "a", "b") == pytest.approx((0, 90))
-    assert pose_metrics(estimated, truth) == (0, pytest.approx(0))
+    assert num_correct(estimated, truth) == 0
 
 
 def test_one_turned_camera_is_wrong_and_the_others_right(truth: Poses) -> None:
-    assert pose_metrics(turned(truth, "2.jpg", 6), truth)[0] == 4
-    assert pose_metrics(turned(truth, "2.jpg", 3), truth)[0] == 5
+    assert num_correct(turned(truth, "2.jpg", 6), truth) == 4
+    assert num_correct(turned(truth, "2.jpg", 3), truth) == 5
 
 
 def test_one_moved_camera_is_wrong_and_the_others_right(truth: Poses) -> None:
-    assert pose_metrics(moved(truth, "2.jpg", (50, 0, 0)), truth)[0] == 4
+    assert num_correct(moved(truth, "2.jpg", (50, 0, 0)), truth) == 4
 
 
 def test_half_of_the_others_decides(truth: Poses) -> None:
     """Of five cameras two turned ones leave three right: 2 of 4 others are half."""
     estimated = turned(turned(truth, "0.jpg", 10), "1.jpg", 60)
-    assert pose_metrics(estimated, truth)[0] == 3
+    assert num_correct(estimated, truth) == 3
     del estimated["4.jpg"]
-    assert pose_metrics(estimated, truth)[0] == 0
+    assert num_correct(estimated, truth) == 0
 
 
 @pytest.mark.parametrize("num_images", [0, 1])
 def test_no_pairs(truth: Poses, num_images: int) -> None:
     estimated = dict(list(truth.items())[:num_images])
-    assert pose_metrics(estimated, truth) == (0, None)
+    scores = pose_scores(estimated, truth, list(truth))
+    assert (scores.correct_names, scores.num_pairs) == ((), 10)
+    assert scores.median_rotation_error_deg is None
+    assert scores.median_position_error is None
+    assert set(scores.auc.values()) == {0.0}
 
 
 def test_images_without_truth_are_not_counted(truth: Poses) -> None:
     estimated = {**truth, "other.jpg": (np.eye(3), np.ones(3))}
-    assert pose_metrics(estimated, truth)[0] == 5
+    assert num_correct(estimated, truth) == 5
 
 
-def test_span() -> None:
-    assert span([2, 3, 3, 3]) == "2.8 [2-3]"
-    assert span([3, 3]) == "3"
-    assert span([0.25, 0.75], 2) == "0.500 [0.25-0.75]"
-    assert span([None, 1.5], 1) == "1.5"
-    assert span([None]) == "-"
+def test_area_under_the_curve_is_that_of_the_steps() -> None:
+    """Of 5 pairs two are at 0 and 2 degrees: 1/5 from 0 to 2, 2/5 from 2 to 4."""
+    assert area_under_curve([2.0, 0.0, 7.0], 5, 4.0) == pytest.approx((0.2 * 2 + 0.4 * 2) / 4)
+    assert area_under_curve([], 0, 4.0) == 0
 
 
-def test_tables() -> None:
-    runs = [{"registered": 3, "correct": i, "points": 9, "seconds": SECONDS} for i in (2, 3)]
-    results: list[Row] = []
-    for method in ("ours", "sift", "ours"):
-        new = {"subset": "b", "method": method, "num_images": 3, "seconds": SECONDS, "runs": runs}
-        results = merge(results, new, ["a", "b"])
-    assert [row["method"] for row in results] == ["sift", "ours"]
-    assert "| b | 3 | 2.5 [2-3] of 3 | 2.5 [2-3] of 3 |" in summary_table(results)
-    assert "| b | 3 | ours | 2.5 [2-3] | 3 | 1 of 2 | - | 9 |" in detail_table(results)
+def test_missing_images_count_as_failures(truth: Poses) -> None:
+    """Three of four given images make 3 of 6 pairs; images that were not given do not count."""
+    given = ["0.jpg", "1.jpg", "2.jpg", "3.jpg"]
+    estimated = {name: truth[name] for name in ("0.jpg", "1.jpg", "2.jpg", "4.jpg")}
+    scores = pose_scores(estimated, truth, given)
+    assert scores.num_pairs == 6
+    assert len(scores.pair_errors_deg) == 3
+    assert scores.correct_names == ("0.jpg", "1.jpg", "2.jpg")
+    assert scores.auc[1.0] == pytest.approx(0.5, abs=1e-6)
+
+
+def test_one_camera_far_off_does_not_move_the_others(truth: Poses) -> None:
+    errors = position_errors(moved(truth, "2.jpg", (50, 0, 0)), truth)
+    centre = -truth["2.jpg"][0].T @ truth["2.jpg"][1]
+    expected = np.linalg.norm(np.array([50, 0, 0]) - centre)
+    assert errors.pop("2.jpg") == pytest.approx(expected)
+    assert max(errors.values()) < 1e-9
+
+
+def test_models_disagree_about_the_camera_that_differs(truth: Poses) -> None:
+    other = moved(truth, "2.jpg", (50, 0, 0))
+    del other["4.jpg"]
+    assert disagreeing_images(truth, other) == ("2.jpg",)
+    assert disagreeing_images(truth, {"0.jpg": truth["1.jpg"]}) == ()
+
+
+def test_poses_are_read_from_text_and_binary_models(tmp_path: Path) -> None:
+    model = pycolmap.synthesize_dataset(
+        pycolmap.SyntheticDatasetOptions(
+            num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=4, num_points3D=20
+        )
+    )
+    (tmp_path / "text").mkdir()
+    model.write(tmp_path)
+    model.write_text(tmp_path / "text")
+    poses = read_poses(tmp_path)
+    image = model.images[min(model.images)]
+    assert len(poses) == 4
+    np.testing.assert_array_equal(poses[image.name][1], image.cam_from_world().translation)
+    text = read_poses(tmp_path / "text")
+    for name, (matrix, translation) in poses.items():
+        np.testing.assert_allclose(text[name][0], matrix, atol=1e-9)
+        np.testing.assert_allclose(text[name][1], translation, atol=1e-9)
+
+
+@pytest.mark.parametrize("content", [None, "nothing of COLMAP\n"])
+def test_folder_without_a_model_is_refused(tmp_path: Path, content: str | None) -> None:
+    if content:
+        for name in ("cameras.txt", "images.txt", "points3D.txt"):
+            (tmp_path / name).write_text(content)
+    with pytest.raises(ComparisonError, match="not a COLMAP model"):
+        read_poses(tmp_path)

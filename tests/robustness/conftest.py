@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from command import FAST, Call, Ended
+from results import Undisturbed, run_undisturbed
 from small_scene import write_photographs
 
 from colmap_affrect.cli import main
@@ -41,6 +42,12 @@ def small_photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("small scene")
     write_photographs(folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def undisturbed(small_photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+    """A finished run of the small scene, fast features; nothing may be changed in it."""
+    return run_undisturbed(small_photos, tmp_path_factory.mktemp("undisturbed") / "out", FAST)
 
 
 @pytest.fixture

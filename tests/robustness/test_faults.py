@@ -15,13 +15,11 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 from command import FAST, Call, Ended
-from results import results
+from results import Undisturbed, results, run_arguments
 
-from colmap_affrect.cli import main
 from colmap_affrect.files import FileTransaction
 from colmap_affrect.store import FeatureStore, MatchStore
 from colmap_affrect.workspace import Workspace
@@ -55,10 +53,6 @@ def call_limited(num_bytes: int, *arguments: object) -> Ended:
     return Ended(done.returncode, done.stdout, done.stderr.splitlines())
 
 
-def run_arguments(photos: Path, out: Path) -> list[object]:
-    return ["run", "--image-path", photos, "--output-path", out, "-q", *FAST]
-
-
 def assert_says_what_to_do(ended: Ended, path: Path) -> None:
     """One line that names a file and says to free space."""
     assert (ended.code, ended.stdout) == (1, "")
@@ -66,15 +60,6 @@ def assert_says_what_to_do(ended: Ended, path: Path) -> None:
     assert line.startswith(f"error: {path}: ")
     assert "free space" in line
     assert "run the same command again" in line
-
-
-@pytest.fixture(scope="module")
-def finished(
-    small_photos: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, dict[str, Any]]:
-    out = tmp_path_factory.mktemp("finished") / "out"
-    assert main([str(argument) for argument in run_arguments(small_photos, out)]) == 0
-    return out, results(out)
 
 
 def copy_without(source: Path, target: Path, *names: str) -> Path:
@@ -88,7 +73,7 @@ def copy_without(source: Path, target: Path, *names: str) -> Path:
 
 @pytest.mark.parametrize("passing", [2, 4])
 def test_hdf5_write_that_fails_loses_nothing_else(
-    small_photos: Path, tmp_path: Path, finished: tuple[Path, dict[str, Any]], call: Call,
+    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call,
     monkeypatch: pytest.MonkeyPatch, passing: int,
 ) -> None:  # fmt: skip
     out, calls = tmp_path / "out", []
@@ -102,31 +87,31 @@ def test_hdf5_write_that_fails_loses_nothing_else(
 
     with monkeypatch.context() as patch:
         patch.setattr(FileTransaction, "commit", full)
-        ended = call(*run_arguments(small_photos, out))
+        ended = call(*run_arguments(small_photos, out, FAST))
     workspace = Workspace(out)
     failed = workspace.features if passing < 4 else workspace.matches
     assert_says_what_to_do(ended, failed)
     assert "No space left on device" in ended.stderr[0]
     assert len(FeatureStore(workspace.features).names()) == passing
-    assert call(*run_arguments(small_photos, out)).code == 0
-    assert results(out) == finished[1]
+    assert call(*run_arguments(small_photos, out, FAST)).code == 0
+    assert results(out) == undisturbed.results
 
 
 def test_features_that_do_not_fit_on_the_disk(
-    small_photos: Path, tmp_path: Path, finished: tuple[Path, dict[str, Any]], call: Call
+    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
 ) -> None:
     out = tmp_path / "out"
-    with file_size_limit(finished[0].joinpath("features.h5").stat().st_size * 2 // 3):
-        ended = call(*run_arguments(small_photos, out))
+    with file_size_limit(undisturbed.out.joinpath("features.h5").stat().st_size * 2 // 3):
+        ended = call(*run_arguments(small_photos, out, FAST))
         assert_says_what_to_do(ended, Workspace(out).features)
-        assert call(*run_arguments(small_photos, out)).code == 1  # nor does it get worse
+        assert call(*run_arguments(small_photos, out, FAST)).code == 1  # nor does it get worse
     assert 1 <= len(FeatureStore(Workspace(out).features).names()) < 4
-    assert call(*run_arguments(small_photos, out)).code == 0
-    assert results(out) == finished[1]
+    assert call(*run_arguments(small_photos, out, FAST)).code == 0
+    assert results(out) == undisturbed.results
 
 
 def test_matches_that_do_not_fit_on_the_disk(
-    small_photos: Path, tmp_path: Path, finished: tuple[Path, dict[str, Any]], call: Call
+    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
 ) -> None:
     out = ["--output-path", tmp_path / "out"]
     workspace = Workspace(tmp_path / "out")
@@ -135,8 +120,8 @@ def test_matches_that_do_not_fit_on_the_disk(
     with file_size_limit(10_000):
         assert_says_what_to_do(call("match", *out, "-q"), workspace.matches)
     assert MatchStore(workspace.matches).names() == []
-    assert call(*run_arguments(small_photos, workspace.path)).code == 0
-    assert results(workspace.path) == finished[1]
+    assert call(*run_arguments(small_photos, workspace.path, FAST)).code == 0
+    assert results(workspace.path) == undisturbed.results
 
 
 def test_record_of_options_that_does_not_fit_on_the_disk(
@@ -144,41 +129,41 @@ def test_record_of_options_that_does_not_fit_on_the_disk(
 ) -> None:
     out = tmp_path / "out"
     with file_size_limit(700):
-        ended = call(*run_arguments(small_photos, out))
+        ended = call(*run_arguments(small_photos, out, FAST))
     assert_says_what_to_do(ended, Workspace(out).config)
     assert not Workspace(out).config.exists()
     assert not Workspace(out).features.exists()
 
 
 def test_report_that_cannot_be_written(
-    small_photos: Path, tmp_path: Path, finished: tuple[Path, dict[str, Any]], call: Call
+    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
 ) -> None:
-    out = copy_without(finished[0], tmp_path / "out")
+    out = copy_without(undisturbed.out, tmp_path / "out")
     (out / "report.json.new").mkdir()
-    assert_says_what_to_do(call(*run_arguments(small_photos, out)), out / "report.json")
+    assert_says_what_to_do(call(*run_arguments(small_photos, out, FAST)), out / "report.json")
     (out / "report.json.new").rmdir()
-    assert call(*run_arguments(small_photos, out)).code == 0
-    assert results(out) == finished[1]
+    assert call(*run_arguments(small_photos, out, FAST)).code == 0
+    assert results(out) == undisturbed.results
 
 
 @pytest.mark.parametrize("limit", [160_000, 200_000])
 def test_database_that_does_not_fit_on_the_disk(
-    small_photos: Path, tmp_path: Path, finished: tuple[Path, dict[str, Any]], call: Call,
+    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call,
     limit: int,
 ) -> None:  # fmt: skip
     # Whole it has 270,000 bytes: it stops before its images are written, and at its matches.
-    out = copy_without(finished[0], tmp_path / "out", "database.db")
-    ended = call_limited(limit, *run_arguments(small_photos, out))
+    out = copy_without(undisturbed.out, tmp_path / "out", "database.db")
+    ended = call_limited(limit, *run_arguments(small_photos, out, FAST))
     assert (ended.code, ended.stdout) == (1, "")
     (line,) = ended.stderr
     assert line.startswith(f"error: {out / 'database.db'}: ")
     assert "cannot be written" in line or "the disk is full" in line
-    assert call(*run_arguments(small_photos, out)).code == 0
-    assert results(out) == finished[1]
+    assert call(*run_arguments(small_photos, out, FAST)).code == 0
+    assert results(out) == undisturbed.results
 
 
 def test_geometries_that_do_not_fit_on_the_disk(
-    small_photos: Path, tmp_path: Path, finished: tuple[Path, dict[str, Any]], call: Call
+    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
 ) -> None:
     out = ["--output-path", tmp_path / "out"]
     workspace = Workspace(tmp_path / "out")
@@ -187,43 +172,43 @@ def test_geometries_that_do_not_fit_on_the_disk(
     # COLMAP would end the process in the middle of this.
     ended = call_limited(workspace.database.stat().st_size + 10_000, "verify", *out, "-q")
     assert_says_what_to_do(ended, workspace.database)
-    assert call(*run_arguments(small_photos, workspace.path)).code == 0
-    assert results(workspace.path) == finished[1]
+    assert call(*run_arguments(small_photos, workspace.path, FAST)).code == 0
+    assert results(workspace.path) == undisturbed.results
 
 
 def test_model_that_does_not_fit_on_the_disk_is_not_taken_for_whole(
-    small_photos: Path, tmp_path: Path, finished: tuple[Path, dict[str, Any]], call: Call
+    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
 ) -> None:
     # pycolmap writes what fits and says nothing.
-    out = copy_without(finished[0], tmp_path / "out")
+    out = copy_without(undisturbed.out, tmp_path / "out")
     with file_size_limit(50_000):
-        ended = call(*run_arguments(small_photos, out))
+        ended = call(*run_arguments(small_photos, out, FAST))
     assert_says_what_to_do(ended, out / "sparse.partial" / "0")
     assert not Workspace(out).sparse.exists()
     assert not Workspace(out).report.exists()
-    assert call(*run_arguments(small_photos, out)).code == 0
-    assert results(out) == finished[1]
+    assert call(*run_arguments(small_photos, out, FAST)).code == 0
+    assert results(out) == undisturbed.results
 
 
 def test_model_that_was_damaged_later_is_named(
-    small_photos: Path, tmp_path: Path, finished: tuple[Path, dict[str, Any]], call: Call
+    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
 ) -> None:
-    out = Path(shutil.copytree(finished[0], tmp_path / "out"))
+    out = Path(shutil.copytree(undisturbed.out, tmp_path / "out"))
     damaged = out / "sparse" / "0" / "points3D.bin"
     os.truncate(damaged, damaged.stat().st_size // 2)
-    ended = call(*run_arguments(small_photos, out))
+    ended = call(*run_arguments(small_photos, out, FAST))
     assert (ended.code, ended.stdout, len(ended.stderr)) == (1, "", 1)
     assert ended.stderr[0].startswith(f"error: {damaged}: damaged")
     assert ended.stderr[0].endswith("run map again with --overwrite")
     assert call("map", "--output-path", out, "--overwrite").code == 0
-    assert results(out) == finished[1]
+    assert results(out) == undisturbed.results
 
 
 def test_hdf5_file_that_was_damaged_later_is_named(
-    tmp_path: Path, finished: tuple[Path, dict[str, Any]], call: Call
+    tmp_path: Path, undisturbed: Undisturbed, call: Call
 ) -> None:
-    content = (finished[0] / "features.h5").read_bytes()
-    out = copy_without(finished[0], tmp_path / "out", "database.db")
+    content = (undisturbed.out / "features.h5").read_bytes()
+    out = copy_without(undisturbed.out, tmp_path / "out", "database.db")
     for start in range(0, 6000, 200):
         damaged = bytearray(content)
         damaged[start : start + 64] = b"\xa5" * 64
@@ -252,6 +237,6 @@ def test_output_folder_that_may_not_be_written_is_refused(
 ) -> None:
     out = tmp_path / "out"
     out.mkdir(mode=0o555)
-    ended = call(*run_arguments(small_photos, out))
+    ended = call(*run_arguments(small_photos, out, FAST))
     assert (ended.code, len(ended.stderr)) == (1, 1)
     assert str(out) in ended.stderr[0]

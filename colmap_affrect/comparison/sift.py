@@ -1,0 +1,113 @@
+"""COLMAP's SIFT through pycolmap, on the images and pairs of a database that has no features."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import image_ids, open_database, require_database_space
+from colmap_affrect.colmap.native_options import differences
+from colmap_affrect.files import replace_text
+from colmap_affrect.matching.pairs import Pair
+from colmap_affrect.options import MaskOptions
+
+ROWS_PER_IMAGE = 400
+"""Room for the features of an image: 8192 of 128 bytes and their positions, in rows of 4 KiB."""
+ROWS_PER_PAIR = 8
+TEMPORARY_NAME = "id:{}"
+"""Name of an image by its id while COLMAP matches."""
+
+
+def extraction_options(*, affine: bool) -> pycolmap.FeatureExtractionOptions:
+    """Return COLMAP's defaults, or with affine shapes and domain-size pooling."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.estimate_affine_shape = affine
+    options.sift.domain_size_pooling = affine
+    return options
+
+
+def describe_options(*, affine: bool) -> dict[str, Any]:
+    """Return what differs from COLMAP's defaults, by pycolmap's dotted keys."""
+    default = pycolmap.FeatureExtractionOptions()
+    return {"extraction": differences(extraction_options(affine=affine), default), "matching": {}}
+
+
+def extract_sift(
+    database_path: Path,
+    image_path: Path,
+    image_names: Sequence[str],
+    masks: MaskOptions,
+    *,
+    affine: bool,
+) -> dict[str, str]:
+    """Extract SIFT features of images that the database has; those with features are kept.
+
+    Args:
+        database_path: with cameras and images.
+        image_path: folder of the images.
+        image_names: the images to look at.
+        masks: where features may be.
+        affine: with affine shapes and domain-size pooling.
+
+    Returns:
+        Images that have no features now, with the reason.
+    """
+    require_database_space(database_path, len(image_names) * ROWS_PER_IMAGE)
+    reader = pycolmap.ImageReaderOptions()
+    if masks.path:
+        reader.mask_path = Path(masks.path)
+    if masks.camera_path:
+        reader.camera_mask_path = Path(masks.camera_path)
+    pycolmap.extract_features(
+        database_path,
+        image_path,
+        image_names=list(image_names),
+        reader_options=reader,
+        extraction_options=extraction_options(affine=affine),
+    )
+    ids = image_ids(database_path)
+    with open_database(database_path) as database:
+        failed = [name for name in image_names if not database.exists_keypoints(ids[name])]
+    return dict.fromkeys(failed, "COLMAP cannot read it or its mask")
+
+
+def match_sift(database_path: Path, pairs: Sequence[Pair], list_path: Path) -> None:
+    """Match pairs of images by COLMAP's defaults, without verification; matched ones are kept.
+
+    COLMAP's lists of pairs cannot hold names with spaces: while it matches, the images have
+    other ones. If the process is killed then, :func:`rename_images` brings the names back.
+
+    Args:
+        database_path: with SIFT features.
+        pairs: names of the images to match.
+        list_path: file for the time of the call.
+    """
+    ids = image_ids(database_path)
+    temporary = {image_id: TEMPORARY_NAME.format(image_id) for image_id in ids.values()}
+    lines = [f"{temporary[ids[first]]} {temporary[ids[second]]}\n" for first, second in pairs]
+    replace_text(list_path, "".join(lines))
+    require_database_space(database_path, len(pairs) * ROWS_PER_PAIR)
+    names = {image_id: name for name, image_id in ids.items()}
+    try:
+        rename_images(database_path, temporary)
+        pycolmap.match_image_pairs(
+            database_path,
+            matching_options=pycolmap.FeatureMatchingOptions(skip_geometric_verification=True),
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=list_path),
+        )
+    finally:
+        rename_images(database_path, names)
+        with suppress(OSError):
+            list_path.unlink()
+
+
+def rename_images(database_path: Path, names: Mapping[int, str]) -> None:
+    """Give the images of a database these names by id."""
+    with open_database(database_path) as database:
+        for image in database.read_all_images():
+            if image.name != names[image.image_id]:
+                image.name = names[image.image_id]
+                database.update_image(image)

@@ -1,0 +1,106 @@
+"""A comparison as a table for the terminal and as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import textwrap
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult, Span
+
+WIDTH = 88
+
+
+def summary(comparison: Comparison) -> str:
+    """Return the verdict under a table of methods."""
+    columns = ["method", "registered", "verified", "points", "track", "px", "seconds", "MB"]
+    if comparison.has_ground_truth:
+        columns.insert(2, "correct")
+    rows = [columns, *(_row(method, comparison) for method in comparison.methods)]
+    widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(len(columns))]
+    lines = [
+        "  ".join(
+            cell.rjust(width) if index else cell.ljust(width)
+            for index, (cell, width) in enumerate(zip(row, widths, strict=False))
+        )
+        for row in rows
+    ]
+    only = comparison.only_registered_by if len(comparison.finished) > 1 else {}
+    lines += [""] * bool(only)
+    lines += [f"only {method} registers {name}" for name, method in only.items()]
+    for paragraph in comparison.verdict:
+        lines += ["", *textwrap.wrap(paragraph, WIDTH, break_on_hyphens=False)]
+    return "\n".join(lines)
+
+
+def _row(method: MethodResult, comparison: Comparison) -> list[str]:
+    if method.failed:
+        return [method.name, "failed"]
+    row = [
+        method.name,
+        f"{_span(method.registered)} of {len(comparison.image_names)}",
+        _span(method.span("verified_pairs")),
+        f"{method.span('points3D').mean:.0f}",
+        f"{method.span('mean_track_length').mean:.2f}",
+        f"{method.span('mean_reprojection_error_px').mean:.2f}",
+        f"{method.total_s:.1f}",
+        f"{method.peak_memory_bytes / 1e6:.0f}",
+    ]
+    if comparison.has_ground_truth:
+        row.insert(2, _span(method.correct) if method.correct else "-")
+    return row
+
+
+def _span(span: Span) -> str:
+    """Return the mean and, if it varies, the range."""
+    if span.min == span.max:
+        return f"{span.mean:g}"
+    return f"{span.mean:.1f} [{span.min:g}-{span.max:g}]"
+
+
+def csv_text(comparison: Comparison) -> str:
+    """Return a row for each method and seed, and one for each method that failed."""
+    rows = [
+        {**_method_cells(method, comparison), **_seed_cells(method, seed)}
+        for method in comparison.methods
+        for seed in method.seeds
+    ]
+    rows += [
+        {"method": method.name, "images": len(comparison.image_names), "failed": method.failed}
+        for method in comparison.methods
+        if method.failed
+    ]
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _method_cells(method: MethodResult, comparison: Comparison) -> dict[str, Any]:
+    return {
+        "method": method.name,
+        "images": len(comparison.image_names),
+        "failed": "",
+        "keypoints": sum(method.num_keypoints.values()),
+        "raw_matches": sum(method.raw_matches.values()),
+        "peak_memory_bytes": method.peak_memory_bytes,
+    }
+
+
+def _seed_cells(method: MethodResult, seed: SeedResult) -> dict[str, Any]:
+    """Return all single numbers of a seed."""
+    cells = _numbers(seed.to_mapping())
+    if seed.scores:
+        scores = seed.scores.to_mapping()
+        cells |= {"correct": len(seed.scores.correct_names), **_numbers(scores)}
+        cells |= {f"auc_{limit}": value for limit, value in scores["auc"].items()}
+    return cells | {f"{key}_s": value for key, value in {**method.wall_s, **seed.wall_s}.items()}
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if isinstance(value, int | float)}

@@ -1,0 +1,329 @@
+"""What a comparison means, in plain words: one small rule per function.
+
+Gains are counted in photographs registered, or registered correctly where there is ground truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from colmap_affrect.comparison.results import Comparison, MethodResult, Span
+
+REFERENCES = ("sift", "sift-affine-dsp")
+"""What gains are measured against: the first of these that was run."""
+
+MIN_MEAN_GAIN = 0.5
+"""More photographs on average over the seeds than this is a gain, though no single photograph is
+registered in most seeds that was not before."""
+
+MIN_OBSERVATIONS = 40
+"""A pose that hangs on fewer points may be chance: COLMAP asks for 30 to register an image."""
+
+MIN_TRACK_LENGTH = 2.2
+"""Below, most points are seen by two images only, which do not tie a third to them."""
+
+MIN_IMAGES = 3
+"""Fewer are a pair, not a reconstruction."""
+
+MAX_NAMES = 6
+MIN_WHOLE_SECONDS = 10
+
+
+def verdict(comparison: Comparison) -> tuple[str, ...]:
+    """Return the paragraphs, the most important one first."""
+    paragraphs = [
+        *headline(comparison),
+        *changes(comparison),
+        *seeds_disagree(comparison),
+        *wrong_poses(comparison),
+        *registered_by_none(comparison),
+        *failures(comparison),
+        *few_observations(comparison),
+        *short_tracks(comparison),
+        *unstable_poses(comparison),
+        *contradictions(comparison),
+    ]
+    return tuple(paragraphs)
+
+
+@dataclass(frozen=True)
+class Change:
+    """What one method does better or worse than another.
+
+    Attributes:
+        gained: images that it usually registers and the other does not, sorted.
+        lost: the other way round.
+        mean: more images on average over the seeds.
+        time_ratio: of their total times; 0 where the other one took none.
+    """
+
+    gained: tuple[str, ...]
+    lost: tuple[str, ...]
+    mean: float
+    time_ratio: float
+
+    @classmethod
+    def between(cls, method: MethodResult, reference: MethodResult) -> Change:
+        """Compare a method with a reference; both have finished."""
+        ours, others = method.usually_correct, reference.usually_correct
+        ratio = method.total_s / reference.total_s if reference.total_s else 0.0
+        mean = _count(method).mean - _count(reference).mean
+        return cls(tuple(sorted(ours - others)), tuple(sorted(others - ours)), mean, ratio)
+
+    @property
+    def is_gain(self) -> bool:
+        """Whether more photographs are registered, or the same ones more often."""
+        more = len(self.gained) - len(self.lost)
+        return more > 0 or (more == 0 and self.mean >= MIN_MEAN_GAIN)
+
+
+def reference_of(comparison: Comparison) -> MethodResult | None:
+    """Return the method that gains are measured against, None if no SIFT has finished."""
+    finished = {method.name: method for method in comparison.finished}
+    return next((finished[name] for name in REFERENCES if name in finished), None)
+
+
+def is_unrectified(method: MethodResult) -> bool:
+    """Tell whether a method is a recipe that warps nothing."""
+    rectifier = method.options.get("rectifier", {})
+    return rectifier.get("name") == "identity" and not method.options.get("escalation")
+
+
+def is_rectified(method: MethodResult) -> bool:
+    """Tell whether a method is a recipe that warps photographs."""
+    return "rectifier" in method.options and not is_unrectified(method)
+
+
+def headline(comparison: Comparison) -> list[str]:
+    """Say first of all whether anything was gained."""
+    finished, total = comparison.finished, len(comparison.image_names)
+    if not finished:
+        return ["No method finished."]
+    best = max(finished, key=lambda method: (_count(method).mean, -method.total_s))
+    most = max(method.registered.max for method in finished)
+    if most < MIN_IMAGES <= total:
+        return [
+            f"Nothing was reconstructed: no method registers more than {most:g} of the {total} "
+            "photographs."
+        ]
+    reference = reference_of(comparison)
+    if reference is None:
+        return [
+            f"{best.name} {_registers(comparison)} most photographs, {_number(_count(best))} of "
+            f"{total}. COLMAP's SIFT was not run, so nothing can be said about a gain."
+        ]
+    if len(finished) == 1:
+        return [
+            f"{best.name} {_registers(comparison)} {_number(_count(best))} of {total} photographs; "
+            "no other method finished."
+        ]
+    if not Change.between(best, reference).is_gain:
+        return [
+            f"No benefit on this set: no method {_registers(comparison)} more photographs than "
+            f"{reference.name}, which {_registers(comparison)} {_number(_count(reference))} "
+            f"of {total}."
+        ]
+    text = (
+        f"{best.name} {_registers(comparison)} {_number(_count(best))} of {total} photographs, "
+        f"{reference.name} {_number(_count(reference))}."
+    )
+    return [text + _without_rectification(comparison, best)]
+
+
+def _without_rectification(comparison: Comparison, best: MethodResult) -> str:
+    """Say when the best method owes nothing to its warps."""
+    if not is_rectified(best):
+        return " Rectification is not needed for that."
+    as_good = [
+        method.name
+        for method in comparison.finished
+        if not is_rectified(method) and not Change.between(best, method).is_gain
+    ]
+    if not as_good:
+        return ""
+    verb = "does" if len(as_good) == 1 else "do"
+    return f" {_listed(as_good)} {verb} as well without rectification."
+
+
+def changes(comparison: Comparison) -> list[str]:
+    """Say for every method what it gains and loses against SIFT, and at what cost.
+
+    Rectified methods are set against our own features without warps too.
+    """
+    reference = reference_of(comparison)
+    texts = [
+        _change_text(method, reference)
+        for method in comparison.finished
+        if reference and method is not reference
+    ]
+    texts += [
+        _change_text(method, unrectified)
+        for unrectified in filter(is_unrectified, comparison.finished)
+        for method in filter(is_rectified, comparison.finished)
+    ]
+    return texts
+
+
+def _change_text(method: MethodResult, reference: MethodResult) -> str:
+    change = Change.between(method, reference)
+    parts = []
+    if change.gained:
+        parts.append(f"gains {_listed(change.gained)}")
+    if change.lost:
+        parts.append(f"loses {_listed(change.lost)}")
+    if not parts:
+        parts.append("the same photographs" if method.usually_correct else "none more")
+        if abs(change.mean) >= MIN_MEAN_GAIN:
+            parts.append(f"{abs(change.mean):.1f} {'more' if change.mean > 0 else 'fewer'} on "
+                         "average over the seeds")  # fmt: skip
+    times = f"{_seconds(method.total_s)} s against {_seconds(reference.total_s)} s"
+    cost = f", in {change.time_ratio:.1f} times the time ({times})" if change.time_ratio else ""
+    return f"{method.name} against {reference.name}: {', '.join(parts)}{cost}."
+
+
+def seeds_disagree(comparison: Comparison) -> list[str]:
+    """Say which methods register more or fewer photographs with another seed."""
+    ranges = [
+        f"{method.name} {_count(method).min:g} to {_count(method).max:g}"
+        for method in comparison.finished
+        if _count(method).min != _count(method).max
+    ]
+    if not ranges:
+        return []
+    verb = "registered correctly" if comparison.has_ground_truth else "registered"
+    return [f"Seeds disagree: photographs {verb} depend on chance, {'; '.join(ranges)}."]
+
+
+def wrong_poses(comparison: Comparison) -> list[str]:
+    """Say which methods register photographs that ground truth contradicts."""
+    return [
+        f"{method.name} registers {_number(method.registered)} photographs, of which only "
+        f"{_number(method.correct)} agree with the ground truth."
+        for method in comparison.finished
+        if method.correct and method.correct.mean < method.registered.mean
+    ]
+
+
+def registered_by_none(comparison: Comparison) -> list[str]:
+    """Name the photographs that nothing registers."""
+    missing = comparison.registered_by_none
+    if not missing or not comparison.finished:
+        return []
+    return [f"Registered by no method: {_listed(missing)}."]
+
+
+def failures(comparison: Comparison) -> list[str]:
+    """Name the methods that failed, with the reason."""
+    return [f"{method.name} failed: {method.failed}" for method in comparison.methods
+            if method.failed]  # fmt: skip
+
+
+def few_observations(comparison: Comparison) -> list[str]:
+    """Doubt gained photographs that hang on few points."""
+    texts = []
+    for method, change in _gains(comparison):
+        weak = {}
+        for name in change.gained:
+            counts = [
+                seed.num_observations[name]
+                for seed in method.seeds
+                if name in seed.num_observations
+            ]
+            if counts and max(counts) < MIN_OBSERVATIONS:
+                weak[name] = max(counts)
+        if weak:
+            points = _listed(f"{name} ({count} points)" for name, count in weak.items())
+            texts.append(f"Doubtful: in {method.name} few points hold {points}.")
+    return texts
+
+
+def short_tracks(comparison: Comparison) -> list[str]:
+    """Doubt gains of models in which hardly any point is seen by three images."""
+    return [
+        f"Doubtful: the mean track length of {method.name} is "
+        f"{method.span('mean_track_length').mean:.2f}; hardly any point is seen by three "
+        "photographs."
+        for method, _ in _gains(comparison)
+        if method.registered.mean >= MIN_IMAGES
+        and method.span("mean_track_length").mean < MIN_TRACK_LENGTH
+    ]
+
+
+def unstable_poses(comparison: Comparison) -> list[str]:
+    """Doubt poses that differ between the seeds."""
+    return [
+        f"Doubtful: in {method.name} the poses of {_listed(method.unstable_names)} contradict "
+        "each other from seed to seed."
+        for method in comparison.finished
+        if method.unstable_names
+    ]
+
+
+def contradictions(comparison: Comparison) -> list[str]:
+    """Doubt poses that differ between methods; the method with most contradictions comes first."""
+    names = {
+        (method.name, other): images
+        for method in comparison.finished
+        for other, images in method.disagreements.items()
+        if images
+    }
+    texts = []
+    while names:
+        partners = {
+            method.name: [other for name, other in names if name == method.name]
+            for method in comparison.finished
+        }
+        worst = max(partners, key=lambda name: len(partners[name]))
+        images = sorted({image for other in partners[worst] for image in names[worst, other]})
+        texts.append(
+            f"Doubtful: {worst} disagrees with {_listed(partners[worst])} about the pose of "
+            f"{_listed(images)}; repeated or symmetric structures can do that."
+        )
+        names = {pair: images for pair, images in names.items() if worst not in pair}
+    return texts
+
+
+def _gains(comparison: Comparison) -> Iterable[tuple[MethodResult, Change]]:
+    """Return the methods whose gain on the reference no ground truth confirms."""
+    reference = reference_of(comparison)
+    for method in comparison.finished:
+        if reference and method is not reference and not comparison.has_ground_truth:
+            change = Change.between(method, reference)
+            if change.is_gain:
+                yield method, change
+
+
+def _count(method: MethodResult) -> Span:
+    """Images that count: those registered correctly, without ground truth those registered."""
+    return method.correct or method.registered
+
+
+def _registers(comparison: Comparison) -> str:
+    return "correctly registers" if comparison.has_ground_truth else "registers"
+
+
+def _number(span: Span | None) -> str:
+    if span is None:
+        return "0"
+    if span.min == span.max:
+        return f"{span.mean:g}"
+    return f"{span.mean:.1f} on average ({span.min:g} to {span.max:g})"
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.1f}" if value < MIN_WHOLE_SECONDS else f"{value:.0f}"
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Join names, the first few of many.
+
+    >>> _listed(["a", "b", "c"]), _listed(map(str, range(9)))
+    ('a, b and c', '0, 1, 2, 3, 4, 5 and 3 more')
+    """
+    shown: Sequence[str] = list(names)
+    if len(shown) > MAX_NAMES + 1:
+        return f"{', '.join(shown[:MAX_NAMES])} and {len(shown) - MAX_NAMES} more"
+    return " and ".join(filter(None, [", ".join(shown[:-1]), shown[-1]]))

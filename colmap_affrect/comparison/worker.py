@@ -1,0 +1,323 @@
+"""One method of a comparison, in a process of its own: ``python -m ... REQUEST.json``.
+
+Its peak memory is the method's, and when it dies the other methods go on. What was done stays:
+run again, it goes on. It tells of its progress and of how it ended by lines of JSON on stdout;
+everything else that is printed goes to stderr.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import resource
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+from colmap_affrect import stages
+from colmap_affrect.children import end_with_parent
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.copies import copy_database
+from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.mapping import map_database
+from colmap_affrect.colmap.verification import verified_pairs, verify
+from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP
+from colmap_affrect.comparison.request import Request, recipe_options
+from colmap_affrect.comparison.results import MethodResult, Pair, SeedResult
+from colmap_affrect.comparison.sift import (
+    describe_options,
+    extract_sift,
+    match_sift,
+    rename_images,
+)
+from colmap_affrect.errors import AffrectError
+from colmap_affrect.escalation import escalate
+from colmap_affrect.files import replace_text
+from colmap_affrect.matching.pairs import read_pairs
+from colmap_affrect.options import CameraOptions
+from colmap_affrect.progress import Advance, Progress
+from colmap_affrect.recipes import Recipe
+from colmap_affrect.workspace import Workspace
+
+logger = logging.getLogger("colmap_affrect")
+
+SAVE_EVERY_S = 1.0
+"""How often the costs so far are written down, in case the process is killed."""
+
+BYTES_PER_RSS = 1 if sys.platform == "darwin" else 1024
+
+
+def main() -> None:
+    """Run the method that the request asks for, unless its parent ends before."""
+    end_with_parent()
+    parent = _take_stdout()
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logger.addHandler(handler)
+    try:
+        request = Request.from_json(Path(sys.argv[1]).read_text(encoding="utf-8"))
+        with Workspace(request.folder).locked():
+            compute(request, _Reported(parent))
+    except AffrectError as error:
+        _tell(parent, failed=str(error))
+    except Exception as error:
+        logger.exception("failed")
+        _tell(parent, failed=f"{type(error).__name__}: {error}")
+
+
+def compute(request: Request, progress: Progress) -> None:
+    """Extract, match, verify and map, and write ``result.json``; what is there is kept."""
+    costs = _Costs(request.folder / "costs.json")
+    if request.method.recipe is None:
+        _match_sift(request, costs, progress)
+    else:
+        _match_recipe(request, request.method.recipe, costs, progress)
+    num_keypoints, raw_matches = _count_features(request.folder / "database.db")
+    result = MethodResult(
+        name=request.method.label,
+        summary=request.method.summary,
+        num_keypoints=num_keypoints,
+        raw_matches=raw_matches,
+        seeds=tuple(_run_seed(request, seed, progress) for seed in request.seeds),
+        wall_s=costs.wall_s,
+        peak_memory_bytes=costs.peak_memory_bytes(),
+        failures=costs.failures,
+        options=_options(request),
+        folder=request.folder.relative_to(request.output_path).as_posix(),
+    )
+    costs.save()
+    content = {"seeds": request.seeds, "result": result.to_mapping()}
+    replace_text(request.result, json.dumps(content, indent=1, ensure_ascii=False))
+
+
+def _options(request: Request) -> dict[str, Any]:
+    if request.method.recipe is None:
+        return describe_options(affine=_is_affine(request))
+    return recipe_options(request.method.recipe)
+
+
+def _is_affine(request: Request) -> bool:
+    return request.method.label == SIFT_AFFINE_DSP
+
+
+def _match_sift(request: Request, costs: _Costs, progress: Progress) -> None:
+    """Put SIFT features and their matches into the database of the method."""
+    path, base = request.folder / "database.db", request.layout.database
+    if not path.exists():
+        copy_database(base, path)
+    rename_images(path, {image_id: name for name, image_id in image_ids(base).items()})
+    names = request.layout.image_names()
+    with costs.stage("extract") as needed:
+        if needed:
+            with progress.stage("extract", len(names), "images") as advance:
+                costs.failures = extract_sift(
+                    path, request.image_path, names, request.masks, affine=_is_affine(request)
+                )
+                advance(len(names))
+    pairs = read_pairs(request.layout.pairs, names)
+    with costs.stage("match") as needed:
+        if needed:
+            with progress.stage("match", len(pairs), "pairs") as advance:
+                match_sift(path, pairs, request.folder / "pairs-by-id.txt")
+                advance(len(pairs))
+
+
+def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Progress) -> None:
+    """Put our features and their matches into the workspace of the method."""
+    workspace = Workspace(request.folder)
+    with costs.stage("extract") as needed:
+        if needed:
+            report = stages.extract(
+                workspace,
+                request.image_path,
+                recipe,
+                CameraOptions(),
+                masks=request.masks,
+                image_list_path=request.layout.images,
+                from_database=request.layout.database,
+                resources=request.resources,
+                progress=progress,
+            )
+            costs.failures = report.failures
+    stages.choose_pairs(workspace, match_list_path=request.layout.pairs)
+    with costs.stage("match") as needed:
+        if needed:
+            stages.match(workspace, recipe.matching, progress=progress)
+    if request.method.climbs:
+        stages.verify_matches(workspace, request.verification, request.seeds[0])
+        with costs.stage("escalate") as needed:
+            if needed:
+                escalate(workspace, resources=request.resources, progress=progress)
+
+
+def _count_features(database_path: Path) -> tuple[dict[str, int], dict[Pair, int]]:
+    """Return the keypoints of the images that have some, and the raw matches of the pairs."""
+    with open_database(database_path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        keypoints = {
+            name: database.num_keypoints_for_image(image_id)
+            for image_id, name in names.items()
+            if database.exists_keypoints(image_id)
+        }
+        pair_ids, counts = database.read_num_matches()
+    matches = {
+        _pair(names, pycolmap.pair_id_to_image_pair(pair_id)): int(count)
+        for pair_id, count in zip(pair_ids, counts, strict=True)
+    }
+    return dict(sorted(keypoints.items())), matches
+
+
+def _pair(names: Mapping[int, str], ids: tuple[int, int]) -> Pair:
+    first, second = sorted((names[ids[0]], names[ids[1]]))
+    return first, second
+
+
+def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
+    """Verify and map a copy of the database of the method, unless that is done."""
+    folder = request.seed_folder(seed)
+    result_path, database_path = folder / "result.json", folder / "database.db"
+    if result_path.exists():
+        return SeedResult.from_mapping(json.loads(result_path.read_text(encoding="utf-8")))
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    copy_database(request.folder / "database.db", database_path)
+    with open_database(database_path) as database:
+        database.clear_two_view_geometries()
+        num_pairs = len(database.read_num_matches()[0])
+    names = {image_id: name for name, image_id in image_ids(database_path).items()}
+    start = time.perf_counter()
+    with progress.stage(f"verify, seed {seed}", num_pairs, "pairs") as advance:
+        verify(database_path, request.verification, seed)
+        advance(num_pairs)
+    middle = time.perf_counter()
+    with progress.stage(f"map, seed {seed}", len(names), "images") as advance:
+        models = map_database(
+            database_path,
+            request.image_path,
+            folder / "sparse",
+            request.mapping,
+            seed,
+            intrinsics_given=request.intrinsics_given,
+            next_image=advance,
+        )
+    end = time.perf_counter()
+    model_path = folder / "sparse" / "0" if models else None
+    model = pycolmap.Reconstruction(model_path) if model_path else pycolmap.Reconstruction()
+    inliers = verified_pairs(database_path, request.verification.min_num_inliers)
+    result = SeedResult(
+        seed=seed,
+        model_names=tuple(item.registered_names for item in models),
+        model_path=model_path.relative_to(request.output_path).as_posix() if model_path else "",
+        num_points3D=models[0].num_points3D if models else 0,
+        mean_track_length=models[0].mean_track_length if models else 0.0,
+        mean_observations=float(model.compute_mean_observations_per_reg_image()) if models else 0.0,
+        mean_reprojection_error_px=models[0].mean_reprojection_error_px if models else 0.0,
+        pair_inliers={_pair(names, ids): count for ids, count in inliers.items()},
+        scores=None,
+        wall_s={"verify": middle - start, "map": end - middle},
+        num_observations={
+            model.images[image_id].name: model.images[image_id].num_points3D
+            for image_id in sorted(model.reg_image_ids())
+        },
+    )
+    replace_text(result_path, json.dumps(result.to_mapping(), ensure_ascii=False))
+    return result
+
+
+class _Costs:
+    """Seconds and memory that a method has taken, over all processes that worked on it.
+
+    Attributes:
+        wall_s: seconds by stage.
+        failures: images that could not be used, with the reason.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read what was written to a file, if it exists."""
+        self._path = path
+        known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        self.wall_s: dict[str, float] = known.get("wall_s", {})
+        self.failures: dict[str, str] = known.get("failures", {})
+        self._finished: list[str] = known.get("finished", [])
+        self._earlier_peak = int(known.get("peak_memory_bytes", 0))
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[bool]:
+        """Measure a block; yields whether it still has something to do."""
+        if name in self._finished:
+            yield False
+            return
+        ended, start, before = threading.Event(), time.perf_counter(), self.wall_s.get(name, 0.0)
+
+        def measure() -> None:
+            self.wall_s[name] = before + time.perf_counter() - start
+            self.save()
+
+        def measure_regularly() -> None:
+            while not ended.wait(SAVE_EVERY_S):
+                measure()
+
+        thread = threading.Thread(target=measure_regularly, daemon=True)
+        thread.start()
+        try:
+            yield True
+            self._finished = sorted({*self._finished, name})
+        finally:
+            ended.set()
+            thread.join()
+            measure()
+
+    def peak_memory_bytes(self) -> int:
+        """Return the most memory that one process has had so far, COLMAP's own ones included."""
+        peaks = (
+            resource.getrusage(whom).ru_maxrss * BYTES_PER_RSS
+            for whom in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+        )
+        return max(self._earlier_peak, *peaks)
+
+    def save(self) -> None:
+        """Write everything to the file."""
+        values = {
+            "wall_s": self.wall_s,
+            "failures": self.failures,
+            "finished": self._finished,
+            "peak_memory_bytes": self.peak_memory_bytes(),
+        }
+        replace_text(self._path, json.dumps(values))
+
+
+class _Reported(Progress):
+    """Progress that is told to the parent process."""
+
+    def __init__(self, parent: TextIO) -> None:
+        super().__init__()
+        self._parent = parent
+
+    @contextmanager
+    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
+        """See :class:`Progress`."""
+        _tell(self._parent, stage=name, total=total, unit=unit)
+        yield lambda count: _tell(self._parent, advance=count)
+        _tell(self._parent, end=name)
+
+
+def _tell(parent: TextIO, **event: Any) -> None:
+    parent.write(json.dumps(event) + "\n")
+    parent.flush()
+
+
+def _take_stdout() -> TextIO:
+    """Return stdout for the lines of JSON; what others print goes to stderr from now on."""
+    stream = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    return stream
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,305 @@
+"""Cameras and points of the models of several methods, in one frame, to be drawn in a page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import registered_names
+from colmap_affrect.comparison.results import MethodResult
+from colmap_affrect.errors import AffrectError
+from colmap_affrect.report.pictures import Picture, base64_text
+
+Array = NDArray[np.float64]
+
+MAX_NUM_POINTS = 8000
+POINT_PERCENTILE = 90.0
+"""Share of the points, from the middle outwards, that the view is made to hold."""
+RADIUS_MARGIN = 1.15
+
+CAMERA_DEPTH = 0.07
+"""Depth of the pyramids that stand for cameras, as a share of the view's radius."""
+MAX_HALF_WIDTH = 0.8
+"""Of the base of a pyramid per depth, for cameras with a very wide view."""
+
+DARKEST, COLOR_RANGE = 60, 140
+"""Colours of points are squeezed so that they show on light and on dark ground."""
+
+STILL_SIZE_PX = (800, 600)
+"""Size of the picture of the points from above."""
+
+
+@dataclass(frozen=True)
+class View3D:
+    """The model of one method, ready for the page; lengths in units of the view's radius.
+
+    Attributes:
+        method: its name.
+        seed: whose model it is.
+        num_points: points in ``points``.
+        points: (N, 3) uint16 positions from -1 to 1 and then (N, 3) uint8 colours, as base64.
+        cameras: name and (5, 3) centre and corners of the pyramid of each camera.
+        still: the points from above.
+        pyramids: SVG path of each camera by name, in px of the still picture.
+        note: what is special about it; empty if nothing is.
+    """
+
+    method: str
+    seed: int
+    num_points: int = 0
+    points: str = ""
+    cameras: tuple[tuple[str, Array], ...] = ()
+    still: Picture | None = None
+    pyramids: tuple[tuple[str, str], ...] = ()
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The models of all methods.
+
+    Attributes:
+        views: one per method.
+        zoom: with which they fill the view from above.
+    """
+
+    views: tuple[View3D, ...]
+    zoom: float
+
+
+@dataclass(frozen=True)
+class _Model:
+    """A model as arrays.
+
+    Attributes:
+        names: of the registered images.
+        centers: (M, 3) of the cameras.
+        axes: (M, 3, 3) rotations world_from_camera.
+        half_sizes: (M, 2) half width and height of the view at depth 1.
+        points, colors: (N, 3) and (N, 3) uint8.
+    """
+
+    names: tuple[str, ...]
+    centers: Array
+    axes: Array
+    half_sizes: Array
+    points: Array
+    colors: NDArray[np.uint8]
+
+    def transformed(self, scale: float, rotation: Array, translation: Array) -> _Model:
+        """Return it after x -> scale rotation x + translation."""
+        return _Model(
+            self.names,
+            scale * self.centers @ rotation.T + translation,
+            rotation @ self.axes,
+            self.half_sizes,
+            scale * self.points @ rotation.T + translation,
+            self.colors,
+        )
+
+
+def read_scene(methods: Sequence[MethodResult], output_path: Path) -> Scene:
+    """Read the models, bring them into the frame of the largest, and prepare them for the page.
+
+    Args:
+        methods: each is shown with the first seed that has a model.
+        output_path: folder of the comparison.
+    """
+    models: dict[str, _Model] = {}
+    notes: dict[str, str] = {}
+    seeds: dict[str, int] = {}
+    for method in methods:
+        seed = next((seed for seed in method.seeds if seed.model_path), None)
+        if seed is None:
+            notes[method.name] = "There is no model."
+            continue
+        seeds[method.name] = seed.seed
+        try:
+            models[method.name] = _read(output_path / seed.model_path)
+        except AffrectError as error:
+            notes[method.name] = f"The model cannot be shown: {error}"
+    if models:
+        models = _in_one_frame(models, notes)
+    zoom = _zoom_from_above(list(models.values()))
+    views = []
+    for method in methods:
+        number, note = seeds.get(method.name, 0), notes.get(method.name, "")
+        if method.name in models:
+            views.append(_view(method.name, number, models[method.name], note, zoom))
+        else:
+            views.append(View3D(method.name, number, note=note))
+    return Scene(tuple(views), zoom)
+
+
+def _zoom_from_above(models: Sequence[_Model]) -> float:
+    """Return the zoom, 1 to 3, with which cameras and nearly all points fill the still picture."""
+    if not models:
+        return 1.0
+    reach = np.max(
+        [
+            np.percentile(np.abs(places), share, axis=0)
+            for model in models
+            for places, share in ((model.points, POINT_PERCENTILE), (model.centers, 100.0))
+            if len(places)
+        ],
+        axis=0,
+    )
+    width, height = STILL_SIZE_PX
+    zoom = min(width / height / max(reach[0], 1e-9), 1.0 / max(reach[1], 1e-9)) / RADIUS_MARGIN
+    return float(np.clip(zoom, 1.0, 3.0))
+
+
+def _read(path: Path) -> _Model:
+    registered_names(path)
+    model = pycolmap.Reconstruction(path)
+    images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
+    sizes = []
+    for image in images:
+        camera = model.cameras[image.camera_id]
+        focal_px = camera.mean_focal_length()
+        sizes.append([camera.width / focal_px / 2, camera.height / focal_px / 2])
+    ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
+    if len(ids) > MAX_NUM_POINTS:
+        ids = np.random.default_rng(0).choice(ids, MAX_NUM_POINTS, replace=False)
+    points = [model.points3D[point_id] for point_id in ids.tolist()]
+    return _Model(
+        tuple(image.name for image in images),
+        np.array([image.projection_center() for image in images]).reshape(-1, 3),
+        np.array([image.cam_from_world().rotation.matrix().T for image in images]),
+        np.array(sizes),
+        np.array([point.xyz for point in points]).reshape(-1, 3),
+        np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+    )
+
+
+def _in_one_frame(models: Mapping[str, _Model], notes: dict[str, str]) -> dict[str, _Model]:
+    """Align models with the largest, turn what is up upwards, and scale the view to radius 1."""
+    reference = max(models, key=lambda name: len(models[name].names))
+    upright = _upright(models[reference])
+    framed = {}
+    for name, model in models.items():
+        similarity = similarity_of(model, upright)
+        if name == reference:
+            framed[name] = upright
+        elif similarity is None:
+            framed[name] = _upright(model)
+            notes[name] = (
+                f"Shares fewer than two photographs at different places with the model of "
+                f"{reference}: drawn in a frame of its own."
+            )
+        else:
+            framed[name] = model.transformed(*similarity)
+    return framed
+
+
+def similarity_of(source: _Model, target: _Model) -> tuple[float, Array, Array] | None:
+    """Estimate scale, rotation and translation target_from_source from the shared images.
+
+    Medians, so that single misplaced cameras do not matter. None with fewer than two shared
+    images at different places.
+    """
+    shared = [name for name in source.names if name in target.names]
+    rows = [source.names.index(name) for name in shared]
+    columns = [target.names.index(name) for name in shared]
+    if len(shared) < 2:
+        return None
+    rotations = target.axes[columns] @ np.swapaxes(source.axes[rows], 1, 2)
+    agreement = np.einsum("iab,jab->ij", rotations, rotations)
+    rotation = rotations[int(np.argmax(np.median(agreement, axis=1)))]
+    first, second = np.triu_indices(len(shared), 1)
+    centers, goals = source.centers[rows], target.centers[columns]
+    lengths = np.linalg.norm(centers[first] - centers[second], axis=1)
+    goal_lengths = np.linalg.norm(goals[first] - goals[second], axis=1)
+    apart = (lengths > 1e-9) & (goal_lengths > 1e-9)
+    if not apart.any():
+        return None
+    scale = float(np.median(goal_lengths[apart] / lengths[apart]))
+    translation = np.median(goals - scale * centers @ rotation.T, axis=0)
+    return scale, rotation, translation
+
+
+def _upright(model: _Model) -> _Model:
+    """Turn a model so that z is up, as cameras are held on average, and x is its long side.
+
+    The middle of cameras and points goes to the origin, and the scale is that of the view.
+    """
+    up = -model.axes[:, :, 1].mean(axis=0)
+    if np.linalg.norm(up) < 1e-6:
+        up = -model.axes[0, :, 1]
+    up /= np.linalg.norm(up)
+    extent = np.concatenate([model.points, model.centers])
+    extent = extent - np.median(extent, axis=0)
+    level = np.linalg.svd(up[None])[2][1:]  # two horizontal directions
+    flat = extent @ level.T
+    distances = np.linalg.norm(flat, axis=1)
+    near = flat[distances <= np.percentile(distances, POINT_PERCENTILE)]
+    along = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][0] @ level
+    rotation = np.stack([along, np.cross(up, along), up])
+    centers, points = model.centers @ rotation.T, model.points @ rotation.T
+    spread = np.linalg.norm(points - np.median(points, axis=0), axis=1) if len(points) else []
+    inner = points[spread <= np.percentile(spread, POINT_PERCENTILE)] if len(points) else points
+    held = np.concatenate([inner, centers])
+    middle = (held.min(axis=0) + held.max(axis=0)) / 2
+    radius = RADIUS_MARGIN * max(float(np.linalg.norm(held - middle, axis=1).max()), 1e-9)
+    return model.transformed(1 / radius, rotation, -middle / radius)
+
+
+def _view(method: str, seed: int, model: _Model, note: str, zoom: float) -> View3D:
+    inside = np.abs(model.points).max(axis=1, initial=0.0) <= 1.0
+    points, colors = model.points[inside], model.colors[inside]
+    if not colors.any():
+        colors = np.full_like(colors, 128)
+    colors = (DARKEST + colors.astype(np.float64) / 255 * COLOR_RANGE).astype(np.uint8)
+    quantised = np.rint((points + 1.0) / 2.0 * np.iinfo(np.uint16).max).astype("<u2")
+    cameras = tuple(zip(model.names, _pyramids(model), strict=True))
+    return View3D(
+        method,
+        seed,
+        len(points),
+        base64_text(quantised.tobytes() + colors.tobytes()),
+        cameras,
+        _still(points, colors, zoom),
+        tuple((name, _still_path(corners, zoom)) for name, corners in cameras),
+        note,
+    )
+
+
+def _pyramids(model: _Model) -> Array:
+    """Return the (M, 5, 3) centre and corners of the view of each camera."""
+    half = np.minimum(model.half_sizes, MAX_HALF_WIDTH)
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    corners = np.ones((len(half), 4, 3))
+    corners[:, :, :2] = signs * half[:, None]
+    turned = np.einsum("mab,mcb->mca", model.axes, corners * CAMERA_DEPTH)
+    return np.concatenate([model.centers[:, None], model.centers[:, None] + turned], axis=1)
+
+
+def _on_still(points: Array, zoom: float) -> Array:
+    """Return the (N, 2) px on the still picture of (N, 3) points, seen from above."""
+    width, height = STILL_SIZE_PX
+    scale = zoom * height / 2
+    return points[:, :2] * [scale, -scale] + [width / 2, height / 2]
+
+
+def _still(points: Array, colors: NDArray[np.uint8], zoom: float) -> Picture:
+    width, height = STILL_SIZE_PX
+    image = np.zeros((height, width, 4), np.uint8)
+    order = np.argsort(points[:, 2], kind="stable")
+    places = np.floor(_on_still(points[order], zoom)).astype(int)
+    inside = (places >= 0).all(axis=1) & (places < STILL_SIZE_PX).all(axis=1)
+    (columns, rows), shown = places[inside].T, colors[order][inside]
+    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        x, y = np.clip(columns + right, 0, width - 1), np.clip(rows + down, 0, height - 1)
+        image[y, x, :3], image[y, x, 3] = shown, 255
+    return Picture.png(image)
+
+
+def _still_path(corners: Array, zoom: float) -> str:
+    places = [f"{x:.0f} {y:.0f}" for x, y in _on_still(corners, zoom)]
+    base = "L".join(places[1:])
+    return f"M{base}Z" + "".join(f"M{places[0]}L{place}" for place in places[1:])

@@ -1,0 +1,356 @@
+"""A comparison on a small scene: figures, files, failures, going on after a stop."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+import pytest
+from command import FAST, run_in_process_of_its_own, start
+from small_scene import INTRINSICS, NAMES, write_photographs
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.copies import open_copy
+from colmap_affrect.comparison import compare as module
+from colmap_affrect.comparison.compare import CompareOptions, compare
+from colmap_affrect.comparison.results import MEASURES, Comparison
+from colmap_affrect.errors import (
+    ComparisonError,
+    OptionError,
+    PairListError,
+    StaleStoreError,
+)
+from colmap_affrect.options import CameraOptions, MappingOptions
+
+CAMERAS = CameraOptions(mode="per-image", model="PINHOLE", params=INTRINSICS)
+NUM_IMAGES = 3
+GIVEN = (*NAMES[:NUM_IMAGES], "broken.png")
+METHODS = ("sift", "unrectified-rootsift", "default", "depth-planes-recommended")
+MIN_NUM_INLIERS = 20
+
+
+def write_ground_truth(folder: Path, suffix: str = ".png") -> None:
+    """Write the true poses of the small scene as a COLMAP model."""
+    folder.mkdir()
+    lines = []
+    for index in range(NUM_IMAGES):
+        yaw = np.deg2rad(-5.0 * (index - 1.5))
+        position = np.array([0.55 * (index - 1.5), -0.1 * index, 0.1 * index])
+        rotation = np.array(
+            [[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]]
+        )
+        pose = [np.cos(yaw / 2), 0, -np.sin(yaw / 2), 0, *(-rotation @ position)]
+        lines.append(f"{index + 1} {' '.join(map(repr, map(float, pose)))} 1 {index}\n\n")
+    (folder / "images.txt").write_text("".join(lines))
+    (folder / "cameras.txt").write_text(f"1 PINHOLE 320 240 {INTRINSICS.replace(',', ' ')}\n")
+    (folder / "points3D.txt").write_text("")
+    model = pycolmap.Reconstruction(folder)
+    for image in model.images.values():  # the text format cannot hold a name with a space
+        image.name = GIVEN[int(image.name)].replace(".png", suffix)
+    for path in folder.iterdir():
+        path.unlink()
+    model.write(folder)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with images, one of them broken, and ground truth."""
+    folder = tmp_path_factory.mktemp("scene")
+    write_photographs(folder / "images", NUM_IMAGES)
+    (folder / "images" / "broken.png").write_bytes(b"no image")
+    write_ground_truth(folder / "truth")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def options(scene: Path) -> CompareOptions:
+    return CompareOptions(
+        methods=METHODS, seeds=(0, 1), cameras=CAMERAS, ground_truth_path=scene / "truth"
+    )
+
+
+@pytest.fixture(scope="module")
+def compared(
+    scene: Path, options: CompareOptions, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Comparison, Path]:
+    out = tmp_path_factory.mktemp("out")
+    comparison = compare(scene / "images", out, options)
+    assert (out / "report.html").stat().st_size > 10_000
+    return comparison, out
+
+
+@pytest.fixture
+def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures take time and have tests of their own."""
+    monkeypatch.setattr(module, "write_page", lambda *_: None)
+
+
+@pytest.fixture
+def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing may be run again."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a method was run")
+
+    monkeypatch.setattr(module, "child", refuse)
+
+
+def test_methods_register_the_scene_and_one_fails_with_its_reason(compared) -> None:
+    comparison, _ = compared
+    *finished, failed = comparison.methods
+    assert [method.name for method in comparison.methods] == list(METHODS)
+    assert comparison.image_names == tuple(sorted(GIVEN))
+    assert comparison.num_pairs == 6
+    for method in finished:
+        assert method.failed == ""
+        assert method.registered.min == method.registered.max == NUM_IMAGES
+        assert method.correct.mean == NUM_IMAGES
+        assert list(method.num_keypoints) == sorted(GIVEN[:NUM_IMAGES])
+        assert len(method.raw_matches) == 3
+        assert "COLMAP cannot read it" in method.failures["broken.png"]
+        assert method.peak_memory_bytes > 50e6
+        assert {*method.stage_seconds} == {"extract", "match", "verify", "map"}
+    assert "depth" in failed.failed
+    assert "Traceback" not in failed.failed
+    assert comparison.registered_by_none == ("broken.png",)
+    assert comparison.verdict[0].startswith("No benefit on this set")
+    assert any(text.startswith("depth-planes-recommended failed: ") for text in comparison.verdict)
+
+
+def test_poses_are_measured_against_ground_truth(compared) -> None:
+    """Of 3 pairs of images with ground truth all count, those of the broken image not."""
+    for method in compared[0].finished:
+        for seed in method.seeds:
+            assert seed.scores.num_pairs == len(seed.scores.pair_errors_deg) == 3
+            assert 1e-4 < seed.scores.median_rotation_error_deg < 0.5
+            assert 0.9 < seed.scores.auc[10.0] <= 1
+            assert seed.scores.auc[1.0] < seed.scores.auc[10.0]
+            assert seed.scores.median_position_error is None  # the cameras are on one line
+
+
+def test_figures_equal_those_of_the_models_on_disk(compared) -> None:
+    comparison, out = compared
+    for method in comparison.finished:
+        for seed in method.seeds:
+            model = pycolmap.Reconstruction(out / seed.model_path)
+            images = [model.images[image_id] for image_id in model.reg_image_ids()]
+            assert seed.registered_names == tuple(sorted(image.name for image in images))
+            lengths = [len(point.track.elements) for point in model.points3D.values()]
+            assert seed.num_points3D == len(lengths)
+            assert seed.mean_track_length == pytest.approx(fmean(lengths))
+            assert seed.mean_observations == pytest.approx(sum(lengths) / len(images))
+            assert sum(seed.num_observations.values()) == sum(lengths)
+            errors = [point.error for point in model.points3D.values()]
+            assert seed.mean_reprojection_error_px == pytest.approx(fmean(errors))
+            with open_copy(out / method.folder / f"seed-{seed.seed}" / "database.db") as database:
+                names = {image.image_id: image.name for image in database.read_all_images()}
+                counts = {
+                    tuple(sorted(names[i] for i in pycolmap.pair_id_to_image_pair(pair_id))): count
+                    for pair_id, count in zip(
+                        *database.read_two_view_geometry_num_inliers(), strict=True
+                    )
+                }
+            assert seed.pair_inliers == {
+                pair: count for pair, count in counts.items() if count >= MIN_NUM_INLIERS
+            }
+
+
+def test_methods_had_the_same_cameras_images_and_pairs(compared) -> None:
+    comparison, out = compared
+    shared = []
+    for method in comparison.finished:
+        with open_copy(out / method.folder / "database.db") as database:
+            images = database.read_all_images()
+            shared.append(
+                (
+                    sorted((image.image_id, image.name, image.camera_id) for image in images),
+                    [list(camera.params) for camera in database.read_all_cameras()],
+                )
+            )
+    assert shared[0] == shared[1] == shared[2]
+    assert len({tuple(sorted(method.raw_matches)) for method in comparison.finished}) == 1
+
+
+def test_json_and_csv_hold_the_same_figures(compared) -> None:
+    comparison, out = compared
+    text = (out / "comparison.json").read_text(encoding="utf-8")
+    assert Comparison.from_json(text) == comparison
+    values = json.loads(text)
+    assert values["verdict"] == list(comparison.verdict)
+    assert values["registered_by_none"] == ["broken.png"]
+    assert next(iter(values["methods"]["depth-planes-recommended"])) == "failed"
+    with (out / "comparison.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["method"], row["seed"]) for row in rows] == [
+        *((name, seed) for name in METHODS[:3] for seed in "01"),
+        (METHODS[3], ""),
+    ]
+    for name in METHODS[:3]:
+        method, mine = values["methods"][name], [row for row in rows if row["method"] == name]
+        for key in MEASURES:
+            numbers = [float(row[key]) for row in mine]
+            assert method[key] == {
+                "mean": fmean(numbers), "min": min(numbers), "max": max(numbers),
+            }  # fmt: skip
+        assert method["correct"]["mean"] == fmean(float(row["correct"]) for row in mine)
+        assert method["wall_s"]["map"] == pytest.approx(fmean(float(r["map_s"]) for r in mine))
+        assert method["wall_s"]["extract"] == float(mine[0]["extract_s"])
+        assert list(method["registered_names"]) == ["0", "1"]
+        assert float(mine[1]["auc_5"]) == method["seeds"][1]["scores"]["auc"]["5"]
+        assert int(mine[0]["keypoints"]) == sum(method["num_keypoints"].values())
+
+
+def test_summary_shows_every_method_and_the_verdict(compared) -> None:
+    summary = compared[0].summary()
+    table, _, text = summary.partition("\n\n")
+    assert max(map(len, text.splitlines())) <= 88
+    assert [line.split()[0] for line in table.splitlines()] == ["method", *METHODS]
+    assert "3 of 4" in table.splitlines()[1]
+    assert text.startswith("No benefit on this set")
+
+
+@pytest.mark.usefixtures("no_processes", "no_page")
+def test_finished_methods_are_not_run_again(scene, options, compared) -> None:
+    """Without the one that failed, which would be."""
+    comparison, out = compared
+    again = compare(scene / "images", out, replace(options, methods=METHODS[:3]))
+    assert again.methods == tuple(replace(m) for m in comparison.methods[:3])
+
+
+@pytest.mark.usefixtures("no_processes")
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cameras": CameraOptions()}, r"compared there with camera.mode='per-image', and it is"),
+        ({"mapping": MappingOptions(min_model_size=3)}, "mapping.min_model_size=2, and it is 3"),
+        (
+            {"methods": ["default=unrectified-rootsift"]},
+            r"default was run there with recipe.rectifier.name='dense-shapes', and it is",
+        ),
+    ],
+)
+def test_other_options_than_before_are_refused(scene, options, compared, changes, message) -> None:
+    with pytest.raises(StaleStoreError, match=f"{message}.*; use --overwrite"):
+        compare(scene / "images", compared[1], replace(options, **changes))
+
+
+@pytest.mark.usefixtures("no_processes")
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"methods": ["sift", "defualt"]}, OptionError, "did you mean 'default'"),
+        ({"seeds": (1, 1)}, OptionError, "give different seeds"),
+        ({"seeds": ()}, OptionError, "give different seeds"),
+        ({"ground_truth_path": Path("nowhere")}, ComparisonError, "nowhere: not a COLMAP model"),
+        ({"match_list_path": Path("nowhere")}, PairListError, "nowhere: cannot be read"),
+        ({"cameras": CameraOptions(model="PINHOLES")}, OptionError, "--camera-model PINHOLES"),
+    ],
+)
+def test_bad_input_is_refused_before_any_work(
+    scene, options, tmp_path, changes, error, message
+) -> None:
+    with pytest.raises(error, match=message):
+        compare(scene / "images", tmp_path / "out", replace(options, **changes))
+    assert not (tmp_path / "out").exists()
+
+
+def test_ground_truth_of_other_images_is_refused(scene, options, tmp_path) -> None:
+    write_ground_truth(tmp_path / "truth", ".jpg")
+    options = replace(options, ground_truth_path=tmp_path / "truth")
+    with pytest.raises(ComparisonError, match=r"shares no image name .* \(it has a.jpg, they"):
+        compare(scene / "images", tmp_path / "out", options)
+
+
+@pytest.mark.parametrize("num_readable", [0, 1])
+def test_fewer_than_two_images_are_refused(tmp_path, num_readable) -> None:
+    images = tmp_path / "images"
+    write_photographs(images, 1)
+    with pytest.raises(ComparisonError, match=r"only a\.png to use; .* at least two"):
+        compare(images, tmp_path / "out")
+    (images / "broken.png").write_bytes(b"no image")
+    if not num_readable:
+        (images / "a.png").write_bytes(b"no image either")
+    with pytest.raises(ComparisonError, match=f"can use {num_readable} of the 2 images"):
+        compare(images, tmp_path / "out")
+    assert not (tmp_path / "out" / "shared").exists()
+
+
+def test_folders_that_were_not_made_here_are_left_alone(scene, options, tmp_path) -> None:
+    (tmp_path / "methods").mkdir()
+    with pytest.raises(StaleStoreError, match="was not made here"):
+        compare(scene / "images", tmp_path, options, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir() if not path.name.startswith(".")] == [
+        "methods"
+    ]
+
+
+DYING = """
+import os, signal, sys
+print('{"stage": "extract", "total": 4, "unit": "images"}', flush=True)
+os.kill(os.getpid(), signal.SIGSEGV)
+"""
+
+
+@pytest.mark.usefixtures("no_page")
+def test_method_whose_process_dies_is_reported(
+    scene, options, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "dying_worker.py").write_text(DYING)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(module.worker, "__name__", "dying_worker")
+    (method,) = compare(
+        scene / "images", tmp_path / "out", replace(options, methods=["sift"])
+    ).methods
+    assert method.failed.startswith("its process ended by SIGSEGV; ")
+    assert method.failed.endswith("run.log may say why")
+
+
+@pytest.fixture
+def killed(scene: Path, tmp_path: Path) -> Iterator[Path]:
+    """Folder of a comparison that was killed while features were extracted."""
+    out = tmp_path / "out"
+    arguments = [
+        "compare", "--image-path", scene / "images", "--output-path", out,
+        "--methods", "default", "--seeds", "0", *FAST[2:],
+    ]  # fmt: skip
+    features = out / "methods" / "default" / "features.h5"
+    with start(*arguments) as process:
+        while not features.exists() and process.poll() is None:
+            time.sleep(0.01)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL
+    assert not (out / "comparison.json").exists()
+    return out
+
+
+@pytest.mark.usefixtures("no_page")
+def test_killed_comparison_goes_on_and_ends_as_an_undisturbed_one(
+    scene, options, compared, killed
+) -> None:
+    options = replace(options, methods=["default"], seeds=[0])
+    (method,) = compare(scene / "images", killed, options).methods
+    expected = compared[0].methods[METHODS.index("default")]
+    assert method.num_keypoints == expected.num_keypoints
+    assert method.raw_matches == expected.raw_matches
+    assert method.seeds[0].registered_names == expected.seeds[0].registered_names
+    assert method.seeds[0].num_points3D == expected.seeds[0].num_points3D
+
+
+def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) -> None:
+    """The methods are finished there: it only prints."""
+    ended = run_in_process_of_its_own(
+        "compare", "--image-path", scene / "images", "--output-path", compared[1],
+        "--ground-truth-path", scene / "truth", "--methods", "sift,default", "--seeds", "0,1",
+        *FAST[2:],
+    )  # fmt: skip
+    assert ended.code == 1
+    assert ended.errors == ["error: could not read 1 of the images: broken.png"]
+    assert ended.stdout.startswith("method")
+    assert "No benefit on this set" in ended.stdout

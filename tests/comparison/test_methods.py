@@ -1,0 +1,111 @@
+"""Methods by name, and COLMAP's SIFT on masks, lists of pairs and names with spaces."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from small_scene import NAMES, write_photographs
+
+from colmap_affrect.colmap.database import image_ids, import_images, open_database
+from colmap_affrect.comparison.methods import DEFAULT_METHODS, parse_methods
+from colmap_affrect.comparison.sift import (
+    describe_options,
+    extract_sift,
+    match_sift,
+    rename_images,
+)
+from colmap_affrect.errors import OptionError
+from colmap_affrect.options import CameraOptions, MaskOptions
+
+
+def test_default_methods_are_known():
+    assert tuple(m.label for m in parse_methods([",".join(DEFAULT_METHODS)])) == DEFAULT_METHODS
+
+
+def test_options_of_a_recipe_are_changed_by_what_follows_the_colon():
+    texts = ["sift, tuned=default:matching.max_ratio=0.7,max_image_size_px=640", "unrectified"]
+    sift, tuned, unrectified = parse_methods(texts)
+    assert (sift.recipe, unrectified.label) == (None, "unrectified")
+    assert tuned.label == "tuned"
+    assert tuned.recipe.matching.max_ratio == 0.7
+    assert tuned.recipe.extraction.max_image_size_px == 640
+    assert tuned.recipe.name == "default"
+
+
+def test_depth_goes_to_the_recipes_that_use_it():
+    depth, default = parse_methods(["depth-planes,default"], ['depth.path="/depth"'])
+    assert depth.recipe.extraction.depth.path == "/depth"
+    assert default.recipe.extraction.depth.path == ""
+
+
+def test_folders_of_methods_differ_and_stay_inside():
+    texts = ["default:max_image_size_px=640", "default:max_image_size_px=641", "a/../b=default"]
+    folders = [method.folder_name for method in parse_methods(texts)]
+    assert len(set(folders)) == 3
+    assert not any("/" in folder or "." in folder for folder in folders)
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["sift,defualt"], "unknown method 'defualt': did you mean 'default'"),
+        (["sfit"], "did you mean 'sift'"),
+        (["sift,sift"], "two are called 'sift'"),
+        (["sift=default"], "'sift' is COLMAP's"),
+        ([","], "none given; known are sift, sift-affine-dsp"),
+        (["default:matching.max_ration=1"], "did you mean 'max_ratio'"),
+    ],
+)
+def test_wrong_methods_are_refused(texts, message):
+    with pytest.raises(OptionError, match=message):
+        parse_methods(texts)
+
+
+def test_affine_sift_differs_from_colmaps_default_as_its_name_says():
+    assert describe_options(affine=False)["extraction"] == {}
+    assert describe_options(affine=True)["extraction"] == {
+        "sift.estimate_affine_shape": True,
+        "sift.domain_size_pooling": True,
+    }
+
+
+def test_sift_looks_at_the_masks_and_matches_the_pairs_of_the_list(tmp_path):
+    names = write_photographs(tmp_path / "images", 3)
+    masks = tmp_path / "masks" / "side"
+    masks.mkdir(parents=True)
+    mask = np.full((240, 320), 255, np.uint8)
+    mask[:, :160] = 0
+    for path in ("a.png.png", "b c.png", "side/č.png.png"):
+        cv2.imwrite(str(tmp_path / "masks" / path), mask)
+    path = tmp_path / "database.db"
+    import_images(path, tmp_path / "images", names, CameraOptions())
+    ids = image_ids(path)
+    options = MaskOptions(path=str(tmp_path / "masks"))
+    assert extract_sift(path, tmp_path / "images", names, options, affine=False) == {}
+    with open_database(path) as database:
+        for name in names:
+            keypoints = database.read_keypoints(ids[name])
+            assert len(keypoints) > 50
+            assert keypoints[:, 0].min() >= 160
+    first, second, third = names
+    assert second == "b c.png"
+    match_sift(path, [(first, second), (second, third)], tmp_path / "pairs.txt")
+    assert image_ids(path) == ids
+    assert not (tmp_path / "pairs.txt").exists()
+    with open_database(path) as database:
+        assert len(database.read_matches(ids[first], ids[second])) > 20
+        assert database.exists_matches(ids[second], ids[third])
+        assert not database.exists_matches(ids[first], ids[third])
+        assert database.num_verified_image_pairs() == 0
+
+
+def test_names_lost_while_matching_was_killed_come_back(tmp_path):
+    names = write_photographs(tmp_path / "images", 2)
+    path = tmp_path / "database.db"
+    import_images(path, tmp_path / "images", names, CameraOptions())
+    ids = image_ids(path)
+    rename_images(path, {image_id: f"id:{image_id}" for image_id in ids.values()})
+    assert set(image_ids(path)).isdisjoint(NAMES)
+    rename_images(path, {image_id: name for name, image_id in ids.items()})
+    assert image_ids(path) == ids

@@ -1,0 +1,189 @@
+"""A comparison whose photographs, databases and models are on disk, made without running any."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from synthetic import texture, write_image
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.comparison.results import (
+    AUC_THRESHOLDS_DEG,
+    Comparison,
+    MethodResult,
+    Pair,
+    PoseScores,
+    SeedResult,
+)
+from colmap_affrect.options import CameraOptions, MaskOptions
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.store import FeatureStore
+from colmap_affrect.types import LocalFeatures
+from colmap_affrect.workspace import Workspace
+
+NAMES = ("<img src=x onerror=alert(1)>.png", "a & b.png", "c.png", "d.png", "e.png", "f.png")
+IMAGE_SIZE = (160, 120)
+SIMILARITY = pycolmap.Sim3d(
+    2.5, pycolmap.Rotation3d(np.array([0.1, 0.7, -0.2, 0.4])), np.array([3.0, -1.0, 2.0])
+)
+"""Between the models of the two methods: no model has a frame of its own."""
+
+
+def make_comparison(folder: Path) -> Comparison:
+    """Six photographs; ``sift`` registers four of them, ``default`` five, with one seed four.
+
+    A third method failed. ``default`` has features from warps, and ground truth says that one
+    photograph which it registers is at a wrong place.
+    """
+    photographs = folder / "photographs"
+    photographs.mkdir(parents=True)
+    for number, name in enumerate(NAMES):
+        upright = texture((3 * IMAGE_SIZE[0], IMAGE_SIZE[1]), number)
+        slanted = cv2.resize(upright, IMAGE_SIZE, interpolation=cv2.INTER_AREA)
+        write_image(photographs / name, slanted)
+    truth, pair_inliers = _write_scene(folder / "all.db")
+    sift = _write_method(folder, "sift", truth, NAMES[:4])
+    default = _write_method(folder, "default", truth, NAMES[:5], SIMILARITY)
+    _write_features(folder / "methods" / "default")
+    fewer = {pair: count for pair, count in pair_inliers.items() if pair != NAMES[:2]}
+    methods = (
+        _method("sift", [_seed(0, sift, fewer), _seed(1, sift, fewer)]),
+        _method("broken", [], failed="weights <affnet> & more are missing"),
+        _method(
+            "default",
+            [
+                _seed(0, default, pair_inliers, wrong=[NAMES[4]]),
+                replace(
+                    _seed(1, default, fewer),
+                    model_names=(tuple(sorted(NAMES[:4])), tuple(NAMES[4:])),
+                    num_points3D=70,
+                ),
+            ],
+        ),
+    )
+    return Comparison(
+        tuple(sorted(NAMES)),
+        str(photographs),
+        methods,
+        (0, 1),
+        15,
+        {"camera": {"mode": "auto"}, "preset": "sparse"},
+        {"pycolmap": pycolmap.__version__},
+    )
+
+
+def _write_scene(database_path: Path) -> tuple[pycolmap.Reconstruction, dict[Pair, int]]:
+    """Write a database of all images; return their model and the inliers of all pairs."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, len(NAMES), 90
+    options.camera_width, options.camera_height = IMAGE_SIZE
+    options.camera_model_id = pycolmap.CameraModelId.PINHOLE
+    options.camera_params = [200.0, 200.0, 80.0, 60.0]
+    pycolmap.set_random_seed(0)
+    with open_database(database_path) as database:
+        model = pycolmap.synthesize_dataset(options, database)
+        for image, name in zip(database.read_all_images(), NAMES, strict=True):
+            image.name = name
+            database.update_image(image)
+            model.images[image.image_id].name = name
+        pairs = {}
+        for pair_id, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
+            ids = pycolmap.pair_id_to_image_pair(pair_id)
+            name1, name2 = sorted(model.images[image_id].name for image_id in ids)
+            pairs[name1, name2] = count
+    return model, pairs
+
+
+def _write_method(
+    folder: Path,
+    method: str,
+    truth: pycolmap.Reconstruction,
+    names: Sequence[str],
+    new_from_old: pycolmap.Sim3d | None = None,
+) -> pycolmap.Reconstruction:
+    """Write the database and the model of a method, which registers some of the images."""
+    model = pycolmap.Reconstruction(truth)
+    for image in list(model.images.values()):
+        if image.name not in names:
+            model.deregister_frame(image.frame_id)
+    if new_from_old is not None:
+        model.transform(new_from_old)
+    seed = folder / "methods" / method / "seed-0"
+    (seed / "sparse" / "0").mkdir(parents=True)
+    model.write(seed / "sparse" / "0")
+    (seed / "database.db").write_bytes((folder / "all.db").read_bytes())
+    return model
+
+
+def _write_features(method_path: Path) -> None:
+    """Write the record of the recipe, and features of which every second one is from a warp."""
+    workspace = Workspace(method_path)
+    record = {
+        "image_path": str(method_path.parents[1] / "photographs"),
+        "camera": CameraOptions().to_mapping(),
+        "masks": MaskOptions().to_mapping(),
+        **load_recipe("default").extraction.to_mapping(),
+    }
+    workspace.claim("extract", record, recipe="default")
+    store = FeatureStore(workspace.features)
+    with open_database(method_path / "seed-0" / "database.db") as database:
+        for image in database.read_all_images():
+            count = database.num_keypoints_for_image(image.image_id)
+            features = LocalFeatures(
+                np.tile(np.eye(2, 3), (count, 1, 1)),
+                np.ones(count, np.float32),
+                np.ones((count, 1), np.float32),
+                np.arange(count, dtype=np.int32) % 2,
+            )
+            store.write(image.name, features, IMAGE_SIZE)
+
+
+def _seed(
+    seed: int,
+    model: pycolmap.Reconstruction,
+    pair_inliers: dict[Pair, int],
+    wrong: Sequence[str] = (),
+) -> SeedResult:
+    registered = sorted(model.images[image_id].name for image_id in model.reg_image_ids())
+    correct = tuple(name for name in registered if name not in wrong)
+    name = "default" if len(registered) == 5 else "sift"
+    pairs = [(a, b) for a in registered for b in registered if a < b]
+    return SeedResult(
+        seed=seed,
+        model_names=(tuple(registered),),
+        model_path=f"methods/{name}/seed-0/sparse/0",
+        num_points3D=model.num_points3D(),
+        mean_track_length=model.compute_mean_track_length(),
+        mean_observations=model.compute_mean_observations_per_reg_image(),
+        mean_reprojection_error_px=0.21 + seed / 100,
+        pair_inliers=pair_inliers,
+        scores=PoseScores(
+            correct,
+            {pair: (0.5 + seed, 40.0 if set(pair) & set(wrong) else 1.25) for pair in pairs},
+            15,
+            {limit: limit / 40 + seed / 100 for limit in AUC_THRESHOLDS_DEG},
+            0.0123,
+        ),
+        wall_s={"verify": 0.75, "map": 3.5 + seed},
+    )
+
+
+def _method(name: str, seeds: Sequence[SeedResult], failed: str = "") -> MethodResult:
+    return MethodResult(
+        name,
+        f"summary of {name}",
+        {image: 100 + number for number, image in enumerate(NAMES)},
+        {},
+        tuple(seeds),
+        {"extract": 12.25, "match": 1.5},
+        123_400_000,
+        {"broken.png": "not a <readable> image"} if name == "sift" else {},
+        {"features": {"profile": "rootsift"}},
+        f"methods/{name}",
+        failed,
+    )
