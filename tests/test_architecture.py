@@ -44,7 +44,7 @@ ROWS = [
     {
         "report.inspection", "report.levels", "report.match_plots", "report.page",
         "report.pictures", "report.scene", "report.sheet", "report.tilt_plot",
-        "report.view_graph", "report.warp_views",
+        "report.view_graph", "report.viewer", "report.warp_views",
     },
     {"comparison.compare"},
     {"cli", "__main__"},
@@ -86,6 +86,7 @@ HOMES = {
     "matplotlib": {"report.sheet", "report.tilt_plot"},
     "jinja2": {"report.page"},
     "networkx": {"report.view_graph"},
+    "rerun": {"report.viewer"},
     "scipy": set(),
     "sqlite3": {"colmap.checks", "colmap.copies"},
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +50,7 @@ class View3D:
     """
 
     method: str
-    seed: int
+    seed: int = 0
     num_points: int = 0
     points: str = ""
     cameras: tuple[tuple[str, Array], ...] = ()
@@ -73,7 +73,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class _Model:
+class Model:
     """A model as arrays.
 
     Attributes:
@@ -81,7 +81,8 @@ class _Model:
         centers: (M, 3) of the cameras.
         axes: (M, 3, 3) rotations world_from_camera.
         half_sizes: (M, 2) half width and height of the view at depth 1.
-        points, colors: (N, 3) and (N, 3) uint8.
+        points, colors: (N, 3) and (N, 3) uint8; at most ``MAX_NUM_POINTS``.
+        seed: that it was made with.
     """
 
     names: tuple[str, ...]
@@ -90,16 +91,15 @@ class _Model:
     half_sizes: Array
     points: Array
     colors: NDArray[np.uint8]
+    seed: int
 
-    def transformed(self, scale: float, rotation: Array, translation: Array) -> _Model:
+    def transformed(self, scale: float, rotation: Array, translation: Array) -> Model:
         """Return it after x -> scale rotation x + translation."""
-        return _Model(
-            self.names,
-            scale * self.centers @ rotation.T + translation,
-            rotation @ self.axes,
-            self.half_sizes,
-            scale * self.points @ rotation.T + translation,
-            self.colors,
+        return replace(
+            self,
+            centers=scale * self.centers @ rotation.T + translation,
+            axes=rotation @ self.axes,
+            points=scale * self.points @ rotation.T + translation,
         )
 
 
@@ -110,33 +110,45 @@ def read_scene(methods: Sequence[MethodResult], output_path: Path) -> Scene:
         methods: each is shown with the first seed that has a model.
         output_path: folder of the comparison.
     """
-    models: dict[str, _Model] = {}
+    models, notes = read_models(methods, output_path)
+    zoom = _zoom_from_above(list(models.values()))
+    views = []
+    for method in methods:
+        note = notes.get(method.name, "")
+        if method.name in models:
+            views.append(_view(method.name, models[method.name], note, zoom))
+        else:
+            views.append(View3D(method.name, note=note))
+    return Scene(tuple(views), zoom)
+
+
+def read_models(
+    methods: Sequence[MethodResult], output_path: Path
+) -> tuple[dict[str, Model], dict[str, str]]:
+    """Read the models of methods and bring them into the frame of the largest.
+
+    Args:
+        methods: each with the first seed that has a model.
+        output_path: folder of the comparison.
+
+    Returns:
+        The models, and what is special about them or why they are missing, by method.
+    """
+    models: dict[str, Model] = {}
     notes: dict[str, str] = {}
-    seeds: dict[str, int] = {}
     for method in methods:
         seed = next((seed for seed in method.seeds if seed.model_path), None)
         if seed is None:
             notes[method.name] = "There is no model."
             continue
-        seeds[method.name] = seed.seed
         try:
-            models[method.name] = _read(output_path / seed.model_path)
+            models[method.name] = _read(output_path / seed.model_path, seed.seed)
         except AffrectError as error:
             notes[method.name] = f"The model cannot be shown: {error}"
-    if models:
-        models = _in_one_frame(models, notes)
-    zoom = _zoom_from_above(list(models.values()))
-    views = []
-    for method in methods:
-        number, note = seeds.get(method.name, 0), notes.get(method.name, "")
-        if method.name in models:
-            views.append(_view(method.name, number, models[method.name], note, zoom))
-        else:
-            views.append(View3D(method.name, number, note=note))
-    return Scene(tuple(views), zoom)
+    return (_in_one_frame(models, notes) if models else {}), notes
 
 
-def _zoom_from_above(models: Sequence[_Model]) -> float:
+def _zoom_from_above(models: Sequence[Model]) -> float:
     """Return the zoom, 1 to 3, with which cameras and nearly all points fill the still picture."""
     if not models:
         return 1.0
@@ -154,7 +166,7 @@ def _zoom_from_above(models: Sequence[_Model]) -> float:
     return float(np.clip(zoom, 1.0, 3.0))
 
 
-def _read(path: Path) -> _Model:
+def _read(path: Path, seed: int) -> Model:
     registered_names(path)
     model = pycolmap.Reconstruction(path)
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
@@ -167,17 +179,18 @@ def _read(path: Path) -> _Model:
     if len(ids) > MAX_NUM_POINTS:
         ids = np.random.default_rng(0).choice(ids, MAX_NUM_POINTS, replace=False)
     points = [model.points3D[point_id] for point_id in ids.tolist()]
-    return _Model(
+    return Model(
         tuple(image.name for image in images),
         np.array([image.projection_center() for image in images]).reshape(-1, 3),
         np.array([image.cam_from_world().rotation.matrix().T for image in images]),
         np.array(sizes),
         np.array([point.xyz for point in points]).reshape(-1, 3),
         np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        seed,
     )
 
 
-def _in_one_frame(models: Mapping[str, _Model], notes: dict[str, str]) -> dict[str, _Model]:
+def _in_one_frame(models: Mapping[str, Model], notes: dict[str, str]) -> dict[str, Model]:
     """Align models with the largest, turn what is up upwards, and scale the view to radius 1."""
     reference = max(models, key=lambda name: len(models[name].names))
     upright = _upright(models[reference])
@@ -197,7 +210,7 @@ def _in_one_frame(models: Mapping[str, _Model], notes: dict[str, str]) -> dict[s
     return framed
 
 
-def similarity_of(source: _Model, target: _Model) -> tuple[float, Array, Array] | None:
+def similarity_of(source: Model, target: Model) -> tuple[float, Array, Array] | None:
     """Estimate scale, rotation and translation target_from_source from the shared images.
 
     Medians, so that single misplaced cameras do not matter. None with fewer than two shared
@@ -223,7 +236,7 @@ def similarity_of(source: _Model, target: _Model) -> tuple[float, Array, Array] 
     return scale, rotation, translation
 
 
-def _upright(model: _Model) -> _Model:
+def _upright(model: Model) -> Model:
     """Turn a model so that z is up, as cameras are held on average, and x is its long side.
 
     The middle of cameras and points goes to the origin, and the scale is that of the view.
@@ -249,7 +262,7 @@ def _upright(model: _Model) -> _Model:
     return model.transformed(1 / radius, rotation, -middle / radius)
 
 
-def _view(method: str, seed: int, model: _Model, note: str, zoom: float) -> View3D:
+def _view(method: str, model: Model, note: str, zoom: float) -> View3D:
     inside = np.abs(model.points).max(axis=1, initial=0.0) <= 1.0
     points, colors = model.points[inside], model.colors[inside]
     if not colors.any():
@@ -259,7 +272,7 @@ def _view(method: str, seed: int, model: _Model, note: str, zoom: float) -> View
     cameras = tuple(zip(model.names, _pyramids(model), strict=True))
     return View3D(
         method,
-        seed,
+        model.seed,
         len(points),
         base64_text(quantised.tobytes() + colors.tobytes()),
         cameras,
@@ -269,7 +282,7 @@ def _view(method: str, seed: int, model: _Model, note: str, zoom: float) -> View
     )
 
 
-def _pyramids(model: _Model) -> Array:
+def _pyramids(model: Model) -> Array:
     """Return the (M, 5, 3) centre and corners of the view of each camera."""
     half = np.minimum(model.half_sizes, MAX_HALF_WIDTH)
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
