@@ -248,6 +248,11 @@ def build_parser() -> argparse.ArgumentParser:
     _add_preset(compare)
     _add_mapper(compare)
     compare.add_argument("--json", action="store_true", help="print comparison.json, no summary")
+    compare.add_argument(
+        "--viewer",
+        action="store_true",
+        help="also comparison.rrd for rerun (pip install 'colmap-affrect[viewer]')",
+    )
 
     inspect = _command(
         commands,
@@ -826,7 +831,10 @@ def _map(options: argparse.Namespace) -> int:
 def _compare(options: argparse.Namespace) -> int:
     from colmap_affrect.comparison.compare import CompareOptions, compare
     from colmap_affrect.comparison.methods import parse_methods
+    from colmap_affrect.report.viewer import log_comparison, require_viewer
 
+    if options.viewer:
+        require_viewer()
     comparison = compare(
         options.image_path,
         options.output_path,
@@ -849,6 +857,9 @@ def _compare(options: argparse.Namespace) -> int:
     print(comparison.to_json() if options.json else comparison.summary())
     if not options.json:
         print(f"\npictures: {options.output_path / 'report.html'}")
+    if options.viewer:
+        path = log_comparison(comparison, options.output_path)
+        print(f"for rerun: {path}", file=sys.stderr)
     return _comparison_exit_code(comparison, options)
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,23 +61,58 @@ def import_images(
     """Add cameras, rigs, frames and images for the names that the database lacks.
 
     Image sizes, EXIF focal lengths and GPS priors are read by COLMAP itself, from the
-    stored, un-rotated files.
+    stored, un-rotated files. Images that come later share the cameras of those that are there
+    as if all had come at once. A new database appears only when all images are in it.
 
     Returns:
         Names that COLMAP could not read.
     """
-    new = sorted(set(names) - set(image_ids(path)))
-    if not new:
-        return []
-    require_database_space(path, len(new))
-    pycolmap.import_images(
-        path,
-        image_path,
-        camera_mode=getattr(pycolmap.CameraMode, cameras.mode.upper().replace("-", "_")),
-        image_names=new,
-        options=reader_options(cameras),
-    )
-    return sorted(set(new) - set(image_ids(path)))
+    if path.exists():
+        _import_into(path, image_path, names, cameras)
+    else:
+        beside = path.with_name(path.name + ".new")
+        for file in (path, beside):
+            for suffix in ("", "-wal", "-shm"):
+                file.with_name(file.name + suffix).unlink(missing_ok=True)
+        _import_into(beside, image_path, names, cameras)
+        beside.replace(path)
+    return sorted(set(names) - set(image_ids(path)))
+
+
+def _import_into(
+    path: Path, image_path: Path, names: Sequence[str], cameras: CameraOptions
+) -> None:
+    for camera_id, new in _by_camera(path, names, cameras).items():
+        # COLMAP takes a camera that is there in this mode only.
+        mode = cameras.mode if camera_id == cameras.existing_camera_id else "single"
+        require_database_space(path, len(new))
+        pycolmap.import_images(
+            path,
+            image_path,
+            camera_mode=getattr(pycolmap.CameraMode, mode.upper().replace("-", "_")),
+            image_names=new,
+            options=reader_options(replace(cameras, existing_camera_id=camera_id)),
+        )
+
+
+def _by_camera(path: Path, names: Sequence[str], cameras: CameraOptions) -> dict[int, list[str]]:
+    """Sort the names that a database lacks by the camera there that they share, -1 for none."""
+
+    def group(name: str) -> str:
+        return str(PurePosixPath(name).parent) if cameras.mode == "per-folder" else ""
+
+    with open_database(path) as database:
+        there = {image.name: image.camera_id for image in database.read_all_images()}
+    shared: dict[str, set[int]] = {}
+    if cameras.mode in ("single", "per-folder"):
+        for name, camera_id in there.items():
+            shared.setdefault(group(name), set()).add(camera_id)
+    found: dict[int, list[str]] = {}
+    for name in sorted(set(names) - set(there)):
+        camera_ids = shared.get(group(name), set())
+        known = min(camera_ids) if len(camera_ids) == 1 else cameras.existing_camera_id
+        found.setdefault(known, []).append(name)
+    return found
 
 
 def reader_options(cameras: CameraOptions) -> pycolmap.ImageReaderOptions:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 from colmap_affrect.comparison.results import Comparison
@@ -13,6 +14,12 @@ from colmap_affrect.report.scene import CAMERA_DEPTH, read_models
 FILE_NAME = "comparison.rrd"
 IMAGE_SIZE_PX = 640
 JPEG_QUALITY = 80
+
+
+def require_viewer() -> None:
+    """Raise ComparisonError when rerun is not installed."""
+    if find_spec("rerun") is None:
+        raise ComparisonError('the viewer needs rerun: pip install "colmap-affrect[viewer]"')
 
 
 def log_comparison(comparison: Comparison, output_path: Path) -> Path:
@@ -30,12 +37,9 @@ def log_comparison(comparison: Comparison, output_path: Path) -> Path:
     Raises:
         ComparisonError: when rerun is not installed.
     """
-    try:
-        import rerun
-    except ImportError as error:
-        raise ComparisonError(
-            'the viewer needs rerun: pip install "colmap-affrect[viewer]"'
-        ) from error
+    require_viewer()
+    import rerun
+
     path = output_path / FILE_NAME
     models, _ = read_models(comparison.finished, output_path)
     with rerun.RecordingStream("colmap_affrect") as recording:

@@ -103,6 +103,42 @@ def test_import_images_shares_cameras_by_mode(
         assert (camera.width, camera.height) == (90, 60)
 
 
+@pytest.mark.parametrize("mode", ["single", "per-folder", "per-image"])
+@pytest.mark.parametrize("first", [["a.png"], ["b.png", "wing/a.png"]])
+def test_images_that_come_later_share_the_cameras_of_those_that_are_there(
+    tmp_path: Path, image_folder: Path, mode: str, first: list[str]
+) -> None:
+    names = NAMES[:2] + NAMES[3:]
+    write_image(image_folder / "wing" / "a.png", texture((90, 60), 9))
+    names.append("wing/a.png")
+    sharing = []
+    for path, parts in (("once.db", [names]), ("later.db", [first, names])):
+        for part in parts:
+            assert (
+                import_images(tmp_path / path, image_folder, part, CameraOptions(mode=mode)) == []
+            )
+        with open_database(tmp_path / path) as database:
+            cameras = {image.name: image.camera_id for image in database.read_all_images()}
+        sharing.append({(a, b) for a in cameras for b in cameras if cameras[a] == cameras[b]})
+    assert sharing[0] == sharing[1]
+    assert len(sharing[0]) == {"single": 16, "per-folder": 8, "per-image": 4}[mode]
+
+
+def test_new_database_appears_with_all_images_or_not_at_all(
+    tmp_path: Path, image_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "database.db"
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", lambda *_: pytest.fail("killed"))
+        with pytest.raises(pytest.fail.Exception):
+            import_images(path, image_folder, NAMES, CameraOptions(mode="per-folder"))
+    assert not path.exists()
+    (tmp_path / "database.db-wal").write_bytes(b"of a database that was removed")
+    import_images(path, image_folder, NAMES[:2], CameraOptions(mode="per-folder"))
+    assert sorted(image_ids(path)) == NAMES[:2]
+    assert sorted(file.name for file in tmp_path.glob("database.db*")) == ["database.db"]
+
+
 def test_image_ids_of_a_file_that_is_no_database_is_a_database_error(tmp_path: Path) -> None:
     path = tmp_path / "not a database.db"
     path.write_bytes(b"something else, long enough to have a header of its own" * 10)
