@@ -53,3 +53,7 @@ class DeviceError(AffrectError):
 
 class ComparisonError(AffrectError):
     """Methods cannot be compared as asked."""
+
+
+class EvaluationError(AffrectError):
+    """A dataset cannot be evaluated as asked."""

@@ -76,8 +76,19 @@ def relative_pose_errors(
     Returns:
         The rotation angle and the angle between the translation directions, in degrees.
     """
-    rotation, translation = relative_pose(estimated[name1], estimated[name2])
-    true_rotation, true_translation = relative_pose(truth[name1], truth[name2])
+    return pose_errors(
+        relative_pose(estimated[name1], estimated[name2]), relative_pose(truth[name1], truth[name2])
+    )
+
+
+def pose_errors(estimated: Pose, truth: Pose) -> tuple[float, float]:
+    """Compare two relative poses, whatever the lengths of their translations.
+
+    Returns:
+        The rotation angle and the angle between the translation directions, in degrees.
+    """
+    rotation, translation = estimated
+    true_rotation, true_translation = truth
     difference = rotation @ true_rotation.T
     skew = difference - difference.T
     sine = np.linalg.norm([skew[2, 1], skew[0, 2], skew[1, 0]])

@@ -35,12 +35,15 @@ class EvaluationPair:
         images: the two.
         category: of difficulty, as the protocol's tables group pairs; empty where it does not.
         truth: what the score needs; known to the protocol only.
+        problem: why it cannot be scored (a file that is missing, a truth that is not finite); such
+            a pair counts as failed. Empty for the others.
     """
 
     name: str
     images: tuple[EvaluationImage, EvaluationImage]
     category: str = ""
     truth: Any = None
+    problem: str = ""
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,11 @@ class PairResult:
         score: of its matches.
         num_matches: before the estimation.
         seconds: matching and estimation.
+        num_keypoints: features of the two images that were matched.
+        seconds_by_step: the same by step, ``match`` and ``estimate``.
+        level: rectifier of the level of escalation that decided; empty without escalation.
+        failure: why there is no score, if an image could not be read or the like; such pairs
+            have an infinite error and count as failed.
     """
 
     name: str
@@ -77,6 +85,10 @@ class PairResult:
     score: PairScore
     num_matches: int
     seconds: float
+    num_keypoints: tuple[int, int] = (0, 0)
+    seconds_by_step: Mapping[str, float] = field(default_factory=dict)
+    level: str = ""
+    failure: str = ""
 
 
 @dataclass(frozen=True)
@@ -96,10 +108,18 @@ class Dataset:
 class EvaluationProtocol(Protocol):
     """Loads a dataset, scores matches, and sums up, as one of the paper's tables does.
 
-    Implementations are frozen dataclasses of their settings, named in ``registry.PROTOCOLS``.
+    Implementations are frozen dataclasses of their settings, named in ``registry.PROTOCOLS``, that
+    can be made without arguments. What follows ``name`` are class variables.
+
+    Attributes:
+        name: as the command line has it.
+        error_title: what the error of a score is, with its unit, for axes of plots.
+        category_title: what the categories are, for axes of plots; empty without categories.
     """
 
     name: str
+    error_title: str
+    category_title: str
 
     def load(self, dataset_path: Path) -> Dataset:
         """Find the pairs of a dataset.
@@ -117,8 +137,22 @@ class EvaluationProtocol(Protocol):
     ) -> PairScore:
         """Score (M, 2) and (M, 2) matched points, pixel-centre px of the stored images."""
 
+    def success(self, score: PairScore) -> float:
+        """Return how far a pair counts as matched, in [0, 1]: 1 or 0 where there is a threshold.
+
+        Plots over categories show its mean, intervals are those of its mean, and the paired test
+        against the baseline compares it pair by pair.
+        """
+
     def summarize(self, results: Sequence[PairResult]) -> dict[str, float]:
-        """Return the columns of the protocol's table by name, in order (counts or shares)."""
+        """Return the columns of the protocol's table by name, in order (counts or shares).
+
+        Failed pairs are among the results. A name ``group: column`` puts the column into a
+        table of its own. The frame adds the column ``seconds``, all time that the recipe took.
+        Names are those of ``published.published`` where the paper has the same number: ``evd`` has
+        ``< 1 px``, ``< 2 px``, ``< 3 px``, ``< 5 px``, ``< 10 px`` and ``< 20 px`` (numbers of
+        pairs) and ``seconds``. Of an empty sequence all columns are 0.
+        """
 
     def settings(self) -> dict[str, Any]:
         """Return everything that decides scores, for the record."""
