@@ -344,7 +344,7 @@ def iterate_matches(
     pairs: Sequence[Pair], features: FeatureStore, options: MatchingOptions, level: int
 ) -> Iterable[PairMatches]:
     """Match pairs by the features of the images themselves and those of one level, in order."""
-    cache = _MatchableCache(features, options, level)
+    cache = MatchableCache(features, options, level)
 
     def match_pair(pair: Pair) -> PairMatches:
         (first, indices1), (second, indices2) = cache[pair[0]], cache[pair[1]]
@@ -357,14 +357,30 @@ def iterate_matches(
     return map_ordered(match_pair, pairs, available_cores())
 
 
-class _MatchableCache:
+class MatchableCache:
     """Images ready for matching, the least recently used dropped over a memory budget.
 
     Each comes with the indices that its features have in the store.
     """
 
-    def __init__(self, store: FeatureStore, options: MatchingOptions, level: int) -> None:
+    def __init__(
+        self,
+        store: FeatureStore,
+        options: MatchingOptions,
+        level: int,
+        max_num_features: int | None = None,
+    ) -> None:
+        """Name the features.
+
+        Args:
+            store: where they are.
+            options: of matching.
+            level: of escalation; its features come together with those of level 0.
+            max_num_features: of the features of an image, those of the largest responses; None
+                takes all.
+        """
         self._store, self._options, self._level = store, options, level
+        self._max_num_features = max_num_features
         self._images: OrderedDict[str, tuple[MatchableImage, NDArray[np.int64]]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -373,6 +389,10 @@ class _MatchableCache:
             if name not in self._images:
                 indices = self._store.level_indices(name, self._level)
                 features = self._store.read(name).select(indices)
+                if self._max_num_features is not None:
+                    order = np.argsort(-features.responses, kind="stable")
+                    strongest = np.sort(order[: self._max_num_features])
+                    indices, features = indices[strongest], features.select(strongest)
                 image = matchable(features.descriptors, features.keypoints, self._options)
                 self._images[name] = image, indices
             self._images.move_to_end(name)

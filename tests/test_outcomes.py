@@ -60,7 +60,7 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "verification": {
             "max_error_px": 3.0,
             "min_num_inliers": 20,
-            "min_inlier_ratio": 0.1,
+            "min_inlier_ratio": 0.2,
             "max_num_trials": 10000,
             "ransac_min_inlier_ratio": 0.1,
         },

@@ -19,6 +19,7 @@ import h5py
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from results import database_content, hdf5_content
 from small_scene import IMAGE_SIZE, INTRINSICS, NAMES, photograph, write_photographs
 from synthetic import write_image
 
@@ -85,29 +86,6 @@ def call(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, lis
 
 
 Call = Callable[..., tuple[int, str, list[str]]]
-
-
-def hdf5_content(path: Path) -> dict[str, tuple[str, bytes]]:
-    """All datasets of a file by key."""
-    content = {}
-
-    def collect(key: str, item: object) -> None:
-        if isinstance(item, h5py.Dataset):
-            content[key] = (f"{item.dtype}{item.shape}", item[()].tobytes())
-
-    with h5py.File(path, "r") as file:
-        file.visititems(collect)
-    return content
-
-
-def geometries(path: Path) -> dict[tuple[int, int], list[list[int]]]:
-    """Inlier matches of all pairs with a two-view geometry."""
-    with open_database(path) as database:
-        pair_ids, pairs = database.read_two_view_geometries()
-        return {
-            pycolmap.pair_id_to_image_pair(pair_id): pair.inlier_matches.tolist()
-            for pair_id, pair in zip(pair_ids, pairs, strict=True)
-        }
 
 
 def without_times(report: dict[str, object]) -> dict[str, object]:
@@ -213,7 +191,7 @@ def test_stage_commands_do_exactly_what_run_does(
     assert made.pairs.read_bytes() == expected.pairs.read_bytes()
     assert made.config.read_bytes() == expected.config.read_bytes()
     assert image_ids(made.database) == image_ids(expected.database)
-    assert geometries(made.database) == geometries(expected.database)
+    assert database_content(made.database) == database_content(expected.database)
     reports = [json.loads(space.report.read_text(encoding="utf-8")) for space in (made, expected)]
     assert without_times(reports[0]) == without_times(reports[1])
 
@@ -221,7 +199,7 @@ def test_stage_commands_do_exactly_what_run_does(
 def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
     before = {path: path.read_bytes() for path in (copy.features, copy.matches, copy.pairs)}
     model = (copy.sparse / "0" / "points3D.bin").stat().st_mtime_ns
-    tables = geometries(copy.database)
+    tables = database_content(copy.database)
     report = run(photos, copy.path, OPTIONS)
     done = {stage.name: (stage.num_done, stage.num_kept) for stage in report.stages}
     assert done == {
@@ -230,7 +208,7 @@ def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
     assert report.status == "ok"
     assert {path: path.read_bytes() for path in before} == before
     assert (copy.sparse / "0" / "points3D.bin").stat().st_mtime_ns == model
-    assert geometries(copy.database) == tables
+    assert database_content(copy.database) == tables
 
 
 @pytest.mark.parametrize("name", NAMES[1:3])
@@ -272,7 +250,7 @@ def test_run_killed_anywhere_completes_with_the_same_result(
     report = run(photos, out, OPTIONS)
     assert hdf5_content(Workspace(out).features) == hdf5_content(expected.features)
     assert hdf5_content(Workspace(out).matches) == hdf5_content(expected.matches)
-    assert geometries(Workspace(out).database) == geometries(expected.database)
+    assert database_content(Workspace(out).database) == database_content(expected.database)
     assert without_times(report.to_mapping()) == without_times(first.to_mapping())
     assert report.stages[0].num_kept >= 2
 
@@ -538,11 +516,11 @@ def test_overwrite_redoes_a_stage_and_run_goes_on_from_it(
     assert (code, stdout.split(" in ")[0]) == (0, "match: 6 done")
     assert copy.features.read_bytes() == features
     assert not copy.sparse.exists()
-    assert geometries(copy.database) == {}
+    assert not database_content(copy.database)["inliers"]
     for stage in ("verify", "map"):
         code, _, stderr = call(stage, "--random-seed", 3, "--output-path", copy.path)
         assert code == 0, stderr
-    assert geometries(copy.database) == geometries(finished[0].database)
+    assert database_content(copy.database) == database_content(finished[0].database)
     report = json.loads(copy.report.read_text(encoding="utf-8"))
     assert without_times(report) == without_times(finished[1].to_mapping())
 

@@ -74,12 +74,12 @@ def unique_methods(methods: Sequence[Method]) -> tuple[Method, ...]:
         OptionError: naming them.
     """
     if not methods:
-        raise OptionError(f"--methods: none given; known are {_known()}")
+        raise OptionError(f"no method given; known are {_known()}")
     labels = [method.label for method in methods]
     for label in labels:
         if labels.count(label) > 1:
             raise OptionError(
-                f"--methods: two are called '{label}'; give one another name, "
+                f"two methods are called '{label}'; give one another name, "
                 "as in NAME=RECIPE:section.option=value"
             )
     return tuple(methods)
@@ -102,7 +102,7 @@ def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
     head, _, settings = text.partition(":")
     label, _, name = head.rpartition("=")
     if label in SIFT_SUMMARIES:
-        raise OptionError(f"--methods {text}: '{label}' is COLMAP's; choose another name")
+        raise OptionError(f"{text}: '{label}' is COLMAP's; choose another name")
     if not name.endswith(".toml") and name not in recipe_names():
         close = difflib.get_close_matches(name, [*SIFT_SUMMARIES, *recipe_names()], n=1)
         hint = f"did you mean '{close[0]}'? " if close else ""

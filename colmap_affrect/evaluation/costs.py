@@ -96,29 +96,25 @@ class _Stopwatch:
     plan: RectificationPlan | None = None
 
 
-@dataclass(frozen=True)
 class _TimedProfile:
     """A feature profile that takes the time of its steps."""
 
-    profile: FeatureProfile
-    watch: _Stopwatch
-
-    @property
-    def descriptor_size(self) -> int:
-        return self.profile.descriptor_size
+    def __init__(self, profile: FeatureProfile, watch: _Stopwatch) -> None:
+        self._profile, self._watch = profile, watch
+        self.descriptor_size = profile.descriptor_size
 
     def detect(self, view: View) -> LocalFeatures:
         start = time.perf_counter()
-        detected = self.profile.detect(view)
-        self.watch.seconds["detect"] += time.perf_counter() - start
+        detected = self._profile.detect(view)
+        self._watch.seconds["detect"] += time.perf_counter() - start
         return detected
 
     def describe(
         self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
     ) -> list[LocalFeatures]:
         start = time.perf_counter()
-        described = self.profile.describe(images, detected)
-        self.watch.seconds["describe"] += time.perf_counter() - start
+        described = self._profile.describe(images, detected)
+        self._watch.seconds["describe"] += time.perf_counter() - start
         return described
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,11 @@ from numpy.typing import NDArray
 
 from colmap_affrect.errors import AffrectError, EvaluationError
 from colmap_affrect.evaluation.homographies import (
-    Homography,
     HomographyEstimator,
-    TrueHomography,
-    doubts,
     homography_counts,
-    oriented,
     read_homography,
     score_homography,
+    true_homography,
 )
 from colmap_affrect.evaluation.protocol import (
     Dataset,
@@ -35,18 +32,17 @@ from colmap_affrect.evaluation.protocol import (
     PairScore,
 )
 from colmap_affrect.executor import available_cores, map_ordered
-from colmap_affrect.imaging import IMAGE_SUFFIXES, read_gray
+from colmap_affrect.imaging import IMAGE_SUFFIXES
 
 SUCCESS_PX = 5.0
 NUM_PAPER_PAIRS = 15
 
 
 @dataclass(frozen=True)
-class Evd:
+class Evd(HomographyEstimator):
     """Number of pairs with a homography error below 1, 2, 3, 5, 10 and 20 px.
 
     Attributes:
-        estimator: of the homographies.
         check_truth: see whether the images confirm the homographies.
     """
 
@@ -54,7 +50,6 @@ class Evd:
     error_title = "mean reprojection error of the visible part (px)"
     category_title = ""
 
-    estimator: HomographyEstimator = field(default_factory=HomographyEstimator)
     check_truth: bool = True
 
     def load(self, dataset_path: Path) -> Dataset:
@@ -84,7 +79,7 @@ class Evd:
         random_seed: int,
     ) -> PairScore:
         """See :class:`EvaluationProtocol`."""
-        return score_homography(pair.truth, points1, points2, self.estimator, random_seed)
+        return score_homography(pair.truth, points1, points2, self, random_seed)
 
     def success(self, score: PairScore) -> float:
         """1 if the error is below 5 px."""
@@ -96,7 +91,7 @@ class Evd:
 
     def settings(self) -> dict[str, Any]:
         """See :class:`EvaluationProtocol`."""
-        return {"success": f"error < {SUCCESS_PX:g} px", **self.estimator.settings()}
+        return {"success": f"error < {SUCCESS_PX:g} px", **super().settings()}
 
 
 @dataclass(frozen=True)
@@ -127,20 +122,6 @@ class _Files:
             return problem, f"{self.name}: cannot be evaluated and counts as failed: {error}"
         note = f"{self.name}: the homography {self.homography} {doubt}" if doubt else ""
         return EvaluationPair(pair.name, pair.images, truth=truth), note
-
-
-def true_homography(
-    matrix: Homography, paths: tuple[Path, Path], *, check: bool
-) -> tuple[TrueHomography, str]:
-    """Return the truth of two images, and what speaks against it (:func:`doubts`).
-
-    Raises:
-        ImageError: when an image cannot be read.
-    """
-    image1, image2 = (read_gray(path) for path in paths)
-    size1, size2 = (image.shape[::-1] for image in (image1, image2))
-    truth = TrueHomography(oriented(matrix, size1, size2), size1, size2)
-    return truth, doubts(matrix, image1, image2) if check else ""
 
 
 def _extreme_views(folder: Path) -> tuple[list[_Files], list[str]]:

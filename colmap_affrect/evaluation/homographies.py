@@ -7,7 +7,7 @@ coordinate in the part of image 1 that image 2 shows.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from statistics import median_low
@@ -22,7 +22,7 @@ from colmap_affrect.errors import EvaluationError
 from colmap_affrect.evaluation.protocol import PairResult, PairScore
 from colmap_affrect.extraction import extract_image
 from colmap_affrect.geometry.affine import project
-from colmap_affrect.imaging import warp
+from colmap_affrect.imaging import read_gray, warp
 from colmap_affrect.matching.nearest import match_features, matchable
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.types import GrayImage, LocalFeatures, Rectification
@@ -112,7 +112,7 @@ class HomographyEstimator:
             "visible_part": "the pixels of image 1 that the truth carries into image 2",
             "estimator": "OpenCV RANSAC",
             "correct_px": CORRECT_PX,
-            **vars(self),
+            **asdict(self),
         }
 
 
@@ -205,6 +205,30 @@ def visible_points(truth: NDArray[np.floating], size1: Size, size2: Size) -> NDA
     return points[is_inside(project(truth, points), size2)]
 
 
+def true_homography(
+    matrix: Homography, paths: tuple[Path, Path], *, check: bool
+) -> tuple[TrueHomography, str]:
+    """Return the truth of two images, and what speaks against it (:func:`doubts`).
+
+    Args:
+        matrix: (3, 3) image2_from_image1 of any scale and sign.
+        paths: of the two images.
+        check: look for doubts.
+
+    Raises:
+        ImageError: when an image cannot be read.
+    """
+    image1, image2 = (read_gray(path) for path in paths)
+    size1, size2 = size_of(image1), size_of(image2)
+    truth = TrueHomography(oriented(matrix, size1, size2), size1, size2)
+    return truth, doubts(matrix, image1, image2) if check else ""
+
+
+def size_of(image: GrayImage) -> Size:
+    """Return (width, height) of an (H, W) image."""
+    return image.shape[1], image.shape[0]
+
+
 def oriented(matrix: Homography, size1: Size, size2: Size) -> Homography:
     """Give a homography of any scale a positive third coordinate in the part that is visible."""
     return max((matrix, -matrix), key=lambda signed: len(visible_points(signed, size1, size2)))
@@ -222,7 +246,7 @@ def doubts(matrix: Homography, image1: GrayImage, image2: GrayImage) -> str:
         image1: (H, W) uint8.
         image2: (H, W) uint8.
     """
-    size1, size2 = (image.shape[::-1] for image in (image1, image2))
+    size1, size2 = size_of(image1), size_of(image2)
     features2 = _features(image2)
     if not len(visible_points(oriented(matrix, size1, size2), size1, size2)):
         doubt = "shows no part of image 1 in image 2"
@@ -255,8 +279,8 @@ def _features(image: GrayImage) -> LocalFeatures:
 
 def _support(matrix: Homography, image1: GrayImage, size2: Size, features2: LocalFeatures) -> int:
     """Count the features of image 1, warped by a homography, that image 2 has at their place."""
-    matrix = oriented(matrix, image1.shape[::-1], size2)
-    if not len(visible_points(matrix, image1.shape[::-1], size2)):
+    matrix = oriented(matrix, size_of(image1), size2)
+    if not len(visible_points(matrix, size_of(image1), size2)):
         return 0
     options = load_recipe(CHECK_RECIPE).matching
     features = _features(warp(image1, Rectification(matrix, size2, None, 1.0, 0.0))), features2

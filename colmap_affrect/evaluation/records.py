@@ -32,7 +32,7 @@ class RecordFile:
         header = json.loads(json.dumps(settings))
         content = path.read_bytes() if path.exists() else b""
         complete = content[: content.rfind(b"\n") + 1]
-        lines = [json.loads(line) for line in complete.decode("utf-8").splitlines()]
+        lines = [json.loads(line) for line in complete.decode("utf-8").split("\n")[:-1]]
         if lines and (difference := first_difference(lines[0], header)):
             raise StaleStoreError(
                 f"{path}: was made with {difference}; use --overwrite to discard it, another name "

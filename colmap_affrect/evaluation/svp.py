@@ -171,7 +171,11 @@ def _load_scene(list_path: Path) -> Dataset:
     ]
     pairs = sorted({pair.name: pair for pair in pairs}.values(), key=_order)
     notes = [
-        *counted(bad_lines, f"{list_path.name}: lines that are no pair", map(str, bad_lines)),
+        *counted(
+            bad_lines,
+            f"lines that are no pair of {list_path.name}",
+            [f"line {number}" for number in bad_lines],
+        ),
         *_missing_notes(listed, files, known),
         *_difficulty_notes(listed, known.poses),
         *size_notes(_images_of(pairs)),

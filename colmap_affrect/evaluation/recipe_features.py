@@ -1,0 +1,125 @@
+"""The features of one recipe on the images of a dataset: computed once, measured, and kept."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from colmap_affrect.comparison.methods import Method
+from colmap_affrect.errors import AffrectError
+from colmap_affrect.evaluation.costs import ImageCost, extract_measured
+from colmap_affrect.evaluation.protocol import EvaluationImage
+from colmap_affrect.evaluation.records import RecordFile
+from colmap_affrect.extraction import ImageExtractor, Resources, prepare
+from colmap_affrect.features.weights import file_sha256
+from colmap_affrect.progress import Progress
+from colmap_affrect.recipes import Recipe
+from colmap_affrect.store import FeatureStore
+
+logger = logging.getLogger(__name__)
+
+
+class RecipeFeatures:
+    """Features by image, level by level of escalation.
+
+    ``NAME.h5`` holds the features and ``NAME.jsonl`` what they cost. The cost of an image is
+    written first, so that its features never lack it.
+
+    Attributes:
+        recipe: what to extract.
+        store: the features; other options than those on record are refused.
+        settings: what the features depend on.
+        failures: images that could not be used in this run, with the reason.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        method: Method,
+        recipe: Recipe,
+        images: Sequence[EvaluationImage],
+        inputs: Mapping[str, Any],
+        resources: Resources,
+        *,
+        overwrite: bool,
+    ) -> None:
+        """Find everything that the recipe needs.
+
+        Args:
+            folder: of the features of all recipes.
+            method: names the files.
+            recipe: of the method.
+            images: of the dataset.
+            inputs: what the images depend on, for the record.
+            resources: weights and device of networks.
+            overwrite: discard what is there.
+
+        Raises:
+            StaleStoreError: when features of other options are there.
+            AffrectError: when weights, a device or all depth maps are missing.
+        """
+        self.recipe = recipe
+        self._images = {image.name: image for image in images}
+        self._extractor: ImageExtractor = prepare(recipe.extraction, resources, list(self._images))
+        weights = {path.name: file_sha256(path) for path in self._extractor.weights.values()}
+        self.settings = {**inputs, **recipe.extraction.to_mapping(), "weights": weights}
+        digest = hashlib.sha256(json.dumps(self.settings, sort_keys=True).encode()).hexdigest()
+        features_path, costs_path = (
+            folder / f"{method.folder_name}.{suffix}" for suffix in ("h5", "jsonl")
+        )
+        if overwrite:
+            features_path.unlink(missing_ok=True)
+            costs_path.unlink(missing_ok=True)
+        self._costs = RecordFile(costs_path, self.settings)
+        self.store = FeatureStore(features_path, digest)
+        self.failures: dict[str, str] = {}
+
+    @property
+    def warnings(self) -> dict[str, str]:
+        """Images that were not rectified though they were to be, with the reason."""
+        records = self._costs.records
+        return {record["image"]: record["warning"] for record in records if record["warning"]}
+
+    def costs(self) -> dict[str, ImageCost]:
+        """Return what each image cost, all its levels together."""
+        by_level = {
+            (record["image"], record["level"]): ImageCost.from_mapping(record["cost"])
+            for record in self._costs.records
+        }
+        found: dict[str, ImageCost] = {}
+        for (name, _), cost in by_level.items():
+            found[name] = found.get(name, ImageCost()) + cost
+        return found
+
+    def extract(self, names: Sequence[str], level: int, title: str, progress: Progress) -> None:
+        """Extract the features that images lack up to a level; what fails goes to ``failures``."""
+        complete = self.store.complete(names)
+        known = {name: len(self.store.level_ends(name)) for name in complete}
+        missing = [name for name in names if known.get(name, 0) <= level]
+        with progress.stage(title, len(missing), "images") as advance:
+            for name in missing:
+                try:
+                    for missing_level in range(known.get(name, 0), level + 1):
+                        self._extract(name, missing_level)
+                except AffrectError as error:
+                    logger.warning("%s", error)
+                    self.failures[name] = str(error)
+                advance(1)
+
+    def _extract(self, name: str, level: int) -> None:
+        image = self._images[name]
+        found, cost = extract_measured(
+            self._extractor, image.path, image.name, image.intrinsics, level
+        )
+        logger.debug("%s: %d features", name, len(found.features))
+        self._costs.append(
+            {"image": name, "level": level, "cost": cost.to_mapping(), "warning": found.warning}
+        )
+        if level:
+            self.store.extend(name, found.features)
+        else:
+            self.store.write(name, found.features, found.image_size)

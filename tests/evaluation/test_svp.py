@@ -1,0 +1,180 @@
+"""Scenes laid out as the Strong ViewPoint Changes dataset, whole and damaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from posed_photographs import image_line, pose, write_svp
+from small_scene import FOCAL_PX
+
+from colmap_affrect.errors import EvaluationError
+from colmap_affrect.evaluation.relative_pose import true_pose
+from colmap_affrect.evaluation.svp import Svp, difficulty, read_camera_poses, read_pair_list
+
+SAMPLE = Path(__file__).parents[3] / "shared" / "pairs" / "svp_sample"
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    return write_svp(tmp_path / "set" / "scene4")
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+@pytest.mark.parametrize("path", [".", "scene4"])
+def test_scene_or_folder_of_scenes_is_read(scene: Path, path: str) -> None:
+    dataset = Svp().load(scene.parent / path)
+    assert dataset.notes == ()
+    assert [(pair.name, pair.category) for pair in dataset.pairs] == [
+        ("scene4/a.png scene4/b.png", "0°"),
+        ("scene4/b.png scene4/d.png", "10°"),
+        ("scene4/a.png scene4/d.png", "20°"),
+    ]
+    image = dataset.pairs[0].images[1]
+    assert image.path == scene.parent / path / "images" / "b.png" if path != "." else True
+    np.testing.assert_allclose(
+        image.intrinsics, [[FOCAL_PX, 0, 159.5], [0, FOCAL_PX, 119.5], [0, 0, 1]]
+    )
+    rotation, translation = true_pose(dataset.pairs[2])
+    pose_a, pose_d = pose(0), pose(3)
+    np.testing.assert_allclose(rotation @ pose_a[0], pose_d[0], atol=1e-9)
+    np.testing.assert_allclose(rotation @ pose_a[1] + translation, pose_d[1], atol=1e-9)
+
+
+def test_model_with_lines_of_points_and_names_of_other_suffixes(scene: Path) -> None:
+    images = scene / "0" / "images.txt"
+    lines = [
+        f"{line.replace('.png', '.jpg')}\n10.5 20.5 1 30.5 40.5 -1 50.5 60.5 7 8.5 9.5 -1"
+        for line in images.read_text().splitlines()[1:]
+    ]
+    images.write_text("\n".join(lines) + "\n")
+    assert len(Svp().load(scene).pairs) == 3
+
+
+def test_missing_files_are_counted_and_named(scene: Path) -> None:
+    (scene / "images" / "d.png").unlink()
+    (scene / "images" / "unlisted.txt").write_text("")
+    dataset = Svp().load(scene)
+    assert [pair.category for pair in dataset.pairs] == ["0°"]
+    assert dataset.notes == (
+        "scene4: 2 of 3 listed pairs are left out",
+        "scene4: 1 of 3 listed images are not in images/: d",
+        "scene4: no pairs are left from 10°, 20°",
+    )
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "fault"),
+    [
+        ("cameras.txt", "SIMPLE_RADIAL", "ROUND", "its camera is of the unknown model ROUND"),
+        ("cameras.txt", "300.0", "nan", "its camera has values that are not finite"),
+        ("cameras.txt", "300.0", "-300.0", "its camera has wrong parameters for SIMPLE_RADIAL"),
+        ("cameras.txt", "300.0", "", "its camera has wrong parameters for SIMPLE_RADIAL"),
+        ("cameras.txt", "300.0", "wide", "its camera cannot be read"),
+        ("cameras.txt", "1 SIMPLE", "9 SIMPLE", "has no camera"),
+        ("images.txt", "1 0.99", "1 1.99", "its quaternion has length 1.9"),
+        ("images.txt", "1 0.99", "1 inf 0.99", "its pose has values that are not finite"),
+    ],
+)
+def test_unusable_truth_of_an_image_is_named(
+    scene: Path, file: str, old: str, new: str, fault: str
+) -> None:
+    if new == "1 inf 0.99":
+        first = image_line(0).split()
+        edit(scene / "0" / file, " ".join(first[:2]), f"{first[0]} inf")
+    else:
+        edit(scene / "0" / file, old, new)
+    dataset = Svp().load(scene)
+    assert [pair.category for pair in dataset.pairs] == ["10°"]
+    assert f"of 3 listed images have no usable pose or camera: a ({fault}" in dataset.notes[1]
+
+
+def test_wrong_difficulty_and_bad_lines_are_named(scene: Path) -> None:
+    path = scene / "scene4_image_pairs.txt"
+    path.write_text("a.png b.png 0\n\na.png d.png 5\nb.png\n# d.png\na.png c.png\n")
+    dataset = Svp().load(scene)
+    assert [pair.category for pair in dataset.pairs] == ["0°", "10°", "20°"]
+    assert dataset.notes[0] == "scene4: 1 lines that are no pair of scene4_image_pairs.txt: line 4"
+    assert dataset.notes[1] == (
+        "scene4: 1 of 4 listed difficulties contradict the poses, which are used: "
+        "a d (listed 5, by its poses 2)"
+    )
+
+
+def test_image_of_another_size_is_named(scene: Path) -> None:
+    path = scene / "images" / "b.png"
+    cv2.imwrite(str(path), cv2.imread(str(path))[:200])
+    assert Svp().load(scene).notes == (
+        "scene4: scene4/b.png: its intrinsics are for 320 x 240 px, the image has 320 x 200 px",
+    )
+
+
+def write_poses(scene: Path, wrong: dict[int, tuple[np.ndarray, np.ndarray]]) -> None:
+    lines = [image_line(index, wrong.get(index)) for index in range(4)]
+    (scene / "0" / "images.txt").write_text("\n".join(lines) + "\n")
+
+
+def test_transposed_rotations_are_named_by_the_matches(scene: Path) -> None:
+    write_poses(scene, {index: (pose(index)[0].T, pose(index)[1]) for index in range(4)})
+    (note,) = Svp().load(scene).notes
+    assert note.startswith(
+        "scene4: the matches of 2 of 2 checked pairs contradict their true poses; they fit with "
+        "rotation transposed, of both images: "
+    )
+
+
+def test_inverted_pose_of_one_image_is_named_by_the_matches(scene: Path) -> None:
+    rotation, translation = pose(3)
+    write_poses(scene, {3: (rotation.T, -rotation.T @ translation)})
+    notes = Svp().load(scene).notes
+    assert any("pose inverted (world_from_camera) of scene4/d.png" in note for note in notes)
+
+
+def test_damaged_image_is_left_to_the_evaluation(scene: Path) -> None:
+    (scene / "images" / "b.png").write_bytes(b"no image")
+    assert len(Svp().load(scene).pairs) == 3
+
+
+def test_folder_without_a_scene_and_scene_without_images_are_errors(
+    scene: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(EvaluationError, match="has no \\*_image_pairs.txt"):
+        Svp().load(tmp_path)
+    for path in (scene / "images").iterdir():
+        path.unlink()
+    with pytest.raises(EvaluationError, match="no pair can be evaluated; scene4: 3 of 3 listed"):
+        Svp().load(scene)
+    (scene / "0" / "cameras.txt").unlink()
+    with pytest.raises(EvaluationError, match="cameras.txt: cannot be read"):
+        Svp().load(scene)
+
+
+@pytest.mark.shared
+@pytest.mark.skipif(not SAMPLE.is_dir(), reason="the sample is not here")
+def test_difficulties_of_the_real_list_are_those_of_the_real_poses() -> None:
+    scene = SAMPLE / "scene1"
+    listed, bad = read_pair_list(scene / "scene1_image_pairs.txt")
+    known = read_camera_poses(scene / "0")
+    assert (len(listed), bad, len(known.poses), dict(known.faults)) == (3590, [], 1608, {})
+    found = [difficulty(known.poses, *pair.names) for pair in listed]
+    assert found == [pair.difficulty for pair in listed]
+    assert np.bincount(found).tolist() == [200] * 17 + [190]
+
+
+@pytest.mark.shared
+@pytest.mark.skipif(not SAMPLE.is_dir(), reason="the sample is not here")
+def test_real_sample_has_one_pair_and_says_what_is_missing() -> None:
+    dataset = Svp().load(SAMPLE)
+    assert [pair.name for pair in dataset.pairs] == [
+        "scene1/frame_0000001535_4.jpg scene1/frame_0000000305_1.jpg"
+    ]
+    assert dataset.notes[0] == "scene1: 3589 of 3590 listed pairs are left out"
+    assert dataset.notes[1].startswith("scene1: 1419 of 1421 listed images are not in images/: ")
+    assert len(dataset.notes) == 3  # the third: empty categories
