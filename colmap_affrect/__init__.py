@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import importlib
 import logging
+import sys
 import zlib
 from typing import Any
 
 __version__ = "0.1.0"
 
-# Using zlib once before pycolmap is imported, by whomever, keeps both working; see
-# colmap_affrect.colmap.
-zlib.decompress(zlib.compress(b"warm"))
+# The wheels of pycolmap 4.1 and 4.2 export zlib's symbols: if Python's zlib is first used after
+# "import pycolmap" the process dies or hangs. Using it once before keeps both working; after, it
+# must not be touched.
+if "pycolmap" not in sys.modules:
+    zlib.decompress(zlib.compress(b"warm"))
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 

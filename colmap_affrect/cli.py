@@ -62,6 +62,8 @@ examples:
       --depth-path depth
   colmap-affrect compare --image-path photos --output-path out
   colmap-affrect compare --image-path photos --output-path out --methods sift,default --seeds 0
+  colmap-affrect evaluate evd --dataset-path EVD --output-path out \\
+      --recipes unrectified-rootsift,default,on-demand
   colmap-affrect inspect photos/a.jpg --output-path out
   colmap-affrect weights fetch
   colmap-affrect doctor out
@@ -253,6 +255,62 @@ def build_parser() -> argparse.ArgumentParser:
         action="store_true",
         help="also comparison.rrd for rerun (pip install 'colmap-affrect[viewer]')",
     )
+
+    evaluate = _command(
+        commands,
+        "evaluate",
+        _evaluate,
+        "score recipes on pairs of images with a known truth, as the paper does on its datasets",
+    )
+    evaluate.add_argument(
+        "protocol",
+        choices=["evd", "svp", "imc", "pairs"],
+        help="evd: homographies; svp, imc: camera poses; pairs: what pairs.json describes",
+    )
+    _add_option(
+        evaluate,
+        "--dataset-path",
+        type=Path,
+        required=True,
+        metavar="FOLDER",
+        help="the dataset, in the layout of the protocol",
+    )
+    _add_option(
+        evaluate,
+        "--recipes",
+        nargs="+",
+        default=["unrectified-rootsift", "default"],
+        metavar="A,B,...",
+        help="by name or path; NAME=RECIPE:section.option=value changes options "
+        "(default: unrectified-rootsift,default)",
+    )
+    _add_option(
+        evaluate,
+        "--baseline",
+        metavar="NAME",
+        help="the recipe that the others are tested against, pair by pair",
+    )
+    _add_option(
+        evaluate,
+        "--max-num-keypoints",
+        type=int,
+        metavar="N",
+        help="equal budget: match only the strongest N features of each image, warps included",
+    )
+    _add_option(
+        evaluate,
+        "--protocol-options",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KEY=VALUE",
+        help="settings of the protocol, e.g. magsac_threshold_px=1 (evd), max_num_iterations=1000 "
+        "(svp, imc: what the code of the paper did)",
+    )
+    _add_resources(evaluate)
+    _add_depth(evaluate)
+    _add_seed(evaluate, "of the estimators and the statistics")
+    evaluate.add_argument("--json", action="store_true", help="print evaluation.json, no tables")
 
     inspect = _command(
         commands,
@@ -648,14 +706,14 @@ def _add_mapper(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_seed(command: argparse.ArgumentParser) -> None:
+def _add_seed(command: argparse.ArgumentParser, what: str = "of verification and mapping") -> None:
     _add_option(
         command,
         "--random-seed",
         type=int,
         default=0,
         metavar="N",
-        help="seed of verification and mapping (default: 0)",
+        help=f"seed {what} (default: 0)",
     )
 
 
@@ -861,6 +919,32 @@ def _compare(options: argparse.Namespace) -> int:
         path = log_comparison(comparison, options.output_path)
         print(f"for rerun: {path}", file=sys.stderr)
     return _comparison_exit_code(comparison, options)
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from colmap_affrect.comparison.methods import parse_methods
+    from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate
+    from colmap_affrect.evaluation.registry import make_protocol
+
+    evaluation = evaluate(
+        make_protocol(options.protocol, options.protocol_options),
+        options.dataset_path,
+        options.output_path,
+        EvaluateOptions(
+            recipes=parse_methods(options.recipes, _depth_settings(options)),
+            baseline=options.baseline,
+            max_num_keypoints=options.max_num_keypoints,
+            random_seed=options.random_seed,
+            resources=_resources(options),
+        ),
+        overwrite=options.overwrite,
+        progress=_progress(options),
+    )
+    print(evaluation.to_json() if options.json else evaluation.summary())
+    if not options.json:
+        print(f"\nplots, all pairs: {options.output_path}")
+    failures = {name: why for recipe in evaluation.recipes for name, why in recipe.failures.items()}
+    return _exit_code(failures, options)
 
 
 def _comparison_exit_code(comparison: Comparison, options: argparse.Namespace) -> int:

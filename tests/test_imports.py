@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
+
+from small_scene import write_photographs
 
 COMPRESS_EVERYTHING = """
 import colmap_affrect.colmap
@@ -26,14 +29,36 @@ print(pycolmap.__version__)
 """
 
 
-def test_zlib_works_after_the_import_of_pycolmap() -> None:
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", COMPRESS_EVERYTHING],
+PYCOLMAP_FIRST = """
+import pycolmap
+import sys
+import colmap_affrect
+database_path, image_path = sys.argv[1:]
+colmap_affrect.extract_features(database_path, image_path)
+colmap_affrect.match_exhaustive(database_path)
+with pycolmap.Database.open(database_path) as database:
+    print(database.num_verified_image_pairs())
+"""
+
+
+def run_python(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code, *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=60,
         check=False,
     )
+
+
+def test_scripts_may_import_pycolmap_first(tmp_path: Path) -> None:
+    write_photographs(tmp_path / "photos", 2)
+    done = run_python(PYCOLMAP_FIRST, tmp_path / "a.db", tmp_path / "photos")
+    assert (done.returncode, done.stdout) == (0, "1\n")
+
+
+def test_zlib_works_after_the_import_of_pycolmap() -> None:
+    done = run_python(COMPRESS_EVERYTHING)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip().startswith("4.")
     assert done.stderr == ""

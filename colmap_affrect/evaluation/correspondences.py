@@ -128,7 +128,7 @@ def symmetric_epipolar_distances(
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse_squares = sum(1.0 / (lines[:, :2] ** 2).sum(axis=1) for lines in (lines1, lines2))
         distances = np.abs(algebraic) * np.sqrt(inverse_squares)
-    return np.nan_to_num(distances, nan=np.inf)
+    return np.asarray(np.nan_to_num(distances, nan=np.inf))
 
 
 def checked_correspondences(values: ArrayLike, where: str) -> Points:

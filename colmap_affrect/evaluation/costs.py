@@ -26,7 +26,8 @@ IMAGE_STEPS = ("plan", "warp", "detect", "describe")
 PAIR_STEPS = ("match", "estimate")
 STEPS = (*IMAGE_STEPS, *PAIR_STEPS)
 """Steps that are timed. ``warp`` has what belongs to it: masks, carrying features back, choosing
-among them. Reading images is not counted."""
+among them; ``detect`` has the descriptors too of profiles that compute both at once (RootSIFT).
+Reading images is not counted."""
 
 PIXELS_PER_MEGAPIXEL = 1e6
 

@@ -6,8 +6,9 @@ A scene is a folder with ``set_100/``, and in it::
     calibration/calibration_<image>.h5   K (3 x 3), R (3 x 3), T (3): x_camera = R x + T
     new-vis-pairs/keys-th-0.<k>.npy      names "<image 1>-<image 2>" with covisibility >= 0.<k>
 
-The lists are cumulative; the categories are their differences, from 0.1 on. A dataset is a scene
-or a folder of scenes. Images are known by ``<scene>/<file name>``, and so are their depth maps.
+The lists are cumulative; the categories are their differences, from 0.1 on, as in the paper, or
+from 0.0 where there is such a list. A dataset is a scene or a folder of scenes. Images are known by
+``<scene>/<file name>``, and so are their depth maps.
 
 K is COLMAP's: the origin is the corner of the image. Where it is plainly that of another size
 (its principal point, taken for the middle, is far from the middle of the image), it is scaled.
@@ -42,8 +43,8 @@ from colmap_affrect.imaging import IMAGE_SUFFIXES, read_gray
 SET_FOLDER = "set_100"
 LIST_FOLDER = "new-vis-pairs"
 CALIBRATION_PREFIX = "calibration_"
-BINS = tuple(range(1, 10))
-"""Lower limits of the categories, in tenths."""
+BINS = tuple(range(10))
+"""Lower limits of the categories, in tenths; the list of the first may be missing."""
 
 MAX_OFF_CENTRE = 1.15
 """Twice the principal point and the size of the image may differ by this factor."""
@@ -75,7 +76,7 @@ class Imc(RelativePoseProtocol):
                 f"{dataset_path}: has no {SET_FOLDER}/{LIST_FOLDER}, nor has a folder in it; give "
                 "a scene of the Phototourism sets, or the folder of its scenes"
             )
-        loaded = [_load_scene(folder) for folder in scenes]
+        loaded = [_load_scene(folder, check_truth=self.check_truth) for folder in scenes]
         pairs = tuple(itertools.chain.from_iterable(scene.pairs for scene in loaded))
         notes = tuple(itertools.chain.from_iterable(scene.notes for scene in loaded))
         if not pairs:
@@ -153,7 +154,7 @@ def _quaternion_doubt(rotation: NDArray[np.float64], q: NDArray[np.float64] | No
     return "R and the quaternion beside it differ"
 
 
-def _load_scene(folder: Path) -> Dataset:
+def _load_scene(folder: Path, *, check_truth: bool) -> Dataset:
     root = folder / SET_FOLDER
     lists, notes = _read_lists(root / LIST_FOLDER)
     calibrations, faults = _read_calibrations(root / "calibration")
@@ -189,13 +190,9 @@ def _load_scene(folder: Path) -> Dataset:
             f"of {len(wanted)} listed images have no usable calibration",
             [f"{name} ({faults.get(name, 'no file')})" for name in uncalibrated],
         ),
-        *(
-            f"calibration of {name}: {calibrations[name].doubt}"
-            for name in sorted(wanted & calibrations.keys())
-            if calibrations[name].doubt
-        ),
+        *_doubt_notes(calibrations, wanted),
         *size_notes,
-        *contradictions(pairs[::-1]),
+        *(contradictions(pairs[::-1]) if check_truth else ()),
         *_empty_notes(pairs),
     ]
     return Dataset(tuple(pairs), tuple(f"{folder.name}: {note}" for note in notes))
@@ -210,10 +207,13 @@ def _read_lists(folder: Path) -> tuple[dict[int, list[str]], list[str]]:
         try:
             values = np.load(path, allow_pickle=False)
         except FileNotFoundError:
-            notes.append(f"{path.name} is missing: its pairs count as of less covisibility")
+            if limit:
+                notes.append(f"{path.name} is missing: its pairs count as of less covisibility")
             continue
         except (OSError, ValueError, EOFError) as error:
-            notes.append(f"{path.name} cannot be read ({error}): its pairs count as of less")
+            notes.append(
+                f"{path.name} cannot be read ({error}): its pairs count as of less covisibility"
+            )
             continue
         lists[limit] = [str(value) for value in values.ravel()]
     for lower, upper in itertools.pairwise(sorted(lists)):
@@ -248,21 +248,33 @@ def _split(key: str, known: set[str]) -> Names | None:
 def _posed(
     scene: str, files: Mapping[str, Path], calibrations: Mapping[str, Calibration]
 ) -> tuple[dict[str, PosedImage], list[str]]:
-    """Give images their cameras; also name those whose intrinsics are of another size."""
+    """Give images their cameras; also say whose intrinsics are of another size."""
     names = sorted(files.keys() & calibrations.keys())
+    sizes = map_ordered(lambda name: _size(files[name]), names, available_cores())
     found: dict[str, PosedImage] = {}
-    notes = []
-    for name, size in zip(
-        names, map_ordered(lambda name: _size(files[name]), names, available_cores()), strict=True
-    ):
-        matrix, note = _fitted(calibrations[name].matrix, size)
-        width, height = size or np.rint(2 * matrix[:2, 2]).astype(int).tolist()
+    scaled, unfitting = [], []
+    for name, size in zip(names, sizes, strict=True):
+        path, matrix = files[name], calibrations[name].matrix
+        guess = tuple(np.rint(2 * matrix[:2, 2]).astype(int).tolist())
+        width, height = size or guess
+        example = f"{path.name} ({width} x {height} px, K about {guess[0]} x {guess[1]} px)"
+        scale = _scale(matrix, width, height)
+        if scale is None:
+            unfitting.append(example)
+        elif scale != 1.0:
+            matrix = np.diag([scale, scale, 1.0]) @ matrix
+            scaled.append(example)
         params = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
-        path, pose = files[name], calibrations[name].pose
-        found[name] = posed_image(f"{scene}/{path.name}", path, camera, pose)
-        if note:
-            notes.append(f"{path.name}: {note}")
+        found[name] = posed_image(f"{scene}/{path.name}", path, camera, calibrations[name].pose)
+    notes = [
+        *counted(
+            scaled,
+            "images are of another size than their K, which is scaled",
+            scaled,
+        ),
+        *counted(unfitting, "images are of another shape than their K", unfitting),
+    ]
     return found, notes
 
 
@@ -275,21 +287,23 @@ def _size(path: Path) -> tuple[int, int] | None:
     return width, height
 
 
-def _fitted(
-    matrix: NDArray[np.float64], size: tuple[int, int] | None
-) -> tuple[NDArray[np.float64], str]:
-    """Scale K to the size of its image if it is that of another one; say so."""
-    if size is None:
-        return matrix, ""
-    ratios = np.asarray(size) / (2.0 * matrix[:2, 2])
+def _scale(matrix: NDArray[np.float64], width: int, height: int) -> float | None:
+    """Return what K is to be multiplied by to fit an image; None if nothing makes it fit."""
+    ratios = np.array([width, height]) / (2.0 * matrix[:2, 2])
     if np.all(np.maximum(ratios, 1 / ratios) < MAX_OFF_CENTRE):
-        return matrix, ""
-    size_text = f"{size[0]} x {size[1]} px"
-    guess = "{:.0f} x {:.0f} px".format(*2 * matrix[:2, 2])
+        return 1.0
     if ratios.max() > MAX_OFF_CENTRE * ratios.min():
-        return matrix, f"K seems to be for {guess}, the image has {size_text} in another shape"
-    note = f"K is for {guess}, the image has {size_text}: scaled by {ratios[0]:.3f}"
-    return np.diag([ratios[0], ratios[0], 1.0]) @ matrix, note
+        return None
+    return float(ratios[0])
+
+
+def _doubt_notes(calibrations: Mapping[str, Calibration], wanted: set[str]) -> Iterator[str]:
+    by_doubt: dict[str, list[str]] = {}
+    for name in sorted(wanted & calibrations.keys()):
+        by_doubt.setdefault(calibrations[name].doubt, []).append(name)
+    for doubt in sorted(by_doubt.keys() - {""}):
+        names = by_doubt[doubt]
+        yield from counted(names, f"of {len(wanted)} calibrations: {doubt}", names)
 
 
 def _left_out_notes(bins: Mapping[Names, int], posed: Mapping[str, PosedImage]) -> Iterator[str]:
@@ -301,6 +315,6 @@ def _left_out_notes(bins: Mapping[Names, int], posed: Mapping[str, PosedImage]) 
 def _empty_notes(pairs: list[EvaluationPair]) -> Iterator[str]:
     """Name the bins without pairs."""
     left = {pair.category for pair in pairs}
-    empty = [f"{limit / 10:.1f}" for limit in BINS if f"{limit / 10:.1f}" not in left]
+    empty = [f"{limit / 10:.1f}" for limit in BINS[1:] if f"{limit / 10:.1f}" not in left]
     if empty:
         yield "no pairs with a covisibility from " + ", ".join(empty)

@@ -8,8 +8,9 @@ Its cameras are taken for unknown.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ from colmap_affrect.stages import MatchableCache
 
 VERIFICATION_SEED = 0
 
+Result = TypeVar("Result")
+
 
 @dataclass(frozen=True)
 class MatchedPair:
@@ -37,99 +40,111 @@ class MatchedPair:
         pair: the pair.
         points: (M, 2) pixel-centre px of the matches in each image.
         num_keypoints: features of the two images that were matched.
-        level: of escalation; -1 when no level was verified.
-        verified_inliers: of COLMAP's two-view geometry; 0 if a run would not take it, or if the
-            recipe does not escalate.
+        level: of escalation; None when no level was verified, or without escalation.
+        verified_inliers: of COLMAP's two-view geometry; 0 if a run would not take it, or without
+            escalation.
         seconds: of matching and verification, at all levels that were tried.
     """
 
     pair: EvaluationPair
-    points: tuple[NDArray[np.floating], NDArray[np.floating]]
+    points: tuple[NDArray[np.float64], NDArray[np.float64]]
     num_keypoints: tuple[int, int]
-    level: int
+    level: int | None
     verified_inliers: int
     seconds: float
 
 
-def match_all(
-    pairs: Sequence[EvaluationPair],
-    features: RecipeFeatures,
-    max_num_keypoints: int | None,
-    title: str,
-    progress: Progress,
-) -> Iterator[MatchedPair]:
-    """Extract what the pairs need, match them, and yield each as soon as it is decided.
+@dataclass(frozen=True)
+class PairMatcher:
+    """Matches pairs by the features of a recipe.
 
-    Pairs of images without features (``features.failures``) are left out.
-
-    Args:
-        pairs: of the dataset.
+    Attributes:
         features: of the recipe.
         max_num_keypoints: of each image, the strongest of all its features; None for all.
         title: of the recipe, for progress.
-        progress: where to show progress of extraction.
+        progress: where to show progress.
     """
-    options = features.recipe.extraction
-    num_levels = len(options.rectifiers)
-    todo, best = list(pairs), dict[str, MatchedPair]()
-    for level, rectifier in enumerate(options.rectifiers):
-        names = sorted({image.name for pair in todo for image in pair.images})
-        label = f"{title}, {rectifier.name}" if num_levels > 1 else title
-        features.extract(names, level, label, progress)
-        todo = [pair for pair in todo if not _lost(pair, features)]
-        still_open = []
-        for found in _match(todo, features, level, max_num_keypoints, verify=num_levels > 1):
-            name = found.pair.name
-            best[name] = _better(best.get(name), found)
-            counts = {("1", "2"): best[name].verified_inliers}
-            if level + 1 < num_levels and open_pairs(counts, options.escalation_strong_num_inliers):
-                still_open.append(found.pair)
-            else:
-                yield best.pop(name)
-        todo = still_open
 
+    features: RecipeFeatures
+    max_num_keypoints: int | None
+    title: str
+    progress: Progress
 
-def _lost(pair: EvaluationPair, features: RecipeFeatures) -> bool:
-    return any(image.name in features.failures for image in pair.images)
+    def run(
+        self, pairs: Sequence[EvaluationPair], finish: Callable[[MatchedPair], Result]
+    ) -> Iterator[Result]:
+        """Extract what pairs need, match them, and yield what ``finish`` makes of their matches.
+
+        It is called in parallel, as soon as the matches of a pair are decided. Pairs of images that
+        cannot be used (``features.failures``) are left out.
+        """
+        rectifiers = self.features.recipe.extraction.rectifiers
+        todo, best = list(pairs), dict[str, MatchedPair]()
+        for level, rectifier in enumerate(rectifiers):
+            names = sorted({image.name for pair in todo for image in pair.images})
+            title = f"{self.title}, {rectifier.name}" if len(rectifiers) > 1 else self.title
+            self.features.extract(names, level, title, self.progress)
+            lost = [pair for pair in todo if self._is_lost(pair)]
+            yield from (finish(best.pop(pair.name)) for pair in lost if pair.name in best)
+            todo = [pair for pair in todo if not self._is_lost(pair)]
+            with self.progress.stage(title, len(todo), "pairs") as advance:
+                for found, result in self._level(level, todo, best, finish):
+                    if result is not None:
+                        best.pop(found.pair.name, None)
+                        yield result
+                    else:
+                        best[found.pair.name] = found
+                    advance(1)
+            todo = [pair for pair in todo if pair.name in best]
+
+    def _is_lost(self, pair: EvaluationPair) -> bool:
+        return any(image.name in self.features.failures for image in pair.images)
+
+    def _level(
+        self,
+        level: int,
+        pairs: Sequence[EvaluationPair],
+        best: Mapping[str, MatchedPair],
+        finish: Callable[[MatchedPair], Result],
+    ) -> Iterator[tuple[MatchedPair, Result | None]]:
+        """Yield the best matches of each pair so far, with a result if it need not climb on."""
+        extraction, matching = self.features.recipe.extraction, self.features.recipe.matching
+        num_levels = len(extraction.rectifiers)
+        cache = MatchableCache(self.features.store, matching, level, self.max_num_keypoints)
+        sizes = self.features.store.image_sizes()
+
+        def match(pair: EvaluationPair) -> tuple[MatchedPair, Result | None]:
+            names = tuple(image.name for image in pair.images)
+            (image1, _), (image2, _) = cache[names[0]], cache[names[1]]
+            start = time.perf_counter()
+            rows1, rows2 = match_features(image1, image2, matching).indices.T
+            points = image1.keypoints[rows1], image2.keypoints[rows2]
+            count = 0
+            if num_levels > 1:
+                count = verified_inliers(*points, sizes[names[0]], sizes[names[1]])
+            found = MatchedPair(
+                pair,
+                (points[0].astype(np.float64), points[1].astype(np.float64)),
+                (len(image1.keypoints), len(image2.keypoints)),
+                level if count else None,
+                count,
+                time.perf_counter() - start,
+            )
+            found = _better(best.get(pair.name), found)
+            counts = {("1", "2"): found.verified_inliers}
+            strong = extraction.escalation_strong_num_inliers
+            climbs = level + 1 < num_levels and bool(open_pairs(counts, strong))
+            return found, None if climbs else finish(found)
+
+        return map_ordered(match, pairs, available_cores())
 
 
 def _better(known: MatchedPair | None, new: MatchedPair) -> MatchedPair:
-    """Choose the one with more verified inliers, of equals the new one without, and add times."""
+    """Choose the one with more verified inliers, the new one if none has any; add their times."""
     if known is None:
         return new
     takes_new = new.verified_inliers > known.verified_inliers or not known.verified_inliers
     return replace(new if takes_new else known, seconds=known.seconds + new.seconds)
-
-
-def _match(
-    pairs: Sequence[EvaluationPair],
-    features: RecipeFeatures,
-    level: int,
-    max_num_keypoints: int | None,
-    *,
-    verify: bool,
-) -> Iterator[MatchedPair]:
-    options = features.recipe.matching
-    cache = MatchableCache(features.store, options, level, max_num_keypoints)
-    sizes = features.store.image_sizes()
-
-    def match(pair: EvaluationPair) -> MatchedPair:
-        names = tuple(image.name for image in pair.images)
-        (image1, _), (image2, _) = cache[names[0]], cache[names[1]]
-        start = time.perf_counter()
-        rows1, rows2 = match_features(image1, image2, options).indices.T
-        points = image1.keypoints[rows1], image2.keypoints[rows2]
-        count = verified_inliers(*points, sizes[names[0]], sizes[names[1]]) if verify else 0
-        return MatchedPair(
-            pair,
-            points,
-            (len(image1.keypoints), len(image2.keypoints)),
-            level if count else -1,
-            count,
-            time.perf_counter() - start,
-        )
-
-    return map_ordered(match, pairs, available_cores())
 
 
 def verified_inliers(

@@ -311,9 +311,7 @@ def _numbers(given: Any, folder: Path) -> Any:
         raise EvaluationError(f"{folder / given}: cannot be read as numbers ({error})") from error
 
 
-def _posed(
-    pair: EvaluationPair, given: Any, offset_px: float
-) -> tuple[EvaluationPair, list[str]]:
+def _posed(pair: EvaluationPair, given: Any, offset_px: float) -> tuple[EvaluationPair, list[str]]:
     """Return a pair with a relative pose: the first camera stands at the origin."""
     if not isinstance(given, dict) or given.keys() != set(POSE_KEYS):
         raise EvaluationError(f"{pair.name}: relative_pose needs {', '.join(POSE_KEYS)}")

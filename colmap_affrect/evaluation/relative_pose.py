@@ -93,6 +93,7 @@ class RelativePoseProtocol:
             paper's numbers.
         use_distortion: whether the lenses are straightened out; the paper's code did not.
         max_error_deg: rotation error below which a pair counts.
+        check_truth: see whether the images confirm the poses.
     """
 
     threshold_px: float = 0.5
@@ -100,12 +101,14 @@ class RelativePoseProtocol:
     max_num_iterations: int = PAPER_MAX_NUM_ITERATIONS
     use_distortion: bool = True
     max_error_deg: float = 5.0
+    check_truth: bool = True
 
     error_title = "rotation error [deg]"
 
     def settings(self) -> dict[str, Any]:
         """Return everything that decides scores."""
-        return {"estimator": "OpenCV findEssentialMat, RANSAC", **asdict(self)}
+        deciding = {key: value for key, value in asdict(self).items() if key != "check_truth"}
+        return {"estimator": "OpenCV findEssentialMat, RANSAC", **deciding}
 
     def score(
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int

@@ -63,7 +63,7 @@ class Svp(RelativePoseProtocol):
                 f"{dataset_path}: has no *{PAIR_LIST_SUFFIX}, nor has a folder in it; give a scene "
                 "of the Strong ViewPoint Changes dataset, or the folder of its scenes"
             )
-        scenes = [_load_scene(path) for path in lists]
+        scenes = [_load_scene(path, check_truth=self.check_truth) for path in lists]
         pairs = tuple(itertools.chain.from_iterable(scene.pairs for scene in scenes))
         notes = tuple(itertools.chain.from_iterable(scene.notes for scene in scenes))
         if not pairs:
@@ -143,7 +143,7 @@ def read_camera_poses(model_path: Path) -> CameraPoses:
     return CameraPoses(cameras, poses, faults)
 
 
-def _load_scene(list_path: Path) -> Dataset:
+def _load_scene(list_path: Path, *, check_truth: bool) -> Dataset:
     folder, scene = list_path.parent, list_path.name.removesuffix(PAIR_LIST_SUFFIX)
     listed, bad_lines = read_pair_list(list_path)
     known = read_camera_poses(folder / "0")
@@ -179,7 +179,7 @@ def _load_scene(list_path: Path) -> Dataset:
         *_missing_notes(listed, files, known),
         *_difficulty_notes(listed, known.poses),
         *size_notes(_images_of(pairs)),
-        *contradictions(pairs),
+        *(contradictions(pairs) if check_truth else ()),
         *_empty_notes(listed, pairs),
     ]
     return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))

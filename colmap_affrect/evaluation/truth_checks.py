@@ -35,10 +35,10 @@ from colmap_affrect.recipes import Recipe, load_recipe
 MAX_NOT_ORTHONORMAL = 1e-3
 """Largest element of R Rᵀ - I of what passes for a rotation."""
 
-MAX_CHECKED_PAIRS = 12
+MAX_CHECKED_PAIRS = 8
 """Per scene."""
 
-CHECK_IMAGE_SIZE_PX = 1000
+CHECK_IMAGE_SIZE_PX = 800
 """Longer side of the images that the check looks at."""
 
 MIN_CONSENSUS = 30
@@ -99,12 +99,12 @@ def rotation_fault(rotation: NDArray[np.float64]) -> str:
 
 
 def size_notes(images: Sequence[PosedImage]) -> list[str]:
-    """Name images that have another size in px than their intrinsics are for.
+    """Count images that have another size in px than their intrinsics are for.
 
     Images that cannot be read are passed over: they fail in the evaluation.
     """
 
-    def note(posed: PosedImage) -> str:
+    def mismatch(posed: PosedImage) -> str:
         try:
             height, width = read_gray(posed.image.path).shape
         except ImageError:
@@ -113,11 +113,12 @@ def size_notes(images: Sequence[PosedImage]) -> list[str]:
         if (camera.width, camera.height) == (width, height):
             return ""
         return (
-            f"{posed.image.name}: its intrinsics are for {camera.width} x {camera.height} px, the "
-            f"image has {width} x {height} px"
+            f"{posed.image.name} ({width} x {height} px, intrinsics for "
+            f"{camera.width} x {camera.height} px)"
         )
 
-    return [text for text in map_ordered(note, images, available_cores()) if text]
+    found = [text for text in map_ordered(mismatch, images, available_cores()) if text]
+    return counted(found, "images are of another size than their intrinsics", found)
 
 
 def contradictions(pairs: Sequence[EvaluationPair]) -> list[str]:

@@ -58,7 +58,7 @@ def write_set(
     image_path: Path,
     scene_path: Path,
 ) -> NDArray[np.int64]:
-    """Write a scene; return how many pairs are in each cumulative list, from 0.1 on."""
+    """Write a scene; return how many pairs are in each cumulative list, from 0.0 on."""
     root = scene_path / "set_100"
     folders = [root / name for name in ("images", "calibration", "new-vis-pairs")]
     for folder in folders:
@@ -85,7 +85,7 @@ def write_set(
         for one, two in itertools.combinations(names, 2)
     }
     counts = []
-    for limit in range(1, 10):
+    for limit in range(10):
         keys = [key for key, share in pairs.items() if share >= limit / 10]
         np.save(lists / f"keys-th-0.{limit}.npy", np.array(keys, dtype=str))
         counts.append(len(keys))
@@ -105,7 +105,7 @@ def main() -> None:
     if not points_model.num_points3D():
         raise SystemExit(f"{options.points or options.model_path}: has no points; give --points")
     counts = write_set(model, points_model, options.image_path, options.scene_path)
-    for limit, count in enumerate(counts - np.append(counts[1:], 0), 1):
+    for limit, count in enumerate(counts - np.append(counts[1:], 0)):
         print(f"covisibility 0.{limit}: {count} pairs")
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pycolmap
 
-import colmap_affrect  # before pycolmap, or after it: both work
+import colmap_affrect
 
 
 def main() -> None:

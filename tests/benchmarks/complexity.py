@@ -15,19 +15,17 @@ only the first level counts: the others depend on pairs.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import fmean, median
+from statistics import median
 
 from speed import describe_machine
 
 from colmap_affrect.comparison.methods import Method, parse_method
-from colmap_affrect.extraction import ImageExtractor, Resources, prepare
-from colmap_affrect.interfaces import FeatureProfile
+from colmap_affrect.evaluation.costs import ImageCost, extract_measured
+from colmap_affrect.extraction import Resources, prepare
 from colmap_affrect.options import ExtractionOptions, IdentityOptions
-from colmap_affrect.types import GrayImage, LocalFeatures, View
 
 DEFAULT_METHODS = ["default", "affnet-shapes-recommended"]
 
@@ -47,81 +45,10 @@ class ImageSet:
     depth_path: Path | None = None
 
 
-class TimedProfile:
-    """A feature profile that adds up its seconds."""
-
-    def __init__(self, profile: FeatureProfile) -> None:
-        self.profile = profile
-        self.descriptor_size = profile.descriptor_size
-        self.seconds = 0.0
-
-    def detect(self, view: View) -> LocalFeatures:
-        """Detect as the profile does."""
-        start = time.perf_counter()
-        detected = self.profile.detect(view)
-        self.seconds += time.perf_counter() - start
-        return detected
-
-    def describe(
-        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
-    ) -> list[LocalFeatures]:
-        """Describe as the profile does."""
-        start = time.perf_counter()
-        described = self.profile.describe(images, detected)
-        self.seconds += time.perf_counter() - start
-        return described
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What one image costs, or the mean of several."""
-
-    area_mpx: float
-    num_keypoints: float
-    num_regions: float
-    num_warps: float
-    plan_s: float
-    warp_s: float
-    features_s: float
-
-    @property
-    def total_s(self) -> float:
-        """Seconds of all steps."""
-        return self.plan_s + self.warp_s + self.features_s
-
-
-def measure(path: Path, extractor: ImageExtractor) -> Cost:
-    """Extract the features of one image; reading it is not counted."""
-    photograph, _ = extractor.photograph(path)
-    profile = TimedProfile(extractor.profile)
-    start = time.perf_counter()
-    plan = extractor.plan(photograph)
-    middle = time.perf_counter()
-    features = replace(extractor, profile=profile).execute(photograph.gray, plan)
-    execute_s = time.perf_counter() - middle
-    return Cost(
-        plan.rectified_area_px / 1e6,
-        len(features),
-        plan.num_regions,
-        len(plan.items),
-        middle - start,
-        execute_s - profile.seconds,
-        profile.seconds,
-    )
-
-
-def mean_cost(costs: Sequence[Cost]) -> Cost:
-    """Average over images."""
-    return Cost(*(fmean(values) for values in zip(*map(_fields, costs), strict=True)))
-
-
-def median_cost(costs: Sequence[Cost]) -> Cost:
+def median_cost(costs: Sequence[ImageCost]) -> ImageCost:
     """Take medians over rounds."""
-    return Cost(*(median(values) for values in zip(*map(_fields, costs), strict=True)))
-
-
-def _fields(cost: Cost) -> tuple[float, ...]:
-    return tuple(vars(cost).values())
+    keys = vars(costs[0])
+    return ImageCost(**{key: median(getattr(cost, key) for cost in costs) for key in keys})
 
 
 def baseline_of(options: ExtractionOptions) -> ExtractionOptions:
@@ -163,15 +90,15 @@ def chosen(paths: list[Path], count: int) -> list[Path]:
     return paths[:: max(1, len(paths) // count)][:count]
 
 
-def table_row(method: str, costs: list[Cost], baseline: list[Cost]) -> str:
+def table_row(method: str, costs: list[ImageCost], baseline: list[ImageCost]) -> str:
     """Format the costs of a method by round, and its ratio to the baseline by round."""
     cost = median_cost(costs)
     ratios = [mine.total_s / base.total_s for mine, base in zip(costs, baseline, strict=True)]
-    warps = f"{cost.num_warps / cost.num_regions:.2f}" if cost.num_regions else "-"
+    warps = f"{cost.warps_per_region:.2f}" if cost.num_regions else "-"
     return (
         f"| {method} | {cost.area_mpx:.2f} | {cost.num_keypoints / 1000:.1f} "
         f"| {cost.num_regions:.2f} | {warps} | {cost.plan_s:.2f} | {cost.warp_s:.2f} "
-        f"| {cost.features_s:.2f} | {cost.total_s:.2f} "
+        f"| {cost.detect_s + cost.describe_s:.2f} | {cost.total_s:.2f} "
         f"| {median(ratios):.2f} [{min(ratios):.2f}-{max(ratios):.2f}] |"
     )
 
@@ -194,14 +121,14 @@ def run_set(images: ImageSet, methods: list[Method], weights: Path | None, round
     extractors = {
         label: prepare(extraction, Resources(weights)) for label, extraction in options.items()
     }
-    costs: dict[str, list[Cost]] = {label: [] for label in options}
+    costs: dict[str, list[ImageCost]] = {label: [] for label in options}
     for _ in range(rounds):
-        found: dict[str, list[Cost]] = {label: [] for label in options}
+        found: dict[str, list[ImageCost]] = {label: [] for label in options}
         for path in images.paths:
             for label, extractor in extractors.items():
-                found[label].append(measure(path, extractor))
+                found[label].append(extract_measured(extractor, path)[1])
         for label, of_images in found.items():
-            costs[label].append(mean_cost(of_images))
+            costs[label].append(ImageCost.mean(of_images))
     lines = [
         f"{images.name}: mean of {len(images.paths)} images, median of {rounds} rounds",
         "",
@@ -219,7 +146,9 @@ def parse_arguments() -> argparse.Namespace:
     """Parse the command line."""
     root = Path(__file__).resolve().parents[2]
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--methods", nargs="+", default=DEFAULT_METHODS, help="as in pairs.py")
+    parser.add_argument(
+        "--methods", nargs="+", default=DEFAULT_METHODS, help="[LABEL=]RECIPE[:KEY=VALUE[,...]]"
+    )
     parser.add_argument("--image-path", type=Path, help="folder of images")
     parser.add_argument("--depth-path", type=Path, help="folder of their depth maps")
     parser.add_argument("--shared-path", type=Path, default=root.parent / "shared")

@@ -92,41 +92,43 @@ def test_wrong_true_position_is_the_direction_error() -> None:
 
 def test_distortion_is_respected_unless_switched_off() -> None:
     points = matches(200)
-    straight = RelativePoseProtocol(threshold_px=1.0)
+    straight = RelativePoseProtocol(threshold_px=0.2)
     bent = dataclasses.replace(straight, use_distortion=False)
     assert straight.score(make_pair(), *points, 0).num_inliers == 200
-    assert bent.score(make_pair(), *points, 0).num_inliers < 150
+    score = bent.score(make_pair(), *points, 0)
+    assert score.num_inliers < 150
+    assert score.error > 1
 
 
 def test_threshold_is_in_pixels_of_the_mean_focal_length() -> None:
     points1, points2 = matches(300)
     noise = np.random.default_rng(1).uniform(-0.6, 0.6, points1.shape)
     counts = [
-        RelativePoseProtocol(threshold_px=threshold_px)
+        RelativePoseProtocol(threshold_px=threshold_px, max_num_iterations=1000)
         .score(make_pair(), points1 + noise, points2, 0)
         .num_inliers
         for threshold_px in (0.1, 2.0)
     ]
     assert counts[0] < 150
-    assert counts[1] > 295
+    assert counts[1] > 280
 
 
 def test_hundred_thousand_iterations_find_what_a_thousand_do_not() -> None:
-    points1, points2 = matches(400)
-    outliers = np.arange(400) >= 400 * 0.21
-    points2[outliers] = np.random.default_rng(5).uniform(0, 600, (outliers.sum(), 2))
-    protocol = RelativePoseProtocol()
-    few = dataclasses.replace(protocol, max_num_iterations=PAPER_CODE_MAX_NUM_ITERATIONS)
-    errors = [few.score(make_pair(), points1, points2, seed).error for seed in range(4)]
-    assert sum(error > 5 for error in errors) >= 2
-    failed = int(np.argmax(errors))
-    assert protocol.score(make_pair(), points1, points2, failed).error < 0.5
+    points1, points2 = matches(120)
+    points2[30:] = np.random.default_rng(5).uniform(0, 600, (90, 2))
+    # A quarter of the matches is right: a thousand samples miss a good one four times in ten.
+    many = RelativePoseProtocol(confidence=0.99)
+    few = dataclasses.replace(many, max_num_iterations=PAPER_CODE_MAX_NUM_ITERATIONS)
+    assert few.score(make_pair(), points1, points2, 1).error > 5
+    score = many.score(make_pair(), points1, points2, 1)
+    assert score.error < 0.1
+    assert score.num_inliers == 30
 
 
 def test_seed_decides_the_result() -> None:
     points1, points2 = matches(100)
     points2 = points2 + np.random.default_rng(2).normal(0, 1, points2.shape)
-    protocol = RelativePoseProtocol()
+    protocol = RelativePoseProtocol(max_num_iterations=100)
     first, again, other = (
         protocol.score(make_pair(), points1, points2, seed) for seed in (0, 0, 1)
     )

@@ -1,0 +1,177 @@
+"""Errors of homographies by hand and by the protocol in words, and wrong truths that are noticed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from colmap_affrect.evaluation.homographies import (
+    HomographyEstimator,
+    TrueHomography,
+    doubts,
+    homography_counts,
+    oriented,
+    score_homography,
+    transfer_errors,
+    visible_points,
+)
+from colmap_affrect.evaluation.protocol import PairResult, PairScore
+from colmap_affrect.evaluation.registry import PROTOCOLS
+from colmap_affrect.imaging import read_gray
+from planar_pairs import SIZE, write_pair
+from planar_pairs import TRUTH as PLANAR_TRUTH
+
+SHARED_PAIRS = Path(__file__).resolve().parents[3] / "shared" / "pairs"
+
+TRUTH = np.array([[0.9, 0.2, 30.0], [-0.1, 1.1, -20.0], [3e-4, -1e-4, 1.0]])
+SIZE1, SIZE2 = (320, 200), (240, 260)
+ROUNDING_PX = 1e-9
+"""Double precision on coordinates of some hundred px."""
+
+
+def shift(x: float, y: float) -> np.ndarray:
+    return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
+
+
+def error_px(estimate: np.ndarray | None, truth: np.ndarray = TRUTH) -> float:
+    return TrueHomography(truth, SIZE1, SIZE2).error_px(estimate)
+
+
+def test_transfer_error_of_one_match_by_hand() -> None:
+    points1 = np.array([[100.0, 50.0]])
+    exact = np.array([(90 + 10 + 30) / 1.025, (-10 + 55 - 20) / 1.025])
+    errors = transfer_errors(TRUTH, points1, exact[None] + [3.0, 4.0])
+    np.testing.assert_allclose(errors, [5.0], atol=ROUNDING_PX)
+
+
+def test_transfer_error_is_measured_in_image_2() -> None:
+    doubling = np.diag([2.0, 2.0, 1.0])
+    errors = transfer_errors(doubling, np.array([[11.0, 5.0]]), np.array([[20.0, 10.0]]))
+    np.testing.assert_allclose(errors, [2.0], atol=ROUNDING_PX)
+
+
+def test_points_behind_the_camera_are_never_correct() -> None:
+    behind = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.01, 0.0, 1.0]])
+    points = np.array([[200.0, 40.0], [100.0, 7.0]])
+    assert np.isinf(transfer_errors(behind, points, np.array([[-200.0, -40.0], [0.0, 0.0]]))).all()
+
+
+def test_visible_points_are_those_that_land_in_image_2() -> None:
+    points = visible_points(shift(-100.0, 40.0), SIZE1, SIZE2)
+    assert (points.min(axis=0) == [100, 0]).all()
+    assert (points.max(axis=0) == [316, 196]).all()
+    assert len(points) == 55 * 50
+
+
+def test_visible_points_end_with_image_2() -> None:
+    points = visible_points(shift(0.0, 100.0), SIZE1, SIZE2)
+    assert (points.max(axis=0) == [236, 156]).all()
+
+
+def test_nothing_behind_the_camera_is_visible() -> None:
+    behind = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.01, 0.0, 1.0]])
+    assert visible_points(behind, SIZE1, (10_000, 10_000))[:, 0].max() == 96
+
+
+def test_error_of_a_shift_is_its_euclidean_length() -> None:
+    assert error_px(shift(0.3, -0.4) @ TRUTH) == pytest.approx(0.5, abs=ROUNDING_PX)
+
+
+def test_error_agrees_with_all_visible_pixels_carried_there_and_back() -> None:
+    """The protocol in words: the mask of image 1, pushed to image 2 and back, and its pixels."""
+    estimate = TRUTH @ np.array([[1.01, 0.02, 1.0], [0.0, 0.99, -2.0], [1e-5, 0.0, 1.0]])
+    ones = np.ones(SIZE1[::-1], np.uint8)
+    there = cv2.warpPerspective(ones, TRUTH, SIZE2, flags=cv2.INTER_NEAREST)
+    back = cv2.warpPerspective(there, np.linalg.inv(TRUTH), SIZE1, flags=cv2.INTER_NEAREST)
+    rows, columns = np.nonzero(back)
+    points = np.stack([columns, rows], axis=1).astype(np.float64)[:, None]
+    carried = [cv2.perspectiveTransform(points, matrix)[:, 0] for matrix in (estimate, TRUTH)]
+    expected = np.linalg.norm(carried[0] - carried[1], axis=1).mean()
+    assert expected > 1.0
+    assert error_px(estimate) == pytest.approx(expected, rel=0.02)  # every 16th pixel, the border
+
+
+@pytest.mark.parametrize("scale", [1.0, -2.0])
+def test_scale_and_sign_of_estimate_and_truth_do_not_matter(scale: float) -> None:
+    assert error_px(scale * TRUTH) == pytest.approx(0, abs=ROUNDING_PX)
+    truth = oriented(scale * TRUTH, SIZE1, SIZE2)
+    assert error_px(shift(0, 2) @ TRUTH, truth) == pytest.approx(2.0, abs=ROUNDING_PX)
+
+
+def test_estimate_with_its_horizon_in_the_image_has_infinite_error() -> None:
+    estimate = TRUTH + np.array([[0, 0, 0], [0, 0, 0], [-0.01, 0, 0]])
+    assert error_px(estimate) == error_px(None) == float("inf")
+
+
+def test_counts_are_of_both_estimators() -> None:
+    errors = [(0.5, 4.0), (3.0, 2.9), (float("inf"), 12.0)]
+    results = [
+        PairResult(str(error), "", PairScore(error, 9, 9, {"magsac_error": other}), 9, 1.0)
+        for error, other in errors
+    ]
+    failed = PairResult("failed", "", PairScore(float("inf"), 0), 0, 0.0, failure="unreadable")
+    counts = homography_counts([*results, failed])
+    assert list(counts.values()) == [1, 1, 1, 2, 2, 2, 0, 0, 1, 2, 2, 3]
+    assert list(counts)[2:7:4] == ["< 3 px", "MAGSAC: < 1 px"]
+
+
+def test_matches_of_which_half_are_wrong_give_the_homography() -> None:
+    rng = np.random.default_rng(5)
+    points1 = rng.uniform(0, SIZE1, (60, 2))
+    mapped = np.hstack([points1, np.ones((60, 1))]) @ TRUTH.T
+    points2 = mapped[:, :2] / mapped[:, 2:]
+    points2[::2] += rng.uniform(30, 60, (30, 2))
+    truth = TrueHomography(TRUTH, SIZE1, SIZE2)
+    score = score_homography(truth, points1, points2, HomographyEstimator(), 3)
+    assert score.error < 1e-3
+    assert score.details["magsac_error"] < 1e-2
+    assert (score.num_inliers, score.num_correct) == (30, 30)
+    swapped = score_homography(truth, points2, points1, HomographyEstimator(), 3)
+    assert swapped.error > 10.0
+
+
+def test_too_few_matches_give_no_homography() -> None:
+    three = np.array([[1.0, 2.0], [30.0, 4.0], [5.0, 60.0]])
+    truth = TrueHomography(TRUTH, SIZE1, SIZE2)
+    score = score_homography(truth, three, three, HomographyEstimator(), 0)
+    assert (score.error, score.num_inliers) == (float("inf"), 0)
+    assert score.details == {"magsac_error": float("inf"), "magsac_num_inliers": 0}
+
+
+@pytest.mark.parametrize(
+    ("given", "note"),
+    [
+        (PLANAR_TRUTH, ""),
+        (-3.0 * PLANAR_TRUTH, ""),
+        (np.linalg.inv(PLANAR_TRUTH), "it is inverted"),
+        (PLANAR_TRUTH.T, "it is transposed"),
+        (np.diag([2.0, 2.0, 1.0]) @ PLANAR_TRUTH, "2 times as large, in image 2"),
+        (np.diag([0.5, 0.5, 1]) @ PLANAR_TRUTH @ np.diag([2, 2, 1]), "0.5 times as large"),
+        (shift(0, 40) @ PLANAR_TRUTH, "not confirmed by features"),
+        (shift(900, 0) @ PLANAR_TRUTH, "shows no part of image 1"),
+    ],
+)
+def test_wrong_truth_is_noticed_and_named(given: np.ndarray, note: str, tmp_path: Path) -> None:
+    paths = tmp_path / "1.png", tmp_path / "2.png"
+    write_pair(*paths, seed=7)
+    found = doubts(given, read_gray(paths[0]), read_gray(paths[1]))
+    assert note in found
+    assert bool(note) == bool(found)
+
+
+def test_planar_pair_is_as_large_as_it_says(tmp_path: Path) -> None:
+    write_pair(tmp_path / "1.png", tmp_path / "2.png", seed=7)
+    assert read_gray(tmp_path / "2.png").shape == SIZE[::-1]
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    ("name", "count"), [("evd_sample", 7), ("oxford_graf", 5), ("oxford_wall", 5)]
+)
+def test_real_homographies_are_confirmed(name: str, count: int) -> None:
+    dataset = PROTOCOLS["evd"]().load(SHARED_PAIRS / name)
+    assert len(dataset.pairs) == count
+    assert not [note for note in dataset.notes if "homography" in note]

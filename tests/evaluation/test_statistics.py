@@ -1,0 +1,80 @@
+"""Intervals and paired tests against known distributions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from colmap_affrect.evaluation.statistics import bootstrap_interval, paired_test
+
+
+def test_interval_of_a_mean_is_that_of_the_normal_distribution() -> None:
+    values = np.random.default_rng(3).normal(5.0, 2.0, 400)
+    low, high = bootstrap_interval(values.tolist(), lambda array: float(array.mean()), 0)
+    half_width = 1.96 * values.std() / math.sqrt(400)
+    assert low == pytest.approx(values.mean() - half_width, abs=0.04)
+    assert high == pytest.approx(values.mean() + half_width, abs=0.04)
+
+
+def test_interval_covers_the_truth_about_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    covered = 0
+    for seed in range(40):
+        values = (rng.random(80) < 0.3).astype(float)
+        low, high = bootstrap_interval(values.tolist(), lambda array: float(array.mean()), seed)
+        covered += low <= 0.3 <= high
+    assert 34 <= covered <= 40
+
+
+def test_interval_depends_on_the_seed_only() -> None:
+    def share(array):
+        return float((array < 5).mean())
+
+    values = [1.0, math.inf, 3.0, 8.0, 2.0, math.inf, 4.0]
+    intervals = [bootstrap_interval(values, share, seed) for seed in (0, 0)]
+    assert intervals[0] == intervals[1]
+    assert 0 <= intervals[0][0] < 4 / 7 < intervals[0][1] <= 1
+    assert bootstrap_interval([2.0], share, 1) == (1.0, 1.0)
+    with pytest.raises(ValueError, match="no values"):
+        bootstrap_interval([], share, 0)
+
+
+def test_paired_test_of_ones_and_zeros_is_the_sign_test() -> None:
+    # Five pairs that only the first solves, one that only the second does: 14 of 64 ways.
+    a = [1, 1, 1, 1, 1, 0, 1, 0]
+    b = [0, 0, 0, 0, 0, 1, 1, 0]
+    assert paired_test(a, b, 0) == pytest.approx(14 / 64)
+    assert paired_test(b, a, 0) == pytest.approx(14 / 64)
+
+
+def test_paired_test_ranks_differences_and_takes_failures_as_the_largest() -> None:
+    # Signed ranks -1, +2, +3 (infinite): the sum 4 or more of either sign in 4 of 8 ways.
+    assert paired_test([1.0, 5.0, math.inf, math.inf], [1.5, 2.0, 7.0, math.inf], 0) == 0.5
+
+
+def test_equal_methods_do_not_differ() -> None:
+    assert paired_test([1.0, math.inf], [1.0, math.inf], 0) == 1.0
+    assert paired_test([], [], 0) == 1.0
+
+
+def test_many_differences_are_sampled() -> None:
+    rng = np.random.default_rng(1)
+    base = rng.normal(size=100)
+    noise = rng.normal(size=100)
+    assert paired_test(base.tolist(), (base + noise + 1.0).tolist(), 0) < 0.001
+    assert paired_test(base.tolist(), (base + noise - noise.mean()).tolist(), 0) > 0.2
+
+
+def test_random_signs_agree_with_all_signs(monkeypatch: pytest.MonkeyPatch) -> None:
+    a = [3.0, 1.0, 4.0, 1.5, 5.0, 9.0, 2.0, 6.0]
+    b = [2.0, 0.5, 1.0, 2.5, 3.0, 4.0, 2.2, 1.0]
+    exact = paired_test(a, b, 0)
+    monkeypatch.setattr("colmap_affrect.evaluation.statistics.MAX_ENUMERATED", 0)
+    assert paired_test(a, b, 0) == pytest.approx(exact, abs=0.01)
+
+
+def test_different_numbers_of_values_are_refused() -> None:
+    with pytest.raises(ValueError, match="2 values against 1"):
+        paired_test([1.0, 2.0], [1.0], 0)
