@@ -46,14 +46,22 @@ ROWS = [
         "report.pictures", "report.scene", "report.sheet", "report.tilt_plot",
         "report.view_graph", "report.viewer", "report.warp_views",
     },
-    {"comparison.compare"},
+    {
+        "comparison.compare",
+        "evaluation.correspondences", "evaluation.costs", "evaluation.evaluate", "evaluation.evd",
+        "evaluation.homographies", "evaluation.imc", "evaluation.pair_matches", "evaluation.pairs",
+        "evaluation.plots", "evaluation.protocol", "evaluation.published",
+        "evaluation.recipe_features", "evaluation.records", "evaluation.registry",
+        "evaluation.relative_pose", "evaluation.results", "evaluation.statistics",
+        "evaluation.svp", "evaluation.tables", "evaluation.truth_checks",
+    },
     {"cli", "__main__"},
 ]  # fmt: skip
 """A module imports from its own row and from those above it in this list."""
 
 ROW_OF = {module: number for number, row in enumerate(ROWS) for module in row}
 
-FREE = {"geometry", "features", "rectifiers", "matching", "comparison", "report", ""}
+FREE = {"geometry", "features", "rectifiers", "matching", "comparison", "report", "evaluation", ""}
 """Packages whose __init__ holds no code, and the top one, which loads its names when used."""
 
 WITHIN_ROW_5 = {("extraction", "rectified")}
@@ -63,8 +71,11 @@ ARRAYS_ONLY = {"conventions", "errors"}
 """All that geometry may import beside itself: it takes and returns plain arrays."""
 
 HOMES = {
-    "cv2": {"imaging", "depth", "features.affnet", "features.dog", "features.second_moment"},
-    "h5py": {"store", "depth", "interchange"},
+    "cv2": {
+        "imaging", "depth", "features.affnet", "features.dog", "features.second_moment",
+        "evaluation.correspondences", "evaluation.homographies", "evaluation.relative_pose",
+    },
+    "h5py": {"store", "depth", "interchange", "evaluation.imc"},
     "pycolmap": {"colmap"},
     "tqdm": {"progress"},
     "threadpoolctl": {"executor"},
@@ -83,7 +94,7 @@ HOMES = {
         "features.weights",
     },
     "transformers": {"depth"},
-    "matplotlib": {"report.sheet", "report.tilt_plot"},
+    "matplotlib": {"report.sheet", "report.tilt_plot", "evaluation.plots"},
     "jinja2": {"report.page"},
     "networkx": {"report.view_graph"},
     "rerun": {"report.viewer"},

@@ -22,7 +22,7 @@ from colmap_affrect.workspace import Workspace
 
 COMMANDS = [
     "run", "extract", "pairs", "match", "verify", "escalate", "map",
-    "compare", "inspect", "recipes", "weights", "doctor",
+    "compare", "evaluate", "inspect", "recipes", "weights", "doctor",
 ]  # fmt: skip
 TIMEOUT_S = 60
 

@@ -189,9 +189,8 @@ class Pairs:
             }
         poses = [result for result in results if "direction_error_deg" in result.score.details]
         if poses:
-            uncategorized = [replace(result, category="") for result in poses]
-            shares = self._poses.summarize(uncategorized)
-            columns |= {f"poses: {name}": value for name, value in shares.items() if name}
+            totals = self._poses.totals(poses)
+            columns |= {f"poses: {name}": value for name, value in totals.items()}
         return columns
 
     def settings(self) -> dict[str, Any]:

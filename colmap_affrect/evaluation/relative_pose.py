@@ -155,13 +155,19 @@ class RelativePoseProtocol:
         by_category: dict[str, list[float]] = {}
         for result in sorted(results, key=lambda result: category_start(result.category)):
             by_category.setdefault(result.category, []).append(self.success(result.score))
+        return {
+            **{name: _mean(values) for name, values in by_category.items()},
+            **self.totals(results),
+        }
+
+    def totals(self, results: Sequence[PairResult]) -> dict[str, float]:
+        """Return the columns of :meth:`summarize` that are of all categories."""
         errors = [result.score.error for result in results]
         both = [
             max(result.score.error, result.score.details.get("direction_error_deg", math.inf))
             for result in results
         ]
         return {
-            **{name: _mean(values) for name, values in by_category.items()},
             "all": _mean([self.success(result.score) for result in results]),
             "all < 10°": _mean([float(error < 10.0) for error in errors]),
             "all < 20°": _mean([float(error < 20.0) for error in errors]),

@@ -51,9 +51,9 @@ def test_folders_of_methods_differ_and_stay_inside():
     [
         (["sift,defualt"], "unknown method 'defualt': did you mean 'default'"),
         (["sfit"], "did you mean 'sift'"),
-        (["sift,sift"], "two are called 'sift'"),
+        (["sift,sift"], "two methods are called 'sift'"),
         (["sift=default"], "'sift' is COLMAP's"),
-        ([","], "none given; known are sift, sift-affine-dsp"),
+        ([","], "no method given; known are sift, sift-affine-dsp"),
         (["default:matching.max_ration=1"], "did you mean 'max_ratio'"),
     ],
 )
