@@ -72,8 +72,14 @@ ARRAYS_ONLY = {"conventions", "errors"}
 
 HOMES = {
     "cv2": {
-        "imaging", "depth", "features.affnet", "features.dog", "features.second_moment",
-        "evaluation.correspondences", "evaluation.homographies", "evaluation.relative_pose",
+        "imaging",
+        "depth",
+        "features.affnet",
+        "features.dog",
+        "features.second_moment",
+        "evaluation.correspondences",
+        "evaluation.homographies",
+        "evaluation.relative_pose",
     },
     "h5py": {"store", "depth", "interchange", "evaluation.imc"},
     "pycolmap": {"colmap"},

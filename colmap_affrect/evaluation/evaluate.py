@@ -46,7 +46,7 @@ from colmap_affrect.evaluation.results import (
     pair_to_mapping,
 )
 from colmap_affrect.evaluation.statistics import bootstrap_interval, paired_test
-from colmap_affrect.evaluation.tables import SECONDS
+from colmap_affrect.evaluation.tables import GROUP, SECONDS
 from colmap_affrect.extraction import Resources
 from colmap_affrect.files import replace_text
 from colmap_affrect.pipeline import installed_versions
@@ -289,6 +289,7 @@ class _Run:
             matched.num_keypoints,
             {"match": matched.seconds, "estimate": estimate_s},
             level,
+            matched.num_levels,
         )
 
     def _failed(self, pair: EvaluationPair, failure: str = "") -> PairResult:
@@ -304,7 +305,11 @@ class _Run:
         self, results: Sequence[PairResult], baseline: Sequence[PairResult] | None
     ) -> RecipeResult:
         """Sum up the results of the pairs, and test them against those of the baseline."""
-        costs = list(self.features.costs().values())
+        num_levels: dict[str, int] = {}
+        for pair, result in zip(self.pairs, results, strict=True):
+            for image in pair.images:
+                num_levels[image.name] = max(num_levels.get(image.name, 0), result.num_levels)
+        costs = list(self.features.costs(num_levels).values())
         seconds = sum(cost.total_s for cost in costs) + sum(result.seconds for result in results)
         seed = self.options.random_seed
         successes = [self.protocol.success(result.score) for result in results]
@@ -352,7 +357,7 @@ def _intervals(
     columns = protocol.summarize(results)
 
     def interval(column: str) -> Interval:
-        rows = categories.get(column, list(range(len(results))))
+        rows = categories.get(column.rpartition(GROUP)[2], list(range(len(results))))
 
         def statistic(picked: NDArray[np.float64]) -> float:
             key = picked.tobytes()  # columns of the same pairs are resampled alike

@@ -155,7 +155,7 @@ def _quaternion_doubt(rotation: NDArray[np.float64], q: NDArray[np.float64] | No
 
 
 def _load_scene(folder: Path, *, check_truth: bool) -> Dataset:
-    root = folder / SET_FOLDER
+    root, scene = folder / SET_FOLDER, folder.absolute().name
     lists, notes = _read_lists(root / LIST_FOLDER)
     calibrations, faults = _read_calibrations(root / "calibration")
     files = {
@@ -171,7 +171,7 @@ def _load_scene(folder: Path, *, check_truth: bool) -> Dataset:
             unclear.append(key)
         else:
             bins[names] = limit
-    posed, size_notes = _posed(folder.name, files, calibrations)
+    posed, size_notes = _posed(scene, files, calibrations)
     pairs = [
         posed_pair(posed[names[0]], posed[names[1]], f"{limit / 10:.1f}")
         for names, limit in bins.items()
@@ -195,7 +195,7 @@ def _load_scene(folder: Path, *, check_truth: bool) -> Dataset:
         *(contradictions(pairs[::-1]) if check_truth else ()),
         *_empty_notes(pairs),
     ]
-    return Dataset(tuple(pairs), tuple(f"{folder.name}: {note}" for note in notes))
+    return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
 
 
 def _read_lists(folder: Path) -> tuple[dict[int, list[str]], list[str]]:

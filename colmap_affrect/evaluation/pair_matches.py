@@ -41,6 +41,7 @@ class MatchedPair:
         points: (M, 2) pixel-centre px of the matches in each image.
         num_keypoints: features of the two images that were matched.
         level: of escalation; None when no level was verified, or without escalation.
+        num_levels: that were tried.
         verified_inliers: of COLMAP's two-view geometry; 0 if a run would not take it, or without
             escalation.
         seconds: of matching and verification, at all levels that were tried.
@@ -50,6 +51,7 @@ class MatchedPair:
     points: tuple[NDArray[np.float64], NDArray[np.float64]]
     num_keypoints: tuple[int, int]
     level: int | None
+    num_levels: int
     verified_inliers: int
     seconds: float
 
@@ -127,6 +129,7 @@ class PairMatcher:
                 (points[0].astype(np.float64), points[1].astype(np.float64)),
                 (len(image1.keypoints), len(image2.keypoints)),
                 level if count else None,
+                level + 1,
                 count,
                 time.perf_counter() - start,
             )
@@ -144,7 +147,8 @@ def _better(known: MatchedPair | None, new: MatchedPair) -> MatchedPair:
     if known is None:
         return new
     takes_new = new.verified_inliers > known.verified_inliers or not known.verified_inliers
-    return replace(new if takes_new else known, seconds=known.seconds + new.seconds)
+    seconds = known.seconds + new.seconds
+    return replace(new if takes_new else known, seconds=seconds, num_levels=new.num_levels)
 
 
 def verified_inliers(

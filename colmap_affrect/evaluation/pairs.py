@@ -64,6 +64,7 @@ from colmap_affrect.evaluation.protocol import (
     PairScore,
 )
 from colmap_affrect.evaluation.relative_pose import RelativePoseProtocol, posed_image
+from colmap_affrect.evaluation.tables import GROUP
 from colmap_affrect.evaluation.truth_checks import contradictions, rotation_fault
 from colmap_affrect.executor import available_cores, map_ordered
 from colmap_affrect.imaging import read_gray
@@ -73,6 +74,8 @@ KINDS = ("homography", "correspondences", "relative_pose")
 KEYS = ("name", "image1", "image2", "category", *KINDS)
 POSE_KEYS = ("rotation", "translation", "intrinsics1", "intrinsics2")
 ORIGINS = ("center", "corner")
+NO_CATEGORY = "0°"
+"""Of all poses, whose categories here are no angles."""
 
 MAX_OFF_CENTRE = 0.25
 """A principal point further from the middle, in image sizes, does not fit the image."""
@@ -189,8 +192,12 @@ class Pairs:
             }
         poses = [result for result in results if "direction_error_deg" in result.score.details]
         if poses:
-            totals = self._poses.totals(poses)
-            columns |= {f"poses: {name}": value for name, value in totals.items()}
+            together = [replace(result, category=NO_CATEGORY) for result in poses]
+            columns |= {
+                f"poses, {name}" if GROUP in name else f"poses{GROUP}{name}": value
+                for name, value in self._poses.summarize(together).items()
+                if name.rpartition(GROUP)[2] != NO_CATEGORY
+            }
         return columns
 
     def settings(self) -> dict[str, Any]:

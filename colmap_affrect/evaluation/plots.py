@@ -83,7 +83,7 @@ def _errors(evaluation: Evaluation) -> Figure:
         errors = sorted(e for e in (pair.score.error for pair in recipe.pairs) if e < high)
         steps = [low, *(max(error, low) for error in errors), high]
         counts = [0, *range(1, len(errors) + 1), len(errors)]
-        style = dict(color=color, linewidth=2, clip_on=False, zorder=3)
+        style: dict[str, Any] = dict(color=color, linewidth=2, clip_on=False, zorder=3)
         axes.step(steps, counts, where="post", label=recipe.name, **style)
     for row, color in zip(evaluation.published, _paper_colors(evaluation), strict=True):
         points = sorted(

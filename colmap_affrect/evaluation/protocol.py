@@ -76,6 +76,7 @@ class PairResult:
         num_keypoints: features of the two images that were matched.
         seconds_by_step: the same by step, ``match`` and ``estimate``.
         level: rectifier of the level of escalation that decided; empty without escalation.
+        num_levels: levels whose features were extracted for the pair, 1 without escalation.
         failure: why there is no score, if an image could not be read or the like; such pairs
             have an infinite error and count as failed.
     """
@@ -88,6 +89,7 @@ class PairResult:
     num_keypoints: tuple[int, int] = (0, 0)
     seconds_by_step: Mapping[str, float] = field(default_factory=dict)
     level: str = ""
+    num_levels: int = 0
     failure: str = ""
 
 

@@ -84,15 +84,16 @@ class RecipeFeatures:
         records = self._costs.records
         return {record["image"]: record["warning"] for record in records if record["warning"]}
 
-    def costs(self) -> dict[str, ImageCost]:
-        """Return what each image cost, all its levels together."""
+    def costs(self, num_levels: Mapping[str, int]) -> dict[str, ImageCost]:
+        """Return what images cost, by name, each with so many of its levels together."""
         by_level = {
             (record["image"], record["level"]): ImageCost.from_mapping(record["cost"])
             for record in self._costs.records
         }
         found: dict[str, ImageCost] = {}
-        for (name, _), cost in by_level.items():
-            found[name] = found.get(name, ImageCost()) + cost
+        for (name, level), cost in by_level.items():
+            if level < num_levels.get(name, 0):
+                found[name] = found.get(name, ImageCost()) + cost
         return found
 
     def extract(self, names: Sequence[str], level: int, title: str, progress: Progress) -> None:

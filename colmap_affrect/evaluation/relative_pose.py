@@ -41,6 +41,10 @@ CORRECT_PX = 3.0
 """A match agrees with a pose up to this Sampson distance."""
 
 
+ESTIMATORS = {"": "", "GC-RANSAC: ": "gc_"}
+"""What the names of columns begin with, and those of details of scores, by estimator."""
+
+
 @dataclass(frozen=True, eq=False)
 class PosedImage:
     """An image with the truth about its camera.
@@ -85,13 +89,18 @@ def rotation_angle_deg(rotation: NDArray[np.float64]) -> float:
 class RelativePoseProtocol:
     """Score of matches by the relative pose that they give, the intrinsics being known.
 
+    Two estimators: the paper's, plain RANSAC, whose result is one sample of five matches, and a
+    recommended one, OpenCV's GC-RANSAC (``USAC_ACCURATE``), which refines on all inliers.
+
     Attributes:
         threshold_px: of an inlier; the distance of points from epipolar lines, in units of the
             mean focal length of the two cameras.
-        confidence: at which RANSAC may end.
-        max_num_iterations: of RANSAC; ``PAPER_CODE_MAX_NUM_ITERATIONS`` is what gave the
+        confidence: at which either may end.
+        max_num_iterations: of either; ``PAPER_CODE_MAX_NUM_ITERATIONS`` is what gave the
             paper's numbers.
         use_distortion: whether the lenses are straightened out; the paper's code did not.
+        gc_threshold_px: of an inlier of GC-RANSAC; as in verification by default.
+        num_gc_estimates: of so many orders of the matches the one of median error counts.
         max_error_deg: rotation error below which a pair counts.
         check_truth: see whether the images confirm the poses.
     """
@@ -100,6 +109,8 @@ class RelativePoseProtocol:
     confidence: float = 0.9999
     max_num_iterations: int = PAPER_MAX_NUM_ITERATIONS
     use_distortion: bool = True
+    gc_threshold_px: float = 3.0
+    num_gc_estimates: int = 5
     max_error_deg: float = 5.0
     check_truth: bool = True
 
@@ -108,16 +119,17 @@ class RelativePoseProtocol:
     def settings(self) -> dict[str, Any]:
         """Return everything that decides scores."""
         deciding = {key: value for key, value in asdict(self).items() if key != "check_truth"}
-        return {"estimator": "OpenCV findEssentialMat, RANSAC", **deciding}
+        return {"estimators": "OpenCV findEssentialMat, RANSAC and USAC_ACCURATE", **deciding}
 
     def score(
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
     ) -> PairScore:
         """Score (M, 2) and (M, 2) matched points, pixel-centre px of the stored images.
 
-        The error is that of the rotation in degrees. Details: ``direction_error_deg``, the angle
-        between the directions of the translations. ``num_correct`` are the matches within
-        ``CORRECT_PX`` of the true epipolar lines: wrong ones may be among them by chance.
+        The error is that of the rotation by the paper's RANSAC, in degrees. Details:
+        ``direction_error_deg``, the angle between the directions of the translations, and both
+        errors and the number of inliers by GC-RANSAC, ``gc_...``. ``num_correct`` are the matches
+        within ``CORRECT_PX`` of the true epipolar lines: wrong ones may be among them by chance.
         """
         cameras = (pair.truth[0].camera, pair.truth[1].camera)
         truth = true_pose(pair)
@@ -126,21 +138,33 @@ class RelativePoseProtocol:
             for camera, points in zip(cameras, (points1, points2), strict=True)
         )
         scale = mean_focal_px(cameras)
-        num_correct = int((scale * sampson_distances(truth, rays1, rays2) < CORRECT_PX).sum())
-        estimate, inliers = estimate_relative_pose(
-            rays1,
-            rays2,
-            self.threshold_px / scale,
-            self.confidence,
-            self.max_num_iterations,
-            random_seed,
+
+        def estimate(threshold_px: float, seed: int, method: int) -> tuple[float, float, int]:
+            """Return the errors of rotation and direction, and the number of inliers."""
+            ransac = Ransac(
+                threshold_px / scale, self.confidence, self.max_num_iterations, seed, method
+            )
+            pose, inliers = estimate_relative_pose(rays1, rays2, ransac)
+            errors = (math.inf, math.inf) if pose is None else pose_errors(pose, truth)
+            return *errors, int(inliers.sum())
+
+        error, direction_error, num_inliers = estimate(self.threshold_px, random_seed, cv2.RANSAC)
+        others = sorted(
+            estimate(self.gc_threshold_px, random_seed + number, cv2.USAC_ACCURATE)
+            for number in range(self.num_gc_estimates)
         )
-        num_inliers = int(inliers.sum())
-        if estimate is None:
-            return PairScore(math.inf, num_inliers, num_correct, {"direction_error_deg": math.inf})
-        rotation_error, direction_error = pose_errors(estimate, truth)
-        details = {"direction_error_deg": direction_error}
-        return PairScore(rotation_error, num_inliers, num_correct, details)
+        gc_error, gc_direction_error, gc_num_inliers = others[(len(others) - 1) // 2]
+        return PairScore(
+            error,
+            num_inliers,
+            int((scale * sampson_distances(truth, rays1, rays2) < CORRECT_PX).sum()),
+            {
+                "direction_error_deg": direction_error,
+                "gc_error": gc_error,
+                "gc_direction_error_deg": gc_direction_error,
+                "gc_num_inliers": gc_num_inliers,
+            },
+        )
 
     def success(self, score: PairScore) -> float:
         """Return 1 if the rotation error is below the limit, else 0."""
@@ -150,29 +174,52 @@ class RelativePoseProtocol:
         """Return shares of pairs with a rotation error below the limit, by category and of all.
 
         Also shares under 10 and 20 degrees, and the area under the curve of the larger of
-        rotation and direction error up to 10 degrees.
+        rotation and direction error up to 10 degrees; then the same by GC-RANSAC.
         """
-        by_category: dict[str, list[float]] = {}
+        by_category: dict[str, list[PairScore]] = {}
         for result in sorted(results, key=lambda result: category_start(result.category)):
-            by_category.setdefault(result.category, []).append(self.success(result.score))
-        return {
-            **{name: _mean(values) for name, values in by_category.items()},
-            **self.totals(results),
-        }
+            by_category.setdefault(result.category, []).append(result.score)
+        everything = [result.score for result in results]
+        columns: dict[str, float] = {}
+        for group, prefix in ESTIMATORS.items():
+            for category, scores in by_category.items():
+                errors = [error for error, _ in _errors(scores, prefix)]
+                columns[group + category] = _share_below(self.max_error_deg, errors)
+            columns |= self._totals(everything, group, prefix)
+        return columns
 
     def totals(self, results: Sequence[PairResult]) -> dict[str, float]:
         """Return the columns of :meth:`summarize` that are of all categories."""
-        errors = [result.score.error for result in results]
-        both = [
-            max(result.score.error, result.score.details.get("direction_error_deg", math.inf))
-            for result in results
-        ]
+        scores = [result.score for result in results]
+        columns: dict[str, float] = {}
+        for group, prefix in ESTIMATORS.items():
+            columns |= self._totals(scores, group, prefix)
+        return columns
+
+    def _totals(self, scores: Sequence[PairScore], group: str, prefix: str) -> dict[str, float]:
+        errors = _errors(scores, prefix)
+        rotation_errors = [error for error, _ in errors]
         return {
-            "all": _mean([self.success(result.score) for result in results]),
-            "all < 10°": _mean([float(error < 10.0) for error in errors]),
-            "all < 20°": _mean([float(error < 20.0) for error in errors]),
-            "pose AUC 10°": area_under_curve(both, len(both), 10.0),
+            f"{group}all": _share_below(self.max_error_deg, rotation_errors),
+            f"{group}all < 10°": _share_below(10.0, rotation_errors),
+            f"{group}all < 20°": _share_below(20.0, rotation_errors),
+            f"{group}pose AUC 10°": area_under_curve(map(max, errors), len(errors), 10.0),
         }
+
+
+def _errors(scores: Sequence[PairScore], prefix: str) -> list[tuple[float, float]]:
+    """Return the errors of rotation and direction by an estimator; infinite for failed pairs."""
+    return [
+        (
+            score.details.get(f"{prefix}error", math.inf) if prefix else score.error,
+            score.details.get(f"{prefix}direction_error_deg", math.inf),
+        )
+        for score in scores
+    ]
+
+
+def _share_below(limit: float, errors: Sequence[float]) -> float:
+    return sum(error < limit for error in errors) / len(errors) if errors else 0.0
 
 
 def category_start(category: str) -> float:
@@ -182,10 +229,6 @@ def category_start(category: str) -> float:
     120.0
     """
     return float(category.rstrip("°"))
-
-
-def _mean(values: Sequence[float]) -> float:
-    return math.fsum(values) / len(values) if values else 0.0
 
 
 def mean_focal_px(cameras: Sequence[pycolmap.Camera]) -> float:
@@ -229,25 +272,36 @@ def sampson_distances(pose: Pose, rays1: Points, rays2: Points) -> NDArray[np.fl
     return np.asarray(np.nan_to_num(distances, nan=np.inf))
 
 
+@dataclass(frozen=True)
+class Ransac:
+    """How to look for an essential matrix.
+
+    Attributes:
+        threshold: of an inlier, in units of the focal length.
+        confidence: at which to end before all iterations.
+        max_num_iterations: at most.
+        random_seed: decides the samples.
+        method: ``cv2.RANSAC`` or another of OpenCV's.
+    """
+
+    threshold: float
+    confidence: float
+    max_num_iterations: int
+    random_seed: int = 0
+    method: int = cv2.RANSAC
+
+
 def estimate_relative_pose(
-    rays1: Points,
-    rays2: Points,
-    threshold: float,
-    confidence: float,
-    max_num_iterations: int,
-    random_seed: int,
+    rays1: Points, rays2: Points, ransac: Ransac
 ) -> tuple[Pose | None, NDArray[np.bool_]]:
-    """Estimate camera2_from_camera1 with OpenCV's five-point RANSAC.
+    """Estimate camera2_from_camera1 from five-point samples.
 
     OpenCV draws the same samples every time, so the seed decides the order of the matches.
 
     Args:
         rays1: (N, 2) of camera 1, see :func:`rays`; matches with NaN are never inliers.
         rays2: (N, 2) of camera 2.
-        threshold: of an inlier, in units of the focal length.
-        confidence: at which RANSAC may end before all iterations.
-        max_num_iterations: at most.
-        random_seed: decides the samples.
+        ransac: how.
 
     Returns:
         The pose, its translation of length 1, None if there is none; and the (N,) inliers.
@@ -256,16 +310,16 @@ def estimate_relative_pose(
     usable = np.flatnonzero(np.isfinite(rays1).all(axis=1) & np.isfinite(rays2).all(axis=1))
     if len(usable) < MIN_NUM_MATCHES:
         return None, inliers
-    order = np.random.default_rng(random_seed).permutation(usable)
+    order = np.random.default_rng(ransac.random_seed).permutation(usable)
     first, second = np.ascontiguousarray(rays1[order]), np.ascontiguousarray(rays2[order])
     essential, mask = cv2.findEssentialMat(
         first,
         second,
         np.eye(3),
-        method=cv2.RANSAC,
-        prob=confidence,
-        threshold=threshold,
-        maxIters=max_num_iterations,
+        method=ransac.method,
+        prob=ransac.confidence,
+        threshold=ransac.threshold,
+        maxIters=ransac.max_num_iterations,
     )
     if essential is None or essential.shape != (3, 3):
         return None, inliers

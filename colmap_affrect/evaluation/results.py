@@ -211,6 +211,7 @@ def pair_to_mapping(pair: PairResult) -> dict[str, Any]:
         "seconds": pair.seconds,
         "seconds_by_step": dict(pair.seconds_by_step),
         "level": pair.level,
+        "num_levels": pair.num_levels,
         "failure": pair.failure,
         "details": {key: _finite(value) for key, value in pair.score.details.items()},
     }
@@ -234,6 +235,7 @@ def pair_from_mapping(values: Mapping[str, Any]) -> PairResult:
         (first, second),
         values["seconds_by_step"],
         values["level"],
+        values["num_levels"],
         values["failure"],
     )
 

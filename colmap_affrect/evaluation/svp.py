@@ -120,11 +120,10 @@ def read_camera_poses(model_path: Path) -> CameraPoses:
     Raises:
         EvaluationError: when one of them cannot be read.
     """
-    read: dict[int, pycolmap.Camera | str] = {}
+    read: dict[str, pycolmap.Camera | str] = {}
     for _, line in _lines(model_path / "cameras.txt"):
         camera_id, *rest = line.split()
-        if camera_id.isdigit():
-            read[int(camera_id)] = _camera(rest)
+        read[camera_id] = _camera(rest)
     cameras: dict[str, pycolmap.Camera] = {}
     poses: dict[str, Pose] = {}
     faults: dict[str, str] = {}
@@ -134,7 +133,7 @@ def read_camera_poses(model_path: Path) -> CameraPoses:
         if len(words) < 10 or not line.lower().endswith(IMAGE_SUFFIXES):
             continue
         name = _stem(words[9])
-        camera = read.get(int(words[8]), "has no camera") if words[8].isdigit() else "no camera"
+        camera = read.get(words[8], "has no camera")
         pose = _pose(words[1:8])
         if isinstance(camera, str) or isinstance(pose, str):
             faults[name] = camera if isinstance(camera, str) else str(pose)

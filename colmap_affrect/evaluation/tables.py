@@ -7,6 +7,7 @@ import io
 import math
 import textwrap
 from collections.abc import Iterable, Sequence
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from colmap_affrect.evaluation.costs import STEPS
@@ -72,14 +73,21 @@ def _published_rows(published: Iterable[PublishedRow], columns: Sequence[str]) -
 
 
 def _chance_table(evaluation: Evaluation) -> str:
-    """Return how many pairs count as solved, and what chance may have to do with it."""
+    """Return how many pairs count as solved, what chance may have to do with it, and means."""
     test = f"p against {evaluation.baseline}" if evaluation.baseline else ""
-    rows = [["recipe", "solved", "95 %", *([test] if test else []), "failed"]]
+    means = ["keypoints", "matches", "inliers"]
+    rows = [["recipe", "solved", "95 %", *([test] if test else []), "failed", *means]]
     for recipe in evaluation.recipes:
         mean, (low, high) = recipe.solved
         p_value = ["-" if recipe.p_value is None else f"{recipe.p_value:.3f}"] if test else []
         interval = f"{low:.2f}-{high:.2f}"
-        rows.append([recipe.name, f"{mean:.2f}", interval, *p_value, str(recipe.num_failed)])
+        used = [
+            fmean(fmean(pair.num_keypoints) for pair in recipe.pairs),
+            fmean(pair.num_matches for pair in recipe.pairs),
+            fmean(pair.score.num_inliers for pair in recipe.pairs),
+        ]
+        cells = [f"{mean:.2f}", interval, *p_value, str(recipe.num_failed)]
+        rows.append([recipe.name, *cells, *(f"{value:.0f}" for value in used)])
     return aligned(rows)
 
 

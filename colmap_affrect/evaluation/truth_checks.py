@@ -20,6 +20,7 @@ from colmap_affrect.evaluation.protocol import EvaluationPair
 from colmap_affrect.evaluation.relative_pose import (
     CORRECT_PX,
     PosedImage,
+    Ransac,
     estimate_relative_pose,
     mean_focal_px,
     rays,
@@ -187,7 +188,7 @@ def _mistake(
     rays1 = rays(cameras[0], first.keypoints[matches[:, 0]])
     rays2 = rays(cameras[1], second.keypoints[matches[:, 1]])
     tolerance = CORRECT_PX / mean_focal_px(cameras)
-    _, inliers = estimate_relative_pose(rays1, rays2, tolerance, 0.999, 1000, 0)
+    _, inliers = estimate_relative_pose(rays1, rays2, Ransac(tolerance, 0.999, 1000))
     if inliers.sum() < max(MIN_CONSENSUS, MIN_CONSENSUS_FRAC * len(matches)):
         return None
     rays1, rays2 = rays1[inliers], rays2[inliers]

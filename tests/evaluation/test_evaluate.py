@@ -227,8 +227,23 @@ def test_escalation_stops_at_the_level_that_suffices(dataset: Path, tmp_path: Pa
     assert recipes[0].pairs[0].level == "identity"
     assert recipes[0].cost.num_warps == 0
     assert recipes[1].cost.num_warps > 0
+    assert [recipe.pairs[0].num_levels for recipe in recipes] == [1, 2]
     inliers = [recipe.pairs[0].score.num_correct for recipe in recipes]
     assert inliers[1] >= 0.9 * inliers[0]
+
+
+def test_cost_is_that_of_the_levels_that_these_settings_need(dataset: Path, tmp_path: Path) -> None:
+    path = tmp_path / "climbing.toml"
+    path.write_text('[rectifier]\nname = "identity"\n[[escalation]]\nname = "dense-shapes"\n')
+    recipes = [f"climbing={path}:escalation_strong_num_inliers=0"]
+    too_few = EvaluateOptions(recipes=recipes, max_num_keypoints=15)
+    (climbed,) = evaluate(PROTOCOL, dataset, tmp_path / "out", too_few).recipes
+    assert climbed.cost.num_warps > 0
+    (recipe,) = evaluate(
+        PROTOCOL, dataset, tmp_path / "out", EvaluateOptions(recipes=recipes)
+    ).recipes
+    assert {pair.level for pair in recipe.pairs} == {"identity"}
+    assert (recipe.cost.num_warps, recipe.num_images) == (0, 6)
 
 
 @pytest.mark.parametrize(

@@ -54,6 +54,13 @@ def test_scene_or_folder_of_scenes_is_read(scene: Path, path: str) -> None:
     np.testing.assert_allclose(rotation @ pose(0)[1] + translation, pose(3)[1], atol=1e-9)
 
 
+def test_scene_in_the_current_folder_has_its_name(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(scene)
+    assert UNCHECKED.load(Path()).pairs[0].images[0].name == "garden/a.png"
+
+
 def test_cumulative_lists_become_disjoint_bins() -> None:
     sizes = [4950, 4466, 3373, 1909, 840, 336, 132, 29, 5]  # of Sacre Coeur
     lists = {limit: [str(i) for i in range(size)] for limit, size in enumerate(sizes, 1)}

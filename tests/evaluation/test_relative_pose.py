@@ -15,6 +15,7 @@ from colmap_affrect.conventions import pixel_from_colmap
 from colmap_affrect.evaluation.protocol import EvaluationPair, PairResult, PairScore
 from colmap_affrect.evaluation.relative_pose import (
     PAPER_CODE_MAX_NUM_ITERATIONS,
+    Ransac,
     RelativePoseProtocol,
     estimate_relative_pose,
     posed_image,
@@ -68,6 +69,9 @@ def test_exact_matches_give_the_pose() -> None:
     assert score.error == pytest.approx(0, abs=1e-4)
     assert score.details["direction_error_deg"] == pytest.approx(0, abs=1e-4)
     assert (score.num_inliers, score.num_correct) == (60, 60)
+    assert score.details["gc_error"] == pytest.approx(0, abs=1e-4)
+    assert score.details["gc_direction_error_deg"] == pytest.approx(0, abs=1e-4)
+    assert score.details["gc_num_inliers"] == 60
 
 
 @pytest.mark.parametrize("degrees", [3.0, 77.0])
@@ -153,7 +157,7 @@ def test_points_that_are_not_finite_are_never_inliers() -> None:
     points1, points2 = matches(60)
     points1[3] = np.nan
     cameras_rays = rays(CAMERA1, points1), rays(CAMERA2, points2)
-    pose, inliers = estimate_relative_pose(*cameras_rays, 1e-3, 0.9999, 1000, 0)
+    pose, inliers = estimate_relative_pose(*cameras_rays, Ransac(1e-3, 0.9999, 1000))
     assert pose is not None
     assert np.flatnonzero(~inliers).tolist() == [3]
 
@@ -172,7 +176,12 @@ def test_angle_of_a_rotation() -> None:
 
 
 def result(category: str, error: float, direction_error: float) -> PairResult:
-    score = PairScore(error, 50, None, {"direction_error_deg": direction_error})
+    details = {
+        "direction_error_deg": direction_error,
+        "gc_error": error / 2,
+        "gc_direction_error_deg": 0.0,
+    }
+    score = PairScore(error, 50, None, details)
     return PairResult("p", category, score, 100, 0.1)
 
 
@@ -184,9 +193,25 @@ def test_summary_has_shares_by_category_in_order_and_counts_failures() -> None:
         result("20°", 15.0, 1.0),
     ]
     summary = RelativePoseProtocol().summarize(results)
-    assert list(summary) == ["20°", "100°", "all", "all < 10°", "all < 20°", "pose AUC 10°"]
+    names = ["20°", "100°", "all", "all < 10°", "all < 20°", "pose AUC 10°"]
+    assert list(summary) == [*names, *(f"GC-RANSAC: {name}" for name in names)]
     expected = [1 / 3, 0, 1 / 4, 2 / 4, 3 / 4, (0.25 + 0.5) / 4]
-    assert list(summary.values()) == pytest.approx(expected)
+    refined = [2 / 3, 0, 2 / 4, 3 / 4, 3 / 4, (0.755 + 0.75 + 0.25) / 4]
+    assert list(summary.values()) == pytest.approx([*expected, *refined])
+
+
+def test_pair_without_features_counts_as_failed() -> None:
+    failed = PairResult("p", "20°", PairScore(math.inf, 0), 0, 0.0)
+    assert set(RelativePoseProtocol().summarize([failed]).values()) == {0.0}
+
+
+def test_refinement_on_all_inliers_beats_one_sample_of_them() -> None:
+    points1, points2 = matches(300)
+    noise = np.random.default_rng(4).normal(0, 1.0, (2, *points1.shape))
+    score = RelativePoseProtocol(max_num_iterations=500).score(
+        make_pair(), points1 + noise[0], points2 + noise[1], 0
+    )
+    assert score.details["gc_error"] < 0.7 * score.error
 
 
 def test_summary_of_nothing_is_zero() -> None:
