@@ -133,7 +133,7 @@ def _success_by_category(evaluation: Evaluation) -> Figure:
     axes.set_xticks(places, categories, rotation=30 if max(map(len, categories)) > 5 else 0)
     axes.set_ylim(0, 1.05)
     axes.set_xlabel(evaluation.category_title)
-    axes.set_ylabel("share of pairs (bars: relative size of categories)")
+    axes.set_ylabel("solved share of pairs (bars: size of categories)")
     _finish(axes, f"{evaluation.protocol}: success by category")
     return figure
 
@@ -158,7 +158,9 @@ def _times(evaluation: Evaluation) -> Figure:
         axes.invert_yaxis()
         axes.set_xlim(0, ROOM_FOR_NUMBERS * max(left.max(), MIN_SECONDS))
         axes.set_xlabel(f"seconds per {unit}")
-        _finish(axes, "")
+        axes.grid(axis="x", color=GRID)
+        axes.set_axisbelow(True)
+        axes.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, frameon=False)
     return figure
 
 

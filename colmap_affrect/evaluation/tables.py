@@ -31,7 +31,8 @@ def summary(evaluation: Evaluation) -> str:
         parts.append(_score_table(evaluation, title, columns))
     parts.append(_chance_table(evaluation))
     parts.append(_cost_table(evaluation))
-    notes = [*evaluation.notes, *_failures(evaluation.recipes)]
+    failures = _failures(evaluation.recipes, "\n".join(evaluation.notes))
+    notes = [*evaluation.notes, *failures]
     if len(notes) > MAX_NOTES:
         more = f"and {len(notes) - MAX_NOTES} more notes in evaluation.json"
         notes = [*notes[:MAX_NOTES], more]
@@ -107,14 +108,15 @@ def _cost_table(evaluation: Evaluation) -> str:
     return aligned([head, *rows, *([*row, *[""] * len(STEPS)] for row in paper)])
 
 
-def _failures(recipes: Iterable[RecipeResult]) -> list[str]:
-    """Say what failed, once for all recipes."""
+def _failures(recipes: Iterable[RecipeResult], said: str) -> list[str]:
+    """Say what failed, once for all recipes, unless it has been said."""
     texts: dict[str, list[str]] = {}
     for recipe in recipes:
         for name, why in {**recipe.failures, **recipe.warnings}.items():
             texts.setdefault(f"{name}: {why}", []).append(recipe.name)
         for pair in recipe.pairs:
-            if pair.failure and not any(name in pair.failure for name in recipe.failures):
+            known = [said, *recipe.failures.values()]
+            if pair.failure and not any(pair.failure in text for text in known):
                 texts.setdefault(f"{pair.name} failed: {pair.failure}", []).append(recipe.name)
     return [f"{text} ({', '.join(names)})" for text, names in texts.items()]
 
