@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
+
+BYTES_PER_RSS = 1 if sys.platform == "darwin" else 1024
+"""Unit of ``getrusage``."""
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -17,6 +22,21 @@ Result = TypeVar("Result")
 def available_cores() -> int:
     """Return the number of cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def peak_memory_bytes() -> int:
+    """Return the most memory that this process has had.
+
+    Not by ``getrusage`` where it can be helped: Linux counts there what the process that started
+    this one had.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        lines = status.read_text(encoding="ascii", errors="replace").splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_RSS
 
 
 def map_ordered(

@@ -38,6 +38,7 @@ from colmap_affrect.comparison.sift import (
 )
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.escalation import escalate
+from colmap_affrect.executor import BYTES_PER_RSS, peak_memory_bytes
 from colmap_affrect.files import replace_text
 from colmap_affrect.matching.pairs import read_pairs
 from colmap_affrect.options import CameraOptions
@@ -49,8 +50,6 @@ logger = logging.getLogger("colmap_affrect")
 
 SAVE_EVERY_S = 1.0
 """How often the costs so far are written down, in case the process is killed."""
-
-BYTES_PER_RSS = 1 if sys.platform == "darwin" else 1024
 
 
 def main() -> None:
@@ -275,11 +274,8 @@ class _Costs:
 
     def peak_memory_bytes(self) -> int:
         """Return the most memory that one process has had so far, COLMAP's own ones included."""
-        peaks = (
-            resource.getrusage(whom).ru_maxrss * BYTES_PER_RSS
-            for whom in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-        )
-        return max(self._earlier_peak, *peaks)
+        children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * BYTES_PER_RSS
+        return max(self._earlier_peak, peak_memory_bytes(), children)
 
     def save(self) -> None:
         """Write everything to the file."""

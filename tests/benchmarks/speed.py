@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import resource
 import tempfile
 from pathlib import Path
 from statistics import median
@@ -19,7 +18,7 @@ from statistics import median
 from registration import compute_sift, link_images, match_recipe
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.executor import available_cores
+from colmap_affrect.executor import available_cores, peak_memory_bytes
 from colmap_affrect.options import CameraOptions
 from colmap_affrect.pipeline import installed_versions
 from colmap_affrect.recipes import load_recipe
@@ -29,8 +28,7 @@ Seconds = list[dict[str, float]]
 
 def peak_memory_mib() -> float:
     """Return the largest resident size that this process has had."""
-    unit = 1 if platform.system() == "Darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+    return peak_memory_bytes() / 2**20
 
 
 def describe_machine() -> str:

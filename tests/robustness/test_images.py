@@ -275,10 +275,11 @@ def test_tiny_images_are_no_obstacle(trio, run_images) -> None:
 
 
 PEAK_MEMORY = """
-import resource, sys
+import sys
 from colmap_affrect.cli import main
+from colmap_affrect.executor import peak_memory_bytes
 code = main(sys.argv[1:])
-print("peak", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+print("peak", peak_memory_bytes() // 1024)
 sys.exit(code)
 """
 BYTES_PER_PIXEL = 10
