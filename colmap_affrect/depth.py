@@ -227,7 +227,7 @@ class MonocularDepth:
         if self._network is not None:
             return
         try:
-            import PIL.Image  # noqa: F401
+            from PIL import Image
             from transformers import pipeline
         except ImportError as error:
             raise DepthError(
@@ -244,14 +244,12 @@ class MonocularDepth:
                 "a depth-estimation model on the Hugging Face hub, or a local folder that has one"
             ) from error
         network.model.float()  # weights that are stored as float16 would give coarse depth
-        self._network = network
+        self._network, self._pillow_from_array = network, Image.fromarray
 
     def _predict(self, image: NDArray[np.uint8]) -> _Prediction:
-        import PIL.Image
-
         # The pipeline also makes a preview, for which it divides by a range that may be 0.
         with np.errstate(all="ignore"):
-            output = self._network(PIL.Image.fromarray(image))["predicted_depth"]
+            output = self._network(self._pillow_from_array(image))["predicted_depth"]
         values = output.detach().cpu().float().numpy()
         values = values.reshape(values.shape[-2:])
         return _Prediction(values, predicts_inverse_depth(self._network.model.config))

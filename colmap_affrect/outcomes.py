@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import io
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from colmap_affrect.options import MappingOptions, VerificationOptions
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
+
+
+def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table with a header; a column for every key, in the order of first use.
+
+    >>> print(csv_text([{"a": 1}, {"a": 2, "b": "x"}]), end="")
+    a,b
+    1,
+    2,x
+    """
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 @dataclass(frozen=True)

@@ -26,22 +26,21 @@ REPORTED_PACKAGES = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """Everything a run depends on beside its images and its output folder.
+class InputOptions:
+    """What a run and a comparison of methods depend on alike, beside images and recipes.
 
     Attributes:
-        recipe: options of extraction and matching.
+        cameras: how images share cameras.
+        masks: where features may be.
+        verification: thresholds of two-view geometry.
+        mapping: mapper and its options.
         match_list_path: list of the pairs to match; None for all pairs.
         image_list_path: list of the images to use; None for all below the folder.
         from_database: COLMAP database whose images, cameras, rigs, frames and pose priors are
             used; it stays as it is.
-        database_descriptors: also write descriptors into the database, as COLMAP's matchers
-            need them.
-        random_seed: seed of verification and mapping.
         resources: weights and device of networks.
     """
 
-    recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
     cameras: CameraOptions = field(default_factory=CameraOptions)
     masks: MaskOptions = field(default_factory=MaskOptions)
     verification: VerificationOptions = field(default_factory=VerificationOptions)
@@ -49,9 +48,23 @@ class RunOptions:
     match_list_path: Path | None = None
     image_list_path: Path | None = None
     from_database: Path | None = None
+    resources: Resources = field(default_factory=Resources)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(InputOptions):
+    """Everything a run depends on beside its images and its output folder.
+
+    Attributes:
+        recipe: options of extraction and matching.
+        database_descriptors: also write descriptors into the database, as COLMAP's matchers
+            need them.
+        random_seed: seed of verification and mapping.
+    """
+
+    recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
     database_descriptors: bool = False
     random_seed: int = 0
-    resources: Resources = field(default_factory=Resources)
 
 
 def run(

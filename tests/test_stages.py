@@ -8,8 +8,6 @@ import os
 import shutil
 import signal
 import sqlite3
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +16,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from command import start
 from numpy.testing import assert_array_equal
 from results import database_content, hdf5_content
 from small_scene import IMAGE_SIZE, INTRINSICS, NAMES, photograph, write_photographs
@@ -222,15 +221,6 @@ def test_image_whose_features_are_lost_gets_the_same_again(
     assert (report.stages[0].num_done, report.stages[0].num_kept) == (1, 3)
     assert hdf5_content(copy.features) == hdf5_content(expected.features)
     assert without_times(report.to_mapping()) == without_times(first.to_mapping())
-
-
-def start(*arguments: object) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "colmap_affrect", *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
 
 
 @pytest.mark.parametrize("line", ["extract: 2/4 images", "match: 3/6 pairs", "verify: 6/6 pairs"])

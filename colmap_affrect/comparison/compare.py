@@ -12,7 +12,7 @@ import shutil
 import signal
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +31,11 @@ from colmap_affrect.comparison.metrics import Poses, disagreeing_images, pose_sc
 from colmap_affrect.comparison.request import Layout, Request
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
-from colmap_affrect.extraction import Resources
 from colmap_affrect.files import replace_text
 from colmap_affrect.matching.pairs import Pair, exhaustive_pairs, read_pairs, write_pairs
-from colmap_affrect.options import CameraOptions, MappingOptions, MaskOptions, VerificationOptions
+from colmap_affrect.options import CameraOptions
 from colmap_affrect.photographs import Photographs, refuse_colliding_keys, refuse_mixed_sizes
-from colmap_affrect.pipeline import installed_versions
+from colmap_affrect.pipeline import InputOptions, installed_versions
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.report.page import write_page
 from colmap_affrect.stages import images_to_use
@@ -46,35 +45,18 @@ DEFAULT_SEEDS = (0, 1, 2)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareOptions:
+class CompareOptions(InputOptions):
     """Everything a comparison depends on beside its images and its output folder.
 
     Attributes:
         methods: names of methods as the command line takes them, or methods.
         seeds: of verification and mapping, which run once for each.
-        cameras: which images share a camera, and known intrinsics.
-        masks: where features may be.
-        verification: options of two-view geometry.
-        mapping: the mapper and its options.
-        match_list_path: list of the pairs to match; None for all pairs.
-        image_list_path: list of the images to use; None for all below the folder.
-        from_database: COLMAP database whose images, cameras, rigs, frames and pose priors are
-            used; it stays as it is.
         ground_truth_path: folder of a COLMAP model with true poses, in any frame; None for none.
-        resources: weights and device of networks.
     """
 
     methods: Sequence[str | Method] = DEFAULT_METHODS
     seeds: Sequence[int] = DEFAULT_SEEDS
-    cameras: CameraOptions = field(default_factory=CameraOptions)
-    masks: MaskOptions = field(default_factory=MaskOptions)
-    verification: VerificationOptions = field(default_factory=VerificationOptions)
-    mapping: MappingOptions = field(default_factory=MappingOptions)
-    match_list_path: Path | None = None
-    image_list_path: Path | None = None
-    from_database: Path | None = None
     ground_truth_path: Path | None = None
-    resources: Resources = field(default_factory=Resources)
 
 
 def compare(
@@ -359,7 +341,7 @@ def _run(request: Request, progress: Progress) -> MethodResult:
         child(worker.__name__, str(request.path), stderr=log) as process,
         ExitStack() as stage,
     ):
-        advance: Advance = lambda count: None  # noqa: E731, ARG005
+        advance: Advance = stage.enter_context(SILENT.stage("", 0, ""))
         for line in process.stdout or ():
             event = json.loads(line)
             if "stage" in event:

@@ -392,7 +392,7 @@ class Comparison:
 
     def to_csv(self) -> str:
         """Return ``comparison.csv``: a row for each method and seed."""
-        return tables.csv_text(self)
+        return tables.comparison_csv(self)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of ``comparison.json``."""

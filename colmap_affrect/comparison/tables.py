@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import textwrap
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
+
+from colmap_affrect.outcomes import csv_text
 
 if TYPE_CHECKING:
     from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult, Span
@@ -61,7 +61,7 @@ def _span(span: Span) -> str:
     return f"{span.mean:.1f} [{span.min:g}-{span.max:g}]"
 
 
-def csv_text(comparison: Comparison) -> str:
+def comparison_csv(comparison: Comparison) -> str:
     """Return a row for each method and seed, and one for each method that failed."""
     rows = [
         {**_method_cells(method, comparison), **_seed_cells(method, seed)}
@@ -73,12 +73,7 @@ def csv_text(comparison: Comparison) -> str:
         for method in comparison.methods
         if method.failed
     ]
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return csv_text(rows)
 
 
 def _method_cells(method: MethodResult, comparison: Comparison) -> dict[str, Any]:

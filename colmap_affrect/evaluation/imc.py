@@ -77,11 +77,7 @@ class Imc(RelativePoseProtocol):
                 "a scene of the Phototourism sets, or the folder of its scenes"
             )
         loaded = [_load_scene(folder, check_truth=self.check_truth) for folder in scenes]
-        pairs = tuple(itertools.chain.from_iterable(scene.pairs for scene in loaded))
-        notes = tuple(itertools.chain.from_iterable(scene.notes for scene in loaded))
-        if not pairs:
-            raise EvaluationError(f"{dataset_path}: no pair can be evaluated; {'; '.join(notes)}")
-        return Dataset(pairs, notes)
+        return Dataset.united(loaded, dataset_path)
 
 
 @dataclass(frozen=True)

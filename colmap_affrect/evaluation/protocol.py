@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from colmap_affrect.errors import EvaluationError
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,19 @@ class Dataset:
 
     pairs: tuple[EvaluationPair, ...]
     notes: tuple[str, ...] = ()
+
+    @classmethod
+    def united(cls, scenes: Sequence[Dataset], dataset_path: Path) -> Self:
+        """Return the pairs and notes of all scenes of a folder.
+
+        Raises:
+            EvaluationError: when there is no pair.
+        """
+        pairs = tuple(pair for scene in scenes for pair in scene.pairs)
+        notes = tuple(note for scene in scenes for note in scene.notes)
+        if not pairs:
+            raise EvaluationError(f"{dataset_path}: no pair can be evaluated; {'; '.join(notes)}")
+        return cls(pairs, notes)
 
 
 class EvaluationProtocol(Protocol):

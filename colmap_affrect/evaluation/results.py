@@ -153,7 +153,7 @@ class Evaluation:
 
     def to_csv(self) -> str:
         """Return a row for each recipe and pair."""
-        return tables.csv_text(self)
+        return tables.evaluation_csv(self)
 
     def to_json(self) -> str:
         """Return everything as JSON; infinite errors are null."""

@@ -13,7 +13,6 @@ so are their depth maps. Names in the lists and files may differ in their suffix
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -64,11 +63,7 @@ class Svp(RelativePoseProtocol):
                 "of the Strong ViewPoint Changes dataset, or the folder of its scenes"
             )
         scenes = [_load_scene(path, check_truth=self.check_truth) for path in lists]
-        pairs = tuple(itertools.chain.from_iterable(scene.pairs for scene in scenes))
-        notes = tuple(itertools.chain.from_iterable(scene.notes for scene in scenes))
-        if not pairs:
-            raise EvaluationError(f"{dataset_path}: no pair can be evaluated; {'; '.join(notes)}")
-        return Dataset(pairs, notes)
+        return Dataset.united(scenes, dataset_path)
 
 
 @dataclass(frozen=True)

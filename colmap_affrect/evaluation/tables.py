@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -11,6 +9,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from colmap_affrect.evaluation.costs import STEPS
+from colmap_affrect.outcomes import csv_text
 
 if TYPE_CHECKING:
     from colmap_affrect.evaluation.published import PublishedRow
@@ -147,7 +146,7 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     )
 
 
-def csv_text(evaluation: Evaluation) -> str:
+def evaluation_csv(evaluation: Evaluation) -> str:
     """Return a row for each recipe and pair."""
     rows = []
     for recipe in evaluation.recipes:
@@ -168,9 +167,4 @@ def csv_text(evaluation: Evaluation) -> str:
                 "failure": pair.failure,
             }
             rows.append({**row, **score.details})
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return csv_text(rows)
