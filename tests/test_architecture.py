@@ -55,7 +55,7 @@ ROWS = [
         "evaluation.relative_pose", "evaluation.results", "evaluation.statistics",
         "evaluation.svp", "evaluation.tables", "evaluation.truth_checks",
     },
-    {"cli", "__main__"},
+    {"cli", "cli.arguments", "cli.commands", "__main__"},
 ]  # fmt: skip
 """A module imports from its own row and from those above it in this list."""
 
@@ -86,7 +86,7 @@ HOMES = {
     "tqdm": {"progress"},
     "threadpoolctl": {"executor"},
     "filelock": {"workspace"},
-    "argparse": {"cli"},
+    "argparse": {"cli", "cli.arguments", "cli.commands"},
     "torch": {
         "features.affnet",
         "features.affnet_hardnet",
@@ -217,7 +217,7 @@ def test_half_pixels_are_added_in_conventions_only() -> None:
 
 
 def test_library_neither_prints_nor_exits_outside_the_command_line() -> None:
-    for module in set(MODULES) - {"cli", "progress", "__main__"}:
+    for module in set(MODULES) - {"cli", "cli.commands", "progress", "__main__"}:
         tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
         names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
         attributes = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}

@@ -1,0 +1,100 @@
+"""Command line: parse, call one library function, print its result."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TextIO
+
+from colmap_affrect import __version__
+from colmap_affrect.cli.arguments import build_parser
+from colmap_affrect.errors import AffrectError
+from colmap_affrect.outcomes import EXIT_FAILED, EXIT_INTERRUPTED
+from colmap_affrect.workspace import Workspace
+
+logger = logging.getLogger("colmap_affrect")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code."""
+    options = build_parser().parse_args(arguments)
+    try:
+        if not hasattr(options, "verbose"):  # a command that only prints
+            return int(options.function(options))
+        with _logging(options):
+            return int(options.function(options))
+    except AffrectError as error:
+        return _fail(str(error))
+    except OSError as error:
+        return _fail(
+            f"{error.filename or 'input/output'}: {error.strerror or error}; when that is mended, "
+            "run the same command again: what was done before is kept"
+        )
+    except KeyboardInterrupt:
+        print("interrupted; run the same command again to go on", file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+def _fail(message: str) -> int:
+    """Print one line; odd characters, out of files perhaps, must not reach the terminal."""
+    shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
+    print(f"error: {''.join(shown)}", file=sys.stderr)
+    return EXIT_FAILED
+
+
+@contextmanager
+def _logging(options: argparse.Namespace) -> Iterator[None]:
+    """Log to the terminal and to ``run.log``, which also takes what C libraries print.
+
+    Commands without an output folder have no such log.
+
+    COLMAP and image decoders write to file descriptor 2: it leads to the log while the
+    command runs, and Python's ``sys.stderr`` to the terminal.
+    """
+    log_path = Workspace(options.output_path).log if options.output_path else Path(os.devnull)
+    log_path.parent.mkdir(parents=True, exist_ok=True)
+    python_stderr, terminal_fd = sys.stderr, os.dup(2)
+    terminal = os.fdopen(terminal_fd, "w", buffering=1, encoding="utf-8", errors="replace")
+    with terminal, _quietly_closed(log_path.open("a", encoding="utf-8", buffering=1)) as log:
+        level = logging.DEBUG if options.verbose else logging.WARNING
+        handlers: list[logging.Handler] = [logging.StreamHandler(terminal), _LogHandler(log)]
+        handlers[0].setLevel(logging.ERROR if options.quiet else level)
+        handlers[0].setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+        handlers[1].setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        for handler in handlers:
+            logger.addHandler(handler)
+        logger.setLevel(logging.DEBUG)
+        logger.info("colmap-affrect %s: %s", __version__, " ".join(sys.argv[1:]))
+        os.dup2(log.fileno(), 2)
+        sys.stderr = terminal
+        try:
+            yield
+        except Exception:
+            logger.log(logging.DEBUG, "failed", exc_info=True)
+            raise
+        finally:
+            sys.stderr = python_stderr
+            os.dup2(terminal.fileno(), 2)
+            for handler in handlers:
+                logger.removeHandler(handler)
+
+
+class _LogHandler(logging.StreamHandler[TextIO]):
+    """Writes to ``run.log``; when that cannot be written the command goes on without."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Pass over what the disk has no room for."""
+
+
+@contextmanager
+def _quietly_closed(file: TextIO) -> Iterator[TextIO]:
+    try:
+        yield file
+    finally:
+        with suppress(OSError):
+            file.close()
