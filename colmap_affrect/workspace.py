@@ -24,6 +24,8 @@ logger = logging.getLogger(__name__)
 LOCAL = ("image_path", "image_list_path", "from_database", "camera", "match_list_path")
 CHOICES = (".name", ".profile")
 STAGES = ("extract", "pairs", "match", "verify", "escalate", "map")
+FORMAT_VERSION = 2
+"""Of ``config.toml``: counts up when a stage records other options than before."""
 
 
 @dataclass(frozen=True)
@@ -119,13 +121,23 @@ class Workspace:
             lock.release()
 
     def recorded(self) -> dict[str, Any]:
-        """Return the options on record by stage; empty where there are none."""
+        """Return the options on record by stage; empty where there are none.
+
+        Raises:
+            WorkspaceError: when the record is damaged or of another version of this package.
+        """
         if not self.config.exists():
             return {}
         try:
-            return tomllib.loads(self.config.read_text(encoding="utf-8"))
+            record = tomllib.loads(self.config.read_text(encoding="utf-8"))
         except (ValueError, RecursionError) as error:
             raise WorkspaceError(f"{self.config}: damaged ({error}); remove it") from error
+        if record.pop("format_version", None) != FORMAT_VERSION:
+            raise WorkspaceError(
+                f"{self.path}: was made by another version of colmap-affrect, which cannot be "
+                "gone on with; use another --output-path or remove it"
+            )
+        return record
 
     def recipe(self) -> str:
         """Return the name of the recipe that the features were made with."""
@@ -178,7 +190,7 @@ class Workspace:
         record[stage] = dict(options)
         record["recipe"] = recipe or record.get("recipe", "")
         ordered = {name: record[name] for name in ("recipe", *STAGES) if name in record}
-        replace_text(self.config, dump_toml(ordered))
+        replace_text(self.config, dump_toml({"format_version": FORMAT_VERSION, **ordered}))
 
     @property
     def _remedy(self) -> str:

@@ -226,3 +226,12 @@ def test_dump_toml_writes_all_options_of_a_recipe() -> None:
     read = tomllib.loads(dump_toml({"extract": values}))["extract"]
     assert read == json.loads(json.dumps(values))
     assert ExtractionOptions.from_mapping(read, "record") == ExtractionOptions()
+
+
+@pytest.mark.parametrize("version", ["", "format_version = 1\n"])
+def test_record_of_another_version_is_one_clear_line(workspace: Workspace, version: str) -> None:
+    workspace.config.write_text(f'{version}recipe = "default"\n[extract]\nimage_path = "/photos"\n')
+    with pytest.raises(WorkspaceError, match="made by another version of colmap-affrect"):
+        workspace.require("extract")
+    with pytest.raises(WorkspaceError, match="use another --output-path or remove it"):
+        workspace.claim("extract", OPTIONS, overwrite=True)
