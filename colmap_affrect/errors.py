@@ -51,6 +51,10 @@ class DeviceError(AffrectError):
     """The device asked for is not there."""
 
 
+class ClusterError(AffrectError):
+    """The cluster is not there, has no workers, or ones that would give other results."""
+
+
 class ComparisonError(AffrectError):
     """Methods cannot be compared as asked."""
 

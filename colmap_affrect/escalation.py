@@ -13,20 +13,25 @@ additions make it serve mapping and not single pairs alone:
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
+from colmap_affrect.errors import ImageError
+from colmap_affrect.executor import Executor
 from colmap_affrect.extraction import ImageExtractor, Resources
+from colmap_affrect.image_tasks import extract_images
 from colmap_affrect.matching.pairs import Pair
 from colmap_affrect.outcomes import StageReport
+from colmap_affrect.pair_tasks import iterate_matches
 from colmap_affrect.photographs import Photographs
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.stages import (
     PAIRS_PER_WRITE,
     feature_store,
-    iterate_matches,
     listed_pairs,
     make_extractor,
     match_pairs,
@@ -37,11 +42,14 @@ from colmap_affrect.stages import (
 )
 from colmap_affrect.workspace import Workspace
 
+logger = logging.getLogger(__name__)
+
 
 def escalate(
     workspace: Workspace,
     *,
     resources: Resources | None = None,
+    executor: Executor | None = None,
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> StageReport:
@@ -50,6 +58,7 @@ def escalate(
     Args:
         workspace: verified.
         resources: weights and device of networks.
+        executor: where images and pairs are worked on; by default in threads of this process.
         overwrite: bring all pairs back to level 0 first; features that are there are kept.
         progress: where to show progress.
 
@@ -59,7 +68,7 @@ def escalate(
     start = time.perf_counter()
     levels = workspace.extraction_options().escalation
     workspace.claim("escalate", {"levels": len(levels)}, overwrite=overwrite)
-    ladder = _Ladder(workspace, resources)
+    ladder = _Ladder(workspace, resources, executor)
     if overwrite:
         ladder.undo(progress)
     climbed: set[Pair] = set()
@@ -82,7 +91,7 @@ def pair_levels(workspace: Workspace) -> dict[str, int]:
     if not options.escalation:
         return {}
     names = [rectifier.name for rectifier in options.rectifiers]
-    ladder = _Ladder(workspace, None)
+    ladder = _Ladder(workspace)
     num_inliers, levels = ladder.num_inliers(), ladder.matches.levels(ladder.pairs)
     counts = dict.fromkeys([*names, "none"], 0)
     for pair in ladder.pairs:
@@ -101,8 +110,15 @@ def open_pairs(num_inliers: Mapping[Pair, int], strong_num_inliers: int) -> list
 class _Ladder:
     """The stores and options of a workspace, and one climb of some pairs to one level."""
 
-    def __init__(self, workspace: Workspace, resources: Resources | None) -> None:
-        self.workspace, self._resources = workspace, resources
+    def __init__(
+        self,
+        workspace: Workspace,
+        resources: Resources | None = None,
+        executor: Executor | None = None,
+    ) -> None:
+        self.workspace, self._executor = workspace, executor
+        self._resources = resources or Resources()
+        self._device = self._resources.device
         self.options = workspace.extraction_options()
         self.pairs = listed_pairs(workspace)
         self.features, self.matches = feature_store(workspace), match_store(workspace)
@@ -142,9 +158,7 @@ class _Ladder:
 
     def climb(self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]) -> None:
         """Match pairs with the features of a level and keep what has more inliers."""
-        for name in self._images_to_extend(pairs, level):
-            self._extend(name, level)
-            advance(1)
+        self._extend(self._images_to_extend(pairs, level), level, advance)
         if pairs:
             self._match_again(pairs, level, advance)
         write_images_and_keypoints(self.workspace, self.features)
@@ -157,7 +171,16 @@ class _Ladder:
         higher = [pair for pair in self.pairs if levels[pair]]
         with progress.stage("match", len(higher), "pairs") as advance:
             options = self.workspace.matching_options()
-            match_pairs(higher, self.features, self.matches, options, 0, advance)
+            match_pairs(
+                higher,
+                self.features,
+                self.matches,
+                options,
+                0,
+                advance,
+                self._device,
+                self._executor,
+            )
         self.matches.mark_tried(self.pairs, 0)
         self._replace_matches()
         verify_new(self.workspace, *self.workspace.verification_options())
@@ -166,15 +189,29 @@ class _Ladder:
         names = sorted({name for pair in pairs for name in pair})
         return [name for name in names if len(self.features.level_ends(name)) <= level]
 
-    def _extend(self, name: str, level: int) -> None:
-        """Add to an image the features of all levels that it lacks, up to this one."""
+    def _extend(self, names: Sequence[str], level: int, advance: Callable[[int], None]) -> None:
+        """Add to images the features of all levels that they lack, up to this one."""
+        if not names:
+            return
         photographs = Photographs.recorded(self.workspace)
         if self._extractor is None:
-            names = self.features.names()
-            self._extractor = make_extractor(self.workspace, self.options, self._resources, names)
-        for missing in range(len(self.features.level_ends(name)), level + 1):
-            found = photographs.extract(self._extractor, name, missing)
-            self.features.extend(name, found.features)
+            known = self.features.names()
+            self._extractor = make_extractor(self.workspace, self.options, self._resources, known)
+        missing = [
+            (name, lacking)
+            for name in names
+            for lacking in range(len(self.features.level_ends(name)), level + 1)
+        ]
+        images = extract_images(photographs, self._extractor, missing, self._executor)
+        with closing(images) as found_images:
+            for (name, reached), found in zip(missing, found_images, strict=True):
+                if isinstance(found, ImageError):
+                    raise found
+                if found.warning:
+                    logger.warning("%s: %s", name, found.warning)
+                self.features.extend(name, found.features)
+                if reached == level:
+                    advance(1)
 
     def _match_again(
         self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]
@@ -185,12 +222,17 @@ class _Ladder:
         matching = self.workspace.matching_options()
         for batch in _batches(pairs, PAIRS_PER_WRITE):
             better = []
-            for found in iterate_matches(batch, self.features, matching, level):
-                first, second = (self.features.read_frames(name)[:, :, 2] for name in found.names)
-                count = verifier.num_inliers(found.names, (first, second), found.indices)
-                if count > num_inliers[found.names]:
-                    better.append(found)
-                advance(1)
+            matches = iterate_matches(
+                batch, self.features, matching, level, self._device, self._executor
+            )
+            with closing(matches) as found_pairs:
+                for found in found_pairs:
+                    names = found.names
+                    first, second = (self.features.read_frames(name)[:, :, 2] for name in names)
+                    count = verifier.num_inliers(names, (first, second), found.indices)
+                    if count > num_inliers[names]:
+                        better.append(found)
+                    advance(1)
             self.matches.mark_tried(batch, level)
             self.matches.write(better)
 

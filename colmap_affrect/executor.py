@@ -1,27 +1,95 @@
-"""Run one function over many tasks, in order and with bounded memory."""
+"""Run one function over many tasks, in order and with bounded memory.
+
+An :class:`Executor` says where: in threads of this process (:class:`Threads`), or on the workers of
+a cluster (:mod:`colmap_affrect.cluster`). Results do not depend on it.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 BYTES_PER_RSS = 1 if sys.platform == "darwin" else 1024
 """Unit of ``getrusage``."""
+
+ASSUMED_MEMORY_BYTES = 8 << 30
+"""Of systems that do not say what they have."""
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
+class Executor(Protocol):
+    """Where the work on images and pairs is done."""
+
+    def sees(self, paths: Sequence[Path]) -> bool:
+        """Tell whether files and folders are there for the work as they are for this process."""
+
+    def map(
+        self,
+        function: Callable[[Task], Result],
+        tasks: Iterable[Task],
+        files: Sequence[Path] = (),
+    ) -> Iterator[Result]:
+        """Yield ``function(task)`` in task order; few tasks are in flight.
+
+        Args:
+            function: does not change its state; it and the tasks can be pickled.
+            tasks: taken from the iterable when their turn comes.
+            files: that the function reads.
+
+        Raises:
+            Exception: whatever the function raises, at the place of its task.
+        """
+
+
+class Threads:
+    """Work in threads of this process."""
+
+    def __init__(self, num_threads: int) -> None:
+        """Set the number of tasks at a time."""
+        self._num_threads = num_threads
+
+    def sees(self, paths: Sequence[Path]) -> bool:
+        """Return True; see :class:`Executor`."""
+        del paths
+        return True
+
+    def map(
+        self,
+        function: Callable[[Task], Result],
+        tasks: Iterable[Task],
+        files: Sequence[Path] = (),
+    ) -> Iterator[Result]:
+        """See :func:`map_ordered`."""
+        del files
+        return map_ordered(function, tasks, self._num_threads)
+
+
 def available_cores() -> int:
     """Return the number of cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def available_memory_bytes() -> int:
+    """Return the memory that this process may take without harm to others."""
+    available = ASSUMED_MEMORY_BYTES
+    with suppress(OSError):
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        available = next(int(s.split()[1]) * 1024 for s in lines if s.startswith("MemAvailable:"))
+    with suppress(OSError, ValueError):  # no container, or one without a limit
+        limit = Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")
+        available = min(available, int(limit))
+    return available
 
 
 def peak_memory_bytes() -> int:
@@ -37,6 +105,27 @@ def peak_memory_bytes() -> int:
     import resource
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_RSS
+
+
+@contextmanager
+def one_openmp_thread() -> Iterator[None]:
+    """Keep torch to the calling thread, which is one of several that work.
+
+    Not by ``torch.set_num_threads``, which would also slow down networks in other threads later.
+    torch must have been imported.
+    """
+    with _loaded_libraries().limit(limits=1, user_api="openmp"):
+        yield
+
+
+def use_one_blas_thread() -> None:
+    """Keep numpy's linear algebra to the calling thread from now on, in all of this process."""
+    threadpool_limits(1, user_api="blas")
+
+
+@cache
+def _loaded_libraries() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 def map_ordered(

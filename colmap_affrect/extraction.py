@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.conventions import camera_matrix, resized_from_original
 from colmap_affrect.depth import depth_source
-from colmap_affrect.errors import DepthError, ImageError, OptionError
+from colmap_affrect.errors import DepthError, ImageError, OptionError, WeightsError
 from colmap_affrect.features.registry import (
     make_profile,
     make_shape_source,
@@ -20,7 +22,7 @@ from colmap_affrect.features.registry import (
     shape_sources,
     uses_networks,
 )
-from colmap_affrect.features.weights import resolve
+from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.geometry.affine import transform_frames
 from colmap_affrect.imaging import read_gray, shrink_mask, shrink_to
 from colmap_affrect.interfaces import Computing, FeatureProfile, Rectifier, Sources
@@ -36,8 +38,6 @@ from colmap_affrect.types import (
     RectificationPlan,
     in_mask,
 )
-
-logger = logging.getLogger(__name__)
 
 MIN_RECTIFIABLE_PX = 32
 """Images with a shorter side are not rectified: no block would see its surroundings."""
@@ -77,17 +77,28 @@ class ExtractedImage:
 class ImageExtractor:
     """A recipe ready to work: built once by :func:`prepare`, used for every image.
 
+    It may work on several images at once, in threads. In another process (pickled) it is prepared
+    there anew, with the weights and the device found there.
+
     Attributes:
         options: of the recipe.
         profile: detector and descriptor.
         rectifiers: one per level, that of every image first, then those of escalation.
         weights: files of the networks by key.
+        resources: that it was prepared with.
+        turn: held while networks run, which take one image at a time.
     """
 
     options: ExtractionOptions
     profile: FeatureProfile
     rectifiers: tuple[Rectifier, ...]
     weights: Mapping[str, Path] = field(default_factory=dict)
+    resources: Resources = field(default_factory=Resources)
+    turn: AbstractContextManager[Any] = field(default_factory=nullcontext)
+
+    def __reduce__(self) -> tuple[Callable[..., ImageExtractor], tuple[Any, ...]]:
+        digests = {key: file_sha256(path) for key, path in self.weights.items()}
+        return _prepared_elsewhere, (self.options, self.resources, digests)
 
     def extract_file(
         self,
@@ -112,12 +123,11 @@ class ImageExtractor:
             ImageError: when the file cannot be read, or its mask has another size.
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask)
-        plan, warning = self.plan_or_warn(photograph, level)
-        if warning:
-            logger.warning("%s: %s", photograph.name, warning)
-        features = self.execute(
-            photograph.gray, plan, with_original=level == 0, mask=photograph.mask
-        )
+        with self.turn:
+            plan, warning = self.plan_or_warn(photograph, level)
+            features = self.execute(
+                photograph.gray, plan, with_original=level == 0, mask=photograph.mask
+            )
         if photograph.size != original_size:
             original_from_resized = np.linalg.inv(
                 resized_from_original(original_size, photograph.size)
@@ -240,7 +250,22 @@ def prepare(
         )
         for item in options.rectifiers
     )
-    return ImageExtractor(options, profile, rectifiers, weights)
+    turn = Lock() if uses_networks(options) else nullcontext()
+    return ImageExtractor(options, profile, rectifiers, weights, resources, turn)
+
+
+def _prepared_elsewhere(
+    options: ExtractionOptions, resources: Resources, digests: Mapping[str, str]
+) -> ImageExtractor:
+    """Prepare a recipe in another process; depth maps of networks are not kept from there."""
+    extractor = prepare(options, replace(resources, depth_cache_path=None))
+    for key, path in extractor.weights.items():
+        if file_sha256(path) != digests[key]:
+            raise WeightsError(
+                f"{path}: is another file than {key} on the machine that leads the work; give "
+                "both the same"
+            )
+    return extractor
 
 
 def _device(options: ExtractionOptions, resources: Resources) -> str:

@@ -52,6 +52,11 @@ MAX_DENSITY = 16
 """Samples per px of a warp along an axis; beyond, memory counts more than aliasing."""
 
 
+def use_one_opencv_thread() -> None:
+    """Keep OpenCV to the calling thread from now on, in all of this process."""
+    cv2.setNumThreads(1)
+
+
 def read_gray(path: Path) -> GrayImage:
     """Read an image as gray, as stored: EXIF orientation is not applied, 16 bit becomes 8.
 

@@ -490,6 +490,34 @@ class ExtractionOptions(Options):
         return (self.rectifier, *self.escalation)
 
 
+PAIR_METHODS = ("exhaustive", "retrieval", "low-resolution", "gps", "sequence")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairOptions(Options):
+    """Which images are matched: the pairs of several methods together."""
+
+    methods: tuple[str, ...] = ("exhaustive",)
+    """``exhaustive``: all pairs. ``retrieval``: images whose descriptors are alike as a whole.
+    ``low-resolution``: images of which the strongest features match. ``gps``: images taken near to
+    each other. ``sequence``: images that follow each other by name."""
+    num_neighbors: int = 20
+    """Of each image: on average, by retrieval and low-resolution, and half as many at least; at
+    most, by gps; before and after it, in a sequence."""
+    max_distance_m: float = 100.0
+    """Between positions of ``gps``; in their own unit where they are not longitude and latitude."""
+
+    def __post_init__(self) -> None:
+        if not self.methods:
+            raise OptionError(f"methods is empty; give some of {', '.join(PAIR_METHODS)}")
+        for name in self.methods:
+            if name not in PAIR_METHODS:
+                close = _suggestion(name, dict.fromkeys(PAIR_METHODS))
+                raise OptionError(f"unknown way to choose pairs {name!r}{close}")
+        self._check("num_neighbors", 1, 1_000_000)
+        self._check("max_distance_m", 0.0, 1e9)
+
+
 @dataclass(frozen=True, kw_only=True)
 class MatchingOptions(Options):
     """Matching of two images."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Self
 
@@ -104,14 +104,35 @@ class Photographs:
         return np.logical_and.reduce(masks) if masks else None
 
     def _mask_path(self, name: str) -> Path:
-        folder = Path(self.masks.path)
-        paths = [folder / f"{name}.png", (folder / name).with_suffix(".png")]
+        paths = self._mask_paths(name)
         for path in paths:
             if path.is_file():
                 return path
         raise ImageError(
             f"{self.folder / name}: has no mask {paths[0]}; make one (black is left out), or "
             "leave out --mask-path"
+        )
+
+    def _mask_paths(self, name: str) -> list[Path]:
+        """Return where the mask of an image may be, the first that is there counts."""
+        folder = Path(self.masks.path)
+        return [folder / f"{name}.png", (folder / name).with_suffix(".png")]
+
+    def files(self, name: str) -> list[Path]:
+        """Return the files that the extraction of an image reads, as far as they are there."""
+        paths = [self.folder / name]
+        if self.masks.path:
+            paths += self._mask_paths(name)
+        if self.masks.camera_path:
+            paths.append(Path(self.masks.camera_path))
+        return [path for path in paths if path.is_file()]
+
+    def moved(self, move: Callable[[Path], Path]) -> Self:
+        """Return the same photographs with all files in other places."""
+        folders = (self.masks.path, self.masks.camera_path)
+        path, camera_path = (str(move(Path(folder))) if folder else "" for folder in folders)
+        return replace(
+            self, folder=move(self.folder), masks=MaskOptions(path=path, camera_path=camera_path)
         )
 
 

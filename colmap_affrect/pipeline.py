@@ -12,9 +12,16 @@ from colmap_affrect import stages
 from colmap_affrect.colmap.mapping import checked_mapping_options, mapping_differences
 from colmap_affrect.colmap.verification import verification_differences
 from colmap_affrect.escalation import escalate, pair_levels
+from colmap_affrect.executor import Executor
 from colmap_affrect.extraction import Resources
 from colmap_affrect.files import replace_text
-from colmap_affrect.options import CameraOptions, MappingOptions, MaskOptions, VerificationOptions
+from colmap_affrect.options import (
+    CameraOptions,
+    MappingOptions,
+    MaskOptions,
+    PairOptions,
+    VerificationOptions,
+)
 from colmap_affrect.outcomes import ModelSummary, ReconstructionReport, StageReport
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import Recipe, load_recipe
@@ -57,12 +64,14 @@ class RunOptions(InputOptions):
 
     Attributes:
         recipe: options of extraction and matching.
+        pairs: how the pairs to match are chosen.
         database_descriptors: also write descriptors into the database, as COLMAP's matchers
             need them.
         random_seed: seed of verification and mapping.
     """
 
     recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
+    pairs: PairOptions = field(default_factory=PairOptions)
     database_descriptors: bool = False
     random_seed: int = 0
 
@@ -72,6 +81,7 @@ def run(
     output_path: Path,
     options: RunOptions | None = None,
     *,
+    executor: Executor | None = None,
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> ReconstructionReport:
@@ -81,6 +91,8 @@ def run(
         image_path: folder of the photographs, searched with its sub-folders.
         output_path: folder for all results, made if missing.
         options: see :class:`RunOptions`.
+        executor: where images and pairs are worked on, a cluster for one
+            (:func:`colmap_affrect.cluster.connected`); by default in threads of this process.
         overwrite: discard results that are there.
         progress: where to show progress.
 
@@ -105,17 +117,33 @@ def run(
                 image_list_path=options.image_list_path,
                 from_database=options.from_database,
                 resources=options.resources,
+                executor=executor,
                 overwrite=overwrite,
                 progress=progress,
             ),
-            stages.choose_pairs(workspace, match_list_path=options.match_list_path),
-            stages.match(workspace, options.recipe.matching, progress=progress),
+            stages.choose_pairs(
+                workspace,
+                options.pairs,
+                match_list_path=options.match_list_path,
+                progress=progress,
+            ),
+            stages.match(
+                workspace,
+                options.recipe.matching,
+                device=options.resources.device,
+                executor=executor,
+                progress=progress,
+            ),
             stages.verify_matches(
                 workspace, options.verification, options.random_seed, progress=progress
             ),
         ]
         if options.recipe.extraction.escalation:
-            reports.append(escalate(workspace, resources=options.resources, progress=progress))
+            reports.append(
+                escalate(
+                    workspace, resources=options.resources, executor=executor, progress=progress
+                )
+            )
         if options.database_descriptors:
             stages.write_descriptors(workspace)
         return map_and_report(

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,11 +17,11 @@ from colmap_affrect.colmap.copies import copy_without_features, open_copy
 from colmap_affrect.colmap.mapping import map_database, read_models
 from colmap_affrect.colmap.verification import verified_pairs, verify
 from colmap_affrect.errors import DatabaseError, ImageError, OptionError, StaleStoreError
-from colmap_affrect.executor import available_cores, map_ordered
+from colmap_affrect.executor import Executor
 from colmap_affrect.extraction import ImageExtractor, Resources, prepare
 from colmap_affrect.features.weights import file_sha256
 from colmap_affrect.files import replace_text
-from colmap_affrect.matching.nearest import MatchableImage, match_features, matchable
+from colmap_affrect.image_tasks import extract_images
 from colmap_affrect.matching.pairs import Pair, exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.options import (
     CameraOptions,
@@ -30,9 +29,17 @@ from colmap_affrect.options import (
     MappingOptions,
     MaskOptions,
     MatchingOptions,
+    PairOptions,
     VerificationOptions,
 )
 from colmap_affrect.outcomes import ModelSummary, StageReport
+from colmap_affrect.pair_selection import (
+    NUM_STRONGEST,
+    low_resolution_pairs,
+    pairs_by_place,
+    retrieved_pairs,
+)
+from colmap_affrect.pair_tasks import MatchableCache, iterate_matches
 from colmap_affrect.photographs import (
     Photographs,
     checked_names,
@@ -51,7 +58,11 @@ logger = logging.getLogger(__name__)
 PAIRS_PER_WRITE = 64
 INPUTS = "inputs.sha256"
 """File in sparse/ that names the verified pairs the models were made from."""
-MATCHING_CACHE_BYTES = 1 << 30
+MANY_IMAGES = 300
+MANY_PAIRS = (
+    "all pairs of %d images are %d; --pairs retrieval matches the promising ones only "
+    "(see --num-neighbors)"
+)
 
 
 def recorded_images(workspace: Workspace) -> list[str]:
@@ -90,6 +101,7 @@ def extract(
     image_names: Sequence[str] = (),
     from_database: Path | None = None,
     resources: Resources | None = None,
+    executor: Executor | None = None,
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> StageReport:
@@ -109,6 +121,7 @@ def extract(
         from_database: database whose images, cameras, rigs, frames and pose priors are taken
             over; it stays as it is.
         resources: weights and device of networks.
+        executor: where images are worked on; by default in threads of this process.
         overwrite: discard the results of this and later stages first.
         progress: where to show progress.
     """
@@ -149,20 +162,21 @@ def extract(
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
     with progress.stage("extract", len(missing), "images") as advance:
-        for name in missing:
-            try:
-                found = photographs.extract(extractor, name)
-            except ImageError as error:
-                logger.warning("%s", error)
-                failures[name] = str(error)
-            else:
-                logger.debug("%s: %d features", name, len(found.features))
-                if not len(found.features):
-                    logger.warning("%s: no features (blank or too small?)", name)
-                if found.warning:
-                    warnings[name] = found.warning
-                store.write(name, found.features, found.image_size)
-            advance(1)
+        images = [(name, 0) for name in missing]
+        with closing(extract_images(photographs, extractor, images, executor)) as found_images:
+            for name, found in zip(missing, found_images, strict=True):
+                if isinstance(found, ImageError):
+                    logger.warning("%s", found)
+                    failures[name] = str(found)
+                else:
+                    logger.debug("%s: %d features", name, len(found.features))
+                    if not len(found.features):
+                        logger.warning("%s: no features (blank or too small?)", name)
+                    if found.warning:
+                        logger.warning("%s: %s", name, found.warning)
+                        warnings[name] = found.warning
+                    store.write(name, found.features, found.image_size)
+                advance(1)
     if len(failures) == len(names):
         raise ImageError(
             f"{image_path}: none of the {len(names)} images can be used; the first: "
@@ -259,42 +273,104 @@ def write_descriptors(workspace: Workspace) -> None:
 
 
 def choose_pairs(
-    workspace: Workspace, *, match_list_path: Path | None = None, overwrite: bool = False
+    workspace: Workspace,
+    options: PairOptions | None = None,
+    *,
+    match_list_path: Path | None = None,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
 ) -> StageReport:
-    """Write the list of the pairs to match: every pair of images, or those of a list."""
+    """Write the list of the pairs to match: by default every pair of images, or those of a list.
+
+    When images are added, pairs that were chosen by other options than these stay.
+
+    Args:
+        workspace: with features.
+        options: how pairs are chosen.
+        match_list_path: list of pairs; takes the place of ``exhaustive``.
+        overwrite: discard the pairs that are there, and what was made of them, first.
+        progress: where to show progress.
+
+    Raises:
+        PairListError: when the list cannot be used.
+        DatabaseError: when there are no positions to choose by.
+        StaleStoreError: when pairs of before are missing in the list, or other options made them.
+    """
     start = time.perf_counter()
+    options = options or PairOptions()
+    pairs = _given_pairs(workspace, options, match_list_path)
+    listed = str(match_list_path.resolve()) if match_list_path else ""
+    recorded = {"match_list_path": listed, **options.to_mapping()}
+    workspace.claim("pairs", recorded, overwrite=overwrite)
+    there = _pairs_there(workspace)
+    if set(options.methods) == {"exhaustive"}:
+        _refuse_lost_pairs(workspace, there - pairs)
+    else:
+        pairs |= there | _similar_pairs(workspace, options, there, progress)
+    write_pairs(workspace.pairs, sorted(pairs))
+    return StageReport("pairs", time.perf_counter() - start, len(pairs))
+
+
+def _given_pairs(
+    workspace: Workspace, options: PairOptions, match_list_path: Path | None
+) -> set[Pair]:
+    """Return the pairs that are chosen without a look at features."""
     workspace.require("extract")
-    names = feature_store(workspace).names()
-    pairs = exhaustive_pairs(names)
+    features = feature_store(workspace)
+    names = features.names()
+    if "gps" in options.methods:
+        write_images_and_keypoints(workspace, features)
+    pairs = pairs_by_place(names, workspace.database, options)
     if match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
-        usable = set(pairs)
-        listed_pairs = read_pairs(match_list_path, recorded_images(workspace))
-        pairs = [pair for pair in listed_pairs if pair in usable]
-    listed = str(match_list_path.resolve()) if match_list_path else ""
-    workspace.claim("pairs", {"match_list_path": listed}, overwrite=overwrite)
-    _refuse_lost_pairs(workspace, pairs)
-    write_pairs(workspace.pairs, pairs)
-    return StageReport("pairs", time.perf_counter() - start, len(pairs))
+        known = set(names)
+        listed = read_pairs(match_list_path, recorded_images(workspace))
+        return pairs | {pair for pair in listed if known.issuperset(pair)}
+    if "exhaustive" in options.methods:
+        pairs |= set(exhaustive_pairs(names))
+        if len(names) > MANY_IMAGES:
+            logger.warning(MANY_PAIRS, len(names), len(pairs))
+    return pairs
+
+
+def _similar_pairs(
+    workspace: Workspace, options: PairOptions, there: Collection[Pair], progress: Progress
+) -> set[Pair]:
+    """Return the pairs that features tell; none when no image has come since those there."""
+    features = feature_store(workspace)
+    names = [name for name, count in features.num_keypoints().items() if count]
+    if len(names) < 2 or {name for pair in there for name in pair}.issuperset(names):
+        return set()
+    pairs: list[Pair] = []
+    if "retrieval" in options.methods:
+        pairs += retrieved_pairs(names, features.read, options.num_neighbors, progress)
+    if "low-resolution" in options.methods:
+        matching = MatchingOptions()
+        cache = MatchableCache(features, matching, 0, NUM_STRONGEST)
+        pairs += low_resolution_pairs(
+            names, lambda name: cache[name][0], matching, options.num_neighbors, progress
+        )
+    return set(pairs)
 
 
 def add_pairs(workspace: Workspace, pairs: Sequence[Pair]) -> None:
     """Add pairs to those that are matched already, as pycolmap's matchers do."""
-    workspace.claim("pairs", {"match_list_path": ""})
-    names = feature_store(workspace).names()
-    there = read_pairs(workspace.pairs, names) if workspace.pairs.exists() else []
-    write_pairs(workspace.pairs, sorted({*there, *pairs}))
+    workspace.claim("pairs", {"match_list_path": "", **PairOptions().to_mapping()})
+    write_pairs(workspace.pairs, sorted(_pairs_there(workspace).union(pairs)))
 
 
-def _refuse_lost_pairs(workspace: Workspace, pairs: Sequence[Pair]) -> None:
+def _pairs_there(workspace: Workspace) -> set[Pair]:
+    """Return the pairs that were chosen before."""
+    there = workspace.pairs.exists() and workspace.pairs.stat().st_size
+    return set(listed_pairs(workspace)) if there else set()
+
+
+def _refuse_lost_pairs(workspace: Workspace, lost: Collection[Pair]) -> None:
     """Pairs may be added, but those that are matched already would stay in the database."""
-    if not workspace.pairs.exists() or not workspace.pairs.stat().st_size:
-        return
-    lost = sorted(set(listed_pairs(workspace)) - set(pairs))
     if lost:
         raise StaleStoreError(
             f"{workspace.pairs}: has pairs that are not to be matched any more, such as "
-            f"{' and '.join(lost[0])}; use --overwrite to redo the pairs stage and those after it"
+            f"{' and '.join(min(lost))}; use --overwrite to redo the pairs stage and those after it"
         )
 
 
@@ -302,10 +378,21 @@ def match(
     workspace: Workspace,
     options: MatchingOptions,
     *,
+    device: str = "auto",
+    executor: Executor | None = None,
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> StageReport:
-    """Match the listed pairs and put the raw matches into the database."""
+    """Match the listed pairs and put the raw matches into the database.
+
+    Args:
+        workspace: with features and a list of pairs.
+        options: of matching.
+        device: ``auto``, ``cpu``, ``cuda``, ``cuda:1``, ``mps``; it changes no result.
+        executor: where pairs are matched; by default in threads of this process.
+        overwrite: discard the results of this and later stages first.
+        progress: where to show progress.
+    """
     start = time.perf_counter()
     pairs = listed_pairs(workspace)
     workspace.claim("match", options.to_mapping(), overwrite=overwrite)
@@ -313,7 +400,7 @@ def match(
     done = matches.complete(pair_key(*pair) for pair in pairs)
     missing = [pair for pair in pairs if pair_key(*pair) not in done]
     with progress.stage("match", len(missing), "pairs") as advance:
-        match_pairs(missing, features, matches, options, 0, advance)
+        match_pairs(missing, features, matches, options, 0, advance, device, executor)
     _write_matches(workspace, pairs, features, matches)
     return StageReport("match", time.perf_counter() - start, len(missing), len(done))
 
@@ -325,83 +412,24 @@ def match_pairs(
     options: MatchingOptions,
     level: int,
     advance: Callable[[int], None],
+    device: str = "auto",
+    executor: Executor | None = None,
 ) -> None:
     """Match pairs by the features of the images and of one level; what is done is written."""
     batch: list[PairMatches] = []
     try:
-        for found in iterate_matches(pairs, features, options, level):
-            batch.append(found)
-            advance(1)
-            if len(batch) == PAIRS_PER_WRITE:
-                matches.write(batch)
-                batch = []
+        with closing(
+            iterate_matches(pairs, features, options, level, device, executor)
+        ) as found_pairs:
+            for found in found_pairs:
+                batch.append(found)
+                advance(1)
+                if len(batch) == PAIRS_PER_WRITE:
+                    matches.write(batch)
+                    batch = []
     finally:
         if batch:
             matches.write(batch)
-
-
-def iterate_matches(
-    pairs: Sequence[Pair], features: FeatureStore, options: MatchingOptions, level: int
-) -> Iterable[PairMatches]:
-    """Match pairs by the features of the images themselves and those of one level, in order."""
-    cache = MatchableCache(features, options, level)
-
-    def match_pair(pair: Pair) -> PairMatches:
-        (first, indices1), (second, indices2) = cache[pair[0]], cache[pair[1]]
-        found = match_features(first, second, options)
-        rows, columns = found.indices.T
-        indices = np.stack([indices1[rows], indices2[columns]], axis=1)
-        count = int(indices1.max(initial=-1)) + 1
-        return PairMatches(pair, indices, 1.0 - found.ratios, count, level)
-
-    return map_ordered(match_pair, pairs, available_cores())
-
-
-class MatchableCache:
-    """Images ready for matching, the least recently used dropped over a memory budget.
-
-    Each comes with the indices that its features have in the store.
-    """
-
-    def __init__(
-        self,
-        store: FeatureStore,
-        options: MatchingOptions,
-        level: int,
-        max_num_features: int | None = None,
-    ) -> None:
-        """Name the features.
-
-        Args:
-            store: where they are.
-            options: of matching.
-            level: of escalation; its features come together with those of level 0.
-            max_num_features: of the features of an image, those of the largest responses; None
-                takes all.
-        """
-        self._store, self._options, self._level = store, options, level
-        self._max_num_features = max_num_features
-        self._images: OrderedDict[str, tuple[MatchableImage, NDArray[np.int64]]] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def __getitem__(self, name: str) -> tuple[MatchableImage, NDArray[np.int64]]:
-        with self._lock:
-            if name not in self._images:
-                indices = self._store.level_indices(name, self._level)
-                features = self._store.read(name).select(indices)
-                if self._max_num_features is not None:
-                    order = np.argsort(-features.responses, kind="stable")
-                    strongest = np.sort(order[: self._max_num_features])
-                    indices, features = indices[strongest], features.select(strongest)
-                image = matchable(features.descriptors, features.keypoints, self._options)
-                self._images[name] = image, indices
-            self._images.move_to_end(name)
-            while self._num_bytes() > MATCHING_CACHE_BYTES and len(self._images) > 1:
-                self._images.popitem(last=False)
-            return self._images[name]
-
-    def _num_bytes(self) -> int:
-        return sum(image.descriptors.nbytes for image, _ in self._images.values())
 
 
 def listed_pairs(workspace: Workspace) -> list[Pair]:

@@ -23,7 +23,7 @@ ROWS = [
     {
         "features.affnet", "features.affnet_hardnet", "features.dog", "features.networks",
         "features.registry", "features.rootsift", "features.second_moment", "features.weights",
-        "imaging", "depth",
+        "imaging", "depth", "cluster",
     },
     {
         "rectifiers.covers", "rectifiers.dense_shapes", "rectifiers.depth_affnet",
@@ -31,12 +31,15 @@ ROWS = [
     },
     {
         "rectified", "extraction", "store", "workspace",
-        "matching.nearest", "matching.pairs",
+        "matching.coarse", "matching.nearest", "matching.pairs", "matching.retrieval",
         "colmap", "colmap.checks", "colmap.copies", "colmap.database",
         "colmap.global_mapping", "colmap.mapping", "colmap.model_files", "colmap.native_options",
         "colmap.running", "colmap.verification",
     },
-    {"doctor", "dropin", "pipeline", "escalation", "interchange", "photographs", "stages"},
+    {
+        "doctor", "dropin", "pipeline", "escalation", "interchange", "photographs", "image_tasks",
+        "pair_selection", "pair_tasks", "stages",
+    },
     {
         "comparison.methods", "comparison.metrics", "comparison.request", "comparison.results",
         "comparison.sift", "comparison.tables", "comparison.verdict", "comparison.worker",
@@ -88,6 +91,7 @@ HOMES = {
     "filelock": {"workspace"},
     "argparse": {"cli", "cli.arguments", "cli.commands"},
     "torch": {
+        "matching.coarse",
         "features.affnet",
         "features.affnet_hardnet",
         "features.networks",
@@ -104,14 +108,17 @@ HOMES = {
     "jinja2": {"report.page"},
     "networkx": {"report.view_graph"},
     "rerun": {"report.viewer"},
+    "dask": {"cluster"},
+    "distributed": {"cluster"},
     "scipy": set(),
     "sqlite3": {"colmap.checks", "colmap.copies"},
 }
 
 PUBLIC = [
-    "AffrectError", "CameraOptions", "CompareOptions", "Comparison", "ExtractionOptions",
-    "LocalFeatures", "MappingOptions", "MaskOptions", "MatchingOptions", "ReconstructionReport",
-    "RunOptions", "VerificationOptions", "__version__", "compare", "extract_features",
+    "AffrectError", "CameraOptions", "CompareOptions", "Comparison", "EvaluateOptions",
+    "Evaluation", "ExtractionOptions", "LocalFeatures", "MappingOptions", "MaskOptions",
+    "MatchingOptions", "PairOptions", "ReconstructionReport", "RunOptions",
+    "VerificationOptions", "__version__", "compare", "evaluate", "extract_features",
     "extract_image", "load_recipe", "match_exhaustive", "match_image_pairs", "run", "verify",
 ]  # fmt: skip
 

@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from small_scene import write_photographs
 
 from colmap_affrect.imaging import read_mask
 from colmap_affrect.recipes import recipe_folder, recipe_names
 
 RECIPES = Path(__file__).parents[1] / "recipes"
+
+FAKE_CLUSTER = """
+class Cluster:
+    scheduler_address = "tcp://there:8786"
+    def __init__(self, **options): pass
+    def __enter__(self): return self
+    def __exit__(self, *error): pass
+    def scale(self, jobs): pass
+    def wait_for_workers(self, count): pass
+
+SLURMCluster = KubeCluster = Cluster
+
+def make_cluster_spec(**options):
+    return {"spec": {part: {"spec": {"containers": [{}]}} for part in ("scheduler", "worker")}}
+"""
 
 
 def run_script(*arguments: object) -> str:
@@ -41,4 +58,26 @@ def test_masks_leave_out_borders_and_captions(tmp_path: Path) -> None:
 
 def test_worked_recipes_are_no_recipes_of_the_command_line() -> None:
     assert recipe_folder() == RECIPES
-    assert not {"historical-photographs", "replace-sift"} & set(recipe_names())
+    assert not {"cluster", "historical-photographs", "replace-sift"} & set(recipe_names())
+
+
+@pytest.mark.parametrize(
+    ("script", "options"), [("on_slurm", []), ("on_kubernetes", ["--image=i"])]
+)
+def test_cluster_is_started_and_its_address_handed_on(
+    tmp_path: Path, script: str, options: list[str]
+) -> None:
+    # Stand-ins for what cannot run here: two packages and the command line itself.
+    (tmp_path / "dask_jobqueue.py").write_text(FAKE_CLUSTER)
+    (tmp_path / "dask_kubernetes").mkdir()
+    (tmp_path / "dask_kubernetes" / "operator.py").write_text(FAKE_CLUSTER)
+    command = tmp_path / "colmap-affrect"
+    command.write_text('#!/bin/sh\necho "$@"\n')
+    command.chmod(0o755)
+    environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHONPATH": str(tmp_path)}
+    path = RECIPES / "cluster" / f"{script}.py"
+    done = subprocess.run(
+        [sys.executable, str(path), *options, "--", "--image-path", "p", "--output-path", "o"],
+        capture_output=True, text=True, check=True, env=environment,
+    )  # fmt: skip
+    assert done.stdout == "run --image-path p --output-path o --scheduler tcp://there:8786\n"

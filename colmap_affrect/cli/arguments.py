@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from colmap_affrect import __version__
 from colmap_affrect.cli import commands
 from colmap_affrect.comparison.methods import DEFAULT_METHODS
-from colmap_affrect.options import MAPPERS, PRESETS
+from colmap_affrect.options import MAPPERS, PRESETS, PairOptions
 
 if TYPE_CHECKING:
     # The types of add_subparsers() and of what takes arguments have no public names.
@@ -25,7 +25,7 @@ examples:
   colmap-affrect run --image-path photos --output-path out --camera-mode single
   colmap-affrect run --image-path photos --output-path out --recipe unrectified-rootsift
   colmap-affrect extract --image-path photos --output-path out
-  colmap-affrect pairs   --output-path out --match-list-path pairs.txt
+  colmap-affrect pairs   --output-path out --pairs retrieval,sequence --num-neighbors 30
   colmap-affrect match   --output-path out
   colmap-affrect verify  --output-path out
   colmap-affrect map     --output-path out
@@ -67,8 +67,9 @@ def build_parser() -> argparse.ArgumentParser:
     _add_database_descriptors(run)
     _add_recipe(run)
     _add_resources(run)
+    _add_scheduler(run)
     _add_depth(run)
-    _add_pair_list(run)
+    _add_pairs(run)
     _add_preset(run)
     _add_mapper(run)
     _add_seed(run)
@@ -81,13 +82,16 @@ def build_parser() -> argparse.ArgumentParser:
     _add_database_descriptors(extract)
     _add_recipe(extract)
     _add_resources(extract)
+    _add_scheduler(extract)
     _add_depth(extract)
 
     pairs = _command(subparsers, "pairs", commands.pairs, "which images to match, into pairs.txt")
-    _add_pair_list(pairs)
+    _add_pairs(pairs)
 
     match = _command(subparsers, "match", commands.match, "matches into matches.h5 and database.db")
     _add_recipe(match, default=None)
+    _add_device(match)
+    _add_scheduler(match)
 
     verify = _command(subparsers, "verify", commands.verify, "two-view geometries into database.db")
     _add_preset(verify)
@@ -100,6 +104,7 @@ def build_parser() -> argparse.ArgumentParser:
         "match pairs that failed again, with more warps (recipes that escalate, as on-demand)",
     )
     _add_resources(escalate)
+    _add_scheduler(escalate)
 
     mapping = _command(subparsers, "map", commands.map, "COLMAP models into sparse/")
     _add_preset(mapping)
@@ -465,6 +470,10 @@ def _numbers(text: str) -> tuple[int, ...]:
         raise argparse.ArgumentTypeError(f"{text}: not whole numbers with commas") from error
 
 
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(text.split(","))
+
+
 def _add_cameras(command: argparse.ArgumentParser) -> None:
     _add_option(
         command,
@@ -533,12 +542,26 @@ def _add_resources(command: argparse.ArgumentParser) -> None:
         metavar="FOLDER",
         help="weights of networks (default: $COLMAP_AFFRECT_WEIGHTS, torch's cache, download)",
     )
+    _add_device(command)
+
+
+def _add_device(command: argparse.ArgumentParser) -> None:
     _add_option(
         command,
         "--device",
         default="auto",
         metavar="DEVICE",
-        help="for networks: auto, cpu, cuda, cuda:1, mps (default: auto)",
+        help="for networks and matching: auto, cpu, cuda, cuda:1, mps (default: auto)",
+    )
+
+
+def _add_scheduler(command: argparse.ArgumentParser) -> None:
+    _add_option(
+        command,
+        "--scheduler",
+        metavar="ADDRESS",
+        help="extract and match on the dask.distributed cluster of this scheduler, such as "
+        "tcp://10.0.0.1:8786 (pip install 'colmap-affrect[cluster]'); default: on this machine",
     )
 
 
@@ -572,6 +595,39 @@ def _add_pair_list(command: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="pairs to match, two names per line (default: all pairs)",
+    )
+
+
+def _add_pairs(command: argparse.ArgumentParser) -> None:
+    _add_pair_list(command)
+    defaults = PairOptions()
+    _add_option(
+        command,
+        "--pairs",
+        type=_words,
+        default=defaults.methods,
+        metavar="A,B,...",
+        help="which pairs to match, all of: exhaustive, retrieval (photographs that are alike), "
+        "low-resolution (whose strongest features match), gps (near to each other), sequence "
+        "(following by name); together with those of --match-list-path, which takes the place of "
+        "exhaustive (default: exhaustive)",
+    )
+    _add_option(
+        command,
+        "--num-neighbors",
+        type=int,
+        default=defaults.num_neighbors,
+        metavar="N",
+        help="retrieval, low-resolution: neighbours of a photograph on average; gps: at most; "
+        f"sequence: before and after it (default: {defaults.num_neighbors})",
+    )
+    _add_option(
+        command,
+        "--max-distance-m",
+        type=float,
+        default=defaults.max_distance_m,
+        metavar="METRES",
+        help=f"gps: largest distance of neighbours (default: {defaults.max_distance_m:g})",
     )
 
 

@@ -9,17 +9,25 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from colmap_affrect.errors import ComparisonError, OptionError
-from colmap_affrect.options import CameraOptions, MappingOptions, MaskOptions, VerificationOptions
+from colmap_affrect.options import (
+    CameraOptions,
+    MappingOptions,
+    MaskOptions,
+    PairOptions,
+    VerificationOptions,
+)
 from colmap_affrect.outcomes import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK, ReconstructionReport
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_affrect.comparison.results import Comparison
+    from colmap_affrect.executor import Executor
     from colmap_affrect.extraction import Resources
     from colmap_affrect.pipeline import RunOptions
     from colmap_affrect.recipes import Recipe
@@ -28,13 +36,15 @@ if TYPE_CHECKING:
 def run(options: argparse.Namespace) -> int:
     from colmap_affrect import pipeline
 
-    report = pipeline.run(
-        options.image_path,
-        options.output_path,
-        _run_options(options),
-        overwrite=options.overwrite,
-        progress=_progress(options),
-    )
+    with _executor(options) as executor:
+        report = pipeline.run(
+            options.image_path,
+            options.output_path,
+            _run_options(options),
+            executor=executor,
+            overwrite=options.overwrite,
+            progress=_progress(options),
+        )
     return _print_reconstruction(report, options)
 
 
@@ -43,6 +53,7 @@ def _run_options(options: argparse.Namespace) -> RunOptions:
 
     return RunOptions(
         recipe=_recipe(options, options.recipe),
+        pairs=_pair_options(options),
         database_descriptors=options.database_descriptors,
         random_seed=options.random_seed,
         **_inputs(options),
@@ -85,6 +96,18 @@ def _resources(options: argparse.Namespace) -> Resources:
     return Resources(options.weights, options.device)
 
 
+@contextmanager
+def _executor(options: argparse.Namespace) -> Iterator[Executor | None]:
+    """Use the cluster that was named, None if there is none."""
+    if not options.scheduler:
+        yield None
+        return
+    from colmap_affrect.cluster import connected
+
+    with connected(options.scheduler) as cluster:
+        yield cluster
+
+
 def _cameras(options: argparse.Namespace) -> CameraOptions:
     return CameraOptions(
         mode=options.camera_mode, model=options.camera_model, params=options.camera_params
@@ -110,7 +133,7 @@ def _masks(options: argparse.Namespace) -> MaskOptions:
 def extract(options: argparse.Namespace) -> int:
     from colmap_affrect import stages
 
-    with Workspace(options.output_path).locked() as workspace:
+    with Workspace(options.output_path).locked() as workspace, _executor(options) as executor:
         report = stages.extract(
             workspace,
             options.image_path,
@@ -120,6 +143,7 @@ def extract(options: argparse.Namespace) -> int:
             image_list_path=options.image_list_path,
             from_database=options.from_database,
             resources=_resources(options),
+            executor=executor,
             overwrite=options.overwrite,
             progress=_progress(options),
         )
@@ -134,19 +158,36 @@ def pairs(options: argparse.Namespace) -> int:
 
     with Workspace(options.output_path).locked() as workspace:
         report = stages.choose_pairs(
-            workspace, match_list_path=options.match_list_path, overwrite=options.overwrite
+            workspace,
+            _pair_options(options),
+            match_list_path=options.match_list_path,
+            overwrite=options.overwrite,
+            progress=_progress(options),
         )
     print(report.summary())
     return EXIT_OK
 
 
+def _pair_options(options: argparse.Namespace) -> PairOptions:
+    return PairOptions(
+        methods=options.pairs,
+        num_neighbors=options.num_neighbors,
+        max_distance_m=options.max_distance_m,
+    )
+
+
 def match(options: argparse.Namespace) -> int:
     from colmap_affrect import stages
 
-    with Workspace(options.output_path).locked() as workspace:
+    with Workspace(options.output_path).locked() as workspace, _executor(options) as executor:
         recipe = _recipe(options, options.recipe or workspace.recipe())
         report = stages.match(
-            workspace, recipe.matching, overwrite=options.overwrite, progress=_progress(options)
+            workspace,
+            recipe.matching,
+            device=options.device,
+            executor=executor,
+            overwrite=options.overwrite,
+            progress=_progress(options),
         )
     print(report.summary())
     return EXIT_OK
@@ -170,10 +211,11 @@ def verify(options: argparse.Namespace) -> int:
 def escalate(options: argparse.Namespace) -> int:
     from colmap_affrect import escalation
 
-    with Workspace(options.output_path).locked() as workspace:
+    with Workspace(options.output_path).locked() as workspace, _executor(options) as executor:
         report = escalation.escalate(
             workspace,
             resources=_resources(options),
+            executor=executor,
             overwrite=options.overwrite,
             progress=_progress(options),
         )

@@ -131,6 +131,36 @@ def image_ids(path: Path) -> dict[str, int]:
         return {image.name: image.image_id for image in database.read_all_images()}
 
 
+def nearest_positions(
+    path: Path, num_neighbors: int, max_distance_m: float
+) -> list[tuple[str, str]]:
+    """Return the pairs of images that were taken near to each other, by COLMAP's pose priors.
+
+    Heights are left out of account, as in COLMAP's spatial matcher: those of GPS are rough.
+
+    Args:
+        path: of the database.
+        num_neighbors: most of each image, the nearest ones.
+        max_distance_m: largest distance; in the unit of the priors if they are Cartesian.
+
+    Raises:
+        DatabaseError: when fewer than two images have a position.
+    """
+    options = pycolmap.SpatialPairingOptions(
+        max_num_neighbors=num_neighbors, max_distance=max_distance_m, ignore_z=True
+    )
+    with open_database(path) as database:
+        positions = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
+        if len(positions) < 2:
+            raise DatabaseError(
+                f"{path}: {len(positions)} images have a position (GPS in EXIF, or pose priors); "
+                "choose pairs in another way"
+            )
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        found = pycolmap.SpatialPairGenerator(options, database).all_pairs()
+    return sorted({(min(names[i], names[j]), max(names[i], names[j])) for i, j in found})
+
+
 def check_cameras(cameras: CameraOptions) -> None:
     """Refuse a camera model that COLMAP does not have, or parameters that do not fit it.
 

@@ -160,7 +160,7 @@ def extract_measured(
     watch = _Stopwatch()
     profile = _TimedProfile(extractor.profile, watch)
     timed = _TimedExtractor(
-        extractor.options, profile, extractor.rectifiers, extractor.weights, watch
+        extractor.options, profile, extractor.rectifiers, extractor.weights, watch=watch
     )
     found = timed.extract_file(path, name, intrinsics, level)
     plan = watch.plan

@@ -24,8 +24,8 @@ from colmap_affrect.evaluation.recipe_features import RecipeFeatures
 from colmap_affrect.executor import available_cores, map_ordered
 from colmap_affrect.matching.nearest import match_features
 from colmap_affrect.options import VerificationOptions
+from colmap_affrect.pair_tasks import MatchableCache
 from colmap_affrect.progress import Progress
-from colmap_affrect.stages import MatchableCache
 
 VERIFICATION_SEED = 0
 

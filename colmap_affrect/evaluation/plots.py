@@ -99,7 +99,7 @@ def _errors(evaluation: Evaluation) -> Figure:
     axes.set_ylim(0, None)
     axes.set_xlabel(f"threshold of the {evaluation.error_title}")
     axes.set_ylabel(f"pairs with a smaller error, of {evaluation.num_pairs}")
-    _finish(axes, f"{evaluation.protocol}: pairs below an error")
+    _finish(figure, axes, f"{evaluation.protocol}: pairs below an error")
     return figure
 
 
@@ -134,7 +134,7 @@ def _success_by_category(evaluation: Evaluation) -> Figure:
     axes.set_ylim(0, 1.05)
     axes.set_xlabel(evaluation.category_title)
     axes.set_ylabel("solved share of pairs (bars: size of categories)")
-    _finish(axes, f"{evaluation.protocol}: success by category")
+    _finish(figure, axes, f"{evaluation.protocol}: success by category")
     return figure
 
 
@@ -193,8 +193,8 @@ def _complexity(evaluation: Evaluation) -> Figure:
     return figure
 
 
-def _finish(axes: Axes, title: str) -> None:
+def _finish(figure: Figure, axes: Axes, title: str) -> None:
     axes.set_title(title, fontsize=11)
     axes.grid(color=GRID)
     axes.set_axisbelow(True)
-    axes.legend(fontsize=7, loc="best")
+    figure.legend(fontsize=7, loc="outside lower center", ncols=2, frameon=False)

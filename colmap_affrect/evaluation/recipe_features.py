@@ -117,6 +117,8 @@ class RecipeFeatures:
             self._extractor, image.path, image.name, image.intrinsics, level
         )
         logger.debug("%s: %d features", name, len(found.features))
+        if found.warning:
+            logger.warning("%s: %s", name, found.warning)
         self._costs.append(
             {"image": name, "level": level, "cost": cost.to_mapping(), "warning": found.warning}
         )

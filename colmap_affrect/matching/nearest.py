@@ -2,8 +2,9 @@
 
 The second neighbour of the ratio test is the nearest descriptor that lies at least
 ``min_contrast_distance_px`` away from the first one (Mishkin, Matas, Perdoch, MODS, 2015):
-features of several warps at one location do not reject each other. Exact: every distance
-is computed, in chunks of bounded memory.
+features of several warps at one location do not reject each other. Every distance is computed,
+in chunks of bounded memory; long lists coarsely at first (:mod:`colmap_affrect.matching.coarse`),
+and exactly where that can decide.
 """
 
 from __future__ import annotations
@@ -14,10 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.geometry.neighbors import NeighborLists, neighbors_within
+from colmap_affrect.matching.coarse import CoarseDescriptors, MakeCoarse, ShortList
 from colmap_affrect.options import MatchingOptions
 
-CHUNK_ELEMENTS = 1 << 24
-"""Similarities held at once: 64 MiB of float32."""
+CHUNK_ELEMENTS = 1 << 22
+"""Similarities held at once: 16 MiB of float32."""
+
+CHUNK_ROWS = 1 << 15
+"""Pairs of descriptors held at once: 32 MiB."""
+
+NO_LIMIT = 2.0
+"""No ratio is larger than 1."""
 
 ROUNDING = np.float32(1e-6)
 """Similarities closer to 1 than this are equal: two copies of a descriptor have ratio 1."""
@@ -31,11 +39,13 @@ class MatchableImage:
         descriptors: (N, D) float32 rows of unit length.
         keypoints: (N, 2) pixel-centre px.
         rivals: for each feature those too close to serve as its second neighbour.
+        coarse: the descriptors in few bits; None where that does not pay.
     """
 
     descriptors: NDArray[np.float32]
     keypoints: NDArray[np.floating]
     rivals: NeighborLists
+    coarse: CoarseDescriptors | None = None
 
 
 @dataclass(frozen=True)
@@ -52,13 +62,25 @@ class PutativeMatches:
 
 
 def matchable(
-    descriptors: NDArray[np.floating], keypoints: NDArray[np.floating], options: MatchingOptions
+    descriptors: NDArray[np.floating],
+    keypoints: NDArray[np.floating],
+    options: MatchingOptions,
+    make_coarse: MakeCoarse | None = None,
 ) -> MatchableImage:
-    """Prepare the features of one image for matching."""
+    """Prepare the features of one image for matching.
+
+    Args:
+        descriptors: (N, D) rows of unit length.
+        keypoints: (N, 2) pixel-centre px.
+        options: of matching.
+        make_coarse: the same for all images that are matched with each other.
+    """
+    descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
     return MatchableImage(
-        np.ascontiguousarray(descriptors, dtype=np.float32),
+        descriptors,
         keypoints,
         neighbors_within(keypoints, options.min_contrast_distance_px),
+        make_coarse(descriptors) if make_coarse else None,
     )
 
 
@@ -68,10 +90,12 @@ def match_features(
     """Match two images; see the module docstring. Either may have no features."""
     if not len(image1.descriptors) or not len(image2.descriptors):
         return PutativeMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
-    forward, ratios = _nearest(image1.descriptors, image2)
+    everything = np.arange(len(image1.descriptors))
+    forward, ratios = _nearest(image1, everything, image2, options.max_ratio)
     rows = np.flatnonzero(ratios < options.max_ratio)
     targets, back = np.unique(forward[rows], return_inverse=True)
-    backward, back_ratios = _nearest(image2.descriptors[targets], image1)
+    back_limit = options.max_ratio if options.ratio_both_ways else NO_LIMIT
+    backward, back_ratios = _nearest(image2, targets, image1, back_limit)
     mutual = backward[back] == rows
     worst = ratios[rows]
     if options.ratio_both_ways:
@@ -82,6 +106,66 @@ def match_features(
 
 
 def _nearest(
+    image1: MatchableImage, rows: NDArray[np.int64], image2: MatchableImage, max_ratio: float
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the nearest feature of each of some features, and the ratio to the nearest non-rival.
+
+    They may be -1 and infinite where the ratio is ``max_ratio`` or larger.
+    """
+    if image1.coarse is None or image2.coarse is None:
+        return _nearest_of_all(image1.descriptors[rows], image2)
+    short = image1.coarse.short_list(rows, image2.coarse, image2.rivals, max_ratio)
+    found, found_ratios, doubtful = _nearest_of_listed(image1.descriptors, image2, short)
+    again = short.rows[doubtful]
+    found[doubtful], found_ratios[doubtful] = _nearest_of_all(image1.descriptors[again], image2)
+    nearest = np.full(len(rows), -1)
+    ratios = np.full(len(rows), np.inf, np.float32)
+    places = np.searchsorted(rows, short.rows)
+    nearest[places], ratios[places] = found, found_ratios
+    return nearest, ratios
+
+
+def _nearest_of_listed(
+    queries: NDArray[np.float32], image: MatchableImage, short: ShortList
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.bool_]]:
+    """Return nearest and ratio among the features listed for each row, and where that is doubtful.
+
+    It is where the second neighbour by coarse similarities is a rival of the nearest by exact
+    ones: what takes its place may not be listed.
+    """
+    similarity = np.empty(len(short.entry_rows), np.float32)
+    for begin in range(0, len(similarity), CHUNK_ROWS):
+        part = slice(begin, begin + CHUNK_ROWS)
+        query = queries[short.rows[short.entry_rows[part]]]
+        similarity[part] = (query * image.descriptors[short.entry_columns[part]]).sum(axis=1)
+    starts = np.searchsorted(short.entry_rows, np.arange(len(short.rows)))
+    if not len(starts):
+        return np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros(0, bool)
+    first = np.maximum.reduceat(similarity, starts)
+    highest = np.flatnonzero(similarity == first[short.entry_rows])
+    _, lowest_column = np.unique(short.entry_rows[highest], return_index=True)
+    nearest = short.entry_columns[highest[lowest_column]]
+    rows, rivals = image.rivals.of(nearest)
+    without_rivals = similarity.copy()
+    without_rivals[_places(short, rows, rivals, len(image.descriptors))] = -1.0
+    second = np.maximum.reduceat(without_rivals, starts)
+    doubtful = np.zeros(len(nearest), dtype=bool)
+    doubtful[rows[rivals == short.runners_up[rows]]] = True
+    return nearest, _ratios(first, second), doubtful
+
+
+def _places(
+    short: ShortList, rows: NDArray[np.int64], columns: NDArray[np.int64], count: int
+) -> NDArray[np.int64]:
+    """Return the entries of a short list that are among some rows and columns of ``count``."""
+    listed = short.entry_rows * count + short.entry_columns
+    wanted = rows * count + columns
+    places = np.searchsorted(listed, wanted)
+    places[places == len(listed)] = 0
+    return np.asarray(places[listed[places] == wanted])
+
+
+def _nearest_of_all(
     queries: NDArray[np.float32], image: MatchableImage
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return the nearest feature of each query and the ratio to the nearest non-rival."""
@@ -95,14 +179,16 @@ def _nearest(
         similarity = np.matmul(chunk, image.descriptors.T, out=buffer[: len(chunk)])
         best = similarity.argmax(axis=1)
         first = similarity[np.arange(len(chunk)), best]
-        rows, rivals = image.rivals.of(best)
-        similarity[rows, rivals] = -1.0
-        second = similarity.max(axis=1)
+        similarity[image.rivals.of(best)] = -1.0
         nearest[begin : begin + step] = best
-        ratios[begin : begin + step] = np.sqrt(
-            np.maximum(1.0 - first, ROUNDING) / np.maximum(1.0 - second, ROUNDING)
-        )
+        ratios[begin : begin + step] = _ratios(first, similarity.max(axis=1))
     return nearest, ratios
+
+
+def _ratios(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the ratios of distances of unit vectors with these similarities."""
+    distances = (np.maximum(1.0 - similarity, ROUNDING) for similarity in (first, second))
+    return np.asarray(np.sqrt(np.divide(*distances)))
 
 
 def _without_duplicates(

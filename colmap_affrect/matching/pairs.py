@@ -1,23 +1,97 @@
-"""Which images to match: all pairs, or a list."""
+"""Which images to match: all pairs, a list, neighbours in a sequence, the most similar ones."""
 
 from __future__ import annotations
 
 import difflib
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from colmap_affrect.errors import PairListError
 from colmap_affrect.files import replace_text
 
 Pair = tuple[str, str]
 MAX_NAMES_IN_MESSAGE = 5
+CANDIDATES_PER_NEIGHBOR = 5
+"""An image may have so many times more neighbours than images have on average."""
 
 
 def exhaustive_pairs(names: Sequence[str]) -> list[Pair]:
     """Return every unordered pair of the names, sorted."""
     return list(itertools.combinations(sorted(names), 2))
+
+
+def sequence_pairs(names: Sequence[str], num_neighbors: int) -> list[Pair]:
+    """Return the pairs of each name and the ``num_neighbors`` after it, sorted.
+
+    Numbers in names count by value: frame 9 comes before frame 10.
+    """
+    ordered = sorted(names, key=_by_numbers)
+    return sorted(
+        (min(first, second), max(first, second))
+        for index, first in enumerate(ordered)
+        for second in ordered[index + 1 : index + 1 + num_neighbors]
+    )
+
+
+def _by_numbers(name: str) -> tuple[list[str | int], str]:
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
+
+
+def most_similar_pairs(
+    names: Sequence[str], similarities: Iterable[NDArray[np.number]], num_neighbors: int
+) -> list[Pair]:
+    """Choose pairs so that images have ``num_neighbors`` neighbours on average.
+
+    Each image is paired with half as many that are most similar to it. The rest goes to the pairs
+    that are the most similar of all: of some places there are many photographs, of others few.
+
+    Args:
+        names: of N different images.
+        similarities: for each image its (N,) similarities with all, larger is more similar.
+        num_neighbors: 1 or more.
+
+    Returns:
+        ``num_neighbors * N / 2`` pairs, sorted; more if the nearest of each image are more.
+    """
+    half, count = -(-num_neighbors // 2), len(names)
+    candidates = [
+        _candidates(index, row.astype(np.float32), CANDIDATES_PER_NEIGHBOR * num_neighbors)
+        for index, row in enumerate(similarities)
+    ]
+    if not candidates:
+        return []
+    indices1, indices2, similarity, rank = (
+        np.concatenate(column) for column in zip(*candidates, strict=True)
+    )
+    best_first = np.lexsort((-similarity, rank >= half))
+    _, first = np.unique((indices1 * count + indices2)[best_first], return_index=True)
+    ranked = best_first[np.sort(first)]
+    num_pairs = max(count * num_neighbors // 2, np.count_nonzero(rank[ranked] < half))
+    chosen = ranked[:num_pairs]
+    return sorted(
+        (min(names[i], names[j]), max(names[i], names[j]))
+        for i, j in zip(indices1[chosen], indices2[chosen], strict=True)
+    )
+
+
+def _candidates(
+    index: int, row: NDArray[np.float32], max_num: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:
+    """Return the smaller and larger indices, similarities and ranks of an image's best pairs."""
+    order = np.argsort(-row, kind="stable")
+    others = order[order != index][:max_num]
+    return (
+        np.minimum(others, index),
+        np.maximum(others, index),
+        row[others],
+        np.arange(len(others)),
+    )
 
 
 def read_pairs(path: Path, names: Sequence[str]) -> list[Pair]:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
-from speed import describe_machine
+from machine import describe_machine
 
 from colmap_affrect.comparison.methods import Method, parse_method
 from colmap_affrect.evaluation.costs import ImageCost, extract_measured

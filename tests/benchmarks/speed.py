@@ -1,86 +1,123 @@
-"""Speed of feature extraction and matching next to COLMAP SIFT, in interleaved rounds.
+"""Speed beside COLMAP's SIFT: whole commands, stages against the machine's peak, growth.
 
-Both write their results into a COLMAP database and use all cores; matching is measured without
-geometric verification. Nothing is asserted: other load on the machine shows in the spread. Usage:
+All methods run on the same photographs in one process, in turn, in several rounds. Sections:
 
-    python tests/benchmarks/speed.py --image-path ../shared/scenes/strecha_fountain_p11/images
+    commands  extract, match, verify and map by the whole commands on all cores
+    stages    each stage in core seconds, its counted work against what a core can do at most
+    pixels    extraction of one picture at 320 to 2400 px, core seconds
+    features  matching of 1000 to 16000 features, ours and COLMAP's, core seconds
+    images    the whole commands on more and more images, and the size of the files
+
+Prints Markdown of everything in the JSON file; sections that are not run this time are kept. Other
+load on the machine shows in the ranges. Usage:
+
+    python tests/benchmarks/speed.py --image-path ../shared/scenes/strecha_fountain_p11/images \
+        --output-path out/speed.json
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import platform
-import tempfile
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from statistics import median
+from typing import Any
 
-from registration import compute_sift, link_images, match_recipe
+from machine import describe_machine, measure_peaks
+from speed_growth import feature_growth, image_growth, pixel_growth
+from speed_measure import SIFT_METHODS, Method, StageMeasurement, measure_commands
+from speed_report import report
+from speed_stages import PAIR_STAGES
+from stage_clock import StageClock
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.executor import available_cores, peak_memory_bytes
-from colmap_affrect.options import CameraOptions
-from colmap_affrect.pipeline import installed_versions
-from colmap_affrect.recipes import load_recipe
+from colmap_affrect.executor import available_cores
+from colmap_affrect.extraction import Resources
 
-Seconds = list[dict[str, float]]
-
-
-def peak_memory_mib() -> float:
-    """Return the largest resident size that this process has had."""
-    return peak_memory_bytes() / 2**20
+SECTIONS = ("commands", "stages", "pixels", "features", "images")
+DEFAULT_METHODS = [*SIFT_METHODS, "unrectified-rootsift", "default"]
+SLOW_SIFT = [name for name in SIFT_METHODS if name != "sift"]
 
 
-def describe_machine() -> str:
-    """Return processor, load and versions."""
-    versions = ", ".join(f"{name} {version}" for name, version in installed_versions().items())
-    load = f"{os.getloadavg()[0]:.1f}"
-    return f"{platform.machine()}, {available_cores()} cores, load {load} at the start\n{versions}"
+def run_commands(methods: Sequence[Method], paths: Sequence[Path], num_rounds: int) -> Any:
+    """Return for each method a row of costs for each round."""
+    rows: dict[str, list[dict[str, float]]] = {method.name: [] for method in methods}
+    for _ in range(num_rounds):
+        for method in methods:
+            rows[method.name].append(measure_commands(method, paths))
+    return rows
 
 
-def comparison(stage: str, count: int, unit: str, sift: Seconds, ours: Seconds) -> str:
-    """Format the medians of one stage, and the median and range of its ratios by round."""
-    medians = [median(seconds[stage] for seconds in rounds) / count for rounds in (sift, ours)]
-    ratios = [mine[stage] / theirs[stage] for theirs, mine in zip(sift, ours, strict=True)]
-    return (
-        f"| {stage} | {medians[0]:.3f} s/{unit} | {medians[1]:.3f} s/{unit} "
-        f"| {median(ratios):.2f} [{min(ratios):.2f}-{max(ratios):.2f}] |"
-    )
+def run_stages(methods: Sequence[Method], paths: Sequence[Path], num_rounds: int) -> Any:
+    """Return for each method the seconds of stages for each round, and their work."""
+    measurements = {method.name: StageMeasurement(method, paths) for method in methods}
+    clocks: dict[str, list[StageClock]] = {name: [] for name in measurements}
+    for _ in range(num_rounds):
+        for name, measurement in measurements.items():
+            clocks[name].append(measurement.run())
+    num_pairs = len(paths) * (len(paths) - 1) // 2
+    counts = {name: num_pairs for name in PAIR_STAGES if not name.startswith("prepare")}
+    return {
+        name: {
+            "seconds": [
+                {stage: s / counts.get(stage, len(paths)) for stage, s in clock.seconds.items()}
+                for clock in of_rounds
+            ],
+            "work": {
+                stage: [value / counts.get(stage, len(paths)) for value in asdict(work).values()]
+                for stage, work in of_rounds[0].work.items()
+            },
+        }
+        for name, of_rounds in clocks.items()
+    }
 
 
 def parse_arguments() -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--image-path", type=Path, required=True, help="folder of images")
-    parser.add_argument("--num-images", type=int, default=4, help="use the first so many")
-    parser.add_argument("--num-rounds", type=int, default=5)
-    parser.add_argument("--recipe", default="default", help="name or TOML path")
+    parser.add_argument(
+        "--num-images", type=int, default=4, help="the first so many; all sections but images"
+    )
+    parser.add_argument("--max-num-images", type=int, default=12, help="of the section images")
+    parser.add_argument("--num-rounds", type=int, default=3)
+    parser.add_argument(
+        "--methods", nargs="+", default=DEFAULT_METHODS, metavar="METHOD",
+        help=f"{', '.join(SIFT_METHODS)} or RECIPE[:KEY=VALUE[,...]]; the first is the reference",
+    )  # fmt: skip
+    parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=SECTIONS)
+    parser.add_argument("--weights", type=Path, help="folder of the networks' weights")
+    parser.add_argument("--output-path", type=Path, required=True, help="JSON file")
     return parser.parse_args()
 
 
 def main() -> None:
-    """Run the rounds and print medians, ratios and peak memory."""
+    """Run the sections and print the tables."""
     arguments = parse_arguments()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    print(describe_machine() + "\n")
-    recipe, cameras = load_recipe(arguments.recipe), CameraOptions()
-    paths = sorted(arguments.image_path.iterdir())[: arguments.num_images]
-    sift: Seconds = []
-    ours: Seconds = []
-    sift_peak = 0.0
-    for _ in range(arguments.num_rounds):
-        with tempfile.TemporaryDirectory() as scratch:
-            image_path = Path(scratch) / "images"
-            link_images(paths, image_path)
-            sift.append(compute_sift(Path(scratch) / "sift.db", image_path, cameras, affine=False))
-            sift_peak = sift_peak or peak_memory_mib()
-            (Path(scratch) / "ours").mkdir()
-            ours.append(match_recipe(Path(scratch) / "ours", image_path, cameras, recipe))
-    num_pairs = len(paths) * (len(paths) - 1) // 2
-    print(f"| stage | COLMAP SIFT | {arguments.recipe} | ratio by round |\n|---|--:|--:|--:|")
-    print(comparison("extraction", len(paths), "image", sift, ours))
-    print(comparison("matching", num_pairs, "pair", sift, ours))
-    print(f"\npeak memory: {sift_peak:.0f} MiB after SIFT, {peak_memory_mib():.0f} MiB after both")
+    output_path, num_rounds = arguments.output_path, arguments.num_rounds
+    all_paths = sorted(arguments.image_path.iterdir())
+    paths = all_paths[: arguments.num_images]
+    methods = [Method(name, Resources(arguments.weights)) for name in arguments.methods]
+    fast = [method for method in methods if method.name not in SLOW_SIFT]
+    run: dict[str, Callable[[], Any]] = {
+        "commands": lambda: run_commands(methods, paths, num_rounds),
+        "stages": lambda: run_stages(fast, paths, num_rounds),
+        "pixels": lambda: pixel_growth(fast, paths, num_rounds),
+        "features": lambda: feature_growth(paths, num_rounds),
+        "images": lambda: image_growth(fast, all_paths, arguments.max_num_images),
+    }
+    results = json.loads(output_path.read_text()) if output_path.exists() else {}
+    results |= {
+        "machine": describe_machine(),
+        "cores": available_cores(),
+        "peaks": asdict(measure_peaks()),
+    }
+    for section in arguments.sections:
+        results[section] = run[section]()
+        output_path.write_text(json.dumps(results, indent=1) + "\n")
+    print(report(results))
 
 
 if __name__ == "__main__":

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from colmap_affrect.errors import PairListError
-from colmap_affrect.matching.pairs import exhaustive_pairs, read_pairs, write_pairs
+from colmap_affrect.matching.pairs import (
+    Pair,
+    exhaustive_pairs,
+    most_similar_pairs,
+    read_pairs,
+    sequence_pairs,
+    write_pairs,
+)
 
 NAMES = ["a.png", "b.png", "new wing/a 1.png", "new wing/b.png", "č, d.png"]
 
@@ -27,6 +35,64 @@ def test_exhaustive_pairs_are_all_pairs_once(names: list[str], count: int) -> No
     assert len(set(pairs)) == len(pairs) == count
     assert all(first < second for first, second in pairs)
     assert pairs == sorted(pairs)
+
+
+def test_sequence_pairs_follow_the_numbers_in_names() -> None:
+    names = ["b/1.png", "a/10.png", "a/9.png", "a/8.png"]
+    assert sequence_pairs(names, 1) == [
+        ("a/10.png", "a/9.png"), ("a/10.png", "b/1.png"), ("a/8.png", "a/9.png"),
+    ]  # fmt: skip
+    assert sequence_pairs(names, 2) == sorted(
+        [*sequence_pairs(names, 1), ("a/10.png", "a/8.png"), ("a/9.png", "b/1.png")]
+    )
+    assert sequence_pairs(names, 9) == exhaustive_pairs(names)
+
+
+def crowd_and_few() -> tuple[list[str], np.ndarray]:
+    """Similarities of 8 images of one place, and of 4 of another where all are less alike."""
+    random = np.random.default_rng(0)
+    similarity = random.uniform(0.0, 0.1, (12, 12))
+    similarity[:8, :8] = random.uniform(0.8, 0.9, (8, 8))
+    similarity[8:, 8:] = random.uniform(0.4, 0.5, (4, 4))
+    similarity = np.maximum(similarity, similarity.T)
+    return [f"{index:02d}" for index in range(12)], similarity
+
+
+def neighbors(pairs: list[Pair], name: str) -> set[str]:
+    """What a name is paired with."""
+    return {other for pair in pairs if name in pair for other in pair} - {name}
+
+
+def test_most_similar_pairs_are_asked_for_on_average_and_half_of_it_for_each() -> None:
+    names, similarity = crowd_and_few()
+    pairs = most_similar_pairs(names, similarity, 4)
+    assert len(pairs) == len(set(pairs)) == 12 * 4 // 2
+    assert pairs == sorted(pairs)
+    assert all(first < second for first, second in pairs)
+    for index, name in enumerate(names):
+        order = [names[other] for other in np.argsort(-similarity[index]) if other != index]
+        assert set(order[:2]) <= neighbors(pairs, name)
+    chosen = [pair for pair in pairs if pair[0] < "08"]
+    # What is over goes to the crowd, although the few have pairs left.
+    assert len(pairs) - len(chosen) < 6
+    assert all(second < "08" for _, second in chosen)
+
+
+def test_most_similar_pairs_with_many_neighbors_are_all() -> None:
+    names, similarity = crowd_and_few()
+    shuffled = names[::-1]
+    assert most_similar_pairs(shuffled, similarity, 11) == exhaustive_pairs(names)
+    assert most_similar_pairs(names[:2], similarity[:2, :2], 20) == [("00", "01")]
+    assert most_similar_pairs(names[:1], similarity[:1, :1], 20) == []
+    assert most_similar_pairs([], [], 20) == []
+
+
+def test_most_similar_pairs_leave_no_image_out() -> None:
+    names, similarity = crowd_and_few()
+    for num_neighbors in range(1, 12):
+        pairs = most_similar_pairs(names, similarity, num_neighbors)
+        assert len(pairs) >= 12 * num_neighbors // 2
+        assert {name for pair in pairs for name in pair} == set(names)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,255 @@
+"""Short lists for the ratio test, by similarities of descriptors in 8 or 16 bits.
+
+On photographs about one feature in twenty passes the test, and its neighbours stand out. Coarse
+similarities tell which features may pass and which features may be their first and second
+neighbours; only those few are compared exactly. They cost a third of the time on a processor with
+8-bit products, less on a GPU. Their error is known, and six times its standard deviation is allowed
+for, so that the matches are those of exact similarities.
+
+torch is loaded here, when there is enough to match to pay for that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.executor import one_openmp_thread
+from colmap_affrect.geometry.neighbors import NeighborLists
+
+MIN_SIMILARITIES = 1.5e9
+"""From about 20 pairs of 8,000 features on, more is saved than loading torch takes."""
+
+ERROR_SIGMAS = 6.0
+MAX_CODE = 127
+NO_SIMILARITY = -(2**30)
+NO_HALF_SIMILARITY = -4.0
+SIMILARITIES_8_BIT = 1 << 21
+"""Held at once: 8 MiB, which stay in the processor's cache."""
+NUM_ROWS_16_BIT = 4096
+HALF_ERROR = 2.0**-11
+"""Standard deviation, rounded up, of the similarity of unit vectors in 16 bits."""
+
+
+@dataclass(frozen=True)
+class ShortList:
+    """Features that may pass the ratio test, and what may be their two nearest neighbours.
+
+    Attributes:
+        rows: (R,) int64 features of the first image that may pass, rising.
+        runners_up: (R,) int64 the second neighbour of each by coarse similarities.
+        entry_rows: (E,) int64 indices into ``rows``, rising.
+        entry_columns: (E,) int64 features of the second image, rising in each row.
+    """
+
+    rows: NDArray[np.int64]
+    runners_up: NDArray[np.int64]
+    entry_rows: NDArray[np.int64]
+    entry_columns: NDArray[np.int64]
+
+
+class CoarseDescriptors(Protocol):
+    """Descriptors of one image in few bits."""
+
+    def short_list(
+        self,
+        rows: NDArray[np.int64],
+        other: Self,
+        rivals: NeighborLists,
+        max_ratio: float,
+    ) -> ShortList:
+        """Compare some features with all of another image.
+
+        Args:
+            rows: features of this image, rising.
+            other: descriptors of the other image, of the same kind.
+            rivals: for each feature of the other image those too close to be its second neighbour.
+            max_ratio: limit of the distances to the first and second neighbour.
+        """
+
+
+MakeCoarse = Callable[[NDArray[np.float32]], CoarseDescriptors]
+"""Makes coarse descriptors of (N, D) unit rows."""
+
+
+def coarse_descriptors(num_similarities: float, device: str = "auto") -> MakeCoarse | None:
+    """Return what makes coarse descriptors; None where they do not pay.
+
+    Args:
+        num_similarities: of all pairs of features to come.
+        device: as in :func:`colmap_affrect.features.networks.resolve_device`; ``auto`` asks for a
+            GPU only when there is enough to do.
+    """
+    if device in ("auto", "cpu") and num_similarities < MIN_SIMILARITIES:
+        return None
+    from colmap_affrect.features.networks import resolve_device
+
+    resolved = resolve_device(device)
+    if resolved.type != "cpu":
+        return partial(HalfDescriptors.of, device=str(resolved))
+    return EightBitDescriptors.of if has_fast_8_bit_products() else None
+
+
+@dataclass(frozen=True)
+class EightBitDescriptors:
+    """Descriptors as signed 8-bit numbers, on the CPU.
+
+    Attributes:
+        codes: (N, D) int8, the descriptors divided by ``step`` and rounded.
+        step: the largest value over 127.
+    """
+
+    codes: NDArray[np.int8]
+    step: float
+
+    @classmethod
+    def of(cls, descriptors: NDArray[np.float32]) -> Self:
+        """Round (N, D) unit rows."""
+        step = max(float(np.abs(descriptors).max(initial=0.0)), 1e-6) / MAX_CODE
+        return cls(np.rint(descriptors / step).astype(np.int8), step)
+
+    def short_list(
+        self,
+        rows: NDArray[np.int64],
+        other: Self,
+        rivals: NeighborLists,
+        max_ratio: float,
+    ) -> ShortList:
+        """See :class:`CoarseDescriptors`."""
+        import torch  # noqa: F401 - its threads can only be limited once they are there
+
+        unit = self.step * other.step
+        # A rounding error is uniform: its standard deviation is a step over the root of 12.
+        margin = ERROR_SIGMAS * math.hypot(self.step, other.step) / math.sqrt(12)
+        step = max(1, SIMILARITIES_8_BIT // len(other.codes))
+        buffer = np.empty((min(step, len(rows)), len(other.codes)), np.int32)
+        parts = []
+        with one_openmp_thread():
+            for begin in range(0, len(rows), step):
+                chunk = rows[begin : begin + step]
+                similarity = buffer[: len(chunk)]
+                _multiply(self.codes[chunk], other.codes, similarity)
+                best = similarity.argmax(axis=1)
+                every = np.arange(len(chunk))
+                first = similarity[every, best]
+                similarity[rivals.of(best)] = NO_SIMILARITY
+                runners_up = similarity.argmax(axis=1)
+                second = similarity[every, runners_up]
+                may = np.flatnonzero(_may_pass(unit * first, unit * second, max_ratio, margin))
+                least = second[may] - math.ceil(2 * margin / unit)
+                close = np.flatnonzero(similarity[may] >= least[:, None])
+                near = np.divmod(close, len(other.codes))
+                parts.append(_part(chunk[may], runners_up[may], near, rivals.of(best[may])))
+        return _joined(parts)
+
+
+@dataclass(frozen=True)
+class HalfDescriptors:
+    """Descriptors as 16-bit floating point numbers, on a GPU.
+
+    Attributes:
+        values: (N, D) tensor.
+    """
+
+    values: Any
+
+    @classmethod
+    def of(cls, descriptors: NDArray[np.float32], device: str) -> Self:
+        """Copy (N, D) unit rows to a device."""
+        import torch
+
+        return cls(torch.from_numpy(descriptors).to(device, torch.float16))
+
+    def short_list(
+        self,
+        rows: NDArray[np.int64],
+        other: Self,
+        rivals: NeighborLists,
+        max_ratio: float,
+    ) -> ShortList:
+        """See :class:`CoarseDescriptors`."""
+        import torch
+
+        device = self.values.device
+        margin = ERROR_SIGMAS * HALF_ERROR
+        parts = []
+        for begin in range(0, len(rows), NUM_ROWS_16_BIT):
+            chunk = rows[begin : begin + NUM_ROWS_16_BIT]
+            similarity = self.values[torch.from_numpy(chunk).to(device)] @ other.values.T
+            first, best = (found.cpu().numpy() for found in similarity.max(dim=1))
+            rival_rows, rival_columns = rivals.of(best)
+            similarity[
+                torch.from_numpy(rival_rows).to(device), torch.from_numpy(rival_columns).to(device)
+            ] = NO_HALF_SIMILARITY
+            seconds, runners = similarity.max(dim=1)
+            second, runners_up = seconds.float().cpu().numpy(), runners.cpu().numpy()
+            may = np.flatnonzero(_may_pass(first.astype(np.float32), second, max_ratio, margin))
+            chosen = torch.from_numpy(may).to(device)
+            close = similarity[chosen] >= (seconds[chosen] - 2 * margin)[:, None]
+            near = tuple(found.cpu().numpy() for found in close.nonzero(as_tuple=True))
+            parts.append(_part(chunk[may], runners_up[may], near, rivals.of(best[may])))
+        return _joined(parts)
+
+
+def _may_pass(
+    first: NDArray[np.floating], second: NDArray[np.floating], max_ratio: float, margin: float
+) -> NDArray[np.bool_]:
+    """Tell where sqrt((1 - first) / (1 - second)) may be under a limit."""
+    return np.asarray(1.0 - first - margin < max_ratio**2 * (1.0 - second + margin))
+
+
+def _part(
+    rows: NDArray[np.int64],
+    runners_up: NDArray[np.int64],
+    near: tuple[NDArray[np.int64], ...],
+    of_best: tuple[NDArray[np.int64], NDArray[np.int64]],
+) -> ShortList:
+    """Unite the entries near the second neighbour with the first one and its rivals, sorted."""
+    entry_rows, columns = (np.concatenate(both) for both in zip(near, of_best, strict=True))
+    order = np.lexsort((columns, entry_rows))
+    return ShortList(rows, runners_up, entry_rows[order], columns[order])
+
+
+def _joined(parts: list[ShortList]) -> ShortList:
+    """Put the lists of consecutive rows together."""
+    begins = np.cumsum([0, *(len(part.rows) for part in parts)])
+    nothing = np.zeros(0, np.int64)
+    return ShortList(
+        np.concatenate([nothing, *(part.rows for part in parts)]),
+        np.concatenate([nothing, *(part.runners_up for part in parts)]),
+        np.concatenate(
+            [nothing, *(p.entry_rows + b for p, b in zip(parts, begins[:-1], strict=True))]
+        ),
+        np.concatenate([nothing, *(part.entry_columns for part in parts)]),
+    )
+
+
+def _multiply(codes1: NDArray[np.int8], codes2: NDArray[np.int8], out: NDArray[np.int32]) -> None:
+    """Write codes1 @ codes2.T."""
+    import torch
+
+    torch._int_mm(torch.from_numpy(codes1), torch.from_numpy(codes2).T, out=torch.from_numpy(out))
+
+
+@cache
+def has_fast_8_bit_products() -> bool:
+    """Tell whether the processor multiplies 8-bit numbers, and without saturation.
+
+    Older ones do it more slowly than floating point, or lose bits on the way.
+    """
+    import torch
+
+    if not torch.backends.cpu.get_cpu_capability().startswith("AVX512"):
+        return False
+    codes = np.full((64, 128), MAX_CODE, np.int8)
+    codes[::2, ::3] = -MAX_CODE
+    product = np.empty((64, 64), np.int32)
+    _multiply(codes, codes, product)
+    wide = codes.astype(np.int32)
+    return bool((product == wide @ wide.T).all())

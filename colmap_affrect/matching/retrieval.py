@@ -1,0 +1,103 @@
+"""Which images show the same, by one vector per image (VLAD).
+
+The vocabulary is built from descriptors of the images themselves. An image is described by the sums
+of the differences between its descriptors and their nearest words (Jegou et al., Aggregating local
+descriptors into a compact image representation, 2010), each sum of unit length and damped by square
+roots, so that neither repeated structures nor single words decide (Arandjelovic and Zisserman, All
+about VLAD, 2013). What all images have in common is subtracted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+NUM_WORDS = 256
+NUM_SAMPLES = 1 << 15
+"""Descriptors that the vocabulary is built from: 16 MiB of 128 floats."""
+NUM_ITERATIONS = 10
+VECTORS_AT_ONCE = 512
+"""Image vectors in 32 bits at a time, twice: 128 MiB in all for descriptors of 128 elements."""
+
+
+def build_vocabulary(
+    samples: NDArray[np.float32], random: np.random.Generator
+) -> NDArray[np.float32]:
+    """Find words by k-means.
+
+    Args:
+        samples: (M, D) descriptors of many images.
+        random: chooses where k-means begins.
+
+    Returns:
+        (K, D) words, ``NUM_WORDS`` or as many as there are samples.
+    """
+    words = random.permutation(samples)[:NUM_WORDS]
+    for _ in range(NUM_ITERATIONS if len(samples) > len(words) else 0):
+        nearest = nearest_words(samples, words)
+        counts = np.bincount(nearest, minlength=len(words))[:, None]
+        means = _sums(samples, nearest, len(words)) / np.maximum(counts, 1).astype(np.float32)
+        words = np.where(counts, means, words)
+    return words
+
+
+def nearest_words(
+    descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]
+) -> NDArray[np.int64]:
+    """Return the (N,) nearest of (K, D) words to (N, D) descriptors."""
+    half_squares = 0.5 * np.einsum("kd,kd->k", vocabulary, vocabulary)
+    return np.asarray((descriptors @ vocabulary.T - half_squares).argmax(axis=1))
+
+
+def image_vector(
+    descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]
+) -> NDArray[np.float16]:
+    """Describe an image by one vector of unit length; zeros without descriptors.
+
+    Args:
+        descriptors: (N, D) of the image.
+        vocabulary: (K, D) words.
+
+    Returns:
+        (K * D,) vector.
+    """
+    words = nearest_words(descriptors, vocabulary)
+    sums = _unit_rows(_sums(descriptors - vocabulary[words], words, len(vocabulary)))
+    damped = np.sign(sums) * np.sqrt(np.abs(sums))
+    return np.asarray(_unit_rows(damped.reshape(1, -1))[0], dtype=np.float16)
+
+
+def _sums(
+    rows: NDArray[np.float32], words: NDArray[np.int64], num_words: int
+) -> NDArray[np.float32]:
+    """Add up the (N, D) rows of each word; (K, D), zeros where there are none."""
+    order = np.argsort(words, kind="stable")
+    present, begins = np.unique(words[order], return_index=True)
+    sums = np.zeros((num_words, rows.shape[1]), np.float32)
+    if len(rows):
+        sums[present] = np.add.reduceat(rows[order], begins, axis=0)
+    return sums
+
+
+def similarities(vectors: NDArray[np.float16]) -> Iterator[NDArray[np.float32]]:
+    """Yield for each of (N, V) image vectors its (N,) similarities with all of them.
+
+    They are the cosines after the mean of all vectors has been subtracted.
+    """
+    mean = vectors.mean(axis=0, dtype=np.float32)
+    begins = range(0, len(vectors), VECTORS_AT_ONCE)
+
+    def centered(begin: int) -> NDArray[np.float32]:
+        return _unit_rows(vectors[begin : begin + VECTORS_AT_ONCE] - mean)
+
+    for begin in begins:
+        queries = centered(begin)
+        yield from np.concatenate([queries @ centered(other).T for other in begins], axis=1)
+
+
+def _unit_rows(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Divide (N, V) rows by their lengths; rows of zeros stay."""
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.asarray(rows / np.maximum(lengths, np.finfo(np.float32).tiny))

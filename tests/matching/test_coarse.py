@@ -1,0 +1,153 @@
+"""Matching by short lists: the matches are those of exact similarities."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from colmap_affrect.errors import DeviceError
+from colmap_affrect.geometry.neighbors import neighbors_within
+from colmap_affrect.matching import coarse, nearest
+from colmap_affrect.matching.coarse import (
+    EightBitDescriptors,
+    HalfDescriptors,
+    MakeCoarse,
+    ShortList,
+    coarse_descriptors,
+    has_fast_8_bit_products,
+)
+from colmap_affrect.matching.nearest import _nearest_of_listed, match_features, matchable
+from colmap_affrect.options import MatchingOptions
+
+KINDS: dict[str, MakeCoarse] = {
+    "8 bit": EightBitDescriptors.of,
+    "16 bit": lambda descriptors: HalfDescriptors.of(descriptors, "cpu"),
+}
+
+
+@pytest.fixture(params=KINDS)
+def kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> MakeCoarse:
+    """Each kind, on any processor."""
+    if not has_fast_8_bit_products():
+        monkeypatch.setattr(coarse, "_multiply", multiply)
+    return KINDS[request.param]
+
+
+def multiply(codes1: NDArray[np.int8], codes2: NDArray[np.int8], out: NDArray[np.int32]) -> None:
+    out[:] = codes1.astype(np.int32) @ codes2.astype(np.int32).T
+
+
+def unit_rows(rows: NDArray[np.float64]) -> NDArray[np.float32]:
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
+def crowded_views(seed: int, noise: float, *, signed: bool) -> list[tuple[NDArray, NDArray]]:
+    """350 and 450 features, of which 250 are the same; some are repeated beside themselves."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(550, 128)) if signed else rng.gamma(0.4, size=(550, 128))
+    places = rng.uniform(0, 180, (550, 2))
+    rows[150:180] = rows[:30] * (1 + 0.02 * rng.normal(size=(30, 128)))
+    places[150:180] = places[:30] + 1.0
+    views = []
+    for chosen in (slice(0, 350), slice(100, 550)):
+        seen = rows[chosen] + noise * np.abs(rows).mean() * rng.normal(size=rows[chosen].shape)
+        views.append((unit_rows(seen if signed else np.abs(seen)), places[chosen] * (1.0, 0.8)))
+    return views
+
+
+@pytest.mark.parametrize("options", [
+    MatchingOptions(),
+    MatchingOptions(max_ratio=0.97, ratio_both_ways=False),
+    MatchingOptions(max_ratio=0.9, min_contrast_distance_px=40.0),
+], ids=str)  # fmt: skip
+@pytest.mark.parametrize("noise", [0.3, 1.0])
+@pytest.mark.parametrize("signed", [False, True])
+def test_matches_are_those_of_exact_similarities(
+    kind: MakeCoarse, options: MatchingOptions, noise: float, signed: bool
+) -> None:
+    views = crowded_views(3, noise, signed=signed)
+    exact = match_features(*(matchable(*view, options) for view in views), options)
+    assert 30 < len(exact.indices) < 260
+    found = match_features(*(matchable(*view, options, kind) for view in views), options)
+    np.testing.assert_array_equal(found.indices, exact.indices)
+    np.testing.assert_allclose(found.ratios, exact.ratios, atol=1e-4)
+
+
+def test_short_list_has_few_rows_and_few_entries(kind: MakeCoarse) -> None:
+    first, second = (kind(descriptors) for descriptors, _ in crowded_views(4, 1.0, signed=False))
+    rivals = neighbors_within(crowded_views(4, 1.0, signed=False)[1][1], 10.0)
+    short = first.short_list(np.arange(350), second, rivals, 0.85)
+    assert len(short.rows) < 300
+    assert len(short.entry_rows) < 0.05 * len(short.rows) * 450
+    part = first.short_list(np.arange(100, 140), second, rivals, 0.85)
+    inside = (short.rows >= 100) & (short.rows < 140)
+    np.testing.assert_array_equal(part.rows, short.rows[inside])
+    np.testing.assert_array_equal(part.runners_up, short.runners_up[inside])
+
+
+def test_lists_of_several_chunks_are_those_of_one(
+    kind: MakeCoarse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = MatchingOptions()
+    views = crowded_views(5, 0.5, signed=False)
+    whole = match_features(*(matchable(*view, options, kind) for view in views), options)
+    monkeypatch.setattr(coarse, "SIMILARITIES_8_BIT", 33 * 450)
+    monkeypatch.setattr(coarse, "NUM_ROWS_16_BIT", 47)
+    monkeypatch.setattr(nearest, "CHUNK_ROWS", 101)
+    parts = match_features(*(matchable(*view, options, kind) for view in views), options)
+    np.testing.assert_array_equal(parts.indices, whole.indices)
+
+
+def test_nearest_whose_rival_is_the_coarse_runner_up_is_doubtful() -> None:
+    # Of the queries' nearest, 1 and 3, the first has the runner-up 2 at the same place.
+    others = np.eye(4, dtype=np.float32)
+    image = matchable(others, np.array([(0, 0), (50, 0), (52, 0), (99, 0)]), MatchingOptions())
+    queries = unit_rows(np.array([(0.2, 1.0, 0.4, 0.3), (0.3, 0.0, 0.2, 1.0)]))
+    short = ShortList(
+        np.array([0, 1]), np.array([2, 0]), np.array([0, 0, 0, 1, 1]), np.array([1, 2, 3, 0, 3])
+    )
+    found, ratios, doubtful = _nearest_of_listed(queries, image, short)
+    assert found.tolist() == [1, 3]
+    assert doubtful.tolist() == [True, False]
+    cosines = (queries[0, 1], queries[0, 3]), (queries[1, 3], queries[1, 0])
+    expected = [np.sqrt((1 - first) / (1 - second)) for first, second in cosines]
+    np.testing.assert_allclose(ratios, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("counts", [(0, 5), (5, 0), (1, 1), (1, 7), (300, 1)])
+def test_few_features(kind: MakeCoarse, counts: tuple[int, int]) -> None:
+    rng = np.random.default_rng(7)
+    options = MatchingOptions()
+    views = [(unit_rows(rng.gamma(0.4, size=(n, 128))), rng.uniform(0, 99, (n, 2))) for n in counts]
+    found = match_features(*(matchable(*view, options, kind) for view in views), options)
+    exact = match_features(*(matchable(*view, options) for view in views), options)
+    np.testing.assert_array_equal(found.indices, exact.indices)
+
+
+def test_coarse_descriptors_are_made_where_they_pay(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> bool:
+        raise AssertionError("asked")
+
+    monkeypatch.setattr(coarse, "has_fast_8_bit_products", refuse)
+    assert coarse_descriptors(1e9) is None
+    assert coarse_descriptors(1e9, "cpu") is None
+    monkeypatch.setattr(coarse, "has_fast_8_bit_products", lambda: False)
+    assert coarse_descriptors(1e15, "cpu") is None
+    monkeypatch.setattr(coarse, "has_fast_8_bit_products", lambda: True)
+    assert coarse_descriptors(1e15, "cpu") == EightBitDescriptors.of
+    with pytest.raises(DeviceError, match="--device cuda:99"):
+        coarse_descriptors(0, "cuda:99")
+
+
+def test_products_that_saturate_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    def saturating(
+        codes1: NDArray[np.int8], codes2: NDArray[np.int8], out: NDArray[np.int32]
+    ) -> None:
+        multiply(codes1, codes2, out)
+        np.clip(out, -(2**15), 2**15, out=out)
+
+    monkeypatch.setattr("torch.backends.cpu.get_cpu_capability", lambda: "AVX512")
+    for product, expected in ((multiply, True), (saturating, False)):
+        monkeypatch.setattr(coarse, "_multiply", product)
+        assert has_fast_8_bit_products.__wrapped__() is expected
