@@ -58,6 +58,8 @@ def retrieved_pairs(
 ) -> list[Pair]:
     """Return the pairs of images whose descriptors are alike as a whole.
 
+    None if all features are those of warps.
+
     Args:
         names: of images that have features.
         read: returns the features of an image; those of warps are not looked at.
@@ -74,6 +76,8 @@ def retrieved_pairs(
             samples.append(random.permutation(descriptors)[:num_each])
             advance(1)
         vocabulary = build_vocabulary(np.concatenate(samples), random)
+        if not len(vocabulary):
+            return []
         vectors = np.empty((len(names), vocabulary.size), np.float16)
         for vector, name in zip(vectors, names, strict=True):
             vector[:] = image_vector(_original_descriptors(read(name)), vocabulary)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import CAMERA
+from command import FAST
 from small_scene import photograph
 from synthetic import write_image
 
@@ -20,6 +20,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, nearest_positions, open_database
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.options import PairOptions
+from colmap_affrect.outcomes import EXIT_INTERRUPTED
 from colmap_affrect.workspace import Workspace
 
 WGS84 = pycolmap.PosePriorCoordinateSystem.WGS84
@@ -70,8 +71,7 @@ def rooms(extracted: Path, tmp_path: Path) -> Workspace:
 
 def extract(folder: Path) -> None:
     command = ["extract", "--image-path", folder / "photos", "--output-path", folder / "out"]
-    options = ["--recipe", "unrectified-rootsift", "--quiet", *CAMERA]
-    assert main([str(argument) for argument in command + options]) == 0
+    assert main([str(argument) for argument in [*command, "-q", *FAST]]) == 0
 
 
 def choose(call: Call, workspace: Workspace, *arguments: object) -> list[str]:
@@ -86,7 +86,6 @@ def test_photographs_of_one_room_are_chosen_by_their_features(
 ) -> None:
     arguments = ["--pairs", method, "--num-neighbors", 1]
     assert choose(call, rooms, *arguments) == ["1.png 3.png", "2.png 4.png"]
-    assert choose(call, rooms, *arguments, "--overwrite") == ["1.png 3.png", "2.png 4.png"]
 
 
 def test_pairs_stay_and_come_when_photographs_come(
@@ -133,6 +132,19 @@ def test_other_options_than_before_are_refused(rooms: Workspace, call: Call) -> 
     assert "methods=['exhaustive'], and it is ['sequence'] now" in stderr[0]
     pairs = choose(call, rooms, "--pairs", "sequence", "--num-neighbors", 1, "--overwrite")
     assert pairs == ["1.png 2.png", "2.png 3.png", "3.png 4.png"]
+
+
+def test_run_chooses_pairs_as_asked(
+    extracted: Path, rooms: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stages, "match", stop)
+    command = ["run", "--image-path", extracted / "photos", "--output-path", rooms.path, "-q"]
+    options = [*FAST, "--pairs", "sequence", "--num-neighbors", 2]
+    assert main([str(argument) for argument in command + options]) == EXIT_INTERRUPTED
+    assert len(rooms.pairs.read_text().splitlines()) == 3 + 2
 
 
 def test_gps_without_positions_is_refused_and_nothing_discarded(
