@@ -3,7 +3,8 @@
 A class of another package becomes known by an entry point of the group
 ``colmap_affrect.rectifiers`` or ``colmap_affrect.features``. Its attribute ``Options`` is a
 subclass of :class:`colmap_affrect.options.RectifierOptions` or ``FeatureOptions``; it is
-called with an instance of that and with :class:`Sources` or :class:`Computing`.
+called with an instance of that and with :class:`Sources` or :class:`Computing`. Several threads
+may call the same object at once.
 """
 
 from __future__ import annotations
