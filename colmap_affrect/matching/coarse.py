@@ -30,8 +30,8 @@ ERROR_SIGMAS = 6.0
 MAX_CODE = 127
 NO_SIMILARITY = -(2**30)
 NO_HALF_SIMILARITY = -4.0
-SIMILARITIES_8_BIT = 1 << 21
-"""Held at once: 8 MiB, which stay in the processor's cache."""
+SIMILARITIES_8_BIT = 1 << 20
+"""Held at once: 4 MiB, which stay in the processor's cache."""
 NUM_ROWS_16_BIT = 4096
 HALF_ERROR = 2.0**-11
 """Standard deviation, rounded up, of the similarity of unit vectors in 16 bits."""
@@ -129,6 +129,7 @@ class EightBitDescriptors:
         margin = ERROR_SIGMAS * math.hypot(self.step, other.step) / math.sqrt(12)
         step = max(1, SIMILARITIES_8_BIT // len(other.codes))
         buffer = np.empty((min(step, len(rows)), len(other.codes)), np.int32)
+        picked, is_near = np.empty_like(buffer), np.empty(buffer.shape, bool)
         parts = []
         with one_openmp_thread():
             for begin in range(0, len(rows), step):
@@ -143,8 +144,9 @@ class EightBitDescriptors:
                 second = similarity[every, runners_up]
                 may = np.flatnonzero(_may_pass(unit * first, unit * second, max_ratio, margin))
                 least = second[may] - math.ceil(2 * margin / unit)
-                close = np.flatnonzero(similarity[may] >= least[:, None])
-                near = np.divmod(close, len(other.codes))
+                candidates = np.take(similarity, may, axis=0, out=picked[: len(may)], mode="clip")
+                close = np.greater_equal(candidates, least[:, None], out=is_near[: len(may)])
+                near = np.divmod(np.flatnonzero(close), len(other.codes))
                 parts.append(_part(chunk[may], runners_up[may], near, rivals.of(best[may])))
         return _joined(parts)
 
