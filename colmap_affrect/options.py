@@ -478,8 +478,8 @@ class ExtractionOptions(Options):
     features: FeatureOptions = field(default_factory=SiftOptions, metadata={"section": "features"})
     max_image_size_px: int = 2400
     """Larger images are shrunk to this longer side before extraction. At 2400 a photograph of
-    12 megapixels needs 1.0 GiB of memory, two at once 1.8 GiB; at 3200 (COLMAP's limit for SIFT) one
-    needs 1.8 GiB."""
+    12 megapixels needs 1.0 GiB of memory, two at once 1.8 GiB; at 3200, COLMAP's limit for SIFT,
+    one needs 1.8 GiB."""
 
     def __post_init__(self) -> None:
         self._check("max_image_size_px", 16, 1_000_000)
