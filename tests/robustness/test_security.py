@@ -18,6 +18,9 @@ PACKAGE = Path(colmap_affrect.__file__).parent
 FORBIDDEN_NAMES = {"eval", "exec", "compile", "__import__"}
 FORBIDDEN_MODULES = {"marshal", "shelve", "dill", "cloudpickle", "joblib", "yaml"}
 
+TASKS = {"cluster.py": {"dumps", "loads"}}
+"""Workers unpickle what the command that leads them sends, and nothing that was read from a file."""
+
 
 def dotted(node: ast.expr) -> str:
     """Name of what is called, such as ``torch.load``."""
@@ -58,7 +61,7 @@ def offences(source: str) -> list[str]:
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: path.stem)
 def test_module_executes_no_data(path: Path) -> None:
-    assert offences(path.read_text(encoding="utf-8")) == []
+    assert set(offences(path.read_text(encoding="utf-8"))) == TASKS.get(path.name, set())
 
 
 @pytest.mark.parametrize(
