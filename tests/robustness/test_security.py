@@ -19,7 +19,7 @@ FORBIDDEN_NAMES = {"eval", "exec", "compile", "__import__"}
 FORBIDDEN_MODULES = {"marshal", "shelve", "dill", "cloudpickle", "joblib", "yaml"}
 
 TASKS = {"cluster.py": {"dumps", "loads"}}
-"""Workers unpickle what the command that leads them sends, and nothing that was read from a file."""
+"""Workers unpickle what the command that leads them sends, and nothing that a file holds."""
 
 
 def dotted(node: ast.expr) -> str:
