@@ -75,6 +75,7 @@ ARRAYS_ONLY = {"conventions", "errors"}
 
 HOMES = {
     "cv2": {
+        "matching.retrieval",
         "imaging",
         "depth",
         "features.affnet",

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,12 +36,12 @@ def build_vocabulary(
         (K, D) words, ``NUM_WORDS`` or as many as there are samples.
     """
     words = random.permutation(samples)[:NUM_WORDS]
-    for _ in range(NUM_ITERATIONS if len(samples) > len(words) else 0):
-        nearest = nearest_words(samples, words)
-        counts = np.bincount(nearest, minlength=len(words))[:, None]
-        means = _sums(samples, nearest, len(words)) / np.maximum(counts, 1).astype(np.float32)
-        words = np.where(counts, means, words)
-    return words
+    if len(samples) <= len(words):
+        return words
+    labels = nearest_words(samples, words).astype(np.int32)
+    ends = (cv2.TERM_CRITERIA_MAX_ITER, NUM_ITERATIONS, 0.0)
+    found = cv2.kmeans(samples, len(words), labels, ends, 1, cv2.KMEANS_USE_INITIAL_LABELS)
+    return np.asarray(found[2], dtype=np.float32)
 
 
 def nearest_words(
