@@ -81,8 +81,8 @@ class ExtractImage:
 def moved(path: Path, root: Path) -> Path:
     """Return where a file would be if ``root`` were the root of the file system.
 
-    >>> moved(Path("/photos/a.jpg"), Path("/tmp/x")).as_posix()
-    '/tmp/x/photos/a.jpg'
+    >>> moved(Path("/photos/a.jpg"), Path("/sent")).as_posix()
+    '/sent/photos/a.jpg'
     """
     absolute = path.absolute()
     return root / absolute.relative_to(absolute.anchor)

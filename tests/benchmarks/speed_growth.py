@@ -86,7 +86,7 @@ def pixel_growth(
 def _extraction(method: Method) -> Callable[[GrayImage], object]:
     if method.is_sift:
         sift = pycolmap.Sift(sift_options(method.name), pycolmap.Device.cpu)
-        return lambda image: sift.extract(image)  # noqa: PLW0108 - it has two overloads
+        return sift.extract
     extractor = method.extractor()
 
     def extract(image: GrayImage) -> LocalFeatures:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,9 +92,14 @@ def test_work_of_a_warp() -> None:
 def test_work_of_a_cover() -> None:
     metrics = metrics_from_tilts([1.0, 3.0, 3.0, 9.0], [0.0, 0.5, 0.5, 0.0])
     weights = np.ones(4)
-    options = {"radius": 1.7, "max_tilt": 5.8, "covered_frac": 1.0, "max_num_centers": 5}
-    cover = cover_shapes(metrics, weights, **options)  # type: ignore[arg-type]
-    work = cover_work(cover, metrics, weights, **options)  # type: ignore[arg-type]
+    options: dict[str, Any] = {
+        "radius": 1.7,
+        "max_tilt": 5.8,
+        "covered_frac": 1.0,
+        "max_num_centers": 5,
+    }
+    cover = cover_shapes(metrics, weights, **options)
+    work = cover_work(cover, metrics, weights, **options)
     assert len(cover.centers) == 1
     assert work.multiply_adds == 2 * 192 * (3 + 1) + 4 * 3 * 2
 
@@ -104,7 +110,8 @@ def test_work_of_matching() -> None:
 
 @pytest.mark.slow  # loads torch
 def test_work_of_a_network() -> None:
-    nn = pytest.importorskip("torch").nn
+    from torch import nn
+
     network = nn.Sequential(
         nn.Conv2d(1, 4, 3, padding=1), nn.MaxPool2d(2, 2), nn.Conv2d(4, 6, 3, padding=1, stride=2)
     )
