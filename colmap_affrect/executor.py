@@ -92,6 +92,15 @@ def available_memory_bytes() -> int:
     return available
 
 
+def is_device_memory_full(error: RuntimeError) -> bool:
+    """Tell whether torch failed for want of memory on a GPU.
+
+    >>> is_device_memory_full(RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB."))
+    True
+    """
+    return "out of memory" in str(error)
+
+
 def peak_memory_bytes() -> int:
     """Return the most memory that this process has had.
 

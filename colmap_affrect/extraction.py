@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from colmap_affrect.conventions import camera_matrix, resized_from_original
 from colmap_affrect.depth import depth_source
 from colmap_affrect.errors import DepthError, ImageError, OptionError, WeightsError
+from colmap_affrect.executor import is_device_memory_full
 from colmap_affrect.features.registry import (
     make_profile,
     make_shape_source,
@@ -42,6 +44,8 @@ from colmap_affrect.types import (
 MIN_RECTIFIABLE_PX = 32
 """Images with a shorter side are not rectified: no block would see its surroundings."""
 
+MEMORY_IS_FULL = "extracted on the CPU, the memory of the GPU is full"
+
 
 @dataclass(frozen=True)
 class Resources:
@@ -65,7 +69,8 @@ class ExtractedImage:
     Attributes:
         features: frames in px of the stored image.
         image_size: (width, height) of the stored image in px.
-        warning: why it was not rectified though it was to be; empty if all went well.
+        warning: why it was not rectified though it was to be, or not on the GPU; empty if all
+            went well.
     """
 
     features: LocalFeatures
@@ -124,10 +129,7 @@ class ImageExtractor:
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask)
         with self.turn:
-            plan, warning = self.plan_or_warn(photograph, level)
-            features = self.execute(
-                photograph.gray, plan, with_original=level == 0, mask=photograph.mask
-            )
+            features, warning = self._features_or_on_cpu(photograph, level)
         if photograph.size != original_size:
             original_from_resized = np.linalg.inv(
                 resized_from_original(original_size, photograph.size)
@@ -137,6 +139,27 @@ class ImageExtractor:
         if mask is not None:
             keep &= in_mask(mask, features.keypoints)
         return ExtractedImage(features.select(keep), original_size, warning)
+
+    def _features_or_on_cpu(self, photograph: Photograph, level: int) -> tuple[LocalFeatures, str]:
+        """Plan and execute, on the CPU if the memory of a GPU is full; also say what went wrong."""
+        try:
+            return self._features(photograph, level)
+        except RuntimeError as error:
+            if not is_device_memory_full(error):
+                raise
+        features, warning = self._on_cpu._features(photograph, level)
+        return features, "; ".join(filter(None, (MEMORY_IS_FULL, warning)))
+
+    def _features(self, photograph: Photograph, level: int) -> tuple[LocalFeatures, str]:
+        plan, warning = self.plan_or_warn(photograph, level)
+        features = self.execute(
+            photograph.gray, plan, with_original=level == 0, mask=photograph.mask
+        )
+        return features, warning
+
+    @cached_property
+    def _on_cpu(self) -> ImageExtractor:
+        return prepare(self.options, replace(self.resources, device="cpu"))
 
     def photograph(
         self,

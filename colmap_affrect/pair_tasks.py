@@ -6,23 +6,36 @@ travel with each pair.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Generator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.executor import Executor, Threads, available_cores
+from colmap_affrect.executor import Executor, Threads, available_cores, is_device_memory_full
 from colmap_affrect.matching.coarse import coarse_descriptors
-from colmap_affrect.matching.nearest import MatchableImage, match_features, matchable
-from colmap_affrect.matching.pairs import Pair
+from colmap_affrect.matching.nearest import (
+    MatchableImage,
+    PutativeMatches,
+    match_features,
+    matchable,
+)
+from colmap_affrect.matching.pairs import Pair, ordered_for_reuse
 from colmap_affrect.options import MatchingOptions
 from colmap_affrect.store import FeatureStore, PairMatches
 
+logger = logging.getLogger(__name__)
+
 MATCHING_CACHE_BYTES = 1 << 30
+BYTES_PER_FEATURE = 800
+"""Of a feature ready for matching: measured 700 to 800 for descriptors of 128."""
+
+Found = TypeVar("Found")
 
 
 def iterate_matches(
@@ -33,7 +46,9 @@ def iterate_matches(
     device: str = "auto",
     executor: Executor | None = None,
 ) -> Generator[PairMatches, None, None]:
-    """Match pairs by the features of the images themselves and those of one level, in order.
+    """Match pairs by the features of the images themselves and those of one level.
+
+    They come in an order in which images that are read stay in memory for most of their pairs.
 
     Args:
         pairs: names of images.
@@ -49,12 +64,13 @@ def iterate_matches(
     store = FeatureStore(features.path.absolute(), features.options_digest)
     counts = store.num_keypoints()
     num_similarities = sum(counts[first] * counts[second] for first, second in pairs)
+    num_kept = MATCHING_CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
     cache = MatchableCache(store, options, level, None, num_similarities, device)
     files = [store.path]
     is_shared = executor.sees(files)
     tasks = (
         PairTask(pair, None if is_shared else (cache.stored(pair[0]), cache.stored(pair[1])))
-        for pair in pairs
+        for pair in ordered_for_reuse(pairs, max(1, num_kept // 2))
     )
     yield from executor.map(MatchPair(cache), tasks, files if is_shared else ())
 
@@ -98,7 +114,7 @@ class MatchPair:
         else:
             images = [self.cache[name] for name in task.names]
         (first, indices1), (second, indices2) = images
-        found = match_features(first, second, self.cache.options)
+        found = self.cache.match(first, second)
         rows, columns = found.indices.T
         indices = np.stack([indices1[rows], indices2[columns]], axis=1)
         count = int(indices1.max(initial=-1)) + 1
@@ -142,6 +158,7 @@ class MatchableCache:
         self._store, self._max_num_features = store, max_num_features
         self._images: OrderedDict[str, tuple[MatchableImage, NDArray[np.int64]]] = OrderedDict()
         self._lock = threading.Lock()
+        self._unsaid = threading.Lock()
 
     def __reduce__(self) -> tuple[type[MatchableCache], tuple[Any, ...]]:
         return MatchableCache, (
@@ -165,8 +182,31 @@ class MatchableCache:
 
     def prepared(self, stored: StoredFeatures) -> tuple[MatchableImage, NDArray[np.int64]]:
         """Make features ready for matching; they are not kept."""
-        image = matchable(stored.descriptors, stored.keypoints, self.options, self._make_coarse)
-        return image, stored.indices
+        with_gpu, without = (
+            partial(matchable, stored.descriptors, stored.keypoints, self.options, make_coarse)
+            for make_coarse in (self._make_coarse, None)
+        )
+        return self._without_gpu_if_full(with_gpu, without), stored.indices
+
+    def match(self, image1: MatchableImage, image2: MatchableImage) -> PutativeMatches:
+        """Match two images; without the GPU, with the same result, if its memory is full."""
+        exact1, exact2 = (replace(image, coarse=None) for image in (image1, image2))
+        return self._without_gpu_if_full(
+            partial(match_features, image1, image2, self.options),
+            partial(match_features, exact1, exact2, self.options),
+        )
+
+    def _without_gpu_if_full(
+        self, with_gpu: Callable[[], Found], without: Callable[[], Found]
+    ) -> Found:
+        try:
+            return with_gpu()
+        except RuntimeError as error:
+            if not is_device_memory_full(error):
+                raise
+        if self._unsaid.acquire(blocking=False):  # never released: said once
+            logger.warning("the memory of the GPU is full; the CPU matches the rest")
+        return without()
 
     def __getitem__(self, name: str) -> tuple[MatchableImage, NDArray[np.int64]]:
         with self._lock:
@@ -178,4 +218,4 @@ class MatchableCache:
             return self._images[name]
 
     def _num_bytes(self) -> int:
-        return sum(image.descriptors.nbytes for image, _ in self._images.values())
+        return sum(image.num_bytes for image, _ in self._images.values())

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from colmap_affrect import stages
 from colmap_affrect.colmap.database import image_ids, open_database, read_camera_matrix
@@ -119,6 +121,32 @@ def test_depth_is_asked_for_before_any_image_is_read(tmp_path):
         with workspace.locked(), pytest.raises(error, match=re.escape(message)):
             stages.extract(workspace, photos, recipe, COURTYARD_CAMERA)
         assert not workspace.features.exists()
+
+
+class FailingProfile:
+    """A feature profile whose device fails."""
+
+    def __init__(self, message):
+        self._message = message
+
+    def detect(self, _):
+        raise RuntimeError(self._message)
+
+
+def test_features_of_a_gpu_without_memory_are_those_of_the_cpu():
+    photo = COURTYARD / "images" / "court_4.jpg"
+    extractor = prepare(load_recipe("default", ["max_image_size_px=200"]).extraction)
+    full = FailingProfile("CUDA out of memory. Tried to allocate 2.00 GiB.")
+    found = replace(extractor, profile=full).extract_file(photo)
+    assert found.warning == "extracted on the CPU, the memory of the GPU is full"
+    assert_array_equal(found.features.lafs, extractor.extract_file(photo).features.lafs)
+
+
+def test_other_failures_of_a_gpu_are_not_passed_over():
+    extractor = prepare(load_recipe("default", ["max_image_size_px=200"]).extraction)
+    broken = replace(extractor, profile=FailingProfile("CUDA error: device-side assert triggered"))
+    with pytest.raises(RuntimeError, match="device-side assert"):
+        broken.extract_file(COURTYARD / "images" / "court_4.jpg")
 
 
 def test_device_that_is_not_there_is_one_clear_line(monkeypatch):

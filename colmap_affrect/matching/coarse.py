@@ -57,6 +57,10 @@ class ShortList:
 class CoarseDescriptors(Protocol):
     """Descriptors of one image in few bits."""
 
+    @property
+    def num_bytes(self) -> int:
+        """Memory they take."""
+
     def short_list(
         self,
         rows: NDArray[np.int64],
@@ -114,6 +118,11 @@ class EightBitDescriptors:
         step = max(float(np.abs(descriptors).max(initial=0.0)), 1e-6) / MAX_CODE
         return cls(np.rint(descriptors / step).astype(np.int8), step)
 
+    @property
+    def num_bytes(self) -> int:
+        """See :class:`CoarseDescriptors`."""
+        return self.codes.nbytes
+
     def short_list(
         self,
         rows: NDArray[np.int64],
@@ -167,6 +176,11 @@ class HalfDescriptors:
         import torch
 
         return cls(torch.from_numpy(descriptors).to(device, torch.float16))
+
+    @property
+    def num_bytes(self) -> int:
+        """See :class:`CoarseDescriptors`."""
+        return int(self.values.nbytes)
 
     def short_list(
         self,

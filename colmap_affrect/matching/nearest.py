@@ -47,6 +47,12 @@ class MatchableImage:
     rivals: NeighborLists
     coarse: CoarseDescriptors | None = None
 
+    @property
+    def num_bytes(self) -> int:
+        """Memory of all arrays, on whatever device."""
+        kept = (self.descriptors, self.keypoints, self.rivals.starts, self.rivals.indices)
+        return sum(array.nbytes for array in kept) + (self.coarse.num_bytes if self.coarse else 0)
+
 
 @dataclass(frozen=True)
 class PutativeMatches:

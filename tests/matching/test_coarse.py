@@ -125,6 +125,14 @@ def test_few_features(kind: MakeCoarse, counts: tuple[int, int]) -> None:
     np.testing.assert_array_equal(found.indices, exact.indices)
 
 
+def test_memory_of_all_arrays_is_counted(kind: MakeCoarse) -> None:
+    rows, places = np.eye(128, dtype=np.float32)[:5], 100.0 * np.arange(10).reshape(5, 2)
+    exact = matchable(rows, places, MatchingOptions())
+    assert exact.num_bytes == 5 * 128 * 4 + 5 * 2 * 8 + 6 * 8 + 5 * 8
+    coarse_bytes = matchable(rows, places, MatchingOptions(), kind).num_bytes - exact.num_bytes
+    assert coarse_bytes in (5 * 128, 5 * 128 * 2)
+
+
 def test_coarse_descriptors_are_made_where_they_pay(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse() -> bool:
         raise AssertionError("asked")

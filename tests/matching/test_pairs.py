@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from colmap_affrect.matching.pairs import (
     Pair,
     exhaustive_pairs,
     most_similar_pairs,
+    ordered_for_reuse,
     read_pairs,
     sequence_pairs,
     write_pairs,
@@ -46,6 +49,40 @@ def test_sequence_pairs_follow_the_numbers_in_names() -> None:
         [*sequence_pairs(names, 1), ("a/10.png", "a/8.png"), ("a/9.png", "b/1.png")]
     )
     assert sequence_pairs(names, 9) == exhaustive_pairs(names)
+
+
+def num_read(pairs: Sequence[Pair], num_kept: int) -> int:
+    """How many images are read when the most recently used ones are kept."""
+    kept: list[str] = []
+    count = 0
+    for name in itertools.chain.from_iterable(pairs):
+        count += name not in kept
+        kept = [name, *(other for other in kept if other != name)][:num_kept]
+    return count
+
+
+@pytest.mark.parametrize("num_images", [1, 2, 5, 40])
+def test_ordered_pairs_are_the_same_pairs(num_images: int) -> None:
+    pairs = [("a", "b"), ("c", "d"), ("b", "c"), ("x", "y"), ("a", "y")]
+    assert sorted(ordered_for_reuse(pairs, num_images)) == sorted(pairs)
+    assert ordered_for_reuse([], num_images) == []
+
+
+def test_few_images_are_read_again_for_all_pairs() -> None:
+    pairs = exhaustive_pairs([f"{index:02d}" for index in range(40)])
+    ordered = ordered_for_reuse(pairs, 5)
+    assert num_read(ordered, 10) <= 8 * 9 // 2 * 10 < num_read(pairs, 10) // 2
+    assert ordered_for_reuse(pairs, 40) == pairs
+
+
+def test_few_images_are_read_again_for_near_ones_whose_names_are_in_disorder() -> None:
+    places = np.random.default_rng(0).permutation(200)
+    pairs = sorted(
+        (f"{min(i, j):03d}", f"{max(i, j):03d}")
+        for i, j in itertools.combinations(range(200), 2)
+        if abs(places[i] - places[j]) <= 3
+    )
+    assert num_read(ordered_for_reuse(pairs, 10), 20) < 230 < 600 < num_read(pairs, 20)
 
 
 def crowd_and_few() -> tuple[list[str], np.ndarray]:
