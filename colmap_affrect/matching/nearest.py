@@ -136,7 +136,7 @@ def _nearest_of_listed(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.bool_]]:
     """Return nearest and ratio among the features listed for each row, and where that is doubtful.
 
-    It is where the second neighbour by coarse similarities is a rival of the nearest by exact
+    Also where the second neighbour by coarse similarities is a rival of the nearest by exact
     ones: what takes its place may not be listed.
     """
     similarity = np.empty(len(short.entry_rows), np.float32)
@@ -155,7 +155,7 @@ def _nearest_of_listed(
     without_rivals = similarity.copy()
     without_rivals[_places(short, rows, rivals, len(image.descriptors))] = -1.0
     second = np.maximum.reduceat(without_rivals, starts)
-    doubtful = np.zeros(len(nearest), dtype=bool)
+    doubtful = short.doubtful.copy()
     doubtful[rows[rivals == short.runners_up[rows]]] = True
     return nearest, _ratios(first, second), doubtful
 
