@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -132,10 +133,17 @@ def module_name(path: Path) -> str:
 MODULES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
 
 
+@cache
+def nodes(path: Path) -> list[ast.AST]:
+    """All nodes of the syntax tree of a file."""
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+@cache
 def imports(path: Path) -> set[str]:
     """Full names of all modules that a file imports, inside functions too."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             found |= {item.name for item in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -203,7 +211,7 @@ def test_pycolmap_is_imported_at_one_site() -> None:
     sites = [
         module
         for module, path in MODULES.items()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in nodes(path)
         if isinstance(node, ast.Import) and any(item.name == "pycolmap" for item in node.names)
     ]
     assert sites == ["colmap"]
@@ -218,7 +226,7 @@ def test_half_pixels_are_added_in_conventions_only() -> None:
             isinstance(node, ast.BinOp)
             and isinstance(node.op, ast.Add | ast.Sub)
             and any(isinstance(s, ast.Constant) and s.value == 0.5 for s in (node.left, node.right))
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            for node in nodes(path)
         )
     }
     assert users <= {"conventions"}
@@ -226,9 +234,9 @@ def test_half_pixels_are_added_in_conventions_only() -> None:
 
 def test_library_neither_prints_nor_exits_outside_the_command_line() -> None:
     for module in set(MODULES) - {"cli", "cli.commands", "progress", "__main__"}:
-        tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
-        names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
-        attributes = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+        tree = nodes(MODULES[module])
+        names = {node.id for node in tree if isinstance(node, ast.Name)}
+        attributes = {node.attr for node in tree if isinstance(node, ast.Attribute)}
         assert not {"print", "SystemExit"} & names, module
         assert not {"exit", "_exit", "basicConfig"} & attributes, module
 

@@ -57,6 +57,7 @@ def write_mask(path: Path, mask: Mask, white: int = 255) -> None:
     write_image(path, mask.astype(np.uint8) * np.uint8(white))
 
 
+@pytest.mark.long
 def test_features_of_the_image_and_of_all_warps_keep_to_the_mask(photo_path: Path) -> None:
     mask = diagonal_mask()
     extractor = prepare(OPTIONS)

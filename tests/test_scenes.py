@@ -29,7 +29,7 @@ def courtyard(tmp_path_factory):
     return report, read_poses(output / "sparse" / "0")
 
 
-@pytest.mark.scene
+@pytest.mark.long
 def test_courtyard_registers_every_photograph_where_it_stands(courtyard):
     _, poses = courtyard
     truth = read_poses(SCENES / "courtyard" / "ground_truth")
@@ -40,7 +40,7 @@ def test_courtyard_registers_every_photograph_where_it_stands(courtyard):
     assert 1e-4 < scores.median_rotation_error_deg < 0.3
 
 
-@pytest.mark.scene
+@pytest.mark.long
 def test_courtyard_report_is_within_bands(courtyard):
     report, _ = courtyard
     values = report.to_mapping()

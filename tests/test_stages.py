@@ -223,6 +223,7 @@ def test_image_whose_features_are_lost_gets_the_same_again(
     assert without_times(report.to_mapping()) == without_times(first.to_mapping())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("line", ["extract: 2/4 images", "match: 3/6 pairs", "verify: 6/6 pairs"])
 def test_run_killed_anywhere_completes_with_the_same_result(
     finished: tuple[Workspace, ReconstructionReport], photos: Path, tmp_path: Path, line: str

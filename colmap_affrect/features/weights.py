@@ -231,10 +231,14 @@ UNREADABLE = (
 
 
 def cache_folder() -> Path:
-    """Return the folder where torch keeps downloaded weights."""
-    import torch
+    """Return the folder where torch keeps downloaded weights, without loading torch for that.
 
-    return Path(torch.hub.get_dir()) / "checkpoints"
+    As ``torch.hub.get_dir`` says, but for a folder set within the process.
+    """
+    home = os.environ.get("TORCH_HOME")
+    if home is None:
+        home = str(Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch")
+    return Path(home).expanduser() / "hub" / "checkpoints"
 
 
 def download_urls(key: str) -> tuple[str, ...]:

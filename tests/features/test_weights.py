@@ -269,6 +269,18 @@ def test_import_loads_neither_torch_nor_kornia() -> None:
     assert output == "[]\n"
 
 
+@pytest.mark.parametrize(
+    "variables",
+    [{}, {"TORCH_HOME": "~/here"}, {"XDG_CACHE_HOME": "/tmp/there"}, {"TORCH_HOME": "/tmp/a"}],
+)
+def test_cache_is_that_of_torch(variables: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("TORCH_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert cache_folder() == Path(torch.hub.get_dir()) / "checkpoints"
+
+
 # Reading.
 
 

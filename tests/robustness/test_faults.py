@@ -25,6 +25,8 @@ from colmap_affrect.files import FileTransaction
 from colmap_affrect.store import FeatureStore, MatchStore
 from colmap_affrect.workspace import Workspace
 
+pytestmark = pytest.mark.long
+
 
 @contextmanager
 def file_size_limit(num_bytes: int) -> Iterator[None]:

@@ -101,6 +101,7 @@ def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
     return run_undisturbed(COURTYARD, out, COURTYARD_OPTIONS)
 
 
+@pytest.mark.long
 def test_run_ended_again_and_again_has_the_results_of_an_undisturbed_one(
     small_photos: Path, tmp_path: Path, undisturbed: Undisturbed
 ) -> None:

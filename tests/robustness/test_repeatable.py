@@ -28,6 +28,7 @@ def run_on_cores(cores: set[int], photos: Path, out: Path) -> dict[str, object]:
     return results(out)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(available_cores() < 2, reason="needs two cores")
 def test_results_do_not_depend_on_the_run_nor_on_the_number_of_cores(
     small_photos: Path, tmp_path: Path

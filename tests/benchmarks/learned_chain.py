@@ -1,0 +1,146 @@
+"""Learned features beside kornia's own modules for them, on the same frames. Usage:
+
+    python tests/benchmarks/learned_chain.py --image-path PHOTOS --weights WEIGHTS
+
+Extracts each image by the recipe ``dense-affnet`` and by the same recipe whose features are
+described by kornia's ``LAFAffNetShapeEstimator``, ``LAFOrienter`` and ``LAFDescriptor``, view by
+view, as the code of the paper does. Prints the seconds of describing and of everything, medians of
+rounds, their ratios, and the largest difference of a descriptor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+from kornia import feature
+from machine import describe_machine
+
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.extraction import ImageExtractor, Resources, prepare
+from colmap_affrect.features.affnet_hardnet import AffNetHardNet
+from colmap_affrect.features.networks import DESCRIPTOR_NETWORKS
+from colmap_affrect.features.weights import load_state_dict
+from colmap_affrect.photographs import list_images
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.types import GrayImage, LocalFeatures, View
+
+
+class Stopwatch:
+    """A feature profile whose description is timed."""
+
+    def __init__(self, profile: Any) -> None:
+        """Take the profile."""
+        self.profile, self.descriptor_size = profile, profile.descriptor_size
+        self.seconds = 0.0
+
+    def detect(self, view: View) -> LocalFeatures:
+        """Detect."""
+        found: LocalFeatures = self.profile.detect(view)
+        return found
+
+    def describe(
+        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
+    ) -> list[LocalFeatures]:
+        """Describe, and remember how long that took."""
+        start = time.perf_counter()
+        described: list[LocalFeatures] = self.profile.describe(images, detected)
+        self.seconds = time.perf_counter() - start
+        return described
+
+
+class KorniaChain:
+    """The networks as kornia has them; detection as here."""
+
+    def __init__(self, ours: AffNetHardNet, extractor: ImageExtractor) -> None:
+        """Load the weights that the extractor has found."""
+        self.ours, self.descriptor_size = ours, ours.descriptor_size
+        weights = extractor.weights
+        affnet = feature.LAFAffNetShapeEstimator(pretrained=False, preserve_orientation=False)
+        orinet = feature.OriNet(pretrained=False)
+        network = DESCRIPTOR_NETWORKS[ours.options.descriptor]()
+        for part, key in (
+            (affnet, "affnet"),
+            (orinet, "orinet"),
+            (network, ours.options.descriptor),
+        ):
+            part.load_state_dict(load_state_dict(weights[key]), strict=False)
+            part.eval()
+        self.shape, self.orientation = affnet, feature.LAFOrienter(32, angle_detector=orinet)
+        self.descriptor = feature.LAFDescriptor(network, 32, grayscale_descriptor=True)
+
+    def detect(self, view: View) -> LocalFeatures:
+        """Detect."""
+        return self.ours.detect(view)
+
+    @torch.inference_mode()
+    def describe(
+        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
+    ) -> list[LocalFeatures]:
+        """Describe view by view; frames stay those detected."""
+        widening = self.ours.options.patch_sigmas / MEASUREMENT_SIGMAS
+        described = []
+        for image, found in zip(images, detected, strict=True):
+            if not len(found):
+                described.append(LocalFeatures.empty(self.descriptor_size))
+                continue
+            pixels = torch.from_numpy(image.astype(np.float32) / 255)[None, None]
+            lafs = torch.from_numpy(found.lafs.astype(np.float32))[None]
+            lafs[..., :2] *= widening
+            turned = self.orientation(self.shape(lafs, pixels), pixels)
+            rows = torch.nn.functional.normalize(self.descriptor(pixels, turned)[0], dim=1)
+            described.append(replace(found, descriptors=rows.numpy()))
+        return described
+
+
+def main() -> None:
+    """Print medians and ratios."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--image-path", type=Path, required=True)
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--descriptor", default="hardtfeat")
+    parser.add_argument("--max-num-images", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=3)
+    arguments = parser.parse_args()
+    recipe = load_recipe("dense-affnet", [f"features.descriptor={arguments.descriptor}"])
+    extractor = prepare(recipe.extraction, Resources(arguments.weights, "cpu"))
+    if not isinstance(extractor.profile, AffNetHardNet):
+        raise SystemExit("dense-affnet has other features")
+    ours, kornia = (
+        Stopwatch(extractor.profile),
+        Stopwatch(KorniaChain(extractor.profile, extractor)),
+    )
+    ways = [replace(extractor, profile=profile) for profile in (ours, kornia)]
+    names = list_images(arguments.image_path)[: arguments.max_num_images]
+    print(describe_machine())
+    for name in names:
+        whole: list[list[float]] = []
+        described: list[list[float]] = []
+        for _ in range(arguments.rounds):
+            rows, seconds = [], []
+            for way in ways:
+                start = time.perf_counter()
+                rows.append(way.extract_file(arguments.image_path / name).features.descriptors)
+                seconds.append(time.perf_counter() - start)
+            whole.append(seconds)
+            described.append([ours.seconds, kornia.seconds])
+        difference = np.abs(rows[0] - rows[1]).max() if rows[0].shape == rows[1].shape else np.nan
+        print(f"{name}: {len(rows[0])} features, descriptors differ by {difference:.1e} at most")
+        for what, pairs in (("describing", described), ("everything", whole)):
+            first, second = (median(column) for column in zip(*pairs, strict=True))
+            ratios = sorted(kornia_s / ours_s for ours_s, kornia_s in pairs)
+            print(
+                f"{what}: ours {first:.1f} s, kornia {second:.1f} s, kornia takes "
+                f"{median(ratios):.2f} [{ratios[0]:.2f}-{ratios[-1]:.2f}] times as long"
+            )
+
+
+if __name__ == "__main__":
+    main()
