@@ -23,8 +23,8 @@ ROWS = [
     {"types", "interfaces", "outcomes", "options", "executor", "recipes"},
     {
         "features.affnet", "features.affnet_hardnet", "features.dog", "features.networks",
-        "features.registry", "features.rootsift", "features.second_moment", "features.weights",
-        "imaging", "depth", "cluster",
+        "features.patches", "features.registry", "features.rootsift", "features.second_moment",
+        "features.weights", "imaging", "depth", "cluster",
     },
     {
         "rectifiers.covers", "rectifiers.dense_shapes", "rectifiers.depth_affnet",
@@ -97,12 +97,14 @@ HOMES = {
         "features.affnet",
         "features.affnet_hardnet",
         "features.networks",
+        "features.patches",
         "features.weights",
     },
     "kornia": {
         "features.affnet",
         "features.affnet_hardnet",
         "features.networks",
+        "features.patches",
         "features.weights",
     },
     "transformers": {"depth"},

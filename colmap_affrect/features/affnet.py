@@ -17,13 +17,14 @@ from math import ceil
 import cv2
 import numpy as np
 import torch
-from kornia.feature import LAFAffNetShapeEstimator, extract_patches_from_pyramid
+from kornia.feature import LAFAffNetShapeEstimator
 from numpy.typing import NDArray
 from torch import nn
 from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, grid_origin, resized_from_original
-from colmap_affrect.features.networks import folded, standardized
+from colmap_affrect.features.networks import PATCH_SIZE_PX, folded, standardized
+from colmap_affrect.features.patches import PatchSampler
 from colmap_affrect.geometry.shapes import (
     STEP_PX,
     log_metrics,
@@ -33,9 +34,6 @@ from colmap_affrect.geometry.shapes import (
 from colmap_affrect.imaging import shrink_to
 from colmap_affrect.options import AffNetOptions
 from colmap_affrect.types import GrayImage, LocalFeatures, Mask, ShapeGrid, ShapeSamples
-
-PATCH_SIZE_PX = 32
-"""Side of the patches that the network was trained on: 8 cells of its output."""
 
 LEAD_PX = (PATCH_SIZE_PX - STEP_PX) // 2
 """Cell (0, 0) of the network has the patch of the rows and columns 0...31. With 14 px more in
@@ -65,8 +63,8 @@ MAX_NORMALISED = 6.0
 PATCH_SIGMAS = 12.0
 """Half width of the patch of a keypoint in units of its sigma (kornia-moons, the paper)."""
 
-BATCH_SIZE = 512
-"""Patches that go through the network at once."""
+BATCH_SIZE = 128
+"""Patches that go through the network at once; 0.75 of the time of 512 on a CPU."""
 
 
 class AffNet:
@@ -173,13 +171,10 @@ class AffNet:
     @torch.inference_mode()
     def _patch_outputs(self, image: GrayImage, lafs: NDArray[np.float64]) -> torch.Tensor:
         """Return the (N, 3) outputs of the network on the patches of (N, 2, 3) frames."""
-        wide = lafs.astype(np.float32)
+        wide = lafs.copy()
         wide[:, :, :2] *= PATCH_SIGMAS / MEASUREMENT_SIGMAS
-        patches = extract_patches_from_pyramid(
-            torch.from_numpy(image).to(self.device, torch.float32)[None, None],
-            torch.from_numpy(wide).to(self.device)[None],
-            PATCH_SIZE_PX,
-        )[0]
+        pixels = torch.from_numpy(image).to(self.device, torch.float32)
+        patches = PatchSampler(pixels[None, None]).sample(wide)
         outputs = torch.empty((len(patches), 3))
         for begin in range(0, len(patches), BATCH_SIZE):
             batch = standardized(patches[begin : begin + BATCH_SIZE])

@@ -4,11 +4,9 @@ The chain of the paper (Sec. 3): an upright patch round each keypoint gives its 
 patch of that shape its orientation, the patch of both its descriptor. AffNet here drops the
 orientation it is given and keeps the area.
 
-Patches are sampled by kornia from a pyramid whose level has steps of 1 to 2 px. Measured with
-images whose pixels hold their own coordinates: kornia 0.9.0 samples at c + A u, u = (2 k + 1) / 32
-- 1, exactly (error under 0.001 px on three levels; earlier versions were half a level's pixel
-off). Coarser levels, or levels for the longer axis of the frame, change the number of right
-matches by less than 6 %, up or down (Graffiti 1-3 and 1-5, Wall 1-3).
+Patches are sampled from a pyramid whose level has steps of 1 to 2 px. Coarser levels, or levels for
+the longer axis of the frame, change the number of right matches by less than 6 %, up or down
+(Graffiti 1-3 and 1-5, Wall 1-3).
 """
 
 from __future__ import annotations
@@ -19,11 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from kornia.feature import (
-    MultiResolutionDetector,
-    ScaleSpaceDetector,
-    extract_patches_from_pyramid,
-)
+from kornia.feature import MultiResolutionDetector, ScaleSpaceDetector
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import pad
@@ -32,7 +26,6 @@ from colmap_affrect.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS
 from colmap_affrect.features.dog import detect_dog, is_searchable
 from colmap_affrect.features.networks import (
     DESCRIPTOR_SIZE,
-    PATCH_SIZE_PX,
     AffineShapes,
     load_affnet,
     load_descriptor,
@@ -40,6 +33,7 @@ from colmap_affrect.features.networks import (
     load_orinet,
     resolve_device,
 )
+from colmap_affrect.features.patches import PatchSampler
 from colmap_affrect.geometry.affine import lafs_from_keypoints, rotation
 from colmap_affrect.options import AffNetHardNetOptions
 from colmap_affrect.types import GrayImage, LocalFeatures, View, in_mask, union
@@ -195,20 +189,13 @@ class _Patches:
     ) -> None:
         """Take the images, and how many features each has."""
         pairs = [pair for pair in zip(images, counts, strict=True) if pair[1]]
-        self.images = [_tensor(image, device) for image, _ in pairs]
+        self.samplers = [PatchSampler(_tensor(image, device)) for image, _ in pairs]
         self.ends = np.cumsum([count for _, count in pairs])
-        self.device = device
 
     def sample(self, lafs: NDArray[np.float64]) -> Tensor:
         """Return (N, 1, 32, 32) float32 patches of the (N, 2, 3) frames of all images in turn."""
-        parts = np.split(lafs.astype(np.float32), self.ends[:-1])
-        frames = [torch.from_numpy(part).to(self.device)[None] for part in parts]
-        return torch.cat(
-            [
-                extract_patches_from_pyramid(image, part, PATCH_SIZE_PX)[0]
-                for image, part in zip(self.images, frames, strict=True)
-            ]
-        )
+        parts = np.split(lafs, self.ends[:-1])
+        return torch.cat([s.sample(part) for s, part in zip(self.samplers, parts, strict=True)])
 
 
 def shapes_from_outputs(outputs: NDArray[np.floating]) -> NDArray[np.float64]:
