@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 
 from colmap_affrect.colmap import database as colmap_database
@@ -40,6 +40,7 @@ from colmap_affrect.stages import (
     verify_new,
     write_images_and_keypoints,
 )
+from colmap_affrect.store import PairMatches
 from colmap_affrect.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -220,21 +221,33 @@ class _Ladder:
         verifier = PairVerifier(self.workspace.database, options, seed)
         num_inliers = self.num_inliers()
         matching = self.workspace.matching_options()
-        for batch in _batches(pairs, PAIRS_PER_WRITE):
-            better = []
-            matches = iterate_matches(
-                batch, self.features, matching, level, self._device, self._executor
-            )
+        tried: list[Pair] = []
+        better: list[PairMatches] = []
+
+        def record() -> None:
+            self.matches.mark_tried(tried, level)
+            self.matches.write(better)
+            tried.clear()
+            better.clear()
+
+        matches = iterate_matches(
+            pairs, self.features, matching, level, self._device, self._executor
+        )
+        try:
             with closing(matches) as found_pairs:
                 for found in found_pairs:
                     names = found.names
                     first, second = (self.features.read_frames(name)[:, :, 2] for name in names)
                     count = verifier.num_inliers(names, (first, second), found.indices)
+                    tried.append(names)
                     if count > num_inliers[names]:
                         better.append(found)
                     advance(1)
-            self.matches.mark_tried(batch, level)
-            self.matches.write(better)
+                    if len(tried) == PAIRS_PER_WRITE:
+                        record()
+        finally:
+            if tried:
+                record()
 
     def _replace_matches(self) -> None:
         """Put those matches into the database that differ from the ones there."""
@@ -245,8 +258,3 @@ class _Ladder:
                 pairs, read_indices(self.matches, pairs), strict=True
             ):
                 colmap_database.replace_matches(database, ids[name1], ids[name2], indices)
-
-
-def _batches(pairs: Sequence[Pair], size: int) -> Iterator[Sequence[Pair]]:
-    for begin in range(0, len(pairs), size):
-        yield pairs[begin : begin + size]

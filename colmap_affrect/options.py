@@ -607,7 +607,8 @@ class MappingOptions(Options):
     abs_pose_min_num_inliers: int = 12
     min_model_size: int = 2
     max_num_attempts: int = 3
-    """While images are missing, map again with another seed and keep the largest model."""
+    """While images are missing, map again with another seed and keep the largest model. With 100
+    images in it nothing is tried again."""
     keep_given_intrinsics: bool = True
     """Leave camera parameters that the user gave as they are; refining them on a few images
     of a sparse set moves them far away (measured: focal lengths of 1437 px to 1256 px)."""

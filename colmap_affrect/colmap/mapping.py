@@ -21,6 +21,9 @@ from colmap_affrect.outcomes import ModelSummary
 ATTEMPT_SEED_STEP = 1_000_003
 """Distance of the seeds of repeated attempts, so that those of runs 0, 1, 2, ... differ."""
 
+LARGE_MODEL = 100
+"""So many images are a model whose first pair no longer matters, and another attempt takes long."""
+
 GLOBAL_TRACK_LENGTHS = (
     "mapper.track_min_num_views_per_track",
     "mapper.global_positioning.min_num_view_per_track",
@@ -145,8 +148,9 @@ def map_database(
     """Map a verified database and write the models to ``sparse_path``/0, /1, ..., largest first.
 
     Which pair incremental mapping begins with is partly chance, and a bad one ends in a small
-    model. So, while images are missing, it is tried again and the attempt with the largest
-    model is kept. ``sparse_path`` appears only once all models are written.
+    model. So, while images are missing and the model is not large, it is tried again and the
+    attempt with the largest model is kept. ``sparse_path`` appears only once all models are
+    written.
 
     Args:
         database_path: database with two-view geometries.
@@ -194,7 +198,7 @@ def map_database(
             )
             shutil.rmtree(raw)
             best = max(best, sorted(models, key=_size, reverse=True), key=_size_of_largest)
-            if _size_of_largest(best)[0] == num_images:
+            if _size_of_largest(best)[0] >= min(num_images, LARGE_MODEL):
                 break
         for index, model in enumerate(best):
             _write(model, partial / str(index))

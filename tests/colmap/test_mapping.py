@@ -291,6 +291,33 @@ def test_mapper_that_fails_is_one_clear_line_and_leaves_nothing(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
 
 
+@pytest.mark.parametrize(
+    ("num_views", "large", "seeds"),
+    [
+        (0, 100, [SEED, SEED + 1_000_003, SEED + 2_000_006]),
+        (3, 100, [SEED, SEED + 1_000_003, SEED + 2_000_006]),
+        (3, 3, [SEED]),
+        (4, 100, [SEED]),
+    ],
+)
+def test_mapping_is_tried_again_while_images_are_missing_in_a_small_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_views: int, large: int, seeds: list[int]
+) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, 4)
+    model = synthesize(tmp_path / "model.db", num_views) if num_views else None
+    given: list[int] = []
+
+    def map_some(*arguments: object, **_: object) -> list[pycolmap.Reconstruction]:
+        given.append(int(str(arguments[4])))
+        return [model] if model else []
+
+    monkeypatch.setattr(mapping, "_map_incrementally_once", map_some)
+    monkeypatch.setattr(mapping, "LARGE_MODEL", large)
+    reconstruct(path, MappingOptions())
+    assert given == seeds
+
+
 def test_global_mapper_that_dies_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "database.db").write_bytes(b"no database" * 100)
     with pytest.raises(MappingError, match=r"^COLMAP's global mapper failed \(exit code -?\d+\)"):
