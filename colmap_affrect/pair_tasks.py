@@ -31,7 +31,8 @@ from colmap_affrect.store import FeatureStore, PairMatches
 
 logger = logging.getLogger(__name__)
 
-MATCHING_CACHE_BYTES = 1 << 30
+MATCHING_CACHE_BYTES = 1 << 29
+"""The process grows by half as much again."""
 BYTES_PER_FEATURE = 800
 """Of a feature ready for matching: measured 700 to 800 for descriptors of 128."""
 

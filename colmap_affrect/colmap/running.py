@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections.abc import Callable
 from typing import TypeVar
@@ -11,13 +12,18 @@ from colmap_affrect.colmap import pycolmap
 Result = TypeVar("Result")
 
 POLL_S = 0.2
+POLLS_PER_WATCH = 10
 
 
-def run_cancellable(call: Callable[[pycolmap.CancellationToken], Result]) -> Result:
+def run_cancellable(
+    call: Callable[[pycolmap.CancellationToken], Result],
+    watch: Callable[[], None] | None = None,
+) -> Result:
     """Run ``call`` in a thread; on Ctrl-C cancel it, wait until it has ended, and re-raise.
 
     Args:
         call: takes the token that pycolmap's call must be given.
+        watch: called every two seconds meanwhile, in the calling thread; an error ends the call.
     """
     token = pycolmap.CancellationToken()
     outcome: list[Result] = []
@@ -36,9 +42,12 @@ def run_cancellable(call: Callable[[pycolmap.CancellationToken], Result]) -> Res
 
     threading.Thread(target=work).start()
     try:
-        while not ended.wait(POLL_S):
-            pass
-    except KeyboardInterrupt:
+        for number in itertools.count(1):
+            if ended.wait(POLL_S):
+                break
+            if watch and number % POLLS_PER_WATCH == 0:
+                watch()
+    except BaseException:
         token.cancel()
         ended.wait()
         raise
