@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -72,9 +72,10 @@ def verify(
 
     def watch() -> None:
         nonlocal shown
-        now = _num_geometries(path)
-        advance(now - shown)
-        shown = now
+        with suppress(sqlite3.OperationalError):  # it is locked just now
+            now = _num_geometries(path)
+            advance(now - shown)
+            shown = now
 
     run_cancellable(
         lambda token: pycolmap.geometric_verification(
