@@ -63,8 +63,7 @@ def verify(
         path: database with raw matches.
         options: of verification.
         random_seed: of RANSAC.
-        advance: called with the number of pairs done since the last call. COLMAP writes a thousand
-            at a time.
+        advance: called with the number of pairs done since the last call.
     """
     todo = num_unverified_pairs(path)
     require_database_space(path, todo)
