@@ -473,19 +473,15 @@ def verify_matches(
     _write_matches(workspace, pairs, features, matches)
     todo = colmap_database.num_unverified_pairs(workspace.database)
     with progress.stage("verify", todo, "pairs") as advance:
-        verify_new(workspace, options, random_seed, advance)
+        verify_new(workspace, options, random_seed)
+        advance(todo)
     return StageReport("verify", time.perf_counter() - start, todo, len(pairs) - todo)
 
 
-def verify_new(
-    workspace: Workspace,
-    options: VerificationOptions,
-    random_seed: int,
-    advance: Callable[[int], None] = lambda _: None,
-) -> None:
+def verify_new(workspace: Workspace, options: VerificationOptions, random_seed: int) -> None:
     """Verify the pairs of the database that have matches and no two-view geometry, good or bad."""
     if colmap_database.num_unverified_pairs(workspace.database):
-        verify(workspace.database, options, random_seed, advance)
+        verify(workspace.database, options, random_seed)
 
 
 def map_images(

@@ -24,7 +24,7 @@ from synthetic import write_image
 
 from colmap_affrect import stages
 from colmap_affrect.cli import main
-from colmap_affrect.colmap import pycolmap, running
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.running import run_cancellable
 from colmap_affrect.errors import DatabaseError, ImageError, StoreError
@@ -685,27 +685,6 @@ def test_interrupt_of_a_pycolmap_call_is_raised_after_the_call_has_ended() -> No
         signal.signal(signal.SIGINT, handler)
     # Else the interpreter would end while pycolmap's thread needs it, and the process abort.
     assert len(ended) == 1
-
-
-def test_error_of_who_watches_a_pycolmap_call_is_raised_after_the_call_has_ended(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(running, "POLL_S", 0.01)
-    monkeypatch.setattr(running, "POLLS_PER_WATCH", 2)
-    ended, watched = [], []
-
-    def call(token: pycolmap.CancellationToken) -> None:
-        time.sleep(0.2)
-        ended.append(token)
-
-    def watch() -> None:
-        watched.append(1)
-        if len(watched) == 3:
-            raise BrokenPipeError
-
-    with pytest.raises(BrokenPipeError):
-        run_cancellable(call, watch)
-    assert (len(ended), len(watched)) == (1, 3)
 
 
 class Terminal(io.StringIO):

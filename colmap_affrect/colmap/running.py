@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
 from collections.abc import Callable
 from typing import TypeVar
@@ -12,18 +11,13 @@ from colmap_affrect.colmap import pycolmap
 Result = TypeVar("Result")
 
 POLL_S = 0.2
-POLLS_PER_WATCH = 10
 
 
-def run_cancellable(
-    call: Callable[[pycolmap.CancellationToken], Result],
-    watch: Callable[[], None] | None = None,
-) -> Result:
+def run_cancellable(call: Callable[[pycolmap.CancellationToken], Result]) -> Result:
     """Run ``call`` in a thread; on Ctrl-C cancel it, wait until it has ended, and re-raise.
 
     Args:
         call: takes the token that pycolmap's call must be given.
-        watch: called every two seconds meanwhile, in the calling thread; an error ends the call.
     """
     token = pycolmap.CancellationToken()
     outcome: list[Result] = []
@@ -42,12 +36,9 @@ def run_cancellable(
 
     threading.Thread(target=work).start()
     try:
-        for number in itertools.count(1):
-            if ended.wait(POLL_S):
-                break
-            if watch and number % POLLS_PER_WATCH == 0:
-                watch()
-    except BaseException:
+        while not ended.wait(POLL_S):
+            pass
+    except KeyboardInterrupt:
         token.cancel()
         ended.wait()
         raise

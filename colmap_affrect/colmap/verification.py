@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
-from collections.abc import Callable
-from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -48,51 +45,20 @@ def verification_differences(options: VerificationOptions, random_seed: int) -> 
     return differences(two_view_options(options, random_seed), pycolmap.TwoViewGeometryOptions())
 
 
-def verify(
-    path: Path,
-    options: VerificationOptions,
-    random_seed: int,
-    advance: Callable[[int], None] = lambda _: None,
-) -> None:
+def verify(path: Path, options: VerificationOptions, random_seed: int) -> None:
     """Estimate the two-view geometry of every matched pair that has none yet.
 
     By ``pycolmap.geometric_verification``, which keeps the raw matches;
     ``pycolmap.verify_matches`` would match again and delete.
-
-    Args:
-        path: database with raw matches.
-        options: of verification.
-        random_seed: of RANSAC.
-        advance: called with the number of pairs done since the last call.
     """
-    todo = num_unverified_pairs(path)
-    require_database_space(path, todo)
-    begin = shown = _num_geometries(path)
-
-    def watch() -> None:
-        nonlocal shown
-        with suppress(sqlite3.OperationalError):  # it is locked just now
-            now = _num_geometries(path)
-            advance(now - shown)
-            shown = now
-
+    require_database_space(path, num_unverified_pairs(path))
     run_cancellable(
         lambda token: pycolmap.geometric_verification(
             path,
             two_view_geometry_options=two_view_options(options, random_seed),
             cancellation_token=token,
-        ),
-        watch,
+        )
     )
-    advance(todo - (shown - begin))
-
-
-def _num_geometries(path: Path) -> int:
-    """Count without waiting for COLMAP, which is writing."""
-    address = f"{path.resolve().as_uri()}?mode=ro"
-    with closing(sqlite3.connect(address, uri=True)) as connection:
-        (count,) = connection.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()
-    return int(count)
 
 
 class PairVerifier:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from itertools import combinations
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from colmap_affrect.colmap import pycolmap, running, verification
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database, write_keypoints, write_matches
 from colmap_affrect.colmap.mapping import global_options, mapping_differences, pipeline_options
 from colmap_affrect.colmap.native_options import flat_values
@@ -149,31 +148,6 @@ def rotation_errors_deg(
         ]
         errors.append(np.rad2deg((relative[0] * relative[1].inverse()).angle()))
     return errors
-
-
-def test_progress_of_verification_counts_the_pairs_that_are_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, _ = rewrite(tmp_path, num_images=5, num_points=150)
-    monkeypatch.setattr(running, "POLL_S", 0.01)
-    monkeypatch.setattr(running, "POLLS_PER_WATCH", 1)
-    ids = [(1, 2), (1, 3), (2, 3)]
-
-    def verify_some(path: Path, **_: object) -> None:
-        with open_database(path) as database:
-            for pair in ids:
-                database.write_two_view_geometry(*pair, pycolmap.TwoViewGeometry())
-                time.sleep(0.1)
-
-    shown: list[int] = []
-    with monkeypatch.context() as patch:
-        patch.setattr(pycolmap, "geometric_verification", verify_some)
-        verification.verify(path, VerificationOptions(), SEED, shown.append)
-    assert sum(shown) == 10
-    assert shown[:-1].count(1) == 3
-    shown.clear()
-    verification.verify(path, VerificationOptions(), SEED, shown.append)
-    assert sum(shown) == 7
 
 
 def test_synthetic_scene_through_our_writer_registers_all_images_in_place(
