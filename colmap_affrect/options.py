@@ -411,7 +411,7 @@ class AffNetHardNetOptions(DogOptions):
     """Estimate affine shapes by AffNet; otherwise measurement regions are circles."""
     patch_sigmas: float = 12.0
     """Half width of a patch in units of the feature's sigma (12 as in the paper, for DoG)."""
-    batch_size: int = 128
+    batch_size: int = 256
     """Patches that go through a network at once."""
     dtype: str = "float32"
     """Arithmetic of the networks: ``float32``, or ``float16`` and ``bfloat16`` where the device

@@ -18,7 +18,7 @@ from torch.nn.functional import affine_grid, grid_sample
 from colmap_affrect.conventions import HALF_PIXEL
 from colmap_affrect.features.networks import PATCH_SIZE_PX
 
-PATCHES_AT_ONCE = 128
+PATCHES_AT_ONCE = 512
 
 
 class PatchSampler:
