@@ -188,6 +188,7 @@ def _restore_interrupt() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("line", ["extract: 1/3 images", "match: 1/3 pairs", "verify: 3/3 pairs"])
 def test_interrupt_ends_with_130_and_a_later_run_completes(
     photos: Path, tmp_path: Path, line: str
@@ -282,6 +283,7 @@ def test_wrong_mapping_options_are_said_before_any_image_is_read(
     assert not (out / "config.toml").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mapper", ["incremental", "global"])
 def test_interrupted_mapping_ends_with_130_and_leaves_no_half_written_models(
     verified: Path, tmp_path: Path, mapper: str

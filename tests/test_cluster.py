@@ -103,6 +103,7 @@ class WithoutSharedStorage(Cluster):
         return False
 
 
+@pytest.mark.long
 def test_cluster_that_loses_a_worker_leaves_what_a_local_run_leaves(
     tmp_path: Path, photos: Path, address: str
 ) -> None:

@@ -61,6 +61,7 @@ def facade_view(recipe_name, view):
     return matchable(features.descriptors, features.keypoints, recipe.matching)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("view", "low", "high"), [(4, 300, 6000), (5, 120, 3000), (6, 30, 2000)])
 def test_facade_matches_follow_the_true_homography(view, low, high):
     homography = np.loadtxt(SCENES / "facade" / f"H_1_{view}.txt")

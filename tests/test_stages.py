@@ -246,6 +246,7 @@ def test_run_killed_anywhere_completes_with_the_same_result(
     assert report.stages[0].num_kept >= 2
 
 
+@pytest.mark.long
 def test_image_added_later_is_picked_up_and_the_others_are_kept(tmp_path: Path) -> None:
     photos, workspace = tmp_path / "photos", Workspace(tmp_path / "out")
     options = RunOptions(recipe=load_recipe("unrectified-rootsift"), cameras=CAMERAS)

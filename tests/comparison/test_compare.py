@@ -330,6 +330,7 @@ def killed(scene: Path, tmp_path: Path) -> Iterator[Path]:
     return out
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_page")
 def test_killed_comparison_goes_on_and_ends_as_an_undisturbed_one(
     scene, options, compared, killed

@@ -301,6 +301,7 @@ def test_fingerprint_sees_numbers_in_any_place() -> None:
         assert module._fingerprint(other) != module._fingerprint(first)
 
 
+@pytest.mark.long
 def test_command_prints_tables_and_errors_are_one_line(dataset: Path, tmp_path: Path) -> None:
     common = ["evaluate", "evd", "--output-path", tmp_path / "out", "-q"]
     settings = ["max_num_iterations=2000", "check_truth=false", "num_magsac_estimates=1"]

@@ -252,6 +252,7 @@ def test_warps_of_the_whole_image_share_one_region() -> None:
     assert RectificationPlan(SIZE).num_regions == 0
 
 
+@pytest.mark.long
 def test_each_level_has_a_sheet_and_an_entry(tmp_path: Path, photo: Path) -> None:
     warps = (affine_warp(2.0, 0.3, (30, 20, 80, 60)),)
     extractor = extractor_of(RectificationPlan(SIZE), RectificationPlan(SIZE, warps))

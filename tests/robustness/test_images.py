@@ -199,6 +199,7 @@ def test_formats_that_are_taken_are_read_alike_by_colmap(tmp_path, suffix) -> No
     assert suffix not in OTHER_IMAGE_SUFFIXES
 
 
+@pytest.mark.long
 def test_pixels_of_all_kinds_register(trio, run_images, tmp_path) -> None:
     gray = fifth_photograph()
     image = PIL.Image.fromarray(gray)
@@ -331,6 +332,7 @@ def test_same_photograph_twice_registers_both(trio, run_images) -> None:
     assert ended.report["registered_names"] == sorted([*TRIO, "copy.png"])
 
 
+@pytest.mark.long
 def test_names_of_all_kinds_go_through(tmp_path, run_images, call) -> None:
     accented = "ž é.png"
     names = [
