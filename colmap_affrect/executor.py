@@ -92,13 +92,14 @@ def available_memory_bytes() -> int:
     return available
 
 
-def is_device_memory_full(error: RuntimeError) -> bool:
-    """Tell whether torch failed for want of memory on a GPU.
-
-    >>> is_device_memory_full(RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB."))
-    True
-    """
-    return "out of memory" in str(error)
+def unless_gpu_is_full(work: Callable[[], Result], instead: Callable[[], Result]) -> Result:
+    """Return what the work does, or what is done instead when torch has no memory left on a GPU."""
+    try:
+        return work()
+    except RuntimeError as error:
+        if "out of memory" not in str(error):
+            raise
+    return instead()
 
 
 def peak_memory_bytes() -> int:

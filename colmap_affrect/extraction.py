@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from colmap_affrect.conventions import camera_matrix, resized_from_original
 from colmap_affrect.depth import depth_source
 from colmap_affrect.errors import DepthError, ImageError, OptionError, WeightsError
-from colmap_affrect.executor import is_device_memory_full
+from colmap_affrect.executor import unless_gpu_is_full
 from colmap_affrect.features.registry import (
     make_profile,
     make_shape_source,
@@ -129,7 +129,10 @@ class ImageExtractor:
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask)
         with self.turn:
-            features, warning = self._features_or_on_cpu(photograph, level)
+            features, warning = unless_gpu_is_full(
+                lambda: self._features(photograph, level),
+                lambda: self._features_on_cpu(photograph, level),
+            )
         if photograph.size != original_size:
             original_from_resized = np.linalg.inv(
                 resized_from_original(original_size, photograph.size)
@@ -140,22 +143,17 @@ class ImageExtractor:
             keep &= in_mask(mask, features.keypoints)
         return ExtractedImage(features.select(keep), original_size, warning)
 
-    def _features_or_on_cpu(self, photograph: Photograph, level: int) -> tuple[LocalFeatures, str]:
-        """Plan and execute, on the CPU if the memory of a GPU is full; also say what went wrong."""
-        try:
-            return self._features(photograph, level)
-        except RuntimeError as error:
-            if not is_device_memory_full(error):
-                raise
-        features, warning = self._on_cpu._features(photograph, level)
-        return features, "; ".join(filter(None, (MEMORY_IS_FULL, warning)))
-
     def _features(self, photograph: Photograph, level: int) -> tuple[LocalFeatures, str]:
+        """Plan and execute; also say what went wrong."""
         plan, warning = self.plan_or_warn(photograph, level)
         features = self.execute(
             photograph.gray, plan, with_original=level == 0, mask=photograph.mask
         )
         return features, warning
+
+    def _features_on_cpu(self, photograph: Photograph, level: int) -> tuple[LocalFeatures, str]:
+        features, warning = self._on_cpu._features(photograph, level)
+        return features, "; ".join(filter(None, (MEMORY_IS_FULL, warning)))
 
     @cached_property
     def _on_cpu(self) -> ImageExtractor:

@@ -271,7 +271,7 @@ def test_import_loads_neither_torch_nor_kornia() -> None:
 
 @pytest.mark.parametrize(
     "variables",
-    [{}, {"TORCH_HOME": "~/here"}, {"XDG_CACHE_HOME": "/tmp/there"}, {"TORCH_HOME": "/tmp/a"}],
+    [{}, {"TORCH_HOME": "~/here"}, {"XDG_CACHE_HOME": "/there"}, {"TORCH_HOME": "/a"}],
 )
 def test_cache_is_that_of_torch(variables: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("TORCH_HOME", "XDG_CACHE_HOME"):
