@@ -30,8 +30,7 @@ ERROR_SIGMAS = 6.0
 MAX_CODE, ZERO_CODE = 127, 128
 CODE_STEP = 1.0 / 250
 """Step of similarities in 8 bits; negative ones are 0, and errors may make them more than 1."""
-SIMILARITIES_8_BIT = 1 << 22
-"""Held at once: 4 MiB."""
+NUM_ROWS_8_BIT = 512
 SIZE_MULTIPLE = 256
 """Of both factors: oneDNN prepares and keeps a program for every size. With a thousand sizes that
 takes 300 MB, and a quarter more time."""
@@ -145,11 +144,10 @@ class EightBitDescriptors:
         # A rounding error is uniform: its standard deviation is a step over the root of 12.
         margin = ERROR_SIGMAS * math.hypot(self.step, other.step, CODE_STEP) / math.sqrt(12)
         width = math.ceil(2 * margin / CODE_STEP)
-        step = max(1, SIMILARITIES_8_BIT // len(other.codes))
         parts = []
         with one_openmp_thread():
-            for begin in range(0, len(rows), step):
-                chunk = rows[begin : begin + step]
+            for begin in range(0, len(rows), NUM_ROWS_8_BIT):
+                chunk = rows[begin : begin + NUM_ROWS_8_BIT]
                 products = _similarity_codes(
                     self.codes[chunk], other.packed, self.step * other.step
                 )

@@ -98,7 +98,7 @@ def test_lists_of_several_chunks_are_those_of_one(
     options = MatchingOptions()
     views = crowded_views(5, 0.5, signed=False)
     whole = match_features(*(matchable(*view, options, kind) for view in views), options)
-    monkeypatch.setattr(coarse, "SIMILARITIES_8_BIT", 33 * 450)
+    monkeypatch.setattr(coarse, "NUM_ROWS_8_BIT", 33)
     monkeypatch.setattr(coarse, "NUM_ROWS_16_BIT", 47)
     monkeypatch.setattr(nearest, "CHUNK_ROWS", 101)
     parts = match_features(*(matchable(*view, options, kind) for view in views), options)
