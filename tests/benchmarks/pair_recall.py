@@ -73,11 +73,20 @@ class MatchedSet:
             path, inner = found(name)
             return caches[path][inner][0]
 
+        def retrieved(num: int) -> list[Pair]:
+            return retrieved_pairs(self.names, read, num, SILENT)
+
+        def low_resolution(num: int) -> list[Pair]:
+            return low_resolution_pairs(self.names, strongest, options, num, SILENT)
+
+        def either(num: int) -> list[Pair]:
+            half = -(-num // 2)
+            return sorted({*retrieved(half), *low_resolution(half)})
+
         return {
-            "retrieval": lambda num: retrieved_pairs(self.names, read, num, SILENT),
-            "low-resolution": lambda num: low_resolution_pairs(
-                self.names, strongest, options, num, SILENT
-            ),
+            "retrieval": retrieved,
+            "low-resolution": low_resolution,
+            "either of both": either,
             "sequence": lambda num: sequence_pairs(self.names, -(-num // 2)),
         }
 
