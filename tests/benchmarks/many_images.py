@@ -1,9 +1,10 @@
-"""Time and memory of ``run`` on many images, stage by stage. Usage:
+"""Time, memory and errors of ``run`` on many images. Usage:
 
     python tests/benchmarks/many_images.py --output-path out/many --num-images 1000
 
 Renders photographs of the sample scene ``courtyard`` from random places, once, and runs the command
-on them in a process of its own, whose memory is looked at ten times a second.
+on them in a process of its own, whose memory is looked at ten times a second. Prints a table of its
+stages, and how many images of the largest model are where they were rendered.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import numpy as np
 from machine import describe_machine
 from speed_report import table
 
+from colmap_affrect.comparison.metrics import pose_scores, read_poses
 from colmap_affrect.executor import available_cores
 
 sys.path.append(str(Path(__file__).parents[2] / "sample_scenes"))
@@ -63,22 +65,33 @@ def courtyard() -> Sequence[Any]:
     return render.courtyard_planes()
 
 
-def take_photograph(path: Path, number: int) -> None:
-    """Render one view of the wall, from a place that depends on the number only."""
+def file_name(number: int) -> str:
+    """Return the name of an image."""
+    return f"{number:05d}.jpg"
+
+
+def view_of(number: int) -> Any:
+    """Return a view of the wall, from a place that depends on the number only."""
     random = np.random.default_rng([67, number])
-    pose = (
+    place = (
         random.uniform(-MAX_AZIMUTH_DEG, MAX_AZIMUTH_DEG),
         random.uniform(4.0, 10.0),
         random.uniform(1.5, 3.0),
         random.uniform(-5.0, 5.0),
     )
-    view = render._walk_view(path.name, pose, random.uniform(-3, 3), FOCAL_LENGTH_PX, IMAGE_SIZE)
-    render.write_jpeg(path, render.photograph(view, courtyard(), random))
+    roll = random.uniform(-3, 3)
+    return render._walk_view(file_name(number), place, roll, FOCAL_LENGTH_PX, IMAGE_SIZE)
+
+
+def take_photograph(path: Path, number: int) -> None:
+    """Render one image."""
+    grain = np.random.default_rng([68, number])
+    render.write_jpeg(path, render.photograph(view_of(number), courtyard(), grain))
 
 
 def take_photographs(folder: Path, count: int) -> None:
     """Render what is not there yet."""
-    paths = {number: folder / f"{number:05d}.jpg" for number in range(count)}
+    paths = {number: folder / file_name(number) for number in range(count)}
     missing = {path: number for number, path in paths.items() if not path.exists()}
     with ProcessPoolExecutor(available_cores()) as pool:
         list(pool.map(take_photograph, missing.keys(), missing.values(), chunksize=8))
@@ -124,6 +137,17 @@ def watched(command: Sequence[str]) -> Iterator[StageMemory]:
         raise subprocess.CalledProcessError(process.returncode, command)
 
 
+def scores(model_path: Path, count: int) -> str:
+    """Compare a model with the places that the images were rendered from."""
+    views = [view_of(number) for number in range(count)]
+    truth = {view.name: (view.rotation, -view.rotation @ view.center) for view in views}
+    found = pose_scores(read_poses(model_path), truth, list(truth))
+    return (
+        f"{len(found.correct_names)} of {count} images are registered correctly; median error of "
+        f"{found.median_rotation_error_deg:.3f} degrees, {found.median_position_error:.4f} m"
+    )
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -154,6 +178,7 @@ def main() -> None:
         for stage in stages
     ]
     print(table(header, rows))
+    print(scores(arguments.output_path / "run" / "sparse" / "0", arguments.num_images))
 
 
 if __name__ == "__main__":
