@@ -148,10 +148,9 @@ class EightBitDescriptors:
         with one_openmp_thread():
             for begin in range(0, len(rows), NUM_ROWS_8_BIT):
                 chunk = rows[begin : begin + NUM_ROWS_8_BIT]
-                products = _similarity_codes(
+                similarity = _similarity_codes(
                     self.codes[chunk], other.packed, self.step * other.step
                 )
-                similarity = products[: len(chunk), : len(other.codes)]
                 every, best = np.arange(len(chunk)), similarity.argmax(axis=1)
                 of_best = rivals.of(best)
                 first, at_rivals = (similarity[at].astype(int) for at in ((every, best), of_best))
@@ -306,7 +305,10 @@ def _filled_up(codes: NDArray[np.int8]) -> NDArray[np.int8]:
 
 
 def _similarity_codes(codes: NDArray[np.int8], packed: Any, unit: float) -> NDArray[np.uint8]:
-    """Return similarities over ``CODE_STEP``, rounded, 0...255: (R, N), more where filled up.
+    """Return similarities over ``CODE_STEP``, rounded, 0...255: (R, N or more).
+
+    The columns that ``packed`` has been filled up with are 0. They stay: without them rows would
+    not follow each other in memory, and numpy would make a copy before it looks for maxima.
 
     Args:
         codes: (R, D).
@@ -322,7 +324,7 @@ def _similarity_codes(codes: NDArray[np.int8], packed: Any, unit: float) -> NDAr
         shifted, 1.0, ZERO_CODE, packed, scale, zero, None,
         CODE_STEP, 0, torch.uint8, "none", [], "",
     )  # fmt: skip
-    return np.asarray(product.numpy())
+    return np.asarray(product.numpy()[: len(codes)])
 
 
 @cache
@@ -344,4 +346,4 @@ def has_fast_8_bit_products() -> bool:
         return False
     wide = codes.astype(np.int32)
     expected = np.maximum(unit / CODE_STEP * (wide @ wide.T), 0.0)
-    return bool((np.abs(found[:64, :64] - expected) < 0.501).all())
+    return bool((np.abs(found[:, :64] - expected) < 0.501).all())

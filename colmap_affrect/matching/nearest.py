@@ -21,8 +21,8 @@ from colmap_affrect.options import MatchingOptions
 CHUNK_ELEMENTS = 1 << 22
 """Similarities held at once: 16 MiB of float32."""
 
-CHUNK_ROWS = 1 << 15
-"""Pairs of descriptors held at once: 32 MiB."""
+CHUNK_ROWS = 1 << 12
+"""Pairs of descriptors held at once: 4 MiB."""
 
 NO_LIMIT = 2.0
 """No ratio is larger than 1."""
@@ -143,7 +143,8 @@ def _nearest_of_listed(
     for begin in range(0, len(similarity), CHUNK_ROWS):
         part = slice(begin, begin + CHUNK_ROWS)
         query = queries[short.rows[short.entry_rows[part]]]
-        similarity[part] = (query * image.descriptors[short.entry_columns[part]]).sum(axis=1)
+        candidates = image.descriptors[short.entry_columns[part]]
+        similarity[part] = np.einsum("ij,ij->i", query, candidates)
     starts = np.searchsorted(short.entry_rows, np.arange(len(short.rows)))
     if not len(starts):
         return np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros(0, bool)
