@@ -20,11 +20,12 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.executor import one_openmp_thread
+from colmap_affrect.executor import available_cores, one_openmp_thread
 from colmap_affrect.geometry.neighbors import NeighborLists
 
-MIN_SIMILARITIES = 1.5e9
-"""From about 20 pairs of 8,000 features on, more is saved than loading torch takes."""
+MIN_SIMILARITIES_PER_CORE = 6e8
+"""So many save a core the 1.5 to 3 seconds that loading torch takes: two cores want seven pairs of
+13,000 features."""
 
 ERROR_SIGMAS = 6.0
 MAX_CODE, ZERO_CODE = 127, 128
@@ -95,7 +96,8 @@ def coarse_descriptors(num_similarities: float, device: str = "auto") -> MakeCoa
         device: as in :func:`colmap_affrect.features.networks.resolve_device`; ``auto`` asks for a
             GPU only when there is enough to do.
     """
-    if device in ("auto", "cpu") and num_similarities < MIN_SIMILARITIES:
+    enough = MIN_SIMILARITIES_PER_CORE * available_cores()
+    if device in ("auto", "cpu") and num_similarities < enough:
         return None
     from colmap_affrect.features.networks import resolve_device
 

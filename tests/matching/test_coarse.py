@@ -168,8 +168,11 @@ def test_coarse_descriptors_are_made_where_they_pay(monkeypatch: pytest.MonkeyPa
         raise AssertionError("asked")
 
     monkeypatch.setattr(coarse, "has_fast_8_bit_products", refuse)
-    assert coarse_descriptors(1e9) is None
-    assert coarse_descriptors(1e9, "cpu") is None
+    monkeypatch.setattr(coarse, "available_cores", lambda: 3)
+    assert coarse_descriptors(1.7e9) is None
+    assert coarse_descriptors(1.7e9, "cpu") is None
+    with pytest.raises(AssertionError, match="asked"):
+        coarse_descriptors(1.9e9, "cpu")
     monkeypatch.setattr(coarse, "has_fast_8_bit_products", lambda: False)
     assert coarse_descriptors(1e15, "cpu") is None
     monkeypatch.setattr(coarse, "has_fast_8_bit_products", lambda: True)
