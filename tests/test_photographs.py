@@ -1,7 +1,8 @@
-"""Masks, and what else is known of photographs beside their pixels."""
+"""Lists of photographs, masks, and what else is known beside their pixels."""
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +28,7 @@ from colmap_affrect.options import (
     MaskOptions,
     SiftOptions,
 )
-from colmap_affrect.photographs import Photographs
+from colmap_affrect.photographs import Photographs, list_images
 from colmap_affrect.store import FeatureStore
 from colmap_affrect.types import Mask
 
@@ -218,3 +219,43 @@ def test_gps_position_and_focal_length_of_exif_are_taken_over(tmp_path: Path) ->
             assert camera.has_prior_focal_length
             # 35 mm film has a diagonal of 43.27 mm.
             assert camera.focal_length == pytest.approx(50 / 43.27 * np.hypot(240, 160), rel=1e-3)
+
+
+def test_list_images_finds_images_in_folders_and_passes_over_the_rest(tmp_path: Path) -> None:
+    for name in (
+        "z.JPG", "a b.png", "deep/er/č.tif", ".hidden.png", ".git/x.png", "notes.txt", "a.webp",
+        "folder.png/inside.bmp",
+    ):  # fmt: skip
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert list_images(tmp_path) == [
+        "a b.png", "deep/er/č.tif", "folder.png/inside.bmp", "z.JPG",
+    ]  # fmt: skip
+
+
+def test_list_images_takes_those_of_a_list(tmp_path: Path) -> None:
+    for name in ("a.png", "b c.png", "deep/č.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    listed = tmp_path / "list.txt"
+    text = "\ufeff# comment\nb c.png\n\n./deep//č.png\nb c.png\n"
+    listed.write_text(text, encoding="utf-8")
+    assert list_images(tmp_path, listed) == ["b c.png", "deep/č.png"]
+
+
+def test_list_images_refuses_a_name_that_is_not_utf8(tmp_path: Path) -> None:
+    Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.png")).write_bytes(b"")
+    with pytest.raises(ImageError, match="is not UTF-8; rename it") as error:
+        list_images(tmp_path)
+    str(error.value).encode("utf-8")
+
+
+@pytest.mark.parametrize("line", ["d.png", "../photos/a.png", "{folder}/a.png", "# a.png", ""])
+def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: str) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "a.png").write_bytes(b"")
+    listed = tmp_path / "list.txt"
+    listed.write_text(line.format(folder=folder))
+    with pytest.raises(ImageError, match=r"list\.txt: (lists .* not in|is empty)"):
+        list_images(folder, listed)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
-import platform
 import shutil
 import signal
 import sqlite3
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -27,14 +23,10 @@ from colmap_affrect import stages
 from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.colmap.running import run_cancellable
-from colmap_affrect.errors import DatabaseError, ImageError, StoreError
-from colmap_affrect.executor import map_ordered
+from colmap_affrect.errors import DatabaseError, StoreError
 from colmap_affrect.options import CameraOptions, VerificationOptions
 from colmap_affrect.outcomes import ReconstructionReport
-from colmap_affrect.photographs import list_images
 from colmap_affrect.pipeline import RunOptions, run
-from colmap_affrect.progress import NUM_PLAIN_LINES, SILENT, Progress
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.store import FeatureStore, MatchStore, pair_key
 from colmap_affrect.workspace import Workspace
@@ -600,124 +592,3 @@ def test_names_with_the_same_key_are_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"wing-b/c\.png and wing/b-c\.png have the same key"):
         run(tmp_path / "photos", tmp_path / "out", OPTIONS)
     assert not Workspace(tmp_path / "out").features.exists()
-
-
-def test_list_images_finds_images_in_folders_and_passes_over_the_rest(tmp_path: Path) -> None:
-    for name in (
-        "z.JPG", "a b.png", "deep/er/č.tif", ".hidden.png", ".git/x.png", "notes.txt", "a.webp",
-        "folder.png/inside.bmp",
-    ):  # fmt: skip
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_bytes(b"")
-    assert list_images(tmp_path) == [
-        "a b.png", "deep/er/č.tif", "folder.png/inside.bmp", "z.JPG",
-    ]  # fmt: skip
-
-
-def test_list_images_takes_those_of_a_list(tmp_path: Path) -> None:
-    for name in ("a.png", "b c.png", "deep/č.png"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(b"")
-    listed = tmp_path / "list.txt"
-    text = "\ufeff# comment\nb c.png\n\n./deep//č.png\nb c.png\n"
-    listed.write_text(text, encoding="utf-8")
-    assert list_images(tmp_path, listed) == ["b c.png", "deep/č.png"]
-
-
-def test_list_images_refuses_a_name_that_is_not_utf8(tmp_path: Path) -> None:
-    Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.png")).write_bytes(b"")
-    with pytest.raises(ImageError, match="is not UTF-8; rename it") as error:
-        list_images(tmp_path)
-    str(error.value).encode("utf-8")
-
-
-@pytest.mark.parametrize("line", ["d.png", "../photos/a.png", "{folder}/a.png", "# a.png", ""])
-def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: str) -> None:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    (folder / "a.png").write_bytes(b"")
-    listed = tmp_path / "list.txt"
-    listed.write_text(line.format(folder=folder))
-    with pytest.raises(ImageError, match=r"list\.txt: (lists .* not in|is empty)"):
-        list_images(folder, listed)
-
-
-def test_map_ordered_keeps_the_order_and_bounds_what_is_in_flight() -> None:
-    started: list[int] = []
-    lock = threading.Lock()
-
-    def work(task: int) -> int:
-        with lock:
-            started.append(task)
-        return task * task
-
-    def tasks() -> Iterator[int]:
-        for task in range(50):
-            assert task - len(results) <= 6
-            yield task
-
-    results: list[int] = []
-    for result in map_ordered(work, tasks(), 3):
-        results.append(result)
-    assert results == [task * task for task in range(50)]
-    assert sorted(started) == list(range(50))
-
-
-def test_map_ordered_raises_an_error_in_its_place() -> None:
-    results = map_ordered(lambda task: 10 // (3 - task), range(100), 2)
-    assert [next(results) for _ in range(3)] == [3, 5, 10]
-    with pytest.raises(ZeroDivisionError):
-        next(results)
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only GNU's C library keeps so much")
-def test_freed_memory_is_given_back_before_pycolmap_is_called() -> None:
-    def resident_bytes(token: object = None) -> int:
-        del token
-        pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
-        return int(pages) * os.sysconf("SC_PAGESIZE")
-
-    blocks = [b"x" * size for size in range(2000, 12_000)]
-    taken = resident_bytes()
-    del blocks[:-1]  # the last one keeps those before it from being given back at once
-    blocks.append(b"x" * 2000)
-    assert taken - run_cancellable(resident_bytes) > 0.8 * 10_000 * 7_000
-
-
-def test_interrupt_of_a_pycolmap_call_is_raised_after_the_call_has_ended() -> None:
-    ended = []
-
-    def call(token: pycolmap.CancellationToken) -> None:
-        time.sleep(0.05)
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.3)
-        ended.append(token)
-
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            run_cancellable(call)
-    finally:
-        signal.signal(signal.SIGINT, handler)
-    # Else the interpreter would end while pycolmap's thread needs it, and the process abort.
-    assert len(ended) == 1
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def test_progress_is_a_bar_on_a_terminal_lines_elsewhere_and_nothing_when_silent() -> None:
-    terminal, file = Terminal(), io.StringIO()
-    for progress in (Progress(terminal), Progress(file), SILENT):
-        with progress.stage("match", 400, "pairs") as advance:
-            for _ in range(400):
-                advance(1)
-        with progress.stage("verify", 0, "pairs") as advance:
-            advance(1)
-    assert "\r" in terminal.getvalue()
-    assert "400/400" in terminal.getvalue()
-    lines = file.getvalue().splitlines()
-    assert len(lines) == NUM_PLAIN_LINES
-    assert (lines[0], lines[-1]) == ("match: 40/400 pairs", "match: 400/400 pairs")

@@ -17,6 +17,8 @@ POLL_S = 0.2
 def run_cancellable(call: Callable[[pycolmap.CancellationToken], Result]) -> Result:
     """Run ``call`` in a thread; on Ctrl-C cancel it, wait until it has ended, and re-raise.
 
+    Memory that this process has freed goes back to the system before.
+
     Args:
         call: takes the token that pycolmap's call must be given.
     """

@@ -32,6 +32,7 @@ MAX_CODE, ZERO_CODE = 127, 128
 CODE_STEP = 1.0 / 250
 """Step of similarities in 8 bits; negative ones are 0, and errors may make them more than 1."""
 NUM_ROWS_8_BIT = 512
+"""Of similarities at once, a multiple of ``SIZE_MULTIPLE``; more are not faster."""
 SIZE_MULTIPLE = 256
 """Of both factors: oneDNN prepares and keeps a program for every size. With a thousand sizes that
 takes 300 MB, and a quarter more time."""
