@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect import PYCOLMAP_CAME_FIRST
 from colmap_affrect.conventions import is_inside
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_frames
@@ -93,6 +94,19 @@ def read_color(path: Path, max_size_px: int) -> ColorImage:
 def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
     """Return an (H, W) or (H, W, 3) uint8 image as JPEG; quality is 0 to 100."""
     return _encode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def require_png() -> None:
+    """Check that this process can write PNG, before work that ends with pictures.
+
+    Raises:
+        ImageError: when it imported pycolmap before this package: compressing would kill it.
+    """
+    if PYCOLMAP_CAME_FIRST:
+        raise ImageError(
+            "pictures cannot be written in a script that imports pycolmap first; put "
+            '"import colmap_affrect" before "import pycolmap"'
+        )
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from small_scene import write_photographs
 
 COMPRESS_EVERYTHING = """
@@ -55,6 +56,40 @@ def test_scripts_may_import_pycolmap_first(tmp_path: Path) -> None:
     write_photographs(tmp_path / "photos", 2)
     done = run_python(PYCOLMAP_FIRST, tmp_path / "a.db", tmp_path / "photos")
     assert (done.returncode, done.stdout) == (0, "1\n")
+
+
+COMPARE = """
+import pycolmap
+from pathlib import Path
+import colmap_affrect
+try:
+    {call}
+except colmap_affrect.AffrectError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        "colmap_affrect.compare(Path('photos'), Path('out'))",
+        "colmap_affrect.evaluate('evd', Path('EVD'), Path('out'))",
+    ],
+)
+def test_what_ends_with_pictures_is_refused_after_pycolmap(call: str) -> None:
+    done = run_python(COMPARE.format(call=call))
+    assert done.returncode == 0, done.stderr
+    assert 'put "import colmap_affrect" before "import pycolmap"' in done.stdout
+
+
+def test_pictures_are_not_refused_where_numpy_came_before_pycolmap() -> None:
+    done = run_python(
+        "import numpy, pycolmap\n"
+        "from colmap_affrect.imaging import encode_png, require_png\n"
+        "require_png()\n"
+        "print(len(encode_png(numpy.eye(300, dtype=numpy.uint8))) > 100)"
+    )
+    assert (done.returncode, done.stdout) == (0, "True\n"), done.stderr
 
 
 def test_zlib_works_after_the_import_of_pycolmap() -> None:

@@ -32,6 +32,7 @@ from colmap_affrect.comparison.request import Layout, Request
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
 from colmap_affrect.files import replace_text
+from colmap_affrect.imaging import require_png
 from colmap_affrect.matching.pairs import Pair, exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.options import CameraOptions
 from colmap_affrect.photographs import Photographs, refuse_colliding_keys, refuse_mixed_sizes
@@ -85,6 +86,7 @@ def compare(
     Raises:
         AffrectError: for anything that the caller can mend, before any method is run.
     """
+    require_png()
     options = options or CompareOptions()
     plan = _Plan.checked(image_path, Layout(output_path), options)
     with Workspace(output_path).locked():

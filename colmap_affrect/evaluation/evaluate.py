@@ -49,6 +49,7 @@ from colmap_affrect.evaluation.statistics import bootstrap_interval, paired_test
 from colmap_affrect.evaluation.tables import GROUP, SECONDS
 from colmap_affrect.extraction import Resources
 from colmap_affrect.files import replace_text
+from colmap_affrect.imaging import require_png
 from colmap_affrect.pipeline import installed_versions
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import Recipe
@@ -109,6 +110,7 @@ def evaluate(
     Raises:
         AffrectError: for anything that the caller can mend, before any image is worked on.
     """
+    require_png()
     options = options or EvaluateOptions()
     chosen = make_protocol(protocol) if isinstance(protocol, str) else protocol
     methods = _methods(options)
