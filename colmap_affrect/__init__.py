@@ -10,7 +10,6 @@ import importlib
 import logging
 import sys
 import zlib
-from itertools import takewhile
 from typing import Any
 
 __version__ = "0.1.0"
@@ -18,9 +17,9 @@ __version__ = "0.1.0"
 # The wheels of pycolmap 4.1 and 4.2 export zlib's symbols: if libz is first loaded by
 # "import pycolmap", the process dies or hangs when it compresses. Loading it before, as numpy does
 # too, keeps both working; after, it must not be touched.
-_before_pycolmap = set(takewhile(lambda name: not name.startswith("pycolmap"), sys.modules))
-PYCOLMAP_CAME_FIRST = "pycolmap" in sys.modules and not _before_pycolmap & {"numpy", "zlib"}
-if "pycolmap" not in sys.modules:
+_first = next(n for n in sys.modules if n.partition(".")[0] in {"numpy", "pycolmap", "zlib"})
+PYCOLMAP_CAME_FIRST = _first.startswith("pycolmap")
+if not PYCOLMAP_CAME_FIRST:
     zlib.decompress(zlib.compress(b"warm"))
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())

@@ -6,8 +6,8 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from small_scene import INTRINSICS
 
@@ -15,8 +15,14 @@ CAMERA = ["--camera-mode", "per-image", "--camera-model", "PINHOLE", "--camera-p
 FAST = ["--recipe", "unrectified-rootsift", *CAMERA]
 
 
-@dataclass(frozen=True)
-class Ended:
+def pair_list(folder: Path, *names: str) -> Path:
+    """Write a list of one pair."""
+    path = folder / "list.txt"
+    path.write_text("\t".join(names) + "\n", encoding="utf-8")
+    return path
+
+
+class Ended(NamedTuple):
     """How a command ended: exit code, what it printed, the lines of stderr."""
 
     code: int

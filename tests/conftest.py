@@ -1,4 +1,4 @@
-"""Settings shared by all tests: the hypothesis profile, and the way to the helpers."""
+"""What all tests share: the hypothesis profile, the way to the helpers, the command line."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -14,6 +15,10 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 # Tests are imported by path (``--import-mode=importlib``), their helpers by name.
 sys.path.insert(0, str(Path(__file__).parent))
+
+from command import Call, Ended
+
+from colmap_affrect.cli import main
 
 settings.register_profile(
     "ci",
@@ -25,3 +30,16 @@ settings.register_profile(
 )
 settings.register_profile("nightly", parent=settings.get_profile("ci"), max_examples=1000)
 settings.load_profile("ci")
+
+
+@pytest.fixture
+def call(capfd: pytest.CaptureFixture[str]) -> Call:
+    """Run the command line here."""
+
+    def run_command(*arguments: object) -> Ended:
+        capfd.readouterr()
+        code = main([str(argument) for argument in arguments])
+        captured = capfd.readouterr()
+        return Ended(code, captured.out, captured.err.splitlines())
+
+    return run_command

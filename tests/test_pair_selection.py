@@ -5,12 +5,11 @@ from __future__ import annotations
 import itertools
 import logging
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command import FAST
+from command import FAST, Call
 from small_scene import photograph
 from synthetic import write_image
 
@@ -30,8 +29,6 @@ ROOM_OF = {"1.png": 0, "2.png": 10, "3.png": 0, "4.png": 10, "10.png": 0}
 """Two rooms, photographed in turn."""
 OF_ONE_ROOM = ["1.png 10.png", "1.png 3.png", "10.png 3.png", "2.png 4.png"]
 
-Call = Callable[..., tuple[int, str, list[str]]]
-
 
 def write_rooms(folder: Path, names: list[str]) -> None:
     folder.mkdir(exist_ok=True)
@@ -39,19 +36,6 @@ def write_rooms(folder: Path, names: list[str]) -> None:
         if name in names:
             position = (0.2 * index - 0.4, -0.1 * index, 0.05 * index)
             write_image(folder / name, photograph(position, -2.0 * index, ROOM_OF[name]))
-
-
-@pytest.fixture
-def call(capfd: pytest.CaptureFixture[str]) -> Call:
-    """Run the command line here; returns the exit code, stdout, and the lines of stderr."""
-
-    def run_command(*arguments: object) -> tuple[int, str, list[str]]:
-        capfd.readouterr()
-        code = main([str(argument) for argument in arguments])
-        captured = capfd.readouterr()
-        return code, captured.out, captured.err.splitlines()
-
-    return run_command
 
 
 @pytest.fixture(scope="module")

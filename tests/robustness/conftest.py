@@ -9,21 +9,6 @@ from command import FAST, Call, Ended
 from results import Undisturbed, run_undisturbed
 from small_scene import write_photographs
 
-from colmap_affrect.cli import main
-
-
-@pytest.fixture
-def call(capfd: pytest.CaptureFixture[str]) -> Call:
-    """Run the command line here."""
-
-    def run_command(*arguments: object) -> Ended:
-        capfd.readouterr()
-        code = main([str(argument) for argument in arguments])
-        captured = capfd.readouterr()
-        return Ended(code, captured.out, captured.err.splitlines())
-
-    return run_command
-
 
 @pytest.fixture
 def run_images(call: Call, tmp_path: Path) -> Call:

@@ -1,0 +1,238 @@
+"""Photographs, options and folders that are no good: one clear line, and the others go on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import CAMERA, FAST, Call, pair_list
+from small_scene import IMAGE_SIZE, photograph, write_photographs
+from synthetic import write_image
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.errors import StoreError
+from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.store import FeatureStore
+from colmap_affrect.workspace import Workspace
+
+
+@pytest.mark.parametrize("content", [b"", b"no image at all"])
+def test_unreadable_image_is_reported_and_the_run_goes_on(
+    trio: Path, tmp_path: Path, call: Call, content: bytes
+) -> None:
+    (trio / "broken.jpg").write_bytes(content)
+    arguments = ["run", "--image-path", trio, "--output-path", tmp_path / "out", *FAST]
+    code, stdout, stderr = call(*arguments)
+    assert code == 1
+    assert stderr[-1] == "error: could not read 1 of the images: broken.jpg"
+    assert sum(line.startswith("error:") for line in stderr) == 1
+    assert any("broken.jpg: not a readable image" in line for line in stderr[:-1])
+    assert "registered  3 of 4 images" in stdout
+    assert "not broken.jpg: unreadable" in stdout
+    report = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
+    assert report["unregistered"] == {"broken.jpg": "unreadable"}
+    assert report["status"] == "partial"
+    code, _, stderr = call(*arguments, "--max-failures", 1)
+    assert code == 0
+    assert not any(line.startswith("error:") for line in stderr)
+
+
+def test_folder_of_unreadable_images_only_is_one_clear_line(tmp_path: Path, call: Call) -> None:
+    for name in ("a.png", "b.jpg"):
+        (tmp_path / name).write_bytes(b"text")
+    code, stdout, stderr = call(
+        "run", "--image-path", tmp_path, "--output-path", tmp_path / "o", "-q"
+    )
+    assert (code, stdout) == (1, "")
+    assert stderr == [
+        f"error: {tmp_path}: none of the 2 images can be used; the first: {tmp_path / 'a.png'}: "
+        "not a readable image (damaged, empty, or of an unknown format)"
+    ]
+
+
+def test_blank_image_has_no_features_and_the_run_goes_on(
+    trio: Path, tmp_path: Path, call: Call
+) -> None:
+    write_image(trio / "blank.png", np.full(IMAGE_SIZE[::-1], 128, np.uint8))
+    code, stdout, stderr = call(
+        "run", "--image-path", trio, "--output-path", tmp_path / "out", *CAMERA, "--json"
+    )
+    assert code == 0, stderr
+    report = json.loads(stdout)
+    assert report["unregistered"] == {"blank.png": "no features"}
+    assert report["images_registered"] == 3
+    assert (report["num_pairs"], report["num_verified_pairs"]) == (6, 3)
+    assert FeatureStore(tmp_path / "out" / "features.h5").num_keypoints()["blank.png"] == 0
+    assert any("blank.png: no features" in line for line in stderr)
+
+
+def test_image_of_another_place_has_no_verified_pair(
+    trio: Path, tmp_path: Path, call: Call
+) -> None:
+    write_image(trio / "elsewhere.png", photograph((0.0, 0.0, 0.0), 0.0)[::-1, ::-1].T[:240, :240])
+    code, stdout, _ = call(
+        "run", "--image-path", trio, "--output-path", tmp_path / "out", "--json",
+        "--recipe", "unrectified-rootsift",
+        "--match-list-path", pair_list(tmp_path, "a.png", "b c.png"),
+    )  # fmt: skip
+    report = json.loads(stdout)
+    assert report["num_pairs"] == 1
+    assert report["unregistered"]["elsewhere.png"] == "no verified pair"
+    assert code in (0, 3)
+
+
+def test_one_image_ends_without_a_model(tmp_path: Path, call: Call) -> None:
+    write_photographs(tmp_path / "photos", 1)
+    out = tmp_path / "out"
+    code, stdout, stderr = call(
+        "run", "--image-path", tmp_path / "photos", "--output-path", out, *FAST, "-q"
+    )
+    assert code == 3
+    assert stderr == [f"error: one image cannot make a model; see {out / 'report.json'}"]
+    assert "registered  0 of 1 images" in stdout
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert (report["status"], report["num_models"], report["num_pairs"]) == ("no_model", 0, 0)
+    assert report["unregistered"] == {"a.png": "no verified pair"}
+
+
+def test_images_without_overlap_end_without_a_model(tmp_path: Path, call: Call) -> None:
+    rng = np.random.default_rng(0)
+    for name in ("a.png", "b.png"):
+        write_image(tmp_path / name, rng.integers(0, 256, (120, 160), dtype=np.uint8))
+    code, _, stderr = call("run", "--image-path", tmp_path, "--output-path", tmp_path / "o", "-q")
+    assert code == 3
+    assert stderr == [f"error: no model was found; see {tmp_path / 'o' / 'report.json'}"]
+
+
+def test_bad_input_is_one_clear_line_and_writes_no_results(
+    trio: Path, tmp_path: Path, call: Call
+) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    (empty / "notes.txt").write_text("no image")
+    cases = [
+        (["--image-path", empty], f"{empty}: holds no images (.jpg"),
+        (["--image-path", tmp_path / "none"], "none: no such folder"),
+        (["--image-path", trio, "--camera-model", "PINHOL"], "--camera-model PINHOL: not one of"),
+        (
+            ["--image-path", trio, "--camera-model", "PINHOLE", "--camera-params", "1,2,3"],
+            "--camera-params: PINHOLE needs 4 values (fx, fy, cx, cy), not 3",
+        ),
+        (["--image-path", trio, "--camera-params", "f,1,2,3"], "--camera-params f,1,2,3: not num"),
+        (["--image-path", trio, "--recipe", "defualt"], "did you mean 'default'"),
+        (["--image-path", trio, "--set", "features.x=1"], "unknown option 'x'"),
+        (["--image-path", trio, "--image-list-path", tmp_path / "none"], "none: cannot be read"),
+    ]
+    for arguments, message in cases:
+        code, stdout, stderr = call("run", "--output-path", tmp_path / "out", *arguments)
+        assert (code, stdout, len(stderr)) == (1, "", 1), stderr
+        assert stderr[0].startswith("error: ")
+        assert message in stderr[0]
+        assert {path.name for path in (tmp_path / "out").iterdir()} <= {".lock", "run.log"}
+
+
+@pytest.mark.parametrize("mode", ["single", "per-folder"])
+def test_images_of_different_sizes_cannot_share_a_camera(
+    trio: Path, tmp_path: Path, call: Call, mode: str
+) -> None:
+    write_image(trio / "side" / "z.png", photograph((0.0, 0.0, 0.0), 0.0)[:, :300])
+    out = tmp_path / "out"
+    arguments = ["extract", "--image-path", trio, "--output-path", out]
+    code, _, stderr = call(*arguments, "--camera-mode", mode)
+    assert code == 1
+    other = {"single": "a.png", "per-folder": "side/č.png"}[mode]
+    places = {"single": "side/z.png", "per-folder": "side/č.png"}
+    assert len(stderr) == 1
+    assert stderr[0].startswith(f"error: --camera-mode {mode}: ")
+    assert "320 x 240 px" in stderr[0]
+    assert "300 x 240 px" in stderr[0]
+    assert other in stderr[0] or places[mode] in stderr[0]
+    assert not Workspace(out).config.exists()
+    # The same folder works with another mode, without --overwrite.
+    code, _, stderr = call(*arguments, "--recipe", "unrectified-rootsift")
+    assert code == 0, stderr
+    assert len(image_ids(Workspace(out).database)) == 4
+
+
+def test_folders_of_different_sizes_work_with_a_camera_per_folder(
+    trio: Path, tmp_path: Path, call: Call
+) -> None:
+    (trio / "other").mkdir()
+    write_image(trio / "other" / "z.png", photograph((0.0, 0.0, 0.0), 0.0)[:, :300])
+    code, _, stderr = call(
+        "extract", "--image-path", trio, "--output-path", tmp_path / "out",
+        "--camera-mode", "per-folder", "--recipe", "unrectified-rootsift",
+    )  # fmt: skip
+    assert code == 0, stderr
+    with open_database(tmp_path / "out" / "database.db") as database:
+        widths = sorted(camera.width for camera in database.read_all_cameras())
+    assert widths == [300, 320, 320]
+
+
+@pytest.mark.parametrize("overwrite", [[], ["--overwrite"]])
+def test_database_of_another_program_is_refused_and_left_as_it_is(
+    trio: Path, tmp_path: Path, call: Call, overwrite: list[str]
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    with pycolmap.Database.open(out / "database.db") as database:
+        database.write_camera(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 9.0, 8, 6))
+    before = (out / "database.db").read_bytes()
+    for command in ("run", "extract"):
+        code, stdout, stderr = call(
+            command, "--image-path", trio, "--output-path", out, *FAST, *overwrite
+        )
+        assert (code, stdout, len(stderr)) == (1, "", 1)
+        assert "database.db: exists and was not made here" in stderr[0]
+        assert (out / "database.db").read_bytes() == before
+
+
+@pytest.mark.parametrize("below", ["file", "file/out"])
+def test_output_folder_that_cannot_be_made_is_refused(
+    trio: Path, tmp_path: Path, call: Call, below: str
+) -> None:
+    (tmp_path / "file").write_text("")
+    code, stdout, stderr = call(
+        "run", "--image-path", trio, "--output-path", tmp_path / below, *FAST
+    )
+    assert (code, stdout, len(stderr)) == (1, "", 1)
+    assert str(tmp_path / below) in stderr[0]
+
+
+def test_unknown_name_in_the_pair_list_is_one_clear_line(
+    trio: Path, tmp_path: Path, call: Call
+) -> None:
+    unknown = pair_list(tmp_path, "a.png", "b d.png")
+    code, stdout, stderr = call(
+        "run", "--image-path", trio, "--output-path", tmp_path / "out", *FAST,
+        "--match-list-path", unknown, "-q",
+    )  # fmt: skip
+    assert (code, stdout, len(stderr)) == (1, "", 1)
+    assert f"{unknown}: names that are not among the images: line 1" in stderr[0]
+    assert not Workspace(tmp_path / "out").pairs.exists()
+
+
+def test_pair_list_may_name_an_image_that_cannot_be_read(
+    trio: Path, tmp_path: Path, call: Call
+) -> None:
+    (trio / "broken.png").write_bytes(b"text")
+    pairs = tmp_path / "list.txt"
+    pairs.write_text("broken.png a.png\na.png\tb c.png\n", encoding="utf-8")
+    out = ["--output-path", tmp_path / "out"]
+    recipe = ["--recipe", "unrectified-rootsift"]
+    call("extract", "--image-path", trio, *out, *recipe)
+    code, stdout, _ = call("pairs", *out, "--match-list-path", pairs)
+    assert (code, stdout.split(" in ")[0]) == (0, "pairs: 1 done")
+    assert Workspace(tmp_path / "out").pairs.read_text() == "a.png\tb c.png\n"
+
+
+def test_names_with_the_same_key_are_refused(tmp_path: Path) -> None:
+    for name in ("wing/b-c.png", "wing-b/c.png"):
+        (tmp_path / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
+        write_image(tmp_path / "photos" / name, photograph((0, 0, 0), 0))
+    with pytest.raises(StoreError, match=r"wing-b/c\.png and wing/b-c\.png have the same key"):
+        run(tmp_path / "photos", tmp_path / "out", RunOptions())
+    assert not Workspace(tmp_path / "out").features.exists()
