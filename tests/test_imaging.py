@@ -20,7 +20,7 @@ from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
-from colmap_affrect.imaging import connected_regions, read_gray, shrink_to, warp, warp_mask
+from colmap_affrect.imaging import connected_regions, halved, read_gray, shrink_to, warp, warp_mask
 from colmap_affrect.types import GrayImage, Mask, Rectification
 
 RAMP_ERROR_PX = 0.05
@@ -518,6 +518,19 @@ def test_read_gray_reads_names_with_spaces_and_letters_of_all_kinds(tmp_path: Pa
 def test_read_gray_reads_images_of_one_pixel_width(tmp_path: Path, shape: tuple[int, int]) -> None:
     image = np.full(shape, 200, np.uint8)
     assert read_gray(write_image(tmp_path / "thin.png", image)).shape == shape
+
+
+@pytest.mark.parametrize(("width", "height"), [(64, 40), (65, 41)])
+def test_halved_samples_at_pixel_centres(width: int, height: int) -> None:
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    for axis, ramp in enumerate((x, y)):
+        small = halved(ramp.astype(np.float32))
+        assert small.shape == (height // 2, width // 2)
+        steps = np.arange(small.shape[1 - axis])
+        along = (steps + 0.5) * (width, height)[axis] / len(steps) - 0.5
+        found = small[10] if axis == 0 else small[:, 10]
+        # Near the border the blur sees the reflected ramp.
+        assert_allclose(found[2:-2], along[2:-2], atol=1e-4)
 
 
 def test_shrink_to_keeps_an_image_that_fits() -> None:

@@ -87,7 +87,7 @@ class AffNet:
         """
         self.options = options
         self.detect = detect
-        self.device = device
+        self.device = torch.device(device)
         self.layers = fully_convolutional(network).to(device)
 
     def grid(self, image: GrayImage) -> ShapeGrid:
@@ -173,8 +173,7 @@ class AffNet:
         """Return the (N, 3) outputs of the network on the patches of (N, 2, 3) frames."""
         wide = lafs.copy()
         wide[:, :, :2] *= PATCH_SIGMAS / MEASUREMENT_SIGMAS
-        pixels = torch.from_numpy(image).to(self.device, torch.float32)
-        patches = PatchSampler(pixels[None, None]).sample(wide)
+        patches = PatchSampler(image.astype(np.float32), self.device).sample(wide)
         outputs = torch.empty((len(patches), 3))
         for begin in range(0, len(patches), BATCH_SIZE):
             batch = standardized(patches[begin : begin + BATCH_SIZE])

@@ -99,7 +99,8 @@ class AffNetHardNet:
         allowed = np.ones(image.shape, dtype=bool) if mask is None else mask > 0
         with torch.inference_mode():
             lafs, strengths = self.detector(
-                _tensor(image, self.device), torch.from_numpy(allowed).to(self.device)[None, None]
+                torch.from_numpy(_unit_range(image)).to(self.device)[None, None],
+                torch.from_numpy(allowed).to(self.device)[None, None],
             )
         frames = lafs[0].cpu().numpy().astype(np.float64)
         responses = strengths[0].cpu().numpy()
@@ -189,7 +190,7 @@ class _Patches:
     ) -> None:
         """Take the images, and how many features each has."""
         pairs = [pair for pair in zip(images, counts, strict=True) if pair[1]]
-        self.samplers = [PatchSampler(_tensor(image, device)) for image, _ in pairs]
+        self.samplers = [PatchSampler(_unit_range(image), device) for image, _ in pairs]
         self.ends = np.cumsum([count for _, count in pairs])
 
     def sample(self, lafs: NDArray[np.float64]) -> Tensor:
@@ -230,9 +231,9 @@ def _frames(
     return np.concatenate([radii_px[:, None, None] * shapes, centers[:, :, None]], axis=2)
 
 
-def _tensor(image: GrayImage, device: torch.device) -> Tensor:
-    """Return (1, 1, H, W) float32 in [0, 1]."""
-    return torch.from_numpy(image.astype(np.float32) / 255)[None, None].to(device)
+def _unit_range(image: GrayImage) -> NDArray[np.float32]:
+    """Return an (H, W) image as float32 in [0, 1]."""
+    return image.astype(np.float32) / np.float32(255)
 
 
 def _detector(

@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 from kornia.feature import extract_patches_from_pyramid
-from kornia.geometry.transform import pyrdown
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
 from colmap_affrect.conventions import HALF_PIXEL
 from colmap_affrect.features.networks import PATCH_SIZE_PX
+from colmap_affrect.imaging import halved
 
 PATCHES_AT_ONCE = 512
 
@@ -24,11 +24,12 @@ PATCHES_AT_ONCE = 512
 class PatchSampler:
     """An image and its halved versions, down to the size of a patch."""
 
-    def __init__(self, image: Tensor) -> None:
-        """Build the pyramid of a (1, 1, H, W) image."""
-        self.levels = [image]
-        while min(self.levels[-1].shape[2:]) >= 2 * PATCH_SIZE_PX:
-            self.levels.append(pyrdown(self.levels[-1]))
+    def __init__(self, image: NDArray[np.float32], device: torch.device) -> None:
+        """Build the pyramid of an (H, W) image, for sampling on a device."""
+        levels = [image]
+        while min(levels[-1].shape) >= 2 * PATCH_SIZE_PX:
+            levels.append(halved(levels[-1]))
+        self.levels = [torch.from_numpy(level)[None, None].to(device) for level in levels]
 
     def sample(self, lafs: NDArray[np.floating]) -> Tensor:
         """Return (N, 1, 32, 32) patches of (N, 2, 3) frames in px.

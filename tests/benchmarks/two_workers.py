@@ -47,7 +47,7 @@ def main() -> None:
     """Print the ratio of every round and the median."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--image-path", type=Path, required=True)
-    parser.add_argument("--max-num-images", type=int, default=8)
+    parser.add_argument("--max-num-images", type=int, default=24)
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
     photographs = Photographs(options.image_path, CameraOptions())

@@ -26,8 +26,11 @@ def some_frames(count: int, size: tuple[int, int], largest_px: float) -> np.ndar
     return np.concatenate([matrices, centers[:, :, None]], axis=2)
 
 
-def tensor(image: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(image.astype(np.float32) / 255)[None, None]
+CPU = torch.device("cpu")
+
+
+def unit_texture(size: tuple[int, int]) -> np.ndarray:
+    return texture(size, seed=1).astype(np.float32) / 255
 
 
 @pytest.mark.parametrize("size", [(301, 257), (640, 130), (64, 63), (40, 20)])
@@ -36,11 +39,11 @@ def test_patches_are_those_of_kornia(
     size: tuple[int, int], patches_at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(patches, "PATCHES_AT_ONCE", patches_at_once)
-    image = tensor(texture(size, seed=1))
+    image = unit_texture(size)
     frames = some_frames(150, size, largest_px=max(size))
-    found = PatchSampler(image).sample(frames)
+    found = PatchSampler(image, CPU).sample(frames)
     expected = extract_patches_from_pyramid(
-        image, torch.from_numpy(frames.astype(np.float32))[None], 32
+        torch.from_numpy(image)[None, None], torch.from_numpy(frames.astype(np.float32))[None], 32
     )[0]
     assert found.dtype == torch.float32
     assert_allclose(found, expected, atol=1e-4)
@@ -51,15 +54,14 @@ def test_columns_of_a_patch_follow_the_first_axis_of_the_frame() -> None:
     frame = np.array([[[3.0, 8.0, 41.0], [0.5, 5.0, 33.0]]])
     u, v = np.meshgrid(*2 * [(2 * np.arange(32) + 1) / 32 - 1])
     for image, row in ((x, frame[0, 0]), (y, frame[0, 1])):
-        sampler = PatchSampler(torch.from_numpy(image.astype(np.float32))[None, None])
+        sampler = PatchSampler(image.astype(np.float32), CPU)
         assert len(sampler.levels) == 2
         expected = row[0] * u + row[1] * v + row[2]
         assert_allclose(sampler.sample(frame)[0, 0], expected, atol=1e-4)
 
 
 def test_no_frames_give_no_patches_and_bad_ones_harm_no_others() -> None:
-    image = tensor(texture((90, 70), seed=1))
-    sampler = PatchSampler(image)
+    sampler = PatchSampler(unit_texture((90, 70)), CPU)
     assert sampler.sample(np.zeros((0, 2, 3))).shape == (0, 1, 32, 32)
     frames = some_frames(4, (90, 70), 20.0)
     expected = sampler.sample(frames)
