@@ -26,7 +26,7 @@ from colmap_affrect.features.registry import (
 )
 from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.geometry.affine import transform_frames
-from colmap_affrect.imaging import read_gray, shrink_mask, shrink_to
+from colmap_affrect.imaging import SHARED_OPENCV_THREADS, read_gray, shrink_mask, shrink_to
 from colmap_affrect.interfaces import Computing, FeatureProfile, Rectifier, Sources
 from colmap_affrect.options import CoverOptions, ExtractionOptions
 from colmap_affrect.progress import SILENT, Progress
@@ -128,7 +128,7 @@ class ImageExtractor:
             ImageError: when the file cannot be read, or its mask has another size.
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask)
-        with self.turn:
+        with self.turn, SHARED_OPENCV_THREADS:
             features, warning = unless_gpu_is_full(
                 lambda: self._features(photograph, level),
                 lambda: self._features_on_cpu(photograph, level),

@@ -157,7 +157,8 @@ class FileTransaction(io.RawIOBase):
         for number, within, there in self._spans(len(view)):
             self._page(number)[within] = view[there]
         self._position += len(view)
-        self._size = max(self._size, self._position)
+        if len(view):  # nothing, written behind the end, does not move it
+            self._size = max(self._size, self._position)
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
@@ -194,9 +195,12 @@ class FileTransaction(io.RawIOBase):
             with self._path.open("r+b") as file:
                 file.seek(self._stored_size)
                 file.write(bytes(max(0, min(self._size, self._page_end) - self._stored_size)))
+                behind = -1
                 for number, page in pages[len(inside) :]:
-                    file.seek(number * PAGE_BYTES)
+                    if number != behind:
+                        file.seek(number * PAGE_BYTES)
                     file.write(page)
+                    behind = number + 1
             with new.open("wb") as file:
                 file.write(struct.pack("<Q", self._size))
                 for number, page in inside:
@@ -224,8 +228,9 @@ class FileTransaction(io.RawIOBase):
         return self._pages[number]
 
     def _read_stored(self, position: int, view: memoryview) -> None:
-        self._stored.seek(position)
-        self._stored.readinto(view[: max(0, self._readable_size - position)])
+        if position < self._readable_size:
+            self._stored.seek(position)
+            self._stored.readinto(view[: self._readable_size - position])
 
     def _spans(self, count: int) -> Iterator[tuple[int, slice, slice]]:
         """Split what follows the position: number of a page, part of it, part of the whole."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.geometry.affine import ellipse_extents, transform_frames
@@ -54,7 +55,7 @@ def extract_rectified(
     rectifications += plan.items
     if not rectifications:
         return LocalFeatures.empty(profile.descriptor_size)
-    views = [_view(image, rectification, mask) for rectification in rectifications]
+    views = _views(image, rectifications, mask)
     detected = [profile.detect(view) for view in views]
     carried = [_carried(*pair) for pair in zip(detected, rectifications, strict=True)]
     keep = [_usable(*pair, plan) for pair in zip(carried, rectifications, strict=True)]
@@ -76,15 +77,22 @@ def extract_rectified(
     )
 
 
-def _view(image: GrayImage, rectification: Rectification | None, mask: Mask | None) -> View:
-    if rectification is None:
-        return image, None if mask is None else mask_values(mask)
-    size = (image.shape[1], image.shape[0])
+def _views(
+    image: GrayImage, rectifications: list[Rectification | None], mask: Mask | None
+) -> list[View]:
+    """Return a warp for each rectification; for None the image itself."""
+    whole = image, None if mask is None else mask_values(mask)
+    source = image.astype(np.float32)
+    return [whole if item is None else _warped(source, item, mask) for item in rectifications]
+
+
+def _warped(source: NDArray[np.float32], rectification: Rectification, mask: Mask | None) -> View:
+    size = (source.shape[1], source.shape[0])
     inside = warp_mask(rectification, size)
     if mask is not None:
         unmasked = replace(rectification, region=mask, region_origin=(0, 0))
         inside = np.minimum(inside, warp_mask(unmasked, size))
-    return warp(image, rectification), inside
+    return warp(source, rectification), inside
 
 
 def _carried(features: LocalFeatures, rectification: Rectification | None) -> LocalFeatures:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.conventions import is_inside
+from colmap_affrect.geometry.affine import determinants
 
 GrayImage = NDArray[np.uint8]
 """(H, W) gray values, 0.299 R + 0.587 G + 0.114 B."""
@@ -119,7 +120,7 @@ class LocalFeatures:
             f"shapes of frames, responses, ids {shapes} and {self.descriptors.shape=} do not fit",
         )
         _require(
-            bool(np.isfinite(self.lafs).all() and (np.linalg.det(self.lafs[:, :, :2]) > 0).all()),
+            bool(np.isfinite(self.lafs).all() and (determinants(self.lafs[:, :, :2]) > 0).all()),
             "frames must be finite and of positive determinant",
         )
 
@@ -134,7 +135,7 @@ class LocalFeatures:
     @property
     def scales(self) -> NDArray[np.float64]:
         """(N,) geometric mean radius sqrt(det A) of the measurement ellipses in px."""
-        return np.asarray(np.sqrt(np.linalg.det(self.lafs[:, :, :2])))
+        return np.asarray(np.sqrt(determinants(self.lafs[:, :, :2])))
 
     def select(self, index: NDArray[np.generic]) -> LocalFeatures:
         """Keep the features of an index or mask array, in its order."""

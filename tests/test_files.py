@@ -14,7 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
@@ -57,6 +57,7 @@ def apply_step(file: io.RawIOBase | io.BytesIO, step: tuple) -> bytes:
     return b""
 
 
+@example(b"", 0, [("write", 1, b"")])
 @given(st.binary(max_size=2 * PAGE_BYTES), st.integers(0, 2 * PAGE_BYTES), STEPS)
 def test_transaction_is_a_file_and_commits_all_of_it(
     tmp_path_factory: pytest.TempPathFactory, start: bytes, filled: int, steps: list[tuple]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import tracemalloc
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,15 @@ from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
-from colmap_affrect.imaging import connected_regions, halved, read_gray, shrink_to, warp, warp_mask
+from colmap_affrect.imaging import (
+    SHARED_OPENCV_THREADS,
+    connected_regions,
+    halved,
+    read_gray,
+    shrink_to,
+    warp,
+    warp_mask,
+)
 from colmap_affrect.types import GrayImage, Mask, Rectification
 
 RAMP_ERROR_PX = 0.05
@@ -398,6 +407,20 @@ def test_connected_regions_are_cropped_and_large_enough() -> None:
     assert len(connected_regions(mask, 10)) == 1
     assert len(connected_regions(mask, 0)) == 3
     assert connected_regions(np.zeros((4, 5), bool), 0) == []
+
+
+def test_opencv_threads_are_shared_by_those_who_hold_them() -> None:
+    given = cv2.getNumThreads()
+    try:
+        for all_threads, shares in ((4, [4, 2, 1]), (1, [1, 1, 1])):
+            cv2.setNumThreads(all_threads)
+            with ExitStack() as stack:
+                for share in shares:
+                    stack.enter_context(SHARED_OPENCV_THREADS)
+                    assert cv2.getNumThreads() == share
+            assert cv2.getNumThreads() == all_threads
+    finally:
+        cv2.setNumThreads(given)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif", ".ppm"])

@@ -25,6 +25,7 @@ from torch.nn.utils import convert_conv2d_weight_memory_format
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, grid_origin, resized_from_original
 from colmap_affrect.features.networks import PATCH_SIZE_PX, folded, standardized
 from colmap_affrect.features.patches import PatchSampler
+from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.shapes import (
     STEP_PX,
     log_metrics,
@@ -120,7 +121,7 @@ class AffNet:
         order = np.argsort(-keypoints.responses, kind="stable")
         keypoints = keypoints.select(order[: self.options.max_num_keypoints])
         shapes = _frames(self._patch_outputs(image, keypoints.lafs))
-        valid = np.isfinite(shapes).all(axis=(1, 2)) & (np.linalg.det(shapes) > 0)
+        valid = np.isfinite(shapes).all(axis=(1, 2)) & (determinants(shapes) > 0)
         return ShapeSamples(keypoints.keypoints[valid], rectifying_metrics(shapes[valid]))
 
     def _mean_logs(self, image: GrayImage) -> NDArray[np.float32]:

@@ -34,7 +34,7 @@ from colmap_affrect.features.networks import (
     resolve_device,
 )
 from colmap_affrect.features.patches import PatchSampler
-from colmap_affrect.geometry.affine import lafs_from_keypoints, rotation
+from colmap_affrect.geometry.affine import determinants, lafs_from_keypoints, rotation
 from colmap_affrect.options import AffNetHardNetOptions
 from colmap_affrect.types import GrayImage, LocalFeatures, View, in_mask, union
 
@@ -106,7 +106,7 @@ class AffNetHardNet:
         responses = strengths[0].cpu().numpy()
         seen = responses > MIN_RESPONSE
         frames, responses = frames[seen], responses[seen]
-        centers, radii_px = frames[:, :, 2], np.sqrt(np.linalg.det(frames[:, :, :2]))
+        centers, radii_px = frames[:, :, 2], np.sqrt(determinants(frames[:, :, :2]))
         if self.options.detector == "keynet":
             centers = _centers_from_keynet(centers, radii_px)
         circles = lafs_from_keypoints(centers, radii_px, np.zeros(len(radii_px)))

@@ -16,6 +16,7 @@ from torch.nn.functional import affine_grid, grid_sample
 
 from colmap_affrect.conventions import HALF_PIXEL
 from colmap_affrect.features.networks import PATCH_SIZE_PX
+from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.imaging import halved
 
 PATCHES_AT_ONCE = 512
@@ -59,7 +60,7 @@ class PatchSampler:
 
     def _level_numbers(self, matrices: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the (N,) levels to sample frames of (N, 2, 2) matrices from."""
-        steps_px = 2.0 * np.sqrt(np.abs(np.linalg.det(matrices))) / PATCH_SIZE_PX
+        steps_px = 2.0 * np.sqrt(np.abs(determinants(matrices))) / PATCH_SIZE_PX
         numbers = np.floor(np.log2(np.maximum(steps_px, 1.0))).astype(np.int64)
         return np.asarray(np.minimum(numbers, len(self.levels) - 1))
 

@@ -14,7 +14,8 @@ from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 from colmap_affrect.types import Mask, Rectification, in_mask
 
 MARGIN_PX = 16.0
-"""Surroundings of a region that its descriptors may see, in warp px."""
+"""Surroundings of a region that its descriptors may see, in warp px. 8 px save 5 to 8 % of the time
+at 640 px and 3 % at 1600 px, and lose 1 % of the right matches (Graffiti, Wall)."""
 
 CANVAS_RATIO = 2.0
 """Area of a homography's canvas, its margin left out, in units of the region's area in the image.

@@ -11,6 +11,7 @@ from strategies import IMAGE_SIZE, Array, affine_maps, affine_shapes, frames, ho
 from colmap_affrect.geometry.affine import (
     compose_affine,
     decompose_affine,
+    determinants,
     ellipse_extents,
     lafs_from_keypoints,
     project,
@@ -30,6 +31,12 @@ JACOBIAN_ERROR = 1e-5
 
 def test_rotation_turns_x_axis_towards_y_axis() -> None:
     assert_allclose(rotation(np.pi / 6) @ [2.0, 0.0], [np.sqrt(3.0), 1.0], atol=ROUNDING)
+
+
+def test_determinants_have_the_sign_of_the_orientation() -> None:
+    matrices = np.array([[[2.0, 1.0], [0.5, 3.0]], [[0.0, 1.0], [4.0, 0.0]]])
+    assert_allclose(determinants(matrices), [5.5, -4.0])
+    assert_allclose(determinants(matrices[0].astype(np.float32)), 5.5)
 
 
 def test_compose_affine_multiplies_scale_psi_tilt_phi_in_this_order() -> None:

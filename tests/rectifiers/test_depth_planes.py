@@ -36,6 +36,7 @@ from colmap_affrect.rectifiers.depth_planes import (
     PlanarSegment,
     planar_segments,
 )
+from colmap_affrect.rectifiers.regions import MARGIN_PX
 from colmap_affrect.types import Mask, Photograph, Rectification, RectificationPlan
 
 COURTYARD = Path(__file__).parents[2] / "sample_scenes" / "courtyard"
@@ -193,9 +194,9 @@ def check_plan(plan: RectificationPlan) -> None:
         mapped = pixels @ item.rectified_from_image.T
         assert (mapped[:, 2] > 0).all()
         mapped = mapped[:, :2] / mapped[:, 2:]
-        assert (mapped > 15.9).all()
-        assert (mapped < np.array(item.canvas_size) - 16.9).all()
-        margin = 32.0 + 2.0
+        assert (mapped > MARGIN_PX - 0.1).all()
+        assert (mapped < np.array(item.canvas_size) - MARGIN_PX - 0.9).all()
+        margin = 2 * MARGIN_PX + 2.0
         box = np.array(item.canvas_size) - margin
         assert np.prod(box) <= 2.0 * np.count_nonzero(item.region)
     assert claimed.max(initial=0) <= 1, "segments overlap"
