@@ -195,12 +195,12 @@ class FileTransaction(io.RawIOBase):
             with self._path.open("r+b") as file:
                 file.seek(self._stored_size)
                 file.write(bytes(max(0, min(self._size, self._page_end) - self._stored_size)))
-                behind = -1
+                following = -1
                 for number, page in pages[len(inside) :]:
-                    if number != behind:
+                    if number != following:
                         file.seek(number * PAGE_BYTES)
                     file.write(page)
-                    behind = number + 1
+                    following = number + 1
             with new.open("wb") as file:
                 file.write(struct.pack("<Q", self._size))
                 for number, page in inside:

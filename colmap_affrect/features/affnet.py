@@ -89,7 +89,7 @@ class AffNet:
         self.options = options
         self.detect = detect
         self.device = torch.device(device)
-        self.layers = fully_convolutional(network).to(device)
+        self.layers = fully_convolutional(network).to(self.device)
 
     def grid(self, image: GrayImage) -> ShapeGrid:
         """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
