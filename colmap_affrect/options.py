@@ -393,6 +393,9 @@ class SiftOptions(DogOptions):
     """Feature profile ``rootsift``."""
 
     profile: str = "rootsift"
+    max_num_features: int = 13_000
+    """Most features of the image itself, by response; those of several orientations count as
+    several. About as many as COLMAP keeps of a large photograph, which counts 8192 before."""
 
 
 DETECTORS = ("dog", "keynet", "hessian")
