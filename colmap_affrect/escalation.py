@@ -6,7 +6,8 @@ again, by these features and those of the images themselves. New matches take th
 old ones only when their two-view geometry has more inliers, so that no pair loses. Two
 additions make it serve mapping and not single pairs alone:
 
-- A pair that is verified but weak counts as open while one of its images has no strong pair.
+- A pair that is verified counts as open while one of its images has no strong pair, or few
+  features in tracks through three images.
 - Verified pairs of images that gained are matched again at the same level. Their new features
   would otherwise be seen in two images only, and the mapper could not tie them to the rest.
 """
@@ -15,11 +16,14 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing
 
+import numpy as np
+from numpy.typing import NDArray
+
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
+from colmap_affrect.colmap.verification import PairVerifier, inlier_matches, verified_pairs
 from colmap_affrect.errors import ImageError
 from colmap_affrect.executor import Executor
 from colmap_affrect.extraction import ImageExtractor, Resources
@@ -100,12 +104,49 @@ def pair_levels(workspace: Workspace) -> dict[str, int]:
     return counts
 
 
-def open_pairs(num_inliers: Mapping[Pair, int], strong_num_inliers: int) -> list[Pair]:
-    """Return the pairs that are not verified, or weak while an image has no strong pair."""
+def open_pairs(
+    num_inliers: Mapping[Pair, int], strong_num_inliers: int, loose: Collection[str] = ()
+) -> list[Pair]:
+    """Return the pairs that are not verified, and those of an image that mapping may well lose.
+
+    Args:
+        num_inliers: of each pair, 0 where it is not verified.
+        strong_num_inliers: an image needs a pair with as many.
+        loose: images that have little in common with two others; see :func:`loose_images`.
+    """
     secure = {
         name for pair, count in num_inliers.items() if count >= strong_num_inliers for name in pair
-    }
+    }.difference(loose)
     return [pair for pair, count in num_inliers.items() if not count or not secure.issuperset(pair)]
+
+
+def loose_images(matches: Mapping[Pair, NDArray[np.int64]], min_num_features: int) -> set[str]:
+    """Return the images with fewer features than that in tracks through three images or more.
+
+    A mapper registers an image by features whose matches it has triangulated already. That takes
+    two other images, so a strong pair alone ties an image to nothing.
+
+    Args:
+        matches: (M, 2) features of the first and the second image, of each verified pair.
+        min_num_features: that an image needs.
+    """
+    names = sorted({name for pair in matches for name in pair})
+    number = {name: index for index, name in enumerate(names)}
+    ends = [
+        (number[pair[side]] << 32) + indices[:, side]
+        for side in (0, 1)
+        for pair, indices in matches.items()
+    ]
+    features, index, num_matches = np.unique(
+        np.concatenate([np.zeros(0, np.int64), *ends]), return_inverse=True, return_counts=True
+    )
+    first, second = index.reshape(2, -1)
+    is_shared = num_matches > 1
+    in_track = is_shared.copy()
+    in_track[first[is_shared[second]]] = True
+    in_track[second[is_shared[first]]] = True
+    counts = np.bincount(features[in_track] >> 32, minlength=len(names))
+    return {name for name, count in zip(names, counts, strict=True) if count < min_num_features}
 
 
 class _Ladder:
@@ -138,8 +179,19 @@ class _Ladder:
         return counts
 
     def open_pairs(self) -> list[Pair]:
-        """See :func:`open_pairs`."""
-        return open_pairs(self.num_inliers(), self.options.escalation_strong_num_inliers)
+        """See :func:`open_pairs`; of two images nothing more can be asked than a strong pair."""
+        num_inliers = self.num_inliers()
+        loose: set[str] = set()
+        if len({name for pair in num_inliers for name in pair}) > 2:
+            loose = loose_images(self._inlier_matches(), self.options.escalation_min_num_tracks)
+        return open_pairs(num_inliers, self.options.escalation_strong_num_inliers, loose)
+
+    def _inlier_matches(self) -> dict[Pair, NDArray[np.int64]]:
+        options, _ = self.workspace.verification_options()
+        ids = colmap_database.image_ids(self.workspace.database)
+        names = {image_id: name for name, image_id in ids.items()}
+        verified = inlier_matches(self.workspace.database, options.min_num_inliers)
+        return {(names[one], names[two]): indices for (one, two), indices in verified.items()}
 
     def links(self, level: int) -> list[Pair]:
         """Return the verified pairs of the images that gained by a level."""

@@ -475,6 +475,9 @@ class ExtractionOptions(Options):
     escalation_strong_num_inliers: int = 100
     """A pair with fewer inliers climbs too while one of its images has no pair with as many:
     an image that hangs on weak pairs alone is verified but rarely registered."""
+    escalation_min_num_tracks: int = 30
+    """All pairs of an image climb that has fewer features in tracks through three images or more:
+    mapping registers images by such features, and COLMAP wants 30 of them."""
     second_moment: SecondMomentOptions = field(default_factory=SecondMomentOptions)
     affnet: AffNetOptions = field(default_factory=AffNetOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
@@ -487,6 +490,7 @@ class ExtractionOptions(Options):
     def __post_init__(self) -> None:
         self._check("max_image_size_px", 16, 1_000_000)
         self._check("escalation_strong_num_inliers", 0, 1_000_000)
+        self._check("escalation_min_num_tracks", 0, 1_000_000)
 
     @property
     def rectifiers(self) -> tuple[RectifierOptions, ...]:

@@ -145,6 +145,58 @@ def test_pairs_that_fail_and_the_only_pairs_of_an_image_are_open(counts, expecte
     assert escalation.open_pairs(counts, 100) == expected
 
 
+def test_pairs_of_a_loose_image_are_open_however_strong() -> None:
+    counts = {("a", "b"): 200, ("a", "c"): 150, ("b", "c"): 100}
+    assert escalation.open_pairs(counts, 100, {"c"}) == [("a", "c"), ("b", "c")]
+
+
+def numbered(*rows: tuple[int, int]) -> np.ndarray:
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+@pytest.mark.parametrize(
+    ("matches", "tracks"),
+    [
+        # Features 5 and 6 of b lead from a to c; feature 7 of b does not.
+        (
+            {("a", "b"): numbered((1, 5), (2, 6), (3, 7)), ("b", "c"): numbered((5, 8), (6, 9))},
+            {"a": 2, "b": 2, "c": 2},
+        ),
+        # The same numbers in another image are other features.
+        (
+            {("a", "b"): numbered((1, 5), (2, 6)), ("b", "c"): numbered((1, 5), (2, 6))},
+            {"a": 0, "b": 0, "c": 0},
+        ),
+        # d is matched with a feature of c that leads on, by one of its two matches.
+        (
+            {("c", "a"): numbered((4, 1), (5, 2)), ("c", "d"): numbered((6, 2), (4, 3))},
+            {"a": 1, "c": 1, "d": 1},
+        ),
+        ({("a", "b"): numbered((1, 1), (2, 2), (3, 3))}, {"a": 0, "b": 0}),
+        ({("b", "a"): numbered()}, {"a": 0, "b": 0}),
+        ({}, {}),
+    ],
+)
+def test_images_with_few_features_in_tracks_of_three_are_loose(matches, tracks) -> None:
+    for limit in range(4):
+        expected = {name for name, count in tracks.items() if count < limit}
+        assert escalation.loose_images(matches, limit) == expected
+
+
+def test_strong_pairs_without_a_track_of_three_climb(
+    before: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ladder = escalation._Ladder(before)
+    chain = {EASY: 200, (NAMES[1], NAMES[2]): 150}
+    matches = {pair: np.arange(80).reshape(40, 2) for pair in chain}
+    apart = {**matches, (NAMES[1], NAMES[2]): np.arange(1, 81).reshape(40, 2)}
+    monkeypatch.setattr(ladder, "num_inliers", lambda: chain)
+    monkeypatch.setattr(ladder, "_inlier_matches", lambda: apart)
+    assert ladder.open_pairs() == []
+    monkeypatch.setattr(ladder, "_inlier_matches", lambda: matches)
+    assert ladder.open_pairs() == list(chain)
+
+
 def test_no_pair_that_verifies_unrectified_loses_inliers(
     climbed: tuple[Workspace, StageReport], plain: Workspace
 ) -> None:

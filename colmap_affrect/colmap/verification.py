@@ -121,3 +121,14 @@ def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], in
         for pair_id, count in zip(pair_ids, counts, strict=True)
         if count >= min_num_inliers
     }
+
+
+def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Return the (M, 2) features of each verified pair of image ids that are inliers."""
+    with open_database(path) as database:
+        pair_ids, geometries = database.read_two_view_geometries()
+    return {
+        pycolmap.pair_id_to_image_pair(pair_id): np.asarray(geometry.inlier_matches, np.int64)
+        for pair_id, geometry in zip(pair_ids, geometries, strict=True)
+        if len(geometry.inlier_matches) >= min_num_inliers
+    }
