@@ -394,8 +394,9 @@ class SiftOptions(DogOptions):
 
     profile: str = "rootsift"
     max_num_features: int = 13_000
-    """Most features of the image itself, by response; those of several orientations count as
-    several. About as many as COLMAP keeps of a large photograph, which counts 8192 before."""
+    """Most features of the image itself, by response times scale: large ones are found again more
+    often. Those of several orientations count as several, so this is about as many as COLMAP keeps
+    of a large photograph, which counts 8192 before."""
 
 
 DETECTORS = ("dog", "keynet", "hessian")

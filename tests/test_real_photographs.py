@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
@@ -19,8 +20,11 @@ from registration import (
     run_seed,
 )
 
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.verification import inlier_matches, verify
 from colmap_affrect.comparison.methods import parse_method
 from colmap_affrect.extraction import Resources
+from colmap_affrect.options import CameraOptions, VerificationOptions
 
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 SUBSET_BY_NAME = {subset.name: subset for subset in SUBSETS}
@@ -58,6 +62,34 @@ def test_sparse_subset_registers_correctly(recipe, name, min_correct, median_err
     assert sum(row["correct"] >= min_correct for row in rows) >= 4
     errors = sorted(row["rotation_error_deg"] for row in rows)
     assert errors[2] < median_error_deg
+
+
+def count_distinct_inliers(database_path):
+    """Count matches by their places: of a place with two orientations COLMAP counts both."""
+    matches = inlier_matches(database_path, 1)
+    with open_database(database_path) as database:
+        points = {
+            image.image_id: np.asarray(database.read_keypoints(image.image_id))[:, :2]
+            for image in database.read_all_images()
+        }
+    return sum(
+        len(np.unique(np.hstack([points[first][rows[:, 0]], points[second][rows[:, 1]]]), axis=0))
+        for (first, second), rows in matches.items()
+    )
+
+
+@pytest.mark.parametrize("scene", ["strecha_fountain_p11", "strecha_herz_jesus_p25", "kermit"])
+def test_photographs_taken_close_together_match_in_as_many_places_as_with_sift(scene, tmp_path):
+    images = tmp_path / "images"
+    link_images(sorted((SCENES / scene / "images").iterdir())[:3], images)
+    counts = {}
+    for label in ("sift", "default"):
+        folder = tmp_path / label
+        folder.mkdir()
+        compute_matches(parse_method(label), CameraOptions(), images, folder, Resources())
+        verify(folder / "database.db", VerificationOptions(), 0)
+        counts[label] = count_distinct_inliers(folder / "database.db")
+    assert counts["default"] >= counts["sift"] > 100
 
 
 def test_peak_memory_of_extraction_stays_under_1500_mb_on_12_megapixels(tmp_path):

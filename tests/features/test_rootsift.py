@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import blobs, texture
 
 from colmap_affrect.features.rootsift import RootSift, root_normalized
@@ -42,9 +42,13 @@ def test_detect_orders_by_falling_response_and_keeps_the_strongest(
     assert (np.diff(everything.responses) <= 0.0).all()
     assert (everything.responses > 0.0).all()
     some = detect(image, max_num_features=37)
-    assert len(some) == 37
-    assert_allclose(some.responses, everything.responses[:37])
-    assert_allclose(some.lafs, everything.lafs[:37])
+    strengths = everything.responses * everything.scales
+    kept = strengths >= np.sort(strengths)[-37]
+    assert len(some) == kept.sum() == 37
+    assert not kept[:37].all(), "neither those of the largest responses"
+    assert not (everything.scales[kept].min() >= everything.scales[~kept]).all(), "nor scales"
+    assert_array_equal(some.responses, everything.responses[kept])
+    assert_array_equal(some.lafs, everything.lafs[kept])
 
 
 def test_detect_twice_gives_the_same_features(image: GrayImage) -> None:
