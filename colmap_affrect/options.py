@@ -2,6 +2,9 @@
 
 A recipe is a TOML file whose sections are the fields of :class:`ExtractionOptions` and
 ``matching``; what it leaves out keeps the defaults below.
+
+In this order: what all options can do; rectifiers; shapes and depth that they use; feature
+profiles; extraction as a whole; then pairs, matching, verification, mapping, cameras and masks.
 """
 
 from __future__ import annotations
