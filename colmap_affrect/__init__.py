@@ -14,7 +14,7 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-# The wheels of pycolmap 4.1 and 4.2 export zlib's symbols: if libz is first loaded by
+# The wheels of pycolmap 4.2 export zlib's symbols: if libz is first loaded by
 # "import pycolmap", the process dies or hangs when it compresses. Loading it before, as numpy does
 # too, keeps both working; after, it must not be touched.
 _first = next(n for n in sys.modules if n.partition(".")[0] in {"numpy", "pycolmap", "zlib"})
@@ -26,58 +26,34 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 _PUBLIC = {
     "AffrectError": "colmap_affrect.errors",
-    "CameraOptions": "colmap_affrect.options",
+    "CameraOptions": "colmap_affrect.images.photographs",
     "CompareOptions": "colmap_affrect.comparison.compare",
     "Comparison": "colmap_affrect.comparison.results",
     "EvaluateOptions": "colmap_affrect.evaluation.evaluate",
     "Evaluation": "colmap_affrect.evaluation.results",
-    "ExtractionOptions": "colmap_affrect.options",
-    "LocalFeatures": "colmap_affrect.types",
-    "MappingOptions": "colmap_affrect.options",
-    "MatchingOptions": "colmap_affrect.options",
-    "PairOptions": "colmap_affrect.options",
-    "ReconstructionReport": "colmap_affrect.outcomes",
+    "ExtractionOptions": "colmap_affrect.recipes",
+    "LocalFeatures": "colmap_affrect.data",
+    "GlobalOptions": "colmap_affrect.mappers.global_mapper",
+    "IncrementalOptions": "colmap_affrect.mappers.incremental",
+    "NearestOptions": "colmap_affrect.matchers.nearest",
+    "PairOptions": "colmap_affrect.pairs.base",
+    "ReconstructionReport": "colmap_affrect.project.report",
     "RunOptions": "colmap_affrect.pipeline",
-    "VerificationOptions": "colmap_affrect.options",
-    "MaskOptions": "colmap_affrect.options",
+    "VerificationOptions": "colmap_affrect.colmap.verification",
+    "MaskOptions": "colmap_affrect.images.photographs",
     "compare": "colmap_affrect.comparison.compare",
     "evaluate": "colmap_affrect.evaluation.evaluate",
-    "extract_features": "colmap_affrect.dropin",
-    "extract_image": "colmap_affrect.extraction",
+    "extract_features": "colmap_affrect.interop.pycolmap_api",
+    "extract_image": "colmap_affrect.stages.one_image",
     "load_recipe": "colmap_affrect.recipes",
-    "match_exhaustive": "colmap_affrect.dropin",
-    "match_image_pairs": "colmap_affrect.dropin",
+    "match_exhaustive": "colmap_affrect.interop.pycolmap_api",
+    "match_image_pairs": "colmap_affrect.interop.pycolmap_api",
     "run": "colmap_affrect.pipeline",
-    "verify": "colmap_affrect.dropin",
+    "verify": "colmap_affrect.interop.pycolmap_api",
 }
 
-__all__ = [
-    "AffrectError",
-    "CameraOptions",
-    "CompareOptions",
-    "Comparison",
-    "EvaluateOptions",
-    "Evaluation",
-    "ExtractionOptions",
-    "LocalFeatures",
-    "MappingOptions",
-    "MaskOptions",
-    "MatchingOptions",
-    "PairOptions",
-    "ReconstructionReport",
-    "RunOptions",
-    "VerificationOptions",
-    "__version__",
-    "compare",
-    "evaluate",
-    "extract_features",
-    "extract_image",
-    "load_recipe",
-    "match_exhaustive",
-    "match_image_pairs",
-    "run",
-    "verify",
-]
+__all__ = ["__version__"]
+__all__ += list(_PUBLIC)
 
 
 def __getattr__(name: str) -> Any:

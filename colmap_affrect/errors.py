@@ -7,7 +7,7 @@ class AffrectError(Exception):
     """Base of all errors that the command line prints as one line (exit code 1)."""
 
 
-class OptionError(AffrectError):
+class OptionError(AffrectError, ValueError):
     """An option is unknown, has a value out of range, or contradicts another one."""
 
 

@@ -1,31 +1,173 @@
-"""Recipes: named TOML files that set the options of extraction and matching."""
+"""Recipes: named TOML files that set the options of a run.
+
+A section is the options of a part, which ``name`` chooses; what a recipe leaves out keeps its
+default.
+"""
 
 from __future__ import annotations
 
 import difflib
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
+
+from pydantic import BeforeValidator, Field, SerializeAsAny
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.options import ExtractionOptions, MatchingOptions, options_class
+from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureOptions, NetworkOptions
+from colmap_affrect.features.sift import SiftOptions
+from colmap_affrect.images.depth import DEPTH_SOURCES, DepthFilesOptions, DepthOptions
+from colmap_affrect.mappers.base import MAPPERS, MapperOptions
+from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
+from colmap_affrect.matchers.nearest import NearestOptions
+from colmap_affrect.options import Options, Registry, within
+from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOptions
+from colmap_affrect.rectifiers.dense import DenseShapesOptions
+
+AnyRectifier = Annotated[SerializeAsAny[RectifierOptions], BeforeValidator(RECTIFIERS.options)]
+
+
+class ExtractionOptions(Options):
+    """Everything that decides the features of an image."""
+
+    rectifier: AnyRectifier = DenseShapesOptions()
+    """Warps that every image gets."""
+    escalation: Annotated[tuple[AnyRectifier, ...], Field(strict=False)] = ()
+    """Rectifiers for pairs that fail verification, one after the other until it succeeds."""
+    features: Annotated[SerializeAsAny[FeatureOptions], BeforeValidator(EXTRACTORS.options)] = (
+        SiftOptions()
+    )
+    depth: Annotated[SerializeAsAny[DepthOptions], BeforeValidator(DEPTH_SOURCES.options)] = (
+        DepthFilesOptions()
+    )
+    max_image_size_px: Annotated[int, within(16, 1_000_000)] = 2400
+    """Larger images are shrunk to this longer side before extraction, which bounds memory. COLMAP's
+    limit for SIFT is 3200."""
+
+    @property
+    def rectifiers(self) -> tuple[RectifierOptions, ...]:
+        """The rectifiers of all levels, that of every image first."""
+        return (self.rectifier, *self.escalation)
+
+    @property
+    def uses_depth(self) -> bool:
+        """Whether any rectifier reads depth maps."""
+        return any(rectifier.uses_depth for rectifier in self.rectifiers)
+
+    @property
+    def _network_parts(self) -> tuple[NetworkOptions, ...]:
+        covers = (item for item in self.rectifiers if isinstance(item, CoverOptions))
+        return (self.features, *(cover.shape_source for cover in covers))
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Keys of the files of weights that are read, sorted."""
+        return tuple(sorted({key for part in self._network_parts for key in part.weights}))
+
+    @property
+    def uses_networks(self) -> bool:
+        """Whether anything runs on torch."""
+        return self.depth.uses_network or any(part.uses_network for part in self._network_parts)
+
+
+class EscalateOptions(Options):
+    """Which pairs climb to the rectifiers of ``escalation``, beside those that are not verified."""
+
+    strong_num_inliers: Annotated[int, within(0, 1_000_000)] = 100
+    """A pair with fewer inliers climbs too while one of its images has no pair with as many:
+    an image that hangs on weak pairs alone is verified but rarely registered."""
+    min_num_tracks: Annotated[int, within(0, 1_000_000)] = 30
+    """All pairs of an image climb when fewer of its features are in tracks through three images or
+    more: mapping registers images by such features, and COLMAP wants 30 of them."""
+
+
+AnyMatcher = Annotated[SerializeAsAny[MatcherOptions], BeforeValidator(MATCHERS.options)]
+
+
+class RecipeOptions(ExtractionOptions):
+    """All sections of a recipe."""
+
+    summary: str = ""
+    matching: AnyMatcher = NearestOptions()
+    escalate: EscalateOptions = EscalateOptions()
+    mapping: dict[str, Any] = Field(default_factory=dict)
+    """``name`` of the mapper and options that differ from the preset."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a recipe decides.
+    """What a recipe decides, resolved once.
 
     Attributes:
         name: its name, or the path it was read from.
         summary: one line for people.
+        extraction: everything that decides the features of an image.
+        matching: the matcher.
+        escalate: which pairs climb.
+        mapping: the mapper's ``name`` and options that differ from the preset.
     """
 
     name: str
-    summary: str
-    extraction: ExtractionOptions
-    matching: MatchingOptions
+    summary: str = ""
+    extraction: ExtractionOptions = field(default_factory=ExtractionOptions)
+    matching: MatcherOptions = field(default_factory=NearestOptions)
+    escalate: EscalateOptions = field(default_factory=EscalateOptions)
+    mapping: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def from_mapping(cls, name: str, values: Mapping[str, Any], where: str = "") -> Self:
+        """Build from the sections of a recipe.
+
+        Raises:
+            OptionError: for an unknown option, or a value out of range.
+        """
+        where = where or f"recipe {name}"
+        options = RecipeOptions.from_mapping(values, where)
+        fields = {key: getattr(options, key) for key in ExtractionOptions.model_fields}
+        recipe = cls(
+            name,
+            options.summary,
+            ExtractionOptions(**fields),
+            options.matching,
+            options.escalate,
+            options.mapping,
+        )
+        if recipe.mapping:
+            try:  # refuses wrong ones now, not when mapping begins
+                recipe.mapper_options("sparse")
+            except OptionError as error:
+                raise OptionError(f"{where}: mapping: {error}") from error
+        return recipe
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return all sections with all options, as :meth:`from_mapping` takes them."""
+        return {
+            **self.extraction.to_mapping(),
+            "matching": self.matching.to_mapping(),
+            "escalate": self.escalate.to_mapping(),
+            "mapping": dict(self.mapping),
+        }
+
+    def mapper_options(self, preset: str, name: str = "", **values: Any) -> MapperOptions:
+        """Return the options of the mapper: those of a preset, of the recipe, and others given.
+
+        Args:
+            preset: ``sparse`` or ``colmap``.
+            name: of the mapper; that of the recipe by default.
+            values: win over those of the recipe.
+
+        Raises:
+            OptionError: for an unknown mapper or option.
+        """
+        own = dict(self.mapping)
+        recipes_name = str(own.pop("name", MAPPERS.default))
+        name = name or recipes_name
+        if name != recipes_name:
+            own = {}
+        options: MapperOptions = MAPPERS.part(name).Options.preset(preset, **{**own, **values})
+        return options
 
 
 def recipe_folder() -> Path:
@@ -49,14 +191,7 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
     Raises:
         OptionError: for an unknown recipe or option, or a value out of range.
     """
-    values = _read(name)
-    for setting in settings:
-        _apply(values, setting)
-    summary = values.pop("summary", "")
-    matching = values.pop("matching", {})
-    extraction = ExtractionOptions.from_mapping(values, f"recipe {name}")
-    where = f"recipe {name}: matching"
-    return Recipe(name, summary, extraction, MatchingOptions.from_mapping(matching, where))
+    return Recipe.from_mapping(name, with_settings(_read(name), settings))
 
 
 def _read(name: str) -> dict[str, Any]:
@@ -72,7 +207,16 @@ def _read(name: str) -> dict[str, Any]:
         raise OptionError(f"recipe {path}: cannot be read ({error})") from error
 
 
+def with_settings(values: Mapping[str, Any], settings: Sequence[str]) -> dict[str, Any]:
+    """Return the sections of a recipe with single options changed; see :func:`load_recipe`."""
+    changed = dict(values)
+    for setting in settings:
+        _apply(changed, setting)
+    return changed
+
+
 def _apply(values: dict[str, Any], setting: str) -> None:
+    """Change one option; where another part is chosen by its name, the old one's options go."""
     key, separator, text = setting.partition("=")
     if not separator or not key.strip():
         raise OptionError(f"--set {setting}: expected section.option=value")
@@ -83,21 +227,25 @@ def _apply(values: dict[str, Any], setting: str) -> None:
     *sections, option = key.strip().split(".")
     target: Any = values
     for section in sections:
-        target = target.setdefault(section, {})
-        if not isinstance(target, Mapping):
+        inner = target.get(section, {})
+        inner = {"name": inner} if isinstance(inner, str) else inner  # a part by its name alone
+        if not isinstance(inner, Mapping):
             raise OptionError(f"--set {setting}: {section} is not a section")
+        target[section] = dict(inner)
+        target = target[section]
+    if option == "name" and key.strip() in PART_SECTIONS and target.get("name") != value:
+        known = PART_SECTIONS[key.strip()].part(str(value)).Options.model_fields
+        for other in set(target) - set(known):
+            del target[other]
     target[option] = value
-    if key.strip() in CHOICES:
-        _keep_known(target, key.strip())
 
 
-CHOICES = {"rectifier.name": "rectifier", "features.profile": "features"}
-"""Options that choose the class of their section, which other options there depend on."""
-
-
-def _keep_known(section: dict[str, Any], key: str) -> None:
-    """Drop what the recipe says of another rectifier or profile than the one now chosen."""
-    name = CHOICES[key]
-    fields = options_class(name, section).__dataclass_fields__
-    for option in set(section) - set(fields):
-        del section[option]
+PART_SECTIONS: dict[str, Registry[Any]] = {
+    "rectifier.name": RECTIFIERS,
+    "rectifier.shape_source.name": SHAPES,
+    "features.name": EXTRACTORS,
+    "matching.name": MATCHERS,
+    "mapping.name": MAPPERS,
+    "depth.name": DEPTH_SOURCES,
+}
+"""Options that choose the part of their section, which the other options there depend on."""

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from colmap_affrect.conventions import resized_from_original
-from colmap_affrect.types import GrayImage, Photograph
+from colmap_affrect.data import GrayImage, Photograph, ShapeGrid, ShapeSamples
+from colmap_affrect.geometry.tilts import metrics_from_tilts
 
 Array = NDArray[np.float64]
 
@@ -27,6 +28,22 @@ class FixedDepth:
         """The map as float32."""
         del photograph
         return self.values.astype(np.float32)
+
+
+@dataclass
+class FixedShapes:
+    """Shape source that knows its shapes beforehand, as rows (x, y, tilt, angle)."""
+
+    rows: Array
+
+    def grid(self, image: GrayImage) -> ShapeGrid:
+        """Not for rectifiers that read samples."""
+        raise NotImplementedError
+
+    def samples(self, image: GrayImage) -> ShapeSamples:
+        """The shapes."""
+        del image
+        return ShapeSamples(self.rows[:, :2], metrics_from_tilts(self.rows[:, 2], self.rows[:, 3]))
 
 
 def unit(vector: ArrayLike) -> Array:

@@ -15,7 +15,7 @@ from command import start
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.workspace import Workspace
+from colmap_affrect.project.workspace import Workspace
 
 
 def results(out: Path) -> dict[str, Any]:

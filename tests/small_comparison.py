@@ -12,19 +12,14 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.comparison.results import (
-    AUC_THRESHOLDS_DEG,
-    Comparison,
-    MethodResult,
-    Pair,
-    PoseScores,
-    SeedResult,
-)
-from colmap_affrect.options import CameraOptions, MaskOptions
+from colmap_affrect.colmap.poses import AUC_THRESHOLDS_DEG, PoseScores
+from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.store import FeatureStore
-from colmap_affrect.types import LocalFeatures
-from colmap_affrect.workspace import Workspace
+from colmap_affrect.stages.extract import Inputs
 
 NAMES = ("<img src=x onerror=alert(1)>.png", "a & b.png", "c.png", "d.png", "e.png", "f.png")
 IMAGE_SIZE = (160, 120)
@@ -66,14 +61,9 @@ def make_comparison(folder: Path) -> Comparison:
             ],
         ),
     )
+    settings, versions = {"camera": {"mode": "auto"}}, {"pycolmap": pycolmap.__version__}
     return Comparison(
-        tuple(sorted(NAMES)),
-        str(photographs),
-        methods,
-        (0, 1),
-        15,
-        {"camera": {"mode": "auto"}, "preset": "sparse"},
-        {"pycolmap": pycolmap.__version__},
+        tuple(sorted(NAMES)), str(photographs), methods, (0, 1), 15, settings, versions
     )
 
 
@@ -123,13 +113,10 @@ def _write_method(
 def _write_features(method_path: Path) -> None:
     """Write the record of the recipe, and features of which every second one is from a warp."""
     workspace = Workspace(method_path)
-    record = {
-        "image_path": str(method_path.parents[1] / "photographs"),
-        "camera": CameraOptions().to_mapping(),
-        "masks": MaskOptions().to_mapping(),
-        **load_recipe("default").extraction.to_mapping(),
-    }
-    workspace.claim("extract", record, recipe="default")
+    inputs = Inputs.of(method_path.parents[1] / "photographs")
+    recipe = load_recipe("default")
+    record = {**inputs.to_mapping(), **recipe.extraction.to_mapping()}
+    workspace.record_options("extract", record, recipe=recipe.name)
     store = FeatureStore(workspace.features)
     with open_database(method_path / "seed-0" / "database.db") as database:
         for image in database.read_all_images():
@@ -161,6 +148,7 @@ def _seed(
         mean_track_length=model.compute_mean_track_length(),
         mean_observations=model.compute_mean_observations_per_reg_image(),
         mean_reprojection_error_px=0.21 + seed / 100,
+        num_observations={},
         pair_inliers=pair_inliers,
         scores=PoseScores(
             correct,
@@ -176,14 +164,13 @@ def _seed(
 def _method(name: str, seeds: Sequence[SeedResult], failed: str = "") -> MethodResult:
     return MethodResult(
         name,
-        f"summary of {name}",
-        {image: 100 + number for number, image in enumerate(NAMES)},
-        {},
-        tuple(seeds),
-        {"extract": 12.25, "match": 1.5},
-        123_400_000,
-        {"broken.png": "not a <readable> image"} if name == "sift" else {},
-        {"features": {"profile": "rootsift"}},
-        f"methods/{name}",
-        failed,
+        summary=f"summary of {name}",
+        num_keypoints={image: 100 + number for number, image in enumerate(NAMES)},
+        seeds=tuple(seeds),
+        wall_s={"extract": 12.25, "match": 1.5},
+        peak_memory_bytes=123_400_000,
+        failures={"broken.png": "not a <readable> image"} if name == "sift" else {},
+        options={"features": {"profile": "rootsift"}},
+        folder=f"methods/{name}",
+        failed=failed,
     )

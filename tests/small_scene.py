@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from synthetic import texture, write_image
 
-from colmap_affrect.types import GrayImage
+from colmap_affrect.data import GrayImage
 
 Array = NDArray[np.float64]
 

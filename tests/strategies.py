@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from colmap_affrect.geometry.affine import compose_affine
+from colmap_affrect.geometry.tilts import cosh_distances, metrics_from_tilts
 
 Array = NDArray[np.float64]
 
@@ -20,6 +21,15 @@ turns = st.floats(-np.pi, np.pi)
 scales = st.floats(0.1, 10.0)
 
 
+def tilt_distance(tilt1: float, angle1_rad: float, tilt2: float, angle2_rad: float) -> float:
+    """Return d = log tau, the log of the transition tilt between two classes.
+
+    cosh d = ((t1/t2 + t2/t1) cos^2 D + (t1 t2 + 1/(t1 t2)) sin^2 D) / 2 with D = phi1 - phi2.
+    """
+    metrics = metrics_from_tilts([tilt1, tilt2], [angle1_rad, angle2_rad])
+    return float(np.arccosh(np.maximum(cosh_distances(metrics[:1], metrics[1:])[0, 0], 1.0)))
+
+
 @st.composite
 def classes(draw: st.DrawFn) -> tuple[float, float]:
     """A class (tilt, angle) of the space of tilts."""
@@ -30,15 +40,6 @@ def classes(draw: st.DrawFn) -> tuple[float, float]:
 def affine_shapes(draw: st.DrawFn) -> Array:
     """A (2, 2) map of positive determinant and condition number at most 8."""
     return compose_affine(draw(scales), draw(turns), draw(tilts), draw(tilt_angles))
-
-
-@st.composite
-def affine_maps(draw: st.DrawFn) -> Array:
-    """A (3, 3) affine map: an affine shape and a translation."""
-    matrix = np.eye(3)
-    matrix[:2, :2] = draw(affine_shapes())
-    matrix[:2, 2] = draw(st.floats(-200, 200)), draw(st.floats(-200, 200))
-    return matrix
 
 
 @st.composite

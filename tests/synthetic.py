@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from colmap_affrect.types import GrayImage
+from colmap_affrect.data import GrayImage
 
 Array = NDArray[np.float64]
 
@@ -69,3 +70,11 @@ def write_image(path: Path, image: NDArray[np.generic]) -> Path:
     assert success
     path.write_bytes(data.tobytes())
     return path
+
+
+def jpeg_with_orientation(image: GrayImage, orientation: int) -> bytes:
+    """JPEG whose EXIF segment holds nothing but the orientation tag."""
+    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    entry = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
+    segment = b"Exif\x00\x00II*\x00" + struct.pack("<IH", 8, 1) + entry + bytes(4)
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]

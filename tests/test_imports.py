@@ -85,7 +85,7 @@ def test_what_ends_with_pictures_is_refused_after_pycolmap(call: str) -> None:
 def test_pictures_are_not_refused_where_numpy_came_before_pycolmap() -> None:
     done = run_python(
         "import numpy, pycolmap\n"
-        "from colmap_affrect.imaging import encode_png, require_png\n"
+        "from colmap_affrect.images.reading import encode_png, require_png\n"
         "require_png()\n"
         "print(len(encode_png(numpy.eye(300, dtype=numpy.uint8))) > 100)"
     )

@@ -11,40 +11,17 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
-from registration import (
-    SUBSETS,
-    camera_options,
-    compute_matches,
-    link_images,
-    read_true_poses,
-    run_seed,
-)
+from registration import compare, compare_subset
 
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.verification import inlier_matches, verify
-from colmap_affrect.comparison.methods import parse_method
-from colmap_affrect.extraction import Resources
-from colmap_affrect.options import CameraOptions, VerificationOptions
+from colmap_affrect.colmap.verification import inlier_matches
 
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
-SUBSET_BY_NAME = {subset.name: subset for subset in SUBSETS}
 
 pytestmark = [
     pytest.mark.shared,
     pytest.mark.skipif(not SCENES.is_dir(), reason="the photographs of ../shared are not here"),
 ]
-
-
-def correct_by_seed(recipe, name, tmp_path, num_seeds):
-    subset = SUBSET_BY_NAME[name]
-    cameras = camera_options(subset, SCENES)
-    images = tmp_path / "images"
-    link_images(subset.image_paths(SCENES), images)
-    folder = tmp_path / "work"
-    folder.mkdir()
-    compute_matches(parse_method(recipe), cameras, images, folder, Resources())
-    truth = read_true_poses(SCENES / subset.scene)
-    return [run_seed(folder, images, cameras, truth, seed) for seed in range(num_seeds)]
 
 
 @pytest.mark.parametrize(
@@ -58,9 +35,10 @@ def correct_by_seed(recipe, name, tmp_path, num_seeds):
     ],
 )
 def test_sparse_subset_registers_correctly(recipe, name, min_correct, median_error_deg, tmp_path):
-    rows = correct_by_seed(recipe, name, tmp_path, num_seeds=5)
-    assert sum(row["correct"] >= min_correct for row in rows) >= 4
-    errors = sorted(row["rotation_error_deg"] for row in rows)
+    result = compare_subset(name, SCENES, tmp_path, [recipe], 5)["methods"][recipe]
+    scores = [seed["scores"] for seed in result["seeds"]]
+    assert sum(len(score["correct_names"]) >= min_correct for score in scores) >= 4
+    errors = sorted(score["median_rotation_error_deg"] for score in scores)
     assert errors[2] < median_error_deg
 
 
@@ -80,15 +58,15 @@ def count_distinct_inliers(database_path):
 
 @pytest.mark.parametrize("scene", ["strecha_fountain_p11", "strecha_herz_jesus_p25", "kermit"])
 def test_photographs_taken_close_together_match_in_as_many_places_as_with_sift(scene, tmp_path):
-    images = tmp_path / "images"
-    link_images(sorted((SCENES / scene / "images").iterdir())[:3], images)
-    counts = {}
-    for label in ("sift", "default"):
-        folder = tmp_path / label
-        folder.mkdir()
-        compute_matches(parse_method(label), CameraOptions(), images, folder, Resources())
-        verify(folder / "database.db", VerificationOptions(), 0)
-        counts[label] = count_distinct_inliers(folder / "database.db")
+    images = SCENES / scene / "images"
+    names = sorted(path.name for path in images.iterdir())[:3]
+    comparison = compare(images, names, tmp_path, ["sift", "default"], 1)
+    counts = {
+        label: count_distinct_inliers(
+            tmp_path / "compare" / of["folder"] / "seed-0" / "database.db"
+        )
+        for label, of in comparison["methods"].items()
+    }
     assert counts["default"] >= counts["sift"] > 100
 
 
@@ -98,8 +76,8 @@ def test_peak_memory_of_extraction_stays_under_1500_mb_on_12_megapixels(tmp_path
     cv2.imwrite(str(tmp_path / "large.jpg"), image)
     script = (
         "import sys; from pathlib import Path\n"
-        "from colmap_affrect.executor import peak_memory_bytes\n"
-        "from colmap_affrect.extraction import prepare\n"
+        "from colmap_affrect.parallel.executor import peak_memory_bytes\n"
+        "from colmap_affrect.stages.one_image import prepare\n"
         "from colmap_affrect.recipes import load_recipe\n"
         "extracted = prepare(load_recipe('default').extraction).extract_file(Path(sys.argv[1]))\n"
         "assert extracted.image_size == (4000, 3000) and len(extracted.features) > 5000\n"

@@ -6,18 +6,16 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import tomli_w
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.options import (
-    AffNetShapesOptions,
-    CoverOptions,
-    DenseShapesOptions,
-    ExtractionOptions,
-    MatchingOptions,
-    SiftOptions,
-)
-from colmap_affrect.recipes import load_recipe, recipe_folder, recipe_names
-from colmap_affrect.workspace import dump_toml
+from colmap_affrect.features.shapes.second_moment import SecondMomentOptions
+from colmap_affrect.features.sift import SiftOptions
+from colmap_affrect.matchers.nearest import NearestOptions
+from colmap_affrect.recipes import ExtractionOptions, load_recipe, recipe_folder, recipe_names
+from colmap_affrect.rectifiers.base import CoverOptions
+from colmap_affrect.rectifiers.dense import DenseShapesOptions
+from colmap_affrect.rectifiers.whole_image import AffNetShapesOptions
 
 NAMES = [
     "affnet-shapes", "affnet-shapes-recommended", "asift", "asift-recommended", "default",
@@ -48,13 +46,13 @@ def test_recipe_has_a_summary_and_only_known_options(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_options_of_a_recipe_survive_being_written_down(name: str) -> None:
     options = load_recipe(name).extraction
-    written = tomllib.loads(dump_toml(options.to_mapping()))
+    written = tomllib.loads(tomli_w.dumps(options.to_mapping()))
     assert ExtractionOptions.from_mapping(written, "config.toml") == options
 
 
 def test_default_recipe_rectifies_with_the_values_of_the_paper() -> None:
     rectifier = load_recipe("default").extraction.rectifier
-    assert (rectifier.name, rectifier.shape_source) == ("dense-shapes", "second-moment")
+    assert (rectifier.name, rectifier.shape_source.name) == ("dense-shapes", "second-moment")
     assert (rectifier.tilt_radius, rectifier.max_tilt, rectifier.covered_frac) == (1.7, 5.8, 0.95)
 
 
@@ -70,14 +68,14 @@ def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> No
     recipe = load_recipe(name)
     extraction, features = recipe.extraction, recipe.extraction.features
     assert extraction.rectifier.name == rectifier
-    assert (features.profile, features.descriptor) == ("affnet-hardnet", "hardnet")
+    assert (features.name, features.descriptor) == ("affnet-hardnet", "hardnet")
     assert (features.detector, features.contrast_threshold) == ("dog", 0.04)
     assert features.max_num_features == features.max_num_rectified_features == 1_000_000
     assert (recipe.matching.max_ratio, recipe.matching.ratio_both_ways) == (0.85, False)
     if isinstance(extraction.rectifier, CoverOptions):
         cover = extraction.rectifier
         assert (cover.tilt_radius, cover.max_tilt, cover.covered_frac) == (1.7, 5.8, 0.95)
-        assert (cover.shape_source, cover.area_preserving) == ("affnet", False)
+        assert (cover.shape_source.name, cover.area_preserving) == ("affnet", False)
 
 
 def test_escalation_climbs_from_no_warps_to_all_tilts() -> None:
@@ -91,10 +89,16 @@ def test_escalation_climbs_from_no_warps_to_all_tilts() -> None:
 
 
 def test_choosing_a_profile_drops_the_options_of_the_other_one() -> None:
-    recipe = load_recipe("asift-recommended", ["features.profile=rootsift"])
+    recipe = load_recipe("asift-recommended", ["features.name=rootsift"])
     assert recipe.extraction.features == SiftOptions(max_num_rectified_features=32768)
-    recipe = load_recipe("unrectified", ["features.dtype=bfloat16", "features.profile=rootsift"])
+    recipe = load_recipe("unrectified", ["features.dtype=bfloat16", "features.name=rootsift"])
     assert recipe.extraction.features.contrast_threshold == 0.04
+
+
+def test_choosing_a_shape_source_drops_the_options_of_the_other_one() -> None:
+    settings = ["rectifier.shape_source.min_gradient=2.0", "rectifier.shape_source.name=affnet"]
+    rectifier = load_recipe("default", settings).extraction.rectifier
+    assert rectifier.to_mapping()["shape_source"]["name"] == "affnet"
 
 
 def test_settings_change_single_options() -> None:
@@ -102,14 +106,14 @@ def test_settings_change_single_options() -> None:
         "default",
         [
             "rectifier.tilt_radius=1.8",
-            "second_moment.integration_sigmas_px=[4.0, 9.0]",
             "matching.max_ratio=0.7",
             "max_image_size_px=1000",
             "rectifier.name=affnet-shapes",
+            "rectifier.shape_source.integration_sigmas_px=[4.0, 9.0]",
         ],
     )
-    assert recipe.extraction.rectifier == AffNetShapesOptions(tilt_radius=1.8)
-    assert recipe.extraction.second_moment.integration_sigmas_px == (4.0, 9.0)
+    shapes = SecondMomentOptions(integration_sigmas_px=(4.0, 9.0))
+    assert recipe.extraction.rectifier == AffNetShapesOptions(tilt_radius=1.8, shape_source=shapes)
     assert recipe.extraction.max_image_size_px == 1000
     assert recipe.matching.max_ratio == 0.7
     assert recipe.extraction.features == load_recipe("default").extraction.features
@@ -122,11 +126,16 @@ def test_settings_change_single_options() -> None:
         ("=3", "expected section.option=value"),
         ("rectifier.tilt_radios=1.8", "did you mean 'tilt_radius'"),
         ("rectifyer.tilt_radius=1.8", "did you mean 'rectifier'"),
-        ("rectifier.tilt_radius=0.5", r"tilt_radius=0\.5 is outside"),
+        ("rectifier.tilt_radius=0.5", r"tilt_radius=0\.5 is outside \[1\.05, 10\]"),
         ("rectifier.tilt_radius=wide", "expected float, got str"),
         ("features.max_num_features=1.5", "expected int, got float"),
         ("matching.max_ratio.deep=1", "is not a section"),
-        ("rectifier.name=dense", "unknown 'dense' .did you mean 'dense-shapes'"),
+        ("mapping.min_model_size=1", "recipe default: mapping: min_model_size=1 is outside"),
+        ("mapping.min_model=1", "recipe default: mapping: .*did you mean 'min_model_size'"),
+        ("escalate=3", "escalate: expected options, got int"),
+        ("escalation=3", "escalation: expected list, got int"),
+        ("rectifier.shape_source.integration_sigmas_px=[]", "integration_sigmas_px is empty"),
+        ("rectifier.name=dense", "unknown rectifier 'dense' .did you mean 'dense-shapes'"),
     ],
 )
 def test_wrong_setting_is_one_clear_line(setting: str, message: str) -> None:
@@ -154,7 +163,7 @@ def test_recipe_file_is_read_and_what_it_leaves_out_is_default(tmp_path: Path) -
     assert recipe.extraction == ExtractionOptions(
         rectifier=DenseShapesOptions(max_num_rectifications=2)
     )
-    assert recipe.matching == MatchingOptions()
+    assert recipe.matching == NearestOptions()
 
 
 @pytest.mark.parametrize(
@@ -162,8 +171,8 @@ def test_recipe_file_is_read_and_what_it_leaves_out_is_default(tmp_path: Path) -
     [
         (b"[rectifier\n", r"mine\.toml: cannot be read"),
         (b"\xff\xfe", r"mine\.toml: cannot be read"),
-        (b"[rectifier]\ntilt = 3\n", r"mine\.toml\.rectifier: unknown option 'tilt'"),
-        (b"[mapping]\nx = 3\n", r"unknown option 'mapping'"),
+        (b"[rectifier]\ntilt = 3\n", r"mine\.toml: rectifier: unknown option 'tilt'"),
+        (b"[mapping]\nx = 3\n", r"unknown option 'x'"),
         (None, "unknown recipe"),
     ],
 )

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from colmap_affrect.comparison.metrics import pose_scores, read_poses
-from colmap_affrect.extraction import prepare
+from colmap_affrect.colmap.poses import pose_scores, read_poses
 from colmap_affrect.geometry.affine import project
-from colmap_affrect.matching.nearest import match_features, matchable
-from colmap_affrect.options import CameraOptions
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.matchers.nearest import match_features, matchable
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.recipes import load_recipe
+from colmap_affrect.stages.one_image import prepare
 
 SCENES = Path(__file__).parents[1] / "sample_scenes"
 COURTYARD_CAMERA = CameraOptions(mode="single", model="PINHOLE", params="1080,1080,360,270")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_scene import write_photographs
 
-from colmap_affrect.imaging import read_mask
+from colmap_affrect.images.masks import read_mask
 from colmap_affrect.recipes import recipe_folder, recipe_names
 
 RECIPES = Path(__file__).parents[1] / "recipes"

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TextIO
 
 from colmap_affrect import __version__
-from colmap_affrect.cli.arguments import build_parser
+from colmap_affrect.cli.parser import build_parser
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.outcomes import EXIT_FAILED, EXIT_INTERRUPTED
-from colmap_affrect.workspace import Workspace
+from colmap_affrect.project.report import EXIT_FAILED, EXIT_INTERRUPTED
+from colmap_affrect.project.workspace import Workspace
 
 logger = logging.getLogger("colmap_affrect")
 

@@ -9,38 +9,40 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from colmap_affrect.errors import ComparisonError, OptionError
-from colmap_affrect.options import (
-    CameraOptions,
-    MappingOptions,
-    MaskOptions,
-    PairOptions,
-    VerificationOptions,
-)
-from colmap_affrect.outcomes import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK, ReconstructionReport
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.workspace import Workspace
+from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK, ReconstructionReport
+from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
+    from colmap_affrect.colmap.verification import VerificationOptions
     from colmap_affrect.comparison.results import Comparison
-    from colmap_affrect.executor import Executor
-    from colmap_affrect.extraction import Resources
-    from colmap_affrect.pipeline import RunOptions
+    from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+    from colmap_affrect.mappers.base import MapperOptions
+    from colmap_affrect.pairs.base import PairOptions
+    from colmap_affrect.parallel.executor import Executor
     from colmap_affrect.recipes import Recipe
+    from colmap_affrect.stages.context import Context, Resources
 
 
 def run(options: argparse.Namespace) -> int:
     from colmap_affrect import pipeline
 
+    recipe = _recipe(options)
+    given = pipeline.RunOptions(
+        recipe=recipe,
+        database_descriptors=options.database_descriptors,
+        **_inputs(options, recipe),
+    )
     with _executor(options) as executor:
         report = pipeline.run(
             options.image_path,
             options.output_path,
-            _run_options(options),
+            given,
             executor=executor,
             overwrite=options.overwrite,
             progress=_progress(options),
@@ -48,201 +50,235 @@ def run(options: argparse.Namespace) -> int:
     return _print_reconstruction(report, options)
 
 
-def _run_options(options: argparse.Namespace) -> RunOptions:
-    from colmap_affrect.pipeline import RunOptions
-
-    return RunOptions(
-        recipe=_recipe(options, options.recipe),
-        pairs=_pair_options(options),
-        database_descriptors=options.database_descriptors,
-        random_seed=options.random_seed,
-        **_inputs(options),
-    )
-
-
-def _inputs(options: argparse.Namespace) -> dict[str, Any]:
+def _inputs(options: argparse.Namespace, recipe: Recipe | None = None) -> dict[str, Any]:
     """Return the fields of InputOptions, which run and compare have in common."""
     return {
         "cameras": _cameras(options),
         "masks": _masks(options),
-        "verification": VerificationOptions.preset(options.preset),
-        "mapping": _mapping(options),
-        "match_list_path": options.match_list_path,
+        "pairs": _pair_options(options),
+        "verification": _verification(options),
+        "mapping": _mapping(options, recipe),
         "image_list_path": options.image_list_path,
         "from_database": options.from_database,
         "resources": _resources(options),
     }
 
 
-def _recipe(options: argparse.Namespace, name: str) -> Recipe:
+def _recipe(options: argparse.Namespace) -> Recipe:
     from colmap_affrect.recipes import load_recipe
 
-    return load_recipe(name, [*options.set, *_depth_settings(options)])
+    matcher = getattr(options, "matcher", None)
+    settings = [f"matching.name={json.dumps(matcher)}"] if matcher else []
+    return load_recipe(options.recipe, [*settings, *options.set, *_depth_settings(options)])
 
 
 def _depth_settings(options: argparse.Namespace) -> list[str]:
-    path = getattr(options, "depth_path", None)
+    path, model = getattr(options, "depth_path", None), getattr(options, "depth_model", None)
     given = {
+        "name": "monocular" if model else "files" if path else None,
         "path": str(path.resolve()) if path else None,
-        "model": getattr(options, "depth_model", None),
+        "model": model,
         "kind": getattr(options, "depth_kind", None),
     }
     return [f"depth.{key}={json.dumps(value)}" for key, value in given.items() if value]
 
 
 def _resources(options: argparse.Namespace) -> Resources:
-    from colmap_affrect.extraction import Resources
+    from colmap_affrect.stages.context import Resources
 
-    return Resources(options.weights, options.device)
+    return Resources(getattr(options, "weights", None), getattr(options, "device", "auto"))
 
 
 @contextmanager
 def _executor(options: argparse.Namespace) -> Iterator[Executor | None]:
     """Use the cluster that was named, None if there is none."""
-    if not options.scheduler:
+    if not getattr(options, "scheduler", None):
         yield None
         return
-    from colmap_affrect.cluster import connected
+    from colmap_affrect.parallel.cluster import connected
 
     with connected(options.scheduler) as cluster:
         yield cluster
 
 
+@contextmanager
+def _context(options: argparse.Namespace) -> Iterator[Context]:
+    """Lock the output folder and return what the stages work with."""
+    from colmap_affrect.stages.context import Context
+
+    with Workspace(options.output_path).locked() as workspace, _executor(options) as executor:
+        yield Context(workspace, _resources(options), executor, _progress(options))
+
+
 def _cameras(options: argparse.Namespace) -> CameraOptions:
+    from colmap_affrect.images.photographs import CameraOptions
+
     return CameraOptions(
         mode=options.camera_mode, model=options.camera_model, params=options.camera_params
     )
 
 
-def _mapping(options: argparse.Namespace) -> MappingOptions:
-    given = {}
-    for setting in options.mapper_options:
-        key, separator, value = setting.partition("=")
-        if not separator or not key.strip():
-            raise OptionError(f"--mapper-options {setting}: expected KEY=VALUE")
-        given[key.strip()] = value
-    return MappingOptions.preset(options.preset, mapper=options.mapper, mapper_options=given)
-
-
 def _masks(options: argparse.Namespace) -> MaskOptions:
+    from colmap_affrect.images.photographs import MaskOptions
+
     paths = (options.mask_path, options.camera_mask_path)
     folder, camera = (str(path.resolve()) if path else "" for path in paths)
     return MaskOptions(path=folder, camera_path=camera)
 
 
-def extract(options: argparse.Namespace) -> int:
-    from colmap_affrect import stages
+def _pair_options(
+    options: argparse.Namespace, recorded: Mapping[str, Any] | None = None
+) -> PairOptions:
+    """Return what is given on the command line, over what is on record."""
+    from colmap_affrect.pairs.base import PairOptions
 
-    with Workspace(options.output_path).locked() as workspace, _executor(options) as executor:
-        report = stages.extract(
-            workspace,
-            options.image_path,
-            _recipe(options, options.recipe),
-            _cameras(options),
-            masks=_masks(options),
-            image_list_path=options.image_list_path,
-            from_database=options.from_database,
-            resources=_resources(options),
-            executor=executor,
-            overwrite=options.overwrite,
-            progress=_progress(options),
-        )
+    listed = options.match_list_path
+    given = {
+        "methods": getattr(options, "pairs", None),
+        "num_neighbors": getattr(options, "num_neighbors", None),
+        "max_distance_m": getattr(options, "max_distance_m", None),
+        "match_list_path": str(listed.resolve()) if listed else None,
+    }
+    chosen = {key: value for key, value in given.items() if value is not None}
+    return PairOptions.from_mapping({**(recorded or {}), **chosen}, "pairs")
+
+
+def _verification(
+    options: argparse.Namespace, recorded: Mapping[str, Any] | None = None
+) -> VerificationOptions:
+    """Return the preset that is given, or what is on record."""
+    from colmap_affrect.colmap.verification import VerificationOptions
+
+    seed = getattr(options, "random_seed", None)
+    given = {} if seed is None else {"random_seed": seed}
+    if recorded and not options.preset:
+        return VerificationOptions(**{**recorded, **given})
+    return VerificationOptions.preset(options.preset or "sparse", **given)
+
+
+def _mapping(
+    options: argparse.Namespace,
+    recipe: Recipe | None = None,
+    recorded: Mapping[str, Any] | None = None,
+) -> MapperOptions:
+    """Return the mapper that is given, or what is on record."""
+    from colmap_affrect.mappers.base import MAPPERS
+    from colmap_affrect.recipes import Recipe
+
+    native = {}
+    for setting in options.mapper_options:
+        key, separator, value = setting.partition("=")
+        if not separator or not key.strip():
+            raise OptionError(f"--mapper-options {setting}: expected KEY=VALUE")
+        native[key.strip()] = value
+    seed = getattr(options, "random_seed", None)
+    given: dict[str, Any] = {} if seed is None else {"random_seed": seed}
+    if native:
+        given["mapper_options"] = native
+    if recorded and not (options.preset or options.mapper):
+        found: MapperOptions = MAPPERS.options({**recorded, **given})
+        return found
+    recipe = recipe or Recipe("")
+    return recipe.mapper_options(options.preset or "sparse", options.mapper or "", **given)
+
+
+def extract(options: argparse.Namespace) -> int:
+    from colmap_affrect.stages import extract as stage
+
+    inputs = stage.Inputs.of(
+        options.image_path,
+        image_list_path=options.image_list_path,
+        from_database=options.from_database,
+        cameras=_cameras(options),
+        masks=_masks(options),
+    )
+    with _context(options) as context:
+        report = stage.extract(context, inputs, _recipe(options), overwrite=options.overwrite)
         if options.database_descriptors:
-            stages.write_descriptors(workspace)
+            stage.write_descriptors(context)
     print(report.summary())
     return _exit_code(report.failures, options)
 
 
 def pairs(options: argparse.Namespace) -> int:
-    from colmap_affrect import stages
+    from colmap_affrect.stages.pairs import choose_pairs
 
-    with Workspace(options.output_path).locked() as workspace:
-        report = stages.choose_pairs(
-            workspace,
-            _pair_options(options),
-            match_list_path=options.match_list_path,
-            overwrite=options.overwrite,
-            progress=_progress(options),
-        )
+    with _context(options) as context:
+        chosen = _pair_options(options, context.workspace.planned("pairs"))
+        report = choose_pairs(context, chosen, overwrite=options.overwrite)
     print(report.summary())
     return EXIT_OK
-
-
-def _pair_options(options: argparse.Namespace) -> PairOptions:
-    return PairOptions(
-        methods=options.pairs,
-        num_neighbors=options.num_neighbors,
-        max_distance_m=options.max_distance_m,
-    )
 
 
 def match(options: argparse.Namespace) -> int:
-    from colmap_affrect import stages
+    from colmap_affrect.matchers.base import MATCHERS
+    from colmap_affrect.stages.match import match
 
-    with Workspace(options.output_path).locked() as workspace, _executor(options) as executor:
-        recipe = _recipe(options, options.recipe or workspace.recipe())
-        report = stages.match(
-            workspace,
-            recipe.matching,
-            device=options.device,
-            executor=executor,
-            overwrite=options.overwrite,
-            progress=_progress(options),
-        )
+    with _context(options) as context:
+        if options.recipe:
+            matching = _recipe(options).matching
+        else:
+            chosen = [f"matching.name={json.dumps(options.matcher)}"] if options.matcher else []
+            recorded = context.workspace.planned("match")
+            values = _changed("matching", recorded, [*chosen, *options.set])
+            matching = MATCHERS.options(values, where="matching")
+        report = match(context, matching, overwrite=options.overwrite)
     print(report.summary())
     return EXIT_OK
 
 
-def verify(options: argparse.Namespace) -> int:
-    from colmap_affrect import stages
+def _changed(
+    section: str, recorded: Mapping[str, Any] | None, settings: Sequence[str]
+) -> dict[str, Any]:
+    """Return the options on record of one section of a recipe, some of them changed."""
+    from colmap_affrect.recipes import with_settings
 
-    with Workspace(options.output_path).locked() as workspace:
-        report = stages.verify_matches(
-            workspace,
-            VerificationOptions.preset(options.preset),
-            options.random_seed,
-            overwrite=options.overwrite,
-            progress=_progress(options),
-        )
+    values = with_settings({section: recorded or {}}, settings)
+    if len(values) > 1:
+        raise OptionError(f"--set: only options of {section} can be changed here")
+    changed: dict[str, Any] = values[section]
+    return changed
+
+
+def verify(options: argparse.Namespace) -> int:
+    from colmap_affrect.stages.verify import verify_matches
+
+    with _context(options) as context:
+        chosen = _verification(options, context.workspace.planned("verify"))
+        report = verify_matches(context, chosen, overwrite=options.overwrite)
     print(report.summary())
     return EXIT_OK
 
 
 def escalate(options: argparse.Namespace) -> int:
-    from colmap_affrect import escalation
+    from colmap_affrect.recipes import EscalateOptions
+    from colmap_affrect.stages.escalate import escalate, pair_levels
 
-    with Workspace(options.output_path).locked() as workspace, _executor(options) as executor:
-        report = escalation.escalate(
-            workspace,
-            resources=_resources(options),
-            executor=executor,
-            overwrite=options.overwrite,
-            progress=_progress(options),
-        )
-        levels = escalation.pair_levels(workspace)
+    with _context(options) as context:
+        values = _changed("escalate", context.workspace.planned("escalate"), options.set)
+        chosen = EscalateOptions.from_mapping(values, "escalate")
+        report = escalate(context, chosen, overwrite=options.overwrite)
+        levels = pair_levels(context)
     print(report.summary())
     print(", ".join(f"{count} pairs by {name}" for name, count in levels.items()))
     return EXIT_OK
 
 
 def map(options: argparse.Namespace) -> int:
+    from colmap_affrect.mappers.base import MAPPERS
     from colmap_affrect.pipeline import map_and_report
 
-    with Workspace(options.output_path).locked() as workspace:
-        report = map_and_report(
-            workspace,
-            _mapping(options),
-            options.random_seed,
-            overwrite=options.overwrite,
-            progress=_progress(options),
-        )
+    with _context(options) as context:
+        mapper = MAPPERS.make(_mapping(options, recorded=context.workspace.planned("map")))
+        report = map_and_report(context, mapper, overwrite=options.overwrite)
     return _print_reconstruction(report, options)
 
 
 def compare(options: argparse.Namespace) -> int:
     from colmap_affrect.comparison.compare import CompareOptions, compare
     from colmap_affrect.comparison.methods import parse_methods
-    from colmap_affrect.report.viewer import log_comparison, require_viewer
+    from colmap_affrect.comparison.tables import summary, to_json
+    from colmap_affrect.comparison.viewer import log_comparison, require_viewer
 
     if options.viewer:
         require_viewer()
@@ -258,7 +294,7 @@ def compare(options: argparse.Namespace) -> int:
         overwrite=options.overwrite,
         progress=SILENT if options.quiet else Progress(sys.stderr, num_plain_lines=1),
     )
-    print(comparison.to_json() if options.json else comparison.summary())
+    print(to_json(comparison) if options.json else summary(comparison))
     if not options.json:
         print(f"\npictures: {options.output_path / 'report.html'}")
     if options.viewer:
@@ -306,7 +342,7 @@ def _comparison_exit_code(comparison: Comparison, options: argparse.Namespace) -
 
 
 def import_h5(options: argparse.Namespace) -> int:
-    from colmap_affrect.interchange import import_h5
+    from colmap_affrect.interop.hdf5 import import_h5
 
     report = import_h5(
         options.image_path,
@@ -325,7 +361,7 @@ def import_h5(options: argparse.Namespace) -> int:
 
 
 def export_h5(options: argparse.Namespace) -> int:
-    from colmap_affrect.interchange import export_h5
+    from colmap_affrect.interop.hdf5 import export_h5
 
     report = export_h5(
         options.features_path,
@@ -375,40 +411,39 @@ def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
 
 
 def inspect(options: argparse.Namespace) -> int:
-    from colmap_affrect.extraction import prepare
-    from colmap_affrect.photographs import Photographs
+    from colmap_affrect.images.photographs import Photographs
     from colmap_affrect.report.inspection import inspect_image
+    from colmap_affrect.stages.one_image import prepare
 
-    recipe = _recipe(options, options.recipe)
-    photographs = Photographs(options.image.parent, CameraOptions(), _masks(options))
+    recipe = _recipe(options)
+    photographs = Photographs(options.image.parent, _masks(options))
     photographs.check()
     mask = photographs.mask(options.image.name)
     extractor = prepare(recipe.extraction, _resources(options), [options.image.name])
-    print(inspect_image(extractor, options.image, options.output_path, mask=mask).summary())
+    print(inspect_image(extractor, options.image, options.output_path, mask))
     return EXIT_OK
 
 
 def recipes(options: argparse.Namespace) -> int:
-    from colmap_affrect.features.registry import needed_weights
+    import tomli_w
+
     from colmap_affrect.recipes import load_recipe, recipe_names
-    from colmap_affrect.workspace import dump_toml
 
     if options.name:
         recipe = load_recipe(options.name)
-        everything = {**recipe.extraction.to_mapping(), "matching": recipe.matching.to_mapping()}
-        print(f"# {recipe.summary}\n{dump_toml(everything)}", end="")
+        print(tomli_w.dumps({"summary": recipe.summary, **recipe.to_mapping()}), end="")
         return EXIT_OK
     for name in recipe_names():
         recipe = load_recipe(name)
-        needs = list(needed_weights(recipe.extraction))
-        needs += ["depth"] if any(r.uses_depth for r in recipe.extraction.rectifiers) else []
+        needs = list(recipe.extraction.weights)
+        needs += ["depth"] if recipe.extraction.uses_depth else []
         print(f"{name:26s} {recipe.summary}")
         print(f"{'':26s} needs {', '.join(needs) or 'nothing'}")
     return EXIT_OK
 
 
 def weights(options: argparse.Namespace) -> int:
-    from colmap_affrect.features.weights import WEIGHT_FILES, describe_weights, fetch
+    from colmap_affrect.features.weights import describe_weights, fetch
 
     if options.action == "fetch":
         keys = options.keys or ["affnet", "orinet", "hardnet"]
@@ -417,9 +452,10 @@ def weights(options: argparse.Namespace) -> int:
         return EXIT_OK
     checks = {None: "", True: ", verified", False: ", NOT the published file"}
     for row in describe_weights(options.weights):
+        file = row.published
         where = f"{row.path}{checks[row.verified]}" if row.path else "not found"
-        print(f"{row.key:10s} {row.file_name:32s} {row.used_for}")
+        print(f"{row.key:10s} {file.file_name:32s} {file.used_for}")
         print(f"{'':10s} {where}")
-        sha256, licence = WEIGHT_FILES[row.key].sha256 or "not known", row.licence or "not stated"
+        sha256, licence = file.sha256 or "not known", file.licence or "not stated"
         print(f"{'':10s} sha256 {sha256}; licence {licence}")
     return EXIT_OK

@@ -1,13 +1,14 @@
 """What can be wrong in a COLMAP database, found without COLMAP.
 
 Rows that COLMAP does not expect end the process inside COLMAP, so the tables are read by SQLite
-itself. The database must have the current schema: give a copy (see :mod:`.copies`).
+itself. The database must have the current schema: give a copy (see :mod:`.database_copy`).
 """
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -16,137 +17,72 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.colmap.copies import DAMAGED
+from colmap_affrect.colmap.database_copy import DAMAGED
 from colmap_affrect.errors import DatabaseError
-
-Kind = Literal[
-    "no-images", "no-camera", "no-prior-focal", "no-frame", "unsafe-name",
-    "no-keypoints", "keypoint-columns", "keypoint-data", "keypoints-not-finite",
-    "keypoints-outside", "descriptor-count", "descriptor-types",
-    "no-matches", "match-data", "match-range", "self-pair", "unknown-pair",
-    "no-geometry", "undefined-geometry",
-    "file-missing", "file-unreadable", "file-size",
-]  # fmt: skip
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
-CHECKS: dict[Kind, tuple[Severity, str, str]] = {
-    "no-images": (
-        "warning",
-        "holds no images",
-        "import some, e.g. by 'colmap feature_extractor --database_path {path} --image_path X'",
-    ),
-    "no-camera": (
-        "error",
-        "images whose camera does not exist",
-        "import these images again into a new database",
-    ),
-    "no-prior-focal": (
-        "note",
-        "cameras whose focal length is a guess",
-        "if you know the intrinsics, give them: --camera-params here, "
-        "--ImageReader.camera_params in COLMAP",
-    ),
-    "no-frame": (
-        "error",
-        "images without a frame while others have one, at which mapping aborts",
+Check = tuple[Severity, str, str]
+"""How serious a problem is, what it is, and what to do about it."""
+
+CHECKS: dict[str, Check] = {
+    "no-images": ("warning", "holds no images",
+        "import some, e.g. by 'colmap feature_extractor --database_path {path} --image_path X'"),
+    "no-camera": ("error", "images whose camera does not exist",
+        "import these images again into a new database"),
+    "no-prior-focal": ("note", "cameras whose focal length is a guess",
+        "if you know the intrinsics, give them: --camera-params here, --ImageReader.camera_params"
+        " in COLMAP"),
+    "no-frame": ("error", "images without a frame while others have one, at which mapping aborts",
         "give each of them a frame (pycolmap.Database.write_frame), or begin anew with "
-        "'colmap-affrect run --database-path {path}', which adds frames to its copy",
-    ),
-    "unsafe-name": (
-        "warning",
-        "image names that lead out of the image folder",
-        "rename these images; programs that write a file per image would write elsewhere",
-    ),
-    "no-keypoints": (
-        "warning",
-        "images without keypoints, which cannot be registered",
-        "extract their features, unless they are blank",
-    ),
-    "keypoint-columns": (
-        "error",
-        "images whose keypoints do not have 2, 4 or 6 columns",
-        "write them again as x, y; or x, y, scale, orientation; or x, y and an affine shape",
-    ),
-    "keypoint-data": (
-        "error",
+        "'colmap-affrect run --database-path {path}', which adds frames to its copy"),
+    "unsafe-name": ("warning", "image names that lead out of the image folder",
+        "rename these images; programs that write a file per image would write elsewhere"),
+    "no-keypoints": ("warning", "images without keypoints, which cannot be registered",
+        "extract their features, unless they are blank"),
+    "keypoint-columns": ("error", "images whose keypoints do not have 2, 4 or 6 columns",
+        "write them again as x, y; or x, y, scale, orientation; or x, y and an affine shape"),
+    "keypoint-data": ("error",
         "images whose keypoints have more or less data than rows and columns",
-        "extract these images again into a new database",
-    ),
-    "keypoints-not-finite": (
-        "error",
-        "images with keypoints that are not finite numbers",
-        "extract these images again into a new database",
-    ),
-    "keypoints-outside": (
-        "warning",
-        "images with keypoints outside of them",
-        "see that they were found in the images as stored: not rotated, not resized",
-    ),
-    "descriptor-count": (
-        "error",
-        "images with another number of descriptors than of keypoints",
-        "extract these images again into a new database",
-    ),
-    "descriptor-types": (
-        "error",
-        "descriptors of several types, which COLMAP does not match",
-        "extract all images with the same features into a new database",
-    ),
-    "no-matches": (
-        "note",
-        "no pairs are matched yet",
-        "match them, e.g. by 'colmap exhaustive_matcher --database_path {path}'",
-    ),
-    "match-data": (
-        "error",
-        "pairs whose matches have more or less data than rows and 2 columns",
-        "delete the matches of these pairs and match them again",
-    ),
-    "match-range": (
-        "error",
+        "extract these images again into a new database"),
+    "keypoints-not-finite": ("error", "images with keypoints that are not finite numbers",
+        "extract these images again into a new database"),
+    "keypoints-outside": ("warning", "images with keypoints outside of them",
+        "see that they were found in the images as stored: not rotated, not resized"),
+    "descriptor-count": ("error", "images with another number of descriptors than of keypoints",
+        "extract these images again into a new database"),
+    "descriptor-types": ("error", "descriptors of several types, which COLMAP does not match",
+        "extract all images with the same features into a new database"),
+    "no-matches": ("note", "no pairs are matched yet",
+        "match them, e.g. by 'colmap exhaustive_matcher --database_path {path}'"),
+    "self-pair": ("error", "images that are matched with themselves",
+        "delete the matches of these pairs"),
+    "unknown-pair": ("error", "matches of images that do not exist",
+        "delete the matches of these pairs"),
+    "match-data": ("error", "pairs whose matches have more or less data than rows and 2 columns",
+        "delete the matches of these pairs and match them again"),
+    "match-range": ("error",
         "pairs with matches of keypoints that do not exist, at which COLMAP crashes",
-        "delete the matches of these pairs and match them again",
-    ),
-    "self-pair": (
-        "error",
-        "images that are matched with themselves",
-        "delete the matches of these pairs",
-    ),
-    "unknown-pair": (
-        "error",
-        "matches of images that do not exist",
-        "delete the matches of these pairs",
-    ),
-    "no-geometry": (
-        "warning",
+        "delete the matches of these pairs and match them again"),
+    "no-geometry": ("warning",
         "matched pairs without a two-view geometry, which mapping does not see",
-        "run 'colmap geometric_verifier --database_path {path}'",
-    ),
-    "undefined-geometry": (
-        "warning",
+        "run 'colmap geometric_verifier --database_path {path}'"),
+    "undefined-geometry": ("warning",
         "two-view geometries of undefined configuration, which mapping passes over",
-        "verify these pairs again: in a copy, delete their two-view geometries and run "
-        "'colmap geometric_verifier'",
-    ),
-    "file-missing": (
-        "warning",
-        "images whose file is missing",
-        "put the files back, or give another --image-path",
-    ),
-    "file-unreadable": (
-        "warning",
-        "images whose file cannot be read",
-        "replace the files",
-    ),
-    "file-size": (
-        "error",
-        "images of another size than their camera",
-        "use the photographs that the database was made from: not resized, not rotated",
-    ),
-}
-"""How serious each problem of a database is, what it is, and what to do about it."""
+        "verify these pairs again: in a copy, delete their two-view geometries and run 'colmap "
+        "geometric_verifier'"),
+    "file-missing": ("warning", "images whose file is missing",
+        "put the files back, or give another --image-path"),
+    "file-unreadable": ("warning", "images whose file cannot be read",
+        "replace the files"),
+    "file-size": ("error", "images of another size than their camera",
+        "use the photographs that the database was made from: not resized, not rotated"),
+}  # fmt: skip
+"""The problems of a database by kind."""
+
+Problems = dict[str, list[str]]
+"""What was found: by kind, the images, pairs or cameras concerned, none if it is the database."""
 
 MAX_NUM_IMAGES = 2**31 - 1
 """COLMAP's id of a pair is the smaller image id times this, plus the larger one."""
@@ -161,14 +97,6 @@ UNDEFINED = 0
 """Configuration of a two-view geometry that COLMAP 4.2 passes over."""
 
 SENSOR_CAMERA = 0
-
-
-@dataclass(frozen=True)
-class Problem:
-    """One thing that is wrong, and all that it is wrong with: images, pairs or cameras."""
-
-    kind: Kind
-    items: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -242,18 +170,13 @@ def pair_images(pair_id: int) -> tuple[int, int]:
     return pair_id // MAX_NUM_IMAGES, pair_id % MAX_NUM_IMAGES
 
 
-def check_database(path: Path) -> tuple[Tables, list[Problem]]:
-    """Read a database and check what it holds.
-
-    Args:
-        path: a database with the current schema that nobody else has open.
-
-    Returns:
-        Its tables and the problems found, at most one of a kind.
+def check_database(path: Path) -> tuple[Tables, Problems]:
+    """Read a database with the current schema that nobody else has open, and check its content.
 
     Raises:
         DatabaseError: when the file itself is damaged.
     """
+    found: Problems = defaultdict(list)
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
             connection.text_factory = lambda data: data.decode("utf-8", "replace")
@@ -261,24 +184,24 @@ def check_database(path: Path) -> tuple[Tables, list[Problem]]:
             if verdict != "ok":
                 raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
             tables = _read_tables(connection)
-            found = [
-                *_check_images(tables),
-                *_check_keypoints(connection, tables),
-                *_check_descriptors(tables),
-                *_check_pairs(connection, tables),
-            ]
+            if tables.names:
+                _check_images(tables, found)
+                _check_keypoints(connection, tables, found)
+            else:
+                found["no-images"] = []
+            _check_descriptors(tables, found)
+            if tables.matches or tables.geometries:
+                _check_pairs(connection, tables, found)
+            elif tables.names:
+                found["no-matches"] = []
     except (*DAMAGED, TypeError, ValueError) as error:
         raise DatabaseError(f"{path}: damaged ({error})") from error
-    return tables, [problem for problem in found if problem.items or problem.kind in WHOLE]
-
-
-WHOLE: tuple[Kind, ...] = ("no-images", "no-matches")
-"""Problems of the database as a whole."""
+    return tables, dict(found)
 
 
 def check_image_files(
     tables: Tables, image_path: Path, sizes: Mapping[str, tuple[int, int] | None]
-) -> list[Problem]:
+) -> Problems:
     """Compare the images of a database with their files.
 
     Args:
@@ -286,27 +209,22 @@ def check_image_files(
         image_path: folder of the photographs.
         sizes: (width, height) in px of files that were read, None for those that cannot be.
     """
-    missing, unreadable, other_size = [], [], []
+    found: Problems = defaultdict(list)
     for image_id, name in tables.names.items():
         if is_unsafe(name):
             continue
         camera = tables.cameras.get(tables.camera_ids[image_id])
         if not (image_path / name).is_file():
-            missing.append(name)
+            found["file-missing"].append(name)
         elif name in sizes and camera:
             size = sizes[name]
             if size is None:
-                unreadable.append(name)
+                found["file-unreadable"].append(name)
             elif size != (camera.width, camera.height):
-                other_size.append(
+                found["file-size"].append(
                     f"{name} is {size[0]} x {size[1]}, its camera {camera.width} x {camera.height}"
                 )
-    found = [
-        Problem("file-missing", tuple(missing)),
-        Problem("file-unreadable", tuple(unreadable)),
-        Problem("file-size", tuple(other_size)),
-    ]
-    return [problem for problem in found if problem.items]
+    return dict(found)
 
 
 def is_unsafe(name: str) -> bool:
@@ -316,25 +234,15 @@ def is_unsafe(name: str) -> bool:
 
 
 def _read_tables(connection: sqlite3.Connection) -> Tables:
-    def rows(query: str) -> Iterator[Any]:
-        return iter(connection.execute(query))
-
+    rows = connection.execute
     images = list(rows("SELECT image_id, name, camera_id FROM images"))
+    cameras = rows("SELECT camera_id, width, height, prior_focal_length FROM cameras")
+    frame_data = rows("SELECT data_id FROM frame_data WHERE sensor_type = ?", [SENSOR_CAMERA])
     return Tables(
-        cameras={
-            int(key): Camera(int(width), int(height), bool(prior))
-            for key, width, height, prior in rows(
-                "SELECT camera_id, width, height, prior_focal_length FROM cameras"
-            )
-        },
+        cameras={int(key): Camera(int(w), int(h), bool(prior)) for key, w, h, prior in cameras},
         names={int(key): str(name) for key, name, _ in images},
         camera_ids={int(key): int(camera_id) for key, _, camera_id in images},
-        frame_images={
-            int(key)
-            for (key,) in connection.execute(
-                "SELECT data_id FROM frame_data WHERE sensor_type = ?", [SENSOR_CAMERA]
-            )
-        },
+        frame_images={int(key) for (key,) in frame_data},
         num_frames=int(next(rows("SELECT COUNT(*) FROM frames"))[0]),
         keypoints=_numbers(rows("SELECT image_id, rows, cols FROM keypoints")),
         descriptors=_numbers(rows("SELECT image_id, type, rows FROM descriptors")),
@@ -343,57 +251,41 @@ def _read_tables(connection: sqlite3.Connection) -> Tables:
     )
 
 
-def _numbers(rows: Iterator[Any]) -> dict[int, tuple[int, int]]:
+def _numbers(rows: Iterable[Any]) -> dict[int, tuple[int, int]]:
     return {int(key): (int(first), int(second)) for key, first, second in rows}
 
 
-def _check_images(tables: Tables) -> list[Problem]:
-    names = tables.names
-    if not names:
-        return [Problem("no-images")]
-    without_frame = names.keys() - tables.frame_images if tables.num_frames else set()
-    guessed = {key: camera for key, camera in tables.cameras.items() if not camera.has_prior_focal}
-    return [
-        Problem(
-            "no-camera",
-            tuple(names[key] for key, camera in tables.camera_ids.items()
-                  if camera not in tables.cameras),
-        ),
-        Problem(
-            "no-prior-focal",
-            tuple(f"camera {key} ({c.width} x {c.height})" for key, c in guessed.items()),
-        ),
-        Problem("no-frame", tuple(names[key] for key in sorted(without_frame))),
-        Problem("unsafe-name", tuple(filter(is_unsafe, names.values()))),
-    ]  # fmt: skip
+def _check_images(tables: Tables, found: Problems) -> None:
+    for image_id, name in tables.names.items():
+        if tables.camera_ids[image_id] not in tables.cameras:
+            found["no-camera"].append(name)
+        if tables.num_frames and image_id not in tables.frame_images:
+            found["no-frame"].append(name)
+        if is_unsafe(name):
+            found["unsafe-name"].append(name)
+    for camera_id, camera in tables.cameras.items():
+        if not camera.has_prior_focal:
+            found["no-prior-focal"].append(f"camera {camera_id} ({camera.width} x {camera.height})")
 
 
-def _check_keypoints(connection: sqlite3.Connection, tables: Tables) -> list[Problem]:
-    none, columns, data, not_finite, outside = [], [], [], [], []
+def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     query = "SELECT data FROM keypoints WHERE image_id = ?"
     for image_id, name in tables.names.items():
         count, width = tables.keypoints.get(image_id, (0, 0))
         if not count:
-            none.append(name)
+            found["no-keypoints"].append(name)
             continue
         if width not in KEYPOINT_COLUMNS:
-            columns.append(f"{name} has {width}")
+            found["keypoint-columns"].append(f"{name} has {width}")
             continue
         (blob,) = connection.execute(query, [image_id]).fetchone()
         keypoints = _array(blob, count, width, np.dtype("<f4"))
         if keypoints is None:
-            data.append(name)
+            found["keypoint-data"].append(name)
         elif not np.isfinite(keypoints).all():
-            not_finite.append(name)
-        elif _num_outside(keypoints, tables.cameras.get(tables.camera_ids[image_id])):
-            outside.append(name)
-    return [
-        Problem("no-keypoints", tuple(none)),
-        Problem("keypoint-columns", tuple(columns)),
-        Problem("keypoint-data", tuple(data)),
-        Problem("keypoints-not-finite", tuple(not_finite)),
-        Problem("keypoints-outside", tuple(outside)),
-    ]
+            found["keypoints-not-finite"].append(name)
+        elif _are_outside(keypoints, tables.cameras.get(tables.camera_ids[image_id])):
+            found["keypoints-outside"].append(name)
 
 
 def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[Any] | None:
@@ -404,34 +296,26 @@ def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[
     return np.frombuffer(blob, dtype).reshape(rows, columns)
 
 
-def _num_outside(keypoints: NDArray[np.float32], camera: Camera | None) -> int:
-    """Count keypoints, whose origin is the corner of the image, that are not in it."""
+def _are_outside(keypoints: NDArray[np.float32], camera: Camera | None) -> bool:
+    """Tell whether any keypoints, whose origin is the corner of the image, are not in it."""
     if camera is None:
-        return 0
-    size = np.array([camera.width, camera.height])
-    points = keypoints[:, :2]
-    inside = (points >= -OUTSIDE_TOLERANCE_PX) & (points <= size + OUTSIDE_TOLERANCE_PX)
-    return int((~inside.all(axis=1)).sum())
+        return False
+    points, size = keypoints[:, :2], np.array([camera.width, camera.height])
+    tolerance = OUTSIDE_TOLERANCE_PX
+    return bool(((points < -tolerance) | (points > size + tolerance)).any())
 
 
-def _check_descriptors(tables: Tables) -> list[Problem]:
-    other_count = [
-        f"{tables.names[key]} has {rows} of {tables.keypoints.get(key, (0, 0))[0]}"
-        for key, (_, rows) in tables.descriptors.items()
-        if key in tables.names and rows != tables.keypoints.get(key, (0, 0))[0]
-    ]
+def _check_descriptors(tables: Tables, found: Problems) -> None:
+    for image_id, (_, rows) in tables.descriptors.items():
+        count, _ = tables.keypoints.get(image_id, (0, 0))
+        if image_id in tables.names and rows != count:
+            found["descriptor-count"].append(f"{tables.names[image_id]} has {rows} of {count}")
     types = sorted({kind for kind, rows in tables.descriptors.values() if rows})
-    mixed = [f"type {kind}" for kind in types] if len(types) > 1 else []
-    return [
-        Problem("descriptor-count", tuple(other_count)),
-        Problem("descriptor-types", tuple(mixed)),
-    ]
+    if len(types) > 1:
+        found["descriptor-types"] = [f"type {kind}" for kind in types]
 
 
-def _check_pairs(connection: sqlite3.Connection, tables: Tables) -> list[Problem]:
-    if not tables.matches and not tables.geometries:
-        return [Problem("no-matches")] if tables.names else []
-    selves, unknown, data, out_of_range = [], [], [], []
+def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     for table, what in (("matches", "raw matches"), ("two_view_geometries", "inliers")):
         query = f"SELECT pair_id, rows, cols, data FROM {table}"  # noqa: S608
         for pair_id, rows, columns, blob in connection.execute(query):
@@ -439,30 +323,18 @@ def _check_pairs(connection: sqlite3.Connection, tables: Tables) -> list[Problem
             images = pair_images(pair_id)
             indices = _array(blob, rows, columns, np.dtype("<u4"))
             if images[0] == images[1]:
-                selves.append(label)
+                found["self-pair"].append(label)
             elif not tables.names.keys() >= set(images):
-                unknown.append(label)
+                found["unknown-pair"].append(label)
             elif indices is None or (rows and columns != 2):
-                data.append(label)
+                found["match-data"].append(label)
             elif rows:
                 counts = [tables.keypoints.get(image, (0, 0))[0] for image in images]
                 if (indices.max(axis=0) >= counts).any():
-                    out_of_range.append(label)
-    without_geometry = [
-        tables.pair_label(key)
-        for key, count in tables.matches.items()
-        if count and key not in tables.geometries
-    ]
-    undefined = [
-        tables.pair_label(key)
-        for key, (count, config) in tables.geometries.items()
-        if count and config == UNDEFINED
-    ]
-    return [
-        Problem("self-pair", tuple(selves)),
-        Problem("unknown-pair", tuple(unknown)),
-        Problem("match-data", tuple(data)),
-        Problem("match-range", tuple(out_of_range)),
-        Problem("no-geometry", tuple(without_geometry)),
-        Problem("undefined-geometry", tuple(undefined)),
-    ]
+                    found["match-range"].append(label)
+    for pair_id, count in tables.matches.items():
+        if count and pair_id not in tables.geometries:
+            found["no-geometry"].append(tables.pair_label(pair_id))
+    for pair_id, (count, config) in tables.geometries.items():
+        if count and config == UNDEFINED:
+            found["undefined-geometry"].append(tables.pair_label(pair_id))

@@ -7,9 +7,10 @@ index out of range would later end the Python process.
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -18,8 +19,8 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import DatabaseError, OptionError
-from colmap_affrect.files import cannot_write, require_space
-from colmap_affrect.options import CameraOptions
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.project.atomic_files import cannot_write, require_space
 
 BYTES_PER_ROW = 4096
 BYTES_OF_EMPTY_DATABASE = 1 << 19
@@ -28,7 +29,7 @@ BYTES_OF_EMPTY_DATABASE = 1 << 19
 
 @contextmanager
 def open_database(path: Path) -> Iterator[pycolmap.Database]:
-    """Open a database and close it again; turns pycolmap's failures into one clear line."""
+    """Open a database and close it again; pycolmap's failures become errors of one line."""
     try:
         database = pycolmap.Database.open(path)
     except RuntimeError as error:
@@ -46,7 +47,7 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
 def require_database_space(path: Path, num_new: int) -> None:
     """Make sure that a database has room for so many new rows, and its log for all its content.
 
-    Before calls of pycolmap that write themselves: it ends the process when it cannot.
+    Called before functions of pycolmap that write, which end the process on a full disk.
 
     Raises:
         WorkspaceError: when there is no room.
@@ -60,12 +61,12 @@ def import_images(
 ) -> list[str]:
     """Add cameras, rigs, frames and images for the names that the database lacks.
 
-    Image sizes, EXIF focal lengths and GPS priors are read by COLMAP itself, from the
-    stored, un-rotated files. Images that come later share the cameras of those that are there
-    as if all had come at once. A new database appears only when all images are in it.
+    Image sizes, EXIF focal lengths and GPS priors are read by COLMAP itself, from the files as
+    stored, not rotated. Images that are added later share cameras as if all had been added at
+    once. A new database appears only when all images are in it.
 
     Returns:
-        Names that COLMAP could not read.
+        Names of the images that COLMAP could not read.
     """
     if path.exists():
         _import_into(path, image_path, names, cameras)
@@ -83,7 +84,7 @@ def _import_into(
     path: Path, image_path: Path, names: Sequence[str], cameras: CameraOptions
 ) -> None:
     for camera_id, new in _by_camera(path, names, cameras).items():
-        # COLMAP takes a camera that is there in this mode only.
+        # Only in this mode does COLMAP use an existing camera.
         mode = cameras.mode if camera_id == cameras.existing_camera_id else "single"
         require_database_space(path, len(new))
         pycolmap.import_images(
@@ -91,27 +92,27 @@ def _import_into(
             image_path,
             camera_mode=getattr(pycolmap.CameraMode, mode.upper().replace("-", "_")),
             image_names=new,
-            options=reader_options(replace(cameras, existing_camera_id=camera_id)),
+            options=reader_options(cameras.changed(existing_camera_id=camera_id)),
         )
 
 
 def _by_camera(path: Path, names: Sequence[str], cameras: CameraOptions) -> dict[int, list[str]]:
-    """Sort the names that a database lacks by the camera there that they share, -1 for none."""
+    """Group the names that a database lacks by the existing camera they share, -1 for none."""
 
     def group(name: str) -> str:
         return str(PurePosixPath(name).parent) if cameras.mode == "per-folder" else ""
 
     with open_database(path) as database:
-        there = {image.name: image.camera_id for image in database.read_all_images()}
-    shared: dict[str, set[int]] = {}
+        existing = {image.name: image.camera_id for image in database.read_all_images()}
+    shared: dict[str, set[int]] = defaultdict(set)
     if cameras.mode in ("single", "per-folder"):
-        for name, camera_id in there.items():
-            shared.setdefault(group(name), set()).add(camera_id)
-    found: dict[int, list[str]] = {}
-    for name in sorted(set(names) - set(there)):
-        camera_ids = shared.get(group(name), set())
+        for name, camera_id in existing.items():
+            shared[group(name)].add(camera_id)
+    found: dict[int, list[str]] = defaultdict(list)
+    for name in sorted(set(names) - set(existing)):
+        camera_ids = shared[group(name)]
         known = min(camera_ids) if len(camera_ids) == 1 else cameras.existing_camera_id
-        found.setdefault(known, []).append(name)
+        found[known].append(name)
     return found
 
 
@@ -136,11 +137,11 @@ def nearest_positions(
 ) -> list[tuple[str, str]]:
     """Return the pairs of images that were taken near to each other, by COLMAP's pose priors.
 
-    Heights are left out of account, as in COLMAP's spatial matcher: those of GPS are rough.
+    Heights are ignored, as in COLMAP's spatial matcher: those of GPS are rough.
 
     Args:
         path: of the database.
-        num_neighbors: most of each image, the nearest ones.
+        num_neighbors: how many neighbours of each image at most, the nearest ones.
         max_distance_m: largest distance; in the unit of the priors if they are Cartesian.
 
     Raises:
@@ -216,30 +217,37 @@ def colmap_keypoints(lafs: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.concatenate([centers, shapes], axis=1)
 
 
+def has_keypoints(database: pycolmap.Database, image_id: int, count: int) -> bool:
+    """Tell whether an image has so many keypoints, also none, on record."""
+    return (
+        database.exists_keypoints(image_id) and database.num_keypoints_for_image(image_id) == count
+    )
+
+
 def write_keypoints(
     database: pycolmap.Database,
     image_id: int,
     lafs: NDArray[np.floating],
     level_ends: Sequence[int] = (),
 ) -> None:
-    """Write the frames of one image unless it has the keypoints already.
+    """Write the frames of one image, in the place of fewer ones that it may have had before.
 
     Args:
         database: an open database.
         image_id: of the image.
         lafs: (N, 2, 3) frames.
-        level_ends: numbers of frames that it may have had before others were added behind.
+        level_ends: how many frames it may have had before escalation appended others.
 
     Raises:
-        DatabaseError: when it has other ones.
+        DatabaseError: when it has another number of keypoints.
     """
-    there = database.num_keypoints_for_image(image_id)
-    exists = database.exists_keypoints(image_id)
-    if exists and there == len(lafs):
+    if has_keypoints(database, image_id, len(lafs)):
         return
-    if exists and there not in level_ends:
+    count = database.num_keypoints_for_image(image_id)
+    exists = database.exists_keypoints(image_id)
+    if exists and count not in level_ends:
         raise DatabaseError(
-            f"image {image_id} has {there} keypoints in the database and {len(lafs)} in the "
+            f"image {image_id} has {count} keypoints in the database and {len(lafs)} in the "
             "feature file; run extract again with --overwrite"
         )
     keypoints = colmap_keypoints(lafs)
@@ -252,8 +260,7 @@ def write_keypoints(
 DESCRIPTOR_SIZE = 128
 DESCRIPTOR_NORM = 512
 SIGNED_SHIFT = 0.30
-"""Added to descriptors with negative elements: COLMAP's brute-force matcher needs cosines >= 0.
-Of 0.20 to 0.35 this and 0.35 lost the fewest matches of simulated descriptors."""
+"""Added to descriptors with negative elements: COLMAP's brute-force matcher needs cosines >= 0."""
 
 
 def colmap_descriptors(descriptors: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -290,7 +297,7 @@ def write_descriptors(
 def replace_matches(
     database: pycolmap.Database, image_id1: int, image_id2: int, indices: NDArray[np.integer]
 ) -> None:
-    """Write raw matches in the place of other ones, whose two-view geometry goes too."""
+    """Write raw matches; different ones are replaced, and their two-view geometry is deleted."""
     if database.exists_matches(image_id1, image_id2):
         if np.array_equal(database.read_matches(image_id1, image_id2), indices):
             return
@@ -306,7 +313,7 @@ def read_camera_matrix(path: Path, cameras: CameraOptions) -> NDArray[np.float64
     From ``cameras.params``, else from EXIF, else COLMAP's guess; without distortion. None
     for a file that COLMAP cannot read.
     """
-    if cameras.params:  # which pycolmap's inference leaves out of account
+    if cameras.params:  # pycolmap's inference would ignore them
         camera = pycolmap.Camera.create_from_model_name(1, cameras.model, 1.0, 1, 1)
         camera.params = [float(value) for value in cameras.params.split(",")]
     else:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import StoreError
+from colmap_affrect.project.atomic_files import cannot_write
 
 SENSOR_BYTES = 8
 """Type and id of a sensor."""
@@ -51,7 +52,7 @@ class _Reader:
 
 
 def registered_names(model_path: Path) -> list[str]:
-    """Return the sorted names of the images of a model, when all its files are whole.
+    """Return the sorted names of the images of a model whose files are all intact.
 
     Raises:
         StoreError: when a file is missing or damaged.
@@ -75,6 +76,26 @@ def registered_names(model_path: Path) -> list[str]:
     return sorted(names)
 
 
+def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write a model into a new folder; pycolmap does not say when the disk is full."""
+    folder.mkdir()
+    model.write(folder)
+    _require_written(folder)
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a model that pycolmap has just written."""
+    _require_written(folder)
+    return pycolmap.Reconstruction(folder)
+
+
+def _require_written(folder: Path) -> None:
+    try:
+        registered_names(folder)
+    except StoreError as error:
+        raise cannot_write(folder, error) from error
+
+
 def _walk_camera(reader: _Reader) -> None:
     reader.skip(4)
     model = reader.number("I")
@@ -95,7 +116,7 @@ def _walk_rig(reader: _Reader) -> None:
     reader.skip(4)
     num_sensors = reader.number("I")
     if num_sensors:
-        reader.skip(SENSOR_BYTES)  # the one that the others are given relative to
+        reader.skip(SENSOR_BYTES)  # the reference sensor, which has no pose
     for _ in range(num_sensors - 1):
         reader.skip(SENSOR_BYTES)
         if reader.number("B"):

@@ -1,20 +1,21 @@
 """pycolmap's own options, by dotted keys and plain values.
 
-``mapper.init_min_tri_angle`` is the option of that name in the section ``mapper``. So users pass
-options through, a report says where a run differs from COLMAP's defaults, and another process
-is told what to do. Lists, sets and arrays have no such value and are left out.
+``mapper.init_min_tri_angle`` is the option of that name in the section ``mapper``. In this form
+users pass options on to COLMAP, a report says where a run differs from COLMAP's defaults, and
+another process gets its options. Lists, sets and arrays cannot be given so and are left out.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import reduce
 from pathlib import Path
 from typing import Any
 
 from colmap_affrect.errors import OptionError
+from colmap_affrect.options import flat
 
 Plain = bool | int | float | str
 
@@ -29,7 +30,7 @@ OWNED = {
 
 def flat_values(options: Any) -> dict[str, Any]:
     """Return the values of a pycolmap options object by dotted key, as pycolmap has them."""
-    return _flat(options.todict())
+    return flat(options.todict())
 
 
 def differences(options: Any, default: Any) -> dict[str, Plain]:
@@ -55,8 +56,8 @@ def resolve(options: Any, given: Mapping[str, Any], flag: str) -> dict[str, Plai
         flag: how a user gives them, for messages.
 
     Raises:
-        OptionError: naming the key, for an unknown or ambiguous one, one that cannot be given
-            so, or a value of a wrong type.
+        OptionError: naming the key, if it is unknown, ambiguous or cannot be given in this way,
+            or if its value is of the wrong type.
     """
     known = flat_values(options)
     resolved: dict[str, Plain] = {}
@@ -72,16 +73,6 @@ def resolve(options: Any, given: Mapping[str, Any], flag: str) -> dict[str, Plai
             expected = type(known[key]).__name__
             raise OptionError(f"{flag} {text}={value}: outside the range of {expected}") from error
     return resolved
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = value
-    return flat
 
 
 def _plain_values(options: Any) -> dict[str, Plain]:
@@ -118,63 +109,44 @@ def _full_key(text: str, known: Mapping[str, Any], flag: str) -> str:
     raise OptionError(f"{flag} {text}: pycolmap has no such option{hint}")
 
 
+EXPECTED = {
+    bool: "true or false", int: "a whole number", float: "a finite number", Path: "a path",
+    str: "text",
+}  # fmt: skip
+"""What may be given for options of each type; the order matters, as bool is an int."""
+
+
 def _converted(value: Any, example: Any, where: str) -> Plain:
     """Turn a value, which may be text, into the type of an example."""
     if _is_enumeration(example):
-        return _member(value, type(example), where)
-    kinds: list[tuple[type, str, Callable[[Any], Plain]]] = [
-        (bool, "true or false", _truth_value),
-        (int, "a whole number", _whole_number),
-        (float, "a finite number", _finite_number),
-        (Path, "a path", _path),
-        (str, "text", _text),
-    ]
-    for kind, expected, convert in kinds:
-        if isinstance(example, kind):
-            try:
-                return convert(value)
-            except (TypeError, ValueError) as error:
-                raise OptionError(
-                    f"{where}={value}: expected {kind.__name__.lower()} ({expected})"
-                ) from error
-    raise OptionError(f"{where}: cannot be given, it is of type {type(example).__name__}")
+        name, names = getattr(value, "name", value), type(example).__members__
+        if isinstance(name, str) and name.upper() in names:
+            return name.upper()
+        raise OptionError(f"{where}={value}: expected one of {', '.join(names)}")
+    kind = next((kind for kind in EXPECTED if isinstance(example, kind)), None)
+    if kind is None:
+        raise OptionError(f"{where}: cannot be given, it is of type {type(example).__name__}")
+    try:
+        converted = _convert(value, kind)
+    except (ValueError, OverflowError):
+        converted = None
+    if converted is None:
+        raise OptionError(f"{where}={value}: expected {kind.__name__.lower()} ({EXPECTED[kind]})")
+    return converted
 
 
-def _member(value: Any, enumeration: Any, where: str) -> str:
-    name = getattr(value, "name", value)
-    if isinstance(name, str) and name.upper() in enumeration.__members__:
-        return name.upper()
-    raise OptionError(f"{where}={value}: expected one of {', '.join(enumeration.__members__)}")
-
-
-def _truth_value(value: Any) -> bool:
-    if isinstance(value, str) and value.lower() in TRUTH_VALUES:
-        return TRUTH_VALUES[value.lower()]
-    if isinstance(value, bool):
-        return value
-    raise TypeError
-
-
-def _whole_number(value: Any) -> int:
-    if isinstance(value, str | int) and not isinstance(value, bool):
+def _convert(value: Any, kind: type) -> Plain | None:
+    """Return a value as one of the types of ``EXPECTED``, None if it is of another type."""
+    is_text, is_truth = isinstance(value, str), isinstance(value, bool)
+    if kind is bool and is_text:
+        return TRUTH_VALUES.get(value.lower())
+    if kind is bool:
+        return value if is_truth else None
+    if kind is int and (is_text or isinstance(value, int)) and not is_truth:
         return int(value)
-    raise TypeError
-
-
-def _finite_number(value: Any) -> float:
-    if not isinstance(value, str | int | float) or isinstance(value, bool):
-        raise TypeError
-    number = float(value)
-    if not math.isfinite(number):
-        raise ValueError
-    return number
-
-
-def _path(value: Any) -> str:
-    return str(Path(value))
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    raise TypeError
+    if kind is float and (is_text or isinstance(value, int | float)) and not is_truth:
+        number = float(value)
+        return number if math.isfinite(number) else None
+    if kind is Path and isinstance(value, str | Path):
+        return str(Path(value))
+    return value if kind is str and is_text else None

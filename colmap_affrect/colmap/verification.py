@@ -2,21 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.database import (
     num_unverified_pairs,
     open_database,
     require_database_space,
 )
 from colmap_affrect.colmap.native_options import Plain, differences
-from colmap_affrect.colmap.running import run_cancellable
 from colmap_affrect.conventions import colmap_from_pixel
-from colmap_affrect.options import VerificationOptions
+from colmap_affrect.options import CUSTOM, MAX_SEED, PRESETS, Options, preset_values, within
+
+
+class VerificationOptions(Options):
+    """Two-view geometry, by default the sparse preset (names as in pycolmap)."""
+
+    max_error_px: Annotated[float, within(0.01, 1000.0)] = 3.0
+    min_num_inliers: Annotated[int, within(5, 1_000_000)] = 20
+    """COLMAP's 15 is what 100 random matches reach."""
+    min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.20
+    """COLMAP's 0 accepts random matches once there are many of them."""
+    max_num_trials: Annotated[int, within(1, 100_000_000)] = 10000
+    ransac_min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.10
+    random_seed: Annotated[int, within(-1, MAX_SEED)] = 0
+
+    COLMAP: ClassVar[Mapping[str, Any]] = {
+        "max_error_px": 4.0,
+        "min_num_inliers": 15,
+        "min_inlier_ratio": 0.0,
+        "max_num_trials": 10000,
+        "ransac_min_inlier_ratio": 0.25,
+    }
+    """The preset ``colmap``: COLMAP's own defaults."""
+
+    @classmethod
+    def preset(cls, preset: str, **values: Any) -> Self:
+        """Return the options of a preset, ``sparse`` or ``colmap``, and others given."""
+        return cls(**{**preset_values(preset, cls.COLMAP), **values})
+
+    @property
+    def preset_name(self) -> str:
+        """Name of the preset that these options are, else ``custom``."""
+        seed = {"random_seed": self.random_seed}
+        return next((name for name in PRESETS if self == self.preset(name, **seed)), CUSTOM)
+
 
 REJECTED = (
     pycolmap.TwoViewGeometryConfiguration.UNDEFINED,
@@ -24,9 +60,7 @@ REJECTED = (
 )
 
 
-def two_view_options(
-    options: VerificationOptions, random_seed: int
-) -> pycolmap.TwoViewGeometryOptions:
+def two_view_options(options: VerificationOptions) -> pycolmap.TwoViewGeometryOptions:
     """Translate our options into pycolmap's."""
     return pycolmap.TwoViewGeometryOptions(
         min_num_inliers=options.min_num_inliers,
@@ -35,17 +69,17 @@ def two_view_options(
             max_error=options.max_error_px,
             min_inlier_ratio=options.ransac_min_inlier_ratio,
             max_num_trials=options.max_num_trials,
-            random_seed=random_seed,
+            random_seed=options.random_seed,
         ),
     )
 
 
-def verification_differences(options: VerificationOptions, random_seed: int) -> dict[str, Plain]:
+def verification_differences(options: VerificationOptions) -> dict[str, Plain]:
     """Return where verification differs from COLMAP's defaults, by pycolmap's dotted keys."""
-    return differences(two_view_options(options, random_seed), pycolmap.TwoViewGeometryOptions())
+    return differences(two_view_options(options), pycolmap.TwoViewGeometryOptions())
 
 
-def verify(path: Path, options: VerificationOptions, random_seed: int) -> None:
+def verify(path: Path, options: VerificationOptions) -> None:
     """Estimate the two-view geometry of every matched pair that has none yet.
 
     By ``pycolmap.geometric_verification``, which keeps the raw matches;
@@ -55,7 +89,7 @@ def verify(path: Path, options: VerificationOptions, random_seed: int) -> None:
     run_cancellable(
         lambda token: pycolmap.geometric_verification(
             path,
-            two_view_geometry_options=two_view_options(options, random_seed),
+            two_view_geometry_options=two_view_options(options),
             cancellation_token=token,
         )
     )
@@ -68,9 +102,9 @@ class PairVerifier:
     (pinned by a test).
     """
 
-    def __init__(self, path: Path, options: VerificationOptions, random_seed: int) -> None:
+    def __init__(self, path: Path, options: VerificationOptions) -> None:
         """Read cameras and image ids of a database."""
-        self.options = two_view_options(options, random_seed)
+        self.options = two_view_options(options)
         with open_database(path) as database:
             cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
             images = database.read_all_images()
@@ -94,17 +128,26 @@ class PairVerifier:
         ]
         if sides[0][0] > sides[1][0]:
             sides, indices = sides[::-1], indices[:, ::-1]
-        (_, camera1, points1), (_, camera2, points2) = sides
-        geometry = pycolmap.estimate_two_view_geometry(
-            camera1,
-            stored_keypoints(points1),
-            camera2,
-            stored_keypoints(points2),
-            indices.astype(np.uint32),
-            self.options,
-        )
-        # Of a geometry that it rejects the estimator returns the inliers all the same.
-        return 0 if geometry.config in REJECTED else len(geometry.inlier_matches)
+        _, cameras, points = zip(*sides, strict=True)
+        return num_two_view_inliers(cameras, points, indices, self.options)
+
+
+def num_two_view_inliers(
+    cameras: Sequence[pycolmap.Camera],
+    keypoints: Sequence[NDArray[np.floating]],
+    indices: NDArray[np.integer],
+    options: pycolmap.TwoViewGeometryOptions,
+) -> int:
+    """Return the number of inliers of (M, 2) matches of two images, 0 without a geometry.
+
+    Keypoints are (N1, 2) and (N2, 2) in pixel-centre px.
+    """
+    stored1, stored2 = map(stored_keypoints, keypoints)
+    geometry = pycolmap.estimate_two_view_geometry(
+        cameras[0], stored1, cameras[1], stored2, indices.astype(np.uint32), options
+    )
+    # Of a geometry that it rejects the estimator returns the inliers all the same.
+    return 0 if geometry.config in REJECTED else len(geometry.inlier_matches)
 
 
 def stored_keypoints(points: NDArray[np.floating]) -> NDArray[np.float64]:

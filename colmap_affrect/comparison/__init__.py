@@ -1,1 +1,4 @@
-"""Which photographs does each method register: run several methods on one set, and compare."""
+"""Comparison of methods on one set of photographs."""
+
+DEFAULT_METHODS = ("sift", "sift-affine-dsp", "unrectified-rootsift", "default", "on-demand")
+"""What is compared where nothing else is asked for."""

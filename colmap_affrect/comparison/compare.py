@@ -16,31 +16,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.children import child
-from colmap_affrect.colmap.copies import copy_without_features
-from colmap_affrect.colmap.database import check_cameras, image_ids, import_images
-from colmap_affrect.colmap.mapping import checked_mapping_options
-from colmap_affrect.comparison import worker
-from colmap_affrect.comparison.methods import (
-    DEFAULT_METHODS,
-    Method,
-    parse_methods,
-    unique_methods,
-)
-from colmap_affrect.comparison.metrics import Poses, disagreeing_images, pose_scores, read_poses
+from colmap_affrect.colmap.database import image_ids, import_images
+from colmap_affrect.colmap.database_copy import copy_without_features
+from colmap_affrect.colmap.poses import Poses, disagreeing_images, pose_scores, read_poses
+from colmap_affrect.comparison import DEFAULT_METHODS, worker
+from colmap_affrect.comparison.methods import Method, parse_methods
+from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.request import Layout, Request
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
+from colmap_affrect.comparison.tables import to_csv, to_json
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
-from colmap_affrect.files import replace_text
-from colmap_affrect.imaging import require_png
-from colmap_affrect.matching.pairs import Pair, exhaustive_pairs, read_pairs, write_pairs
-from colmap_affrect.options import CameraOptions
-from colmap_affrect.photographs import Photographs, refuse_colliding_keys, refuse_mixed_sizes
+from colmap_affrect.images.reading import require_png
+from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.options import Options
+from colmap_affrect.pairs.base import Pair, PairOptions
+from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, write_pairs
+from colmap_affrect.parallel.subprocesses import child
 from colmap_affrect.pipeline import InputOptions, installed_versions
 from colmap_affrect.progress import SILENT, Advance, Progress
-from colmap_affrect.report.page import write_page
-from colmap_affrect.stages import images_to_use
-from colmap_affrect.workspace import Workspace, first_difference
+from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.workspace import Workspace, first_difference
 
 DEFAULT_SEEDS = (0, 1, 2)
 
@@ -93,11 +88,11 @@ def compare(
         unreadable = _share(plan, overwrite=overwrite)
         requests = plan.requests()
         for request in requests:
-            _claim(request, overwrite=overwrite)
-        results = [_finished(request) or _run(request, progress) for request in requests]
-        results = [
-            replace(result, failures={**unreadable, **result.failures}) for result in results
-        ]
+            _record(request, overwrite=overwrite)
+        results = []
+        for request in requests:
+            result = _finished(request) or _run(request, progress)
+            results.append(replace(result, failures={**unreadable, **result.failures}))
         comparison = Comparison(
             image_names=tuple(plan.names),
             image_path=str(image_path.resolve()),
@@ -107,8 +102,8 @@ def compare(
             settings=plan.settings(),
             versions=installed_versions(),
         )
-        replace_text(output_path / "comparison.json", comparison.to_json())
-        replace_text(output_path / "comparison.csv", comparison.to_csv())
+        replace_text(output_path / "comparison.json", to_json(comparison))
+        replace_text(output_path / "comparison.csv", to_csv(comparison))
         write_page(comparison, output_path, progress, options.resources)
     return comparison
 
@@ -138,29 +133,27 @@ class _Plan:
     @classmethod
     def checked(cls, image_path: Path, layout: Layout, options: CompareOptions) -> _Plan:
         """Refuse what cannot work before anything is written."""
-        methods = _methods(options.methods)
+        methods = parse_methods(options.methods)
         if not options.seeds or len(set(options.seeds)) < len(options.seeds):
             raise OptionError(f"--seeds {','.join(map(str, options.seeds))}: give different seeds")
-        mapping = checked_mapping_options(options.mapping)
-        check_cameras(options.cameras)
-        Photographs(image_path, options.cameras, options.masks).check()
-        names = images_to_use(image_path, options.image_list_path, options.from_database)
+        options.resources.require_device()
+        for seed in options.seeds:
+            options.verification.changed(random_seed=seed)
+        mapping = MAPPERS.make(options.mapping).options
+        inputs = options.inputs(image_path)
+        inputs.check()
+        names = inputs.names()
         if len(names) < 2:
             raise ComparisonError(
                 f"{image_path}: only {names[0] if names else 'no image'} to use; a comparison "
                 "needs at least two images"
             )
-        refuse_colliding_keys(names)
-        if options.from_database and options.cameras != CameraOptions():
-            raise OptionError(
-                f"the cameras of {options.from_database} are used; leave out camera mode, model "
-                "and parameters"
-            )
-        if options.cameras.mode in ("single", "per-folder"):
-            refuse_mixed_sizes(image_path, names, options.cameras.mode, {})
+        inputs.check_names(names)
         pairs = exhaustive_pairs(names)
-        if options.match_list_path:
-            pairs = read_pairs(options.match_list_path, names)
+        if options.pairs != PairOptions(match_list_path=options.pairs.match_list_path):
+            raise OptionError("pairs: a comparison matches all pairs, or those of match_list_path")
+        if options.pairs.match_list_path:
+            pairs = read_pairs(Path(options.pairs.match_list_path), names)
         truth = _ground_truth(options.ground_truth_path, names)
         options = replace(options, mapping=mapping)
         return cls(image_path, layout, options, methods, names, pairs, truth)
@@ -175,23 +168,22 @@ class _Plan:
             "pairs": _fingerprint([f"{first}\n{second}" for first, second in self.pairs]),
             "camera": options.cameras.to_mapping(),
             "masks": options.masks.to_mapping(),
-            "verification": options.verification.to_mapping(),
-            "mapping": options.mapping.to_mapping(),
+            "verification": _without_seed(options.verification),
+            "mapping": _without_seed(options.mapping),
         }
 
     def settings(self) -> dict[str, Any]:
         """Return what all methods had, for the report."""
-        options = self.options
+        inputs = self.inputs()
+        paths = ("image_list_path", "from_database", "ground_truth_path")
         return {
-            "camera": options.cameras.to_mapping(),
-            "masks": options.masks.to_mapping(),
-            "image_list_path": _absolute(options.image_list_path),
-            "match_list_path": _absolute(options.match_list_path),
-            "from_database": _absolute(options.from_database),
-            "ground_truth_path": _absolute(options.ground_truth_path),
-            "preset": options.mapping.preset_name,
-            "verification": options.verification.to_mapping(),
-            "mapping": options.mapping.to_mapping(),
+            "camera": inputs["camera"],
+            "masks": inputs["masks"],
+            **{key: _absolute(getattr(self.options, key)) for key in paths},
+            "match_list_path": self.options.pairs.match_list_path,
+            "preset": self.options.mapping.preset_name,
+            "verification": inputs["verification"],
+            "mapping": inputs["mapping"],
         }
 
     def requests(self) -> list[Request]:
@@ -213,14 +205,9 @@ class _Plan:
         ]
 
 
-def _methods(given: Sequence[str | Method]) -> tuple[Method, ...]:
-    """Parse the names among the methods; no two may have one name."""
-    methods = [
-        method
-        for item in given
-        for method in ([item] if isinstance(item, Method) else parse_methods([item]))
-    ]
-    return unique_methods(methods)
+def _without_seed(options: Options) -> dict[str, Any]:
+    """Return options without their seed: a comparison runs with several."""
+    return {key: value for key, value in options.to_mapping().items() if key != "random_seed"}
 
 
 def _absolute(path: Path | None) -> str:
@@ -304,7 +291,7 @@ def _make_shared(plan: _Plan, inputs: Mapping[str, Any]) -> None:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def _claim(request: Request, *, overwrite: bool) -> None:
+def _record(request: Request, *, overwrite: bool) -> None:
     """Put a request on record before its method is run.
 
     Raises:
@@ -360,7 +347,7 @@ def _run(request: Request, progress: Progress) -> MethodResult:
     result = None if failed else _finished(request)
     return result or MethodResult(
         request.method.label,
-        request.method.summary,
+        summary=request.method.summary,
         folder=request.folder.relative_to(request.output_path).as_posix(),
         failed=failed,
     )
@@ -377,31 +364,32 @@ def _measured(results: Sequence[MethodResult], plan: _Plan) -> tuple[MethodResul
     """Add what needs the models: scores against ground truth, and where models contradict."""
     poses = {
         (result.name, seed.seed): read_poses(plan.layout.path / seed.model_path)
+        if seed.model_path
+        else {}
         for result in results
         for seed in result.seeds
-        if seed.model_path
     }
     first = plan.options.seeds[0]
 
     def scored(result: MethodResult, seed: SeedResult) -> SeedResult:
         if plan.truth is None:
             return seed
-        estimated = poses.get((result.name, seed.seed), {})
-        return replace(seed, scores=pose_scores(estimated, plan.truth, plan.names))
+        scores = pose_scores(poses[result.name, seed.seed], plan.truth, plan.names)
+        return replace(seed, scores=scores)
 
-    def contradicting(name1: str, seed1: int, name2: str, seed2: int) -> tuple[str, ...]:
-        return disagreeing_images(poses.get((name1, seed1), {}), poses.get((name2, seed2), {}))
+    def contradicting(name: str, seed: int, result: MethodResult) -> tuple[str, ...]:
+        """Compare a model with that of a method with the first seed."""
+        return disagreeing_images(poses.get((result.name, first), {}), poses.get((name, seed), {}))
 
     measured = []
     for result in results:
-        name = result.name
         unstable = {
             image
             for seed in result.seeds[1:]
-            for image in contradicting(name, first, name, seed.seed)
+            for image in contradicting(result.name, seed.seed, result)
         }
         others = {
-            other.name: contradicting(name, first, other.name, first)
+            other.name: contradicting(other.name, first, result)
             for other in results
             if other is not result
         }

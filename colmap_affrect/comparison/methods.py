@@ -17,7 +17,6 @@ SIFT_SUMMARIES = {
     SIFT: "COLMAP's SIFT with its default options",
     SIFT_AFFINE_DSP: "COLMAP's SIFT with affine shapes and domain-size pooling",
 }
-DEFAULT_METHODS = (SIFT, SIFT_AFFINE_DSP, "unrectified-rootsift", "default", "on-demand")
 
 
 @dataclass(frozen=True)
@@ -46,33 +45,29 @@ class Method:
         return f"{plain}-{zlib.crc32(self.label.encode()):08x}"
 
 
-def parse_methods(texts: Iterable[str], depth_settings: Sequence[str] = ()) -> tuple[Method, ...]:
+def parse_methods(
+    given: Iterable[str | Method], depth_settings: Sequence[str] = ()
+) -> tuple[Method, ...]:
     """Read methods, each as :func:`parse_method` takes them, several separated by commas.
 
-    What follows a colon belongs to the last method of its text.
+    What follows a colon belongs to the last method of its text. Methods stay as they are.
 
     >>> [method.label for method in parse_methods(["sift,a=default:matching.max_ratio=0.8"])]
     ['sift', 'a']
 
     Raises:
-        OptionError: for an unknown method or option, or two methods with one name.
+        OptionError: for an unknown method or option, no method, or two with one name.
     """
     methods: list[Method] = []
-    for text in texts:
+    for text in given:
+        if isinstance(text, Method):
+            methods.append(text)
+            continue
         head, colon, settings = text.partition(":")
         *names, last = (name.strip() for name in head.split(","))
         methods += [parse_method(name, depth_settings) for name in names if name]
         if last:
             methods.append(parse_method(last + colon + settings, depth_settings))
-    return unique_methods(methods)
-
-
-def unique_methods(methods: Sequence[Method]) -> tuple[Method, ...]:
-    """Refuse no methods, and two with one name.
-
-    Raises:
-        OptionError: naming them.
-    """
     if not methods:
         raise OptionError(f"no method given; known are {_known()}")
     labels = [method.label for method in methods]

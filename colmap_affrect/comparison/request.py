@@ -12,59 +12,36 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison.methods import Method
-from colmap_affrect.extraction import Resources
-from colmap_affrect.options import (
-    ExtractionOptions,
-    MappingOptions,
-    MaskOptions,
-    MatchingOptions,
-    VerificationOptions,
-)
+from colmap_affrect.images.photographs import MaskOptions
+from colmap_affrect.mappers.base import MAPPERS, MapperOptions
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
-from colmap_affrect.workspace import Workspace
+from colmap_affrect.stages.context import Resources
 
 
-@dataclass(frozen=True)
 class Layout:
-    """Paths below the folder of a comparison."""
+    """Paths below the folder of a comparison.
 
-    path: Path
-    shared_name: str = "shared"
+    Attributes:
+        path: that folder.
+        shared: folder of what all methods begin with.
+        inputs: record of what ``shared`` was made from, and of the options all methods have.
+        database: cameras and images, no features.
+        images: names of the images that COLMAP can read, one a line.
+        pairs: the pairs to match.
+        methods: folder of the folders of the methods.
+    """
 
-    @property
-    def shared(self) -> Path:
-        """Folder of what all methods begin with."""
-        return self.path / self.shared_name
-
-    @property
-    def inputs(self) -> Path:
-        """Record of what ``shared`` was made from, and of the options that all methods have."""
-        return self.shared / "inputs.json"
-
-    @property
-    def database(self) -> Path:
-        """Cameras and images, no features."""
-        return self.shared / "database.db"
-
-    @property
-    def images(self) -> Path:
-        """Names of the images that COLMAP can read, one a line."""
-        return self.shared / "images.txt"
-
-    @property
-    def pairs(self) -> Path:
-        """The pairs to match."""
-        return self.shared / "pairs.txt"
-
-    @property
-    def methods(self) -> Path:
-        """Folder of the methods."""
-        return self.path / "methods"
-
-    def method(self, method: Method) -> Path:
-        """Folder of one method."""
-        return self.methods / method.folder_name
+    def __init__(self, path: Path, shared_name: str = "shared") -> None:
+        self.path = path
+        self.shared = path / shared_name
+        self.inputs = self.shared / "inputs.json"
+        self.database = self.shared / "database.db"
+        self.images = self.shared / "images.txt"
+        self.pairs = self.shared / "pairs.txt"
+        self.methods = path / "methods"
 
     def image_names(self) -> list[str]:
         """Read the list of images."""
@@ -92,7 +69,7 @@ class Request:
     image_path: Path
     masks: MaskOptions
     verification: VerificationOptions
-    mapping: MappingOptions
+    mapping: MapperOptions
     intrinsics_given: bool
     seeds: tuple[int, ...]
     resources: Resources
@@ -105,7 +82,7 @@ class Request:
     @property
     def folder(self) -> Path:
         """Folder of the results of the method."""
-        return self.layout.method(self.method)
+        return self.layout.methods / self.method.folder_name
 
     def seed_folder(self, seed: int) -> Path:
         """Folder of the results of one seed."""
@@ -131,7 +108,7 @@ class Request:
         recipe = self.method.recipe
         if recipe is None:
             return {"sift": self.method.label}
-        options = {"recipe": recipe_options(recipe)}
+        options = {"recipe": _what_decides(recipe)}
         return {**options, "climbing_seed": self.seeds[0]} if self.method.climbs else options
 
     def to_json(self) -> str:
@@ -139,11 +116,8 @@ class Request:
         recipe, weights = self.method.recipe, self.resources.weights_path
         values = {
             "label": self.method.label,
-            "recipe": recipe and {
-                "name": recipe.name,
-                "summary": recipe.summary,
-                "options": recipe_options(recipe),
-            },
+            "recipe": recipe
+            and {"name": recipe.name, "summary": recipe.summary, **recipe.to_mapping()},
             "output_path": str(self.output_path.resolve()),
             "image_path": str(self.image_path.resolve()),
             "masks": self.masks.to_mapping(),
@@ -153,39 +127,31 @@ class Request:
             "seeds": self.seeds,
             "weights_path": str(weights.resolve()) if weights else "",
             "device": self.resources.device,
-        }  # fmt: skip
+        }
         return json.dumps(values, indent=1)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Read :meth:`to_json`."""
         values = json.loads(text)
-        recipe, where = values["recipe"], "request"
-        extraction = dict(recipe["options"]) if recipe else {}
-        matching = extraction.pop("matching", {})
+        recipe = values["recipe"]
         return cls(
             method=Method(
-                values["label"],
-                recipe and Recipe(
-                    recipe["name"],
-                    recipe["summary"],
-                    ExtractionOptions.from_mapping(extraction, where),
-                    MatchingOptions.from_mapping(matching, where),
-                ),
+                values["label"], recipe and Recipe.from_mapping(recipe.pop("name"), recipe)
             ),
             output_path=Path(values["output_path"]),
             image_path=Path(values["image_path"]),
-            masks=MaskOptions.from_mapping(values["masks"], where),
-            verification=VerificationOptions.from_mapping(values["verification"], where),
-            mapping=MappingOptions.from_mapping(values["mapping"], where),
+            masks=MaskOptions(**values["masks"]),
+            verification=VerificationOptions(**values["verification"]),
+            mapping=MAPPERS.options(values["mapping"]),
             intrinsics_given=values["intrinsics_given"],
             seeds=tuple(values["seeds"]),
             resources=Resources(
                 Path(values["weights_path"]) if values["weights_path"] else None, values["device"]
             ),
-        )  # fmt: skip
+        )
 
 
-def recipe_options(recipe: Recipe) -> dict[str, Any]:
-    """Return all options of a recipe."""
-    return {**recipe.extraction.to_mapping(), "matching": recipe.matching.to_mapping()}
+def _what_decides(recipe: Recipe) -> dict[str, Any]:
+    """Return the options that decide features and matches."""
+    return {key: value for key, value in recipe.to_mapping().items() if key != "mapping"}

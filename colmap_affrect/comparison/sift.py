@@ -10,9 +10,9 @@ from typing import Any
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database, require_database_space
 from colmap_affrect.colmap.native_options import differences
-from colmap_affrect.files import replace_text
-from colmap_affrect.matching.pairs import Pair
-from colmap_affrect.options import MaskOptions
+from colmap_affrect.images.photographs import MaskOptions
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.project.atomic_files import replace_text
 
 ROWS_PER_IMAGE = 400
 """Room for the features of an image: 8192 of 128 bytes and their positions, in rows of 4 KiB."""

@@ -1,15 +1,16 @@
-"""A comparison as a table for the terminal and as CSV."""
+"""A comparison as a table for the terminal, as CSV and as JSON."""
 
 from __future__ import annotations
 
+import json
 import textwrap
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
+from typing import Any
 
-from colmap_affrect.outcomes import csv_text
-
-if TYPE_CHECKING:
-    from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult, Span
+from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult, Span
+from colmap_affrect.comparison.verdict import verdict
+from colmap_affrect.project.report import csv_text
 
 WIDTH = 88
 
@@ -19,21 +20,30 @@ def summary(comparison: Comparison) -> str:
     columns = ["method", "registered", "verified", "points", "track", "px", "seconds", "MB"]
     if comparison.has_ground_truth:
         columns.insert(2, "correct")
-    rows = [columns, *(_row(method, comparison) for method in comparison.methods)]
-    widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(len(columns))]
-    lines = [
-        "  ".join(
-            cell.rjust(width) if index else cell.ljust(width)
-            for index, (cell, width) in enumerate(zip(row, widths, strict=False))
-        )
-        for row in rows
-    ]
+    lines = [aligned([columns, *(_row(method, comparison) for method in comparison.methods)])]
     only = comparison.only_registered_by if len(comparison.finished) > 1 else {}
     lines += [""] * bool(only)
     lines += [f"only {method} registers {name}" for name, method in only.items()]
-    for paragraph in comparison.verdict:
+    for paragraph in verdict(comparison):
         lines += ["", *textwrap.wrap(paragraph, WIDTH, break_on_hyphens=False)]
     return "\n".join(lines)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Align columns, the first to the left; rows may end early.
+
+    >>> print(aligned([["recipe", "< 1 px", "s"], ["default", "3"]]))
+    recipe   < 1 px  s
+    default       3
+    """
+    widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if number else cell.ljust(width)
+            for number, (cell, width) in enumerate(zip(row, widths, strict=False))
+        ).rstrip()
+        for row in rows
+    )
 
 
 def _row(method: MethodResult, comparison: Comparison) -> list[str]:
@@ -61,8 +71,14 @@ def _span(span: Span) -> str:
     return f"{span.mean:.1f} [{span.min:g}-{span.max:g}]"
 
 
-def comparison_csv(comparison: Comparison) -> str:
-    """Return a row for each method and seed, and one for each method that failed."""
+def to_json(comparison: Comparison) -> str:
+    """Return ``comparison.json``: all results, and the verdict first."""
+    values = {"verdict": verdict(comparison), **comparison.to_mapping()}
+    return json.dumps(values, indent=2, ensure_ascii=False) + "\n"
+
+
+def to_csv(comparison: Comparison) -> str:
+    """Return ``comparison.csv``: a row for each method and seed, and for each failed method."""
     rows = [
         {**_method_cells(method, comparison), **_seed_cells(method, seed)}
         for method in comparison.methods

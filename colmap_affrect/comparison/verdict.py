@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from colmap_affrect.comparison.results import Comparison, MethodResult, Span
+from colmap_affrect.comparison.results import Comparison, MethodResult, Span
 
 REFERENCES = ("sift", "sift-affine-dsp")
 """What gains are measured against: the first of these that was run."""
@@ -34,19 +32,11 @@ MIN_WHOLE_SECONDS = 10
 
 def verdict(comparison: Comparison) -> tuple[str, ...]:
     """Return the paragraphs, the most important one first."""
-    paragraphs = [
-        *headline(comparison),
-        *changes(comparison),
-        *seeds_disagree(comparison),
-        *wrong_poses(comparison),
-        *registered_by_none(comparison),
-        *failures(comparison),
-        *few_observations(comparison),
-        *short_tracks(comparison),
-        *unstable_poses(comparison),
-        *contradictions(comparison),
-    ]
-    return tuple(paragraphs)
+    rules = (
+        headline, changes, seeds_disagree, wrong_poses, registered_by_none, failures,
+        few_observations, short_tracks, unstable_poses, contradictions,
+    )  # fmt: skip
+    return tuple(text for rule in rules for text in rule(comparison))
 
 
 @dataclass(frozen=True)
@@ -109,28 +99,23 @@ def headline(comparison: Comparison) -> list[str]:
             f"Nothing was reconstructed: no method registers more than {most:g} of the {total} "
             "photographs."
         ]
-    reference = reference_of(comparison)
+    reference, registers = reference_of(comparison), _registers(comparison)
+    best_of_total = f"{_number(_count(best))} of {total}"
     if reference is None:
         return [
-            f"{best.name} {_registers(comparison)} most photographs, {_number(_count(best))} of "
-            f"{total}. COLMAP's SIFT was not run, so nothing can be said about a gain."
+            f"{best.name} {registers} most photographs, {best_of_total}. COLMAP's SIFT was not "
+            "run, so nothing can be said about a gain."
         ]
     if len(finished) == 1:
-        return [
-            f"{best.name} {_registers(comparison)} {_number(_count(best))} of {total} photographs; "
-            "no other method finished."
-        ]
+        return [f"{best.name} {registers} {best_of_total} photographs; no other method finished."]
+    num_of_reference = _number(_count(reference))
     if not Change.between(best, reference).is_gain:
         return [
-            f"No benefit on this set: no method {_registers(comparison)} more photographs than "
-            f"{reference.name}, which {_registers(comparison)} {_number(_count(reference))} "
-            f"of {total}."
+            f"No benefit on this set: no method {registers} more photographs than "
+            f"{reference.name}, which {registers} {num_of_reference} of {total}."
         ]
-    text = (
-        f"{best.name} {_registers(comparison)} {_number(_count(best))} of {total} photographs, "
-        f"{reference.name} {_number(_count(reference))}."
-    )
-    return [text + _without_rectification(comparison, best)]
+    gain = f"{best.name} {registers} {best_of_total} photographs, {reference.name} "
+    return [f"{gain}{num_of_reference}.{_without_rectification(comparison, best)}"]
 
 
 def _without_rectification(comparison: Comparison, best: MethodResult) -> str:
@@ -225,18 +210,15 @@ def few_observations(comparison: Comparison) -> list[str]:
     """Doubt gained photographs that hang on few points."""
     texts = []
     for method, change in _gains(comparison):
-        weak = {}
-        for name in change.gained:
-            counts = [
-                seed.num_observations[name]
-                for seed in method.seeds
-                if name in seed.num_observations
-            ]
-            if counts and max(counts) < MIN_OBSERVATIONS:
-                weak[name] = max(counts)
+        most = {
+            name: max(seed.num_observations.get(name, 0) for seed in method.seeds)
+            for name in change.gained
+        }
+        weak = [
+            f"{name} ({num} points)" for name, num in most.items() if 0 < num < MIN_OBSERVATIONS
+        ]
         if weak:
-            points = _listed(f"{name} ({count} points)" for name, count in weak.items())
-            texts.append(f"Doubtful: in {method.name} few points hold {points}.")
+            texts.append(f"Doubtful: in {method.name} few points hold {_listed(weak)}.")
     return texts
 
 

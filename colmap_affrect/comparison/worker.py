@@ -17,19 +17,17 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
-from colmap_affrect import stages
-from colmap_affrect.children import end_with_parent
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.copies import copy_database
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.colmap.mapping import map_database
+from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import verified_pairs, verify
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP
-from colmap_affrect.comparison.request import Request, recipe_options
-from colmap_affrect.comparison.results import MethodResult, Pair, SeedResult
+from colmap_affrect.comparison.request import Request
+from colmap_affrect.comparison.results import MethodResult, SeedResult
 from colmap_affrect.comparison.sift import (
     describe_options,
     extract_sift,
@@ -37,14 +35,24 @@ from colmap_affrect.comparison.sift import (
     rename_images,
 )
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.escalation import escalate
-from colmap_affrect.executor import BYTES_PER_RSS, peak_memory_bytes
-from colmap_affrect.files import replace_text
-from colmap_affrect.matching.pairs import read_pairs
-from colmap_affrect.options import CameraOptions
-from colmap_affrect.progress import Advance, Progress
+from colmap_affrect.mappers.attempts import map_database
+from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.pairs.base import Pair, PairOptions
+from colmap_affrect.pairs.lists import read_pairs
+from colmap_affrect.parallel.executor import BYTES_PER_RSS, peak_memory_bytes
+from colmap_affrect.parallel.subprocesses import end_with_parent
+from colmap_affrect.progress import SILENT, Advance, Progress
+from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.stopwatch import Stopwatch
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
-from colmap_affrect.workspace import Workspace
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.escalate import escalate
+from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.match import match
+from colmap_affrect.stages.pairs import choose_pairs
+from colmap_affrect.stages.verify import verify_matches
 
 logger = logging.getLogger("colmap_affrect")
 
@@ -73,10 +81,14 @@ def main() -> None:
 def compute(request: Request, progress: Progress) -> None:
     """Extract, match, verify and map, and write ``result.json``; what is there is kept."""
     costs = _Costs(request.folder / "costs.json")
-    if request.method.recipe is None:
-        _match_sift(request, costs, progress)
+    recipe = request.method.recipe
+    if recipe is None:
+        affine = request.method.label == SIFT_AFFINE_DSP
+        options = describe_options(affine=affine)
+        _match_sift(request, costs, progress, affine=affine)
     else:
-        _match_recipe(request, request.method.recipe, costs, progress)
+        options = recipe.to_mapping()
+        _match_recipe(request, recipe, costs, progress)
     num_keypoints, raw_matches = _count_features(request.folder / "database.db")
     result = MethodResult(
         name=request.method.label,
@@ -87,7 +99,7 @@ def compute(request: Request, progress: Progress) -> None:
         wall_s=costs.wall_s,
         peak_memory_bytes=costs.peak_memory_bytes(),
         failures=costs.failures,
-        options=_options(request),
+        options=options,
         folder=request.folder.relative_to(request.output_path).as_posix(),
     )
     costs.save()
@@ -95,17 +107,7 @@ def compute(request: Request, progress: Progress) -> None:
     replace_text(request.result, json.dumps(content, indent=1, ensure_ascii=False))
 
 
-def _options(request: Request) -> dict[str, Any]:
-    if request.method.recipe is None:
-        return describe_options(affine=_is_affine(request))
-    return recipe_options(request.method.recipe)
-
-
-def _is_affine(request: Request) -> bool:
-    return request.method.label == SIFT_AFFINE_DSP
-
-
-def _match_sift(request: Request, costs: _Costs, progress: Progress) -> None:
+def _match_sift(request: Request, costs: _Costs, progress: Progress, *, affine: bool) -> None:
     """Put SIFT features and their matches into the database of the method."""
     path, base = request.folder / "database.db", request.layout.database
     if not path.exists():
@@ -116,7 +118,7 @@ def _match_sift(request: Request, costs: _Costs, progress: Progress) -> None:
         if needed:
             with progress.stage("extract", len(names), "images") as advance:
                 costs.failures = extract_sift(
-                    path, request.image_path, names, request.masks, affine=_is_affine(request)
+                    path, request.image_path, names, request.masks, affine=affine
                 )
                 advance(len(names))
     pairs = read_pairs(request.layout.pairs, names)
@@ -129,30 +131,26 @@ def _match_sift(request: Request, costs: _Costs, progress: Progress) -> None:
 
 def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Progress) -> None:
     """Put our features and their matches into the workspace of the method."""
-    workspace = Workspace(request.folder)
+    context = Context(Workspace(request.folder), request.resources, progress=progress)
+    inputs = Inputs.of(
+        request.image_path,
+        image_list_path=request.layout.images,
+        from_database=request.layout.database,
+        masks=request.masks,
+    )
     with costs.stage("extract") as needed:
         if needed:
-            report = stages.extract(
-                workspace,
-                request.image_path,
-                recipe,
-                CameraOptions(),
-                masks=request.masks,
-                image_list_path=request.layout.images,
-                from_database=request.layout.database,
-                resources=request.resources,
-                progress=progress,
-            )
-            costs.failures = report.failures
-    stages.choose_pairs(workspace, match_list_path=request.layout.pairs)
+            costs.failures = extract(context, inputs, recipe).failures
+    choose_pairs(context, PairOptions(match_list_path=str(request.layout.pairs.resolve())))
     with costs.stage("match") as needed:
         if needed:
-            stages.match(workspace, recipe.matching, progress=progress)
+            match(context)
     if request.method.climbs:
-        stages.verify_matches(workspace, request.verification, request.seeds[0])
+        verification = request.verification.changed(random_seed=request.seeds[0])
+        verify_matches(replace(context, progress=SILENT), verification)
         with costs.stage("escalate") as needed:
             if needed:
-                escalate(workspace, resources=request.resources, progress=progress)
+                escalate(context)
 
 
 def _count_features(database_path: Path) -> tuple[dict[str, int], dict[Pair, int]]:
@@ -190,22 +188,16 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
         database.clear_two_view_geometries()
         num_pairs = len(database.read_num_matches()[0])
     names = {image_id: name for name, image_id in image_ids(database_path).items()}
-    start = time.perf_counter()
-    with progress.stage(f"verify, seed {seed}", num_pairs, "pairs") as advance:
-        verify(database_path, request.verification, seed)
+    watch = Stopwatch()
+    title = f"verify, seed {seed}"
+    with watch.step("verify"), progress.stage(title, num_pairs, "pairs") as advance:
+        verify(database_path, request.verification.changed(random_seed=seed))
         advance(num_pairs)
-    middle = time.perf_counter()
-    with progress.stage(f"map, seed {seed}", len(names), "images") as advance:
-        models = map_database(
-            database_path,
-            request.image_path,
-            folder / "sparse",
-            request.mapping,
-            seed,
-            intrinsics_given=request.intrinsics_given,
-            next_image=advance,
-        )
-    end = time.perf_counter()
+    with watch.step("map"), progress.stage(f"map, seed {seed}", len(names), "images") as advance:
+        mapper = MAPPERS.make(request.mapping.changed(random_seed=seed))
+        task = MappingTask(database_path, request.image_path, request.intrinsics_given)
+        models = map_database(mapper, task, folder / "sparse", advance)
+    largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
     model_path = folder / "sparse" / "0" if models else None
     model = pycolmap.Reconstruction(model_path) if model_path else pycolmap.Reconstruction()
     inliers = verified_pairs(database_path, request.verification.min_num_inliers)
@@ -213,13 +205,13 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
         seed=seed,
         model_names=tuple(item.registered_names for item in models),
         model_path=model_path.relative_to(request.output_path).as_posix() if model_path else "",
-        num_points3D=models[0].num_points3D if models else 0,
-        mean_track_length=models[0].mean_track_length if models else 0.0,
+        num_points3D=largest.num_points3D,
+        mean_track_length=largest.mean_track_length,
         mean_observations=float(model.compute_mean_observations_per_reg_image()) if models else 0.0,
-        mean_reprojection_error_px=models[0].mean_reprojection_error_px if models else 0.0,
+        mean_reprojection_error_px=largest.mean_reprojection_error_px,
         pair_inliers={_pair(names, ids): count for ids, count in inliers.items()},
         scores=None,
-        wall_s={"verify": middle - start, "map": end - middle},
+        wall_s=watch.seconds,
         num_observations={
             model.images[image_id].name: model.images[image_id].num_points3D
             for image_id in sorted(model.reg_image_ids())

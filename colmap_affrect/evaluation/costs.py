@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.extraction import ExtractedImage, ImageExtractor
-from colmap_affrect.interfaces import FeatureProfile
-from colmap_affrect.types import (
-    GrayImage,
-    LocalFeatures,
-    Mask,
-    Photograph,
-    RectificationPlan,
-    View,
-)
+from colmap_affrect.data import LocalFeatures, Photograph, RectificationPlan
+from colmap_affrect.project.stopwatch import Stopwatch
+from colmap_affrect.report.levels import PIXELS_PER_MEGAPIXEL, TimedFeatures
+from colmap_affrect.stages.one_image import ExtractedImage, ImageExtractor
 
 IMAGE_STEPS = ("plan", "warp", "detect", "describe")
 PAIR_STEPS = ("match", "estimate")
 STEPS = (*IMAGE_STEPS, *PAIR_STEPS)
 """Steps that are timed. ``warp`` has what belongs to it: masks, carrying features back, choosing
-among them; ``detect`` has the descriptors too of profiles that compute both at once (RootSIFT).
+among them; ``detect`` has the descriptors too of extractors that compute both at once (RootSIFT).
 Reading images is not counted."""
-
-PIXELS_PER_MEGAPIXEL = 1e6
 
 
 @dataclass(frozen=True)
@@ -67,86 +58,49 @@ class ImageCost:
         """Return the seconds by step."""
         return {step: getattr(self, f"{step}_s") for step in IMAGE_STEPS}
 
-    def __add__(self, other: Self) -> Self:
+    def complexity(self) -> dict[str, float]:
+        """Return what the paper's table of complexity has."""
+        return {
+            "area_mpx": self.area_mpx,
+            "num_keypoints": self.num_keypoints,
+            "num_regions": self.num_regions,
+            "num_warps": self.num_warps,
+            "warps_per_region": self.warps_per_region,
+        }
+
+    @classmethod
+    def total(cls, costs: Sequence[Self]) -> Self:
         """Add up, as over the levels of an image."""
-        mine, theirs = vars(self), vars(other)
-        return type(self)(**{key: mine[key] + theirs[key] for key in mine})
+        return cls(**{key: sum(vars(cost)[key] for cost in costs) for key in vars(cls())})
 
     @classmethod
     def mean(cls, costs: Sequence[Self]) -> Self:
         """Average over images; all 0 without any."""
-        total = sum(costs, start=cls())
-        count = max(1, len(costs))
-        return cls(**{item.name: getattr(total, item.name) / count for item in fields(cls)})
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return dict(vars(self))
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Read :meth:`to_mapping`."""
-        return cls(**values)
+        total = vars(cls.total(costs))
+        return cls(**{key: value / max(1, len(costs)) for key, value in total.items()})
 
 
-@dataclass
-class _Stopwatch:
-    """Seconds since it was last set to zero, by step, and the last plan."""
-
-    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(IMAGE_STEPS, 0.0))
-    plan: RectificationPlan | None = None
-
-
-class _TimedProfile:
-    """A feature profile that takes the time of its steps."""
-
-    def __init__(self, profile: FeatureProfile, watch: _Stopwatch) -> None:
-        self._profile, self._watch = profile, watch
-        self.descriptor_size = profile.descriptor_size
-
-    def detect(self, view: View) -> LocalFeatures:
-        start = time.perf_counter()
-        detected = self._profile.detect(view)
-        self._watch.seconds["detect"] += time.perf_counter() - start
-        return detected
-
-    def describe(
-        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
-    ) -> list[LocalFeatures]:
-        start = time.perf_counter()
-        described = self._profile.describe(images, detected)
-        self._watch.seconds["describe"] += time.perf_counter() - start
-        return described
-
-
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class _TimedExtractor(ImageExtractor):
-    """An extractor that takes the time of planning, and of execution without the profile."""
+    """An extractor that takes the time of its steps and keeps its plans."""
 
-    watch: _Stopwatch = field(default_factory=_Stopwatch)
+    watch: Stopwatch = field(default_factory=Stopwatch)
+    plans: list[RectificationPlan] = field(default_factory=list)
 
     def plan(self, photograph: Photograph, level: int = 0) -> RectificationPlan:
-        start = time.perf_counter()
-        try:
-            self.watch.plan = super().plan(photograph, level)
-        finally:
-            self.watch.seconds["plan"] += time.perf_counter() - start
-        return self.watch.plan
+        with self.watch.step("plan"):
+            self.plans.append(super().plan(photograph, level))
+        return self.plans[-1]
 
     def execute(
         self,
-        image: GrayImage,
+        photograph: Photograph,
         plan: RectificationPlan,
         *,
         with_original: bool = True,
-        mask: Mask | None = None,
     ) -> LocalFeatures:
-        seconds = self.watch.seconds
-        start, before = time.perf_counter(), seconds["detect"] + seconds["describe"]
-        features = super().execute(image, plan, with_original=with_original, mask=mask)
-        profile_s = seconds["detect"] + seconds["describe"] - before
-        seconds["warp"] += time.perf_counter() - start - profile_s
-        return features
+        with self.watch.step("warp"):
+            return super().execute(photograph, plan, with_original=with_original)
 
 
 def extract_measured(
@@ -157,18 +111,21 @@ def extract_measured(
     level: int = 0,
 ) -> tuple[ExtractedImage, ImageCost]:
     """Extract the features of an image, as :meth:`ImageExtractor.extract_file`, and their cost."""
-    watch = _Stopwatch()
-    profile = _TimedProfile(extractor.profile, watch)
+    watch = Stopwatch(*IMAGE_STEPS)
     timed = _TimedExtractor(
-        extractor.options, profile, extractor.rectifiers, extractor.weights, watch=watch
+        extractor.options,
+        TimedFeatures(extractor.extractor, watch),
+        extractor.rectifiers,
+        extractor.weights,
+        extractor.resources,
+        watch=watch,
     )
     found = timed.extract_file(path, name, intrinsics, level)
-    plan = watch.plan
-    cost = ImageCost(
-        area_mpx=plan.rectified_area_px / PIXELS_PER_MEGAPIXEL if plan else 0.0,
-        num_keypoints=len(found.features),
-        num_regions=plan.num_regions if plan else 0,
-        num_warps=len(plan.items) if plan else 0,
-        **{f"{step}_s": watch.seconds[step] for step in IMAGE_STEPS},
+    plan = timed.plans[-1] if timed.plans else RectificationPlan(found.image_size)
+    return found, ImageCost(
+        plan.rectified_area_px / PIXELS_PER_MEGAPIXEL,
+        len(found.features),
+        plan.num_regions,
+        len(plan.items),
+        **{f"{step}_s": seconds for step, seconds in watch.seconds.items()},
     )
-    return found, cost

@@ -7,28 +7,29 @@ was stopped goes on; scores of other settings are kept beside, so that only what
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import logging
 import math
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.comparison.methods import Method, parse_methods, unique_methods
+from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import AffrectError, EvaluationError, OptionError
-from colmap_affrect.evaluation.costs import ImageCost
+from colmap_affrect.evaluation.costs import PAIR_STEPS, ImageCost
 from colmap_affrect.evaluation.pair_matches import MatchedPair, PairMatcher
 from colmap_affrect.evaluation.plots import write_plots
 from colmap_affrect.evaluation.protocol import (
+    GROUP,
     Dataset,
-    EvaluationImage,
     EvaluationPair,
     EvaluationProtocol,
     PairResult,
@@ -39,21 +40,21 @@ from colmap_affrect.evaluation.recipe_features import RecipeFeatures
 from colmap_affrect.evaluation.records import RecordFile
 from colmap_affrect.evaluation.registry import make_protocol
 from colmap_affrect.evaluation.results import (
+    PAIR_RESULT,
+    SECONDS,
     Evaluation,
     Interval,
     RecipeResult,
-    pair_from_mapping,
-    pair_to_mapping,
+    Solved,
 )
-from colmap_affrect.evaluation.statistics import bootstrap_interval, paired_test
-from colmap_affrect.evaluation.tables import GROUP, SECONDS
-from colmap_affrect.extraction import Resources
-from colmap_affrect.files import replace_text
-from colmap_affrect.imaging import require_png
+from colmap_affrect.evaluation.statistics import bootstrap_intervals, paired_test
+from colmap_affrect.images.reading import require_png
 from colmap_affrect.pipeline import installed_versions
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
-from colmap_affrect.workspace import Workspace
+from colmap_affrect.stages.context import Resources
 
 logger = logging.getLogger(__name__)
 
@@ -117,35 +118,26 @@ def evaluate(
     if not dataset_path.is_dir():
         raise EvaluationError(f"{dataset_path}: no such folder; give the folder of the dataset")
     with Workspace(output_path).locked():
-        with progress.stage("check dataset", 1, "datasets") as advance:
-            dataset = chosen.load(dataset_path)
-            advance(1)
-        _refuse_unusable(dataset, dataset_path)
+        dataset = _loaded(chosen, dataset_path, progress)
         settings = {
             "scores": chosen.settings(),
             "random_seed": options.random_seed,
             "max_num_keypoints": options.max_num_keypoints,
         }
         inputs = {"protocol": chosen.name, "dataset_path": str(dataset_path.resolve())}
-        runs = [
-            _Run.prepared(
-                method, chosen, dataset, output_path, inputs, settings, options, overwrite=overwrite
-            )
-            for method in methods
-        ]
+        rest = (dataset.pairs, output_path, inputs, settings, options)
+        runs = [_Run(method, chosen, *rest, overwrite=overwrite) for method in methods]
         results = {run.method.label: run.results(progress) for run in runs}
-        baseline = options.baseline or ""
+        baseline = results.get(options.baseline or "")
         evaluation = Evaluation(
             protocol=chosen.name,
             error_title=chosen.error_title,
             category_title=chosen.category_title,
             dataset_path=inputs["dataset_path"],
             settings=settings,
-            recipes=tuple(
-                run.summarized(results[run.method.label], results.get(baseline)) for run in runs
-            ),
+            baseline=options.baseline or "",
             notes=dataset.notes,
-            baseline=baseline,
+            recipes=tuple(run.summarized(results[run.method.label], baseline) for run in runs),
             published=tuple(published(chosen.name)),
             published_complexity=tuple(published(COMPLEXITY)),
             versions=installed_versions(),
@@ -158,83 +150,71 @@ def evaluate(
 
 def _methods(options: EvaluateOptions) -> tuple[Method, ...]:
     """Parse recipes and refuse what cannot work."""
-    methods = unique_methods(
-        [
-            method
-            for item in options.recipes
-            for method in ([item] if isinstance(item, Method) else parse_methods([item]))
-        ]
-    )
+    methods = parse_methods(options.recipes)
     labels = [method.label for method in methods]
     for method in methods:
-        if method.recipe is None:
-            raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
+        _recipe(method)
     if options.baseline is not None and options.baseline not in labels:
         raise OptionError(
             f"--baseline {options.baseline}: is not among the recipes {', '.join(labels)}"
         )
     if options.max_num_keypoints is not None and options.max_num_keypoints < 1:
         raise OptionError(f"--max-num-keypoints {options.max_num_keypoints}: must be at least 1")
+    if options.random_seed < 0:
+        raise OptionError(f"--random-seed {options.random_seed}: must be at least 0")
     return methods
 
 
-def _refuse_unusable(dataset: Dataset, path: Path) -> None:
+def _loaded(protocol: EvaluationProtocol, path: Path, progress: Progress) -> Dataset:
+    """Load a dataset and refuse one without a pair that can be evaluated."""
+    with progress.stage("check dataset", 1, "datasets") as advance:
+        dataset = protocol.load(path)
+        advance(1)
     if all(pair.problem for pair in dataset.pairs):
         why = dataset.pairs[0].problem if dataset.pairs else "it has none"
         raise EvaluationError(f"{path}: no pair can be evaluated; the first: {why}")
+    return dataset
 
 
-@dataclass(frozen=True)
+def _recipe(method: Method) -> Recipe:
+    if method.recipe is None:
+        raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
+    return method.recipe
+
+
 class _Run:
-    """One recipe on the pairs of a dataset.
+    """One recipe on the pairs of a dataset."""
 
-    Attributes:
-        method: the recipe under its label.
-        protocol: scores its matches.
-        pairs: of the dataset.
-        features: of the recipe.
-        records: results of pairs, with a fingerprint of the truth that they are of.
-        options: of the evaluation.
-    """
-
-    method: Method
-    protocol: EvaluationProtocol
-    pairs: tuple[EvaluationPair, ...]
-    features: RecipeFeatures
-    records: RecordFile
-    options: EvaluateOptions
-
-    @classmethod
-    def prepared(
-        cls,
+    def __init__(
+        self,
         method: Method,
         protocol: EvaluationProtocol,
-        dataset: Dataset,
+        pairs: Sequence[EvaluationPair],
         output_path: Path,
         inputs: Mapping[str, Any],
         settings: Mapping[str, Any],
         options: EvaluateOptions,
         *,
         overwrite: bool,
-    ) -> _Run:
-        """Find everything that the recipe needs before any image is worked on."""
-        recipe = _recipe(method)
-        usable = [pair for pair in dataset.pairs if not pair.problem]
-        images: dict[str, EvaluationImage] = {
-            image.name: image for pair in usable for image in pair.images
-        }
-        features = RecipeFeatures(
-            output_path / "features",
-            method,
-            recipe,
-            list(images.values()),
+    ) -> None:
+        """Find everything that the recipe needs before any image is worked on.
+
+        Features depend on ``inputs``, and scores on ``settings`` beside them; both are recorded.
+        """
+        self.method, self.protocol, self.pairs, self.options = method, protocol, pairs, options
+        self.recipe = _recipe(method)
+        images = {image.name: image for p in pairs if not p.problem for image in p.images}
+        self.features = RecipeFeatures(
+            output_path / "features" / method.folder_name,
+            self.recipe.extraction,
+            images,
             inputs,
             options.resources,
             overwrite=overwrite,
         )
         decisive = {
-            "features": features.settings,
-            "matching": recipe.matching.to_mapping(),
+            "features": self.features.settings,
+            "matching": self.recipe.matching.to_mapping(),
             **settings,
         }
         digest = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
@@ -242,27 +222,23 @@ class _Run:
         if overwrite:
             for old in path.parent.glob(f"{method.folder_name}-????????.jsonl"):
                 old.unlink()
-        return cls(method, protocol, dataset.pairs, features, RecordFile(path, decisive), options)
+        self.records = RecordFile(path, decisive)
 
     def results(self, progress: Progress) -> list[PairResult]:
         """Match and score all pairs that have not been; what fails is tried again next time."""
         truths = {pair.name: _fingerprint(pair.truth) for pair in self.pairs}
         done = {
-            record["name"]: pair_from_mapping(record["result"])
+            record["name"]: PAIR_RESULT.validate_python(record["result"])
             for record in self.records.records
             if truths.get(record["name"]) == record["truth"]
         }
         todo = [pair for pair in self.pairs if not pair.problem and pair.name not in done]
-        matcher = PairMatcher(
-            self.features, self.options.max_num_keypoints, self.method.label, progress
-        )
+        budget, title = self.options.max_num_keypoints, self.method.label
+        matcher = PairMatcher(self.recipe, self.features, budget, title, progress)
         for result in matcher.run(todo, self._scored):
             if not result.failure:
-                record = {
-                    "name": result.name,
-                    "truth": truths[result.name],
-                    "result": pair_to_mapping(result),
-                }
+                values = json.loads(PAIR_RESULT.dump_json(result))
+                record = {"name": result.name, "truth": truths[result.name], "result": values}
                 self.records.append(record)
             done[result.name] = result
         return [done.get(pair.name) or self._failed(pair) for pair in self.pairs]
@@ -278,30 +254,27 @@ class _Run:
             logger.exception("%s: %s cannot be scored", self.method.label, pair.name)
             return self._failed(pair, f"{type(error).__name__}: {error}")
         estimate_s = time.perf_counter() - start
-        level = ""
-        if self.method.climbs:
-            rectifiers = self.features.recipe.extraction.rectifiers
-            level = "none" if matched.level is None else rectifiers[matched.level].name
         return PairResult(
-            pair.name,
-            pair.category,
-            score,
-            len(matched.points[0]),
-            matched.seconds + estimate_s,
-            matched.num_keypoints,
-            {"match": matched.seconds, "estimate": estimate_s},
-            level,
-            matched.num_levels,
+            **vars(score),
+            name=pair.name,
+            category=pair.category,
+            num_matches=len(matched.points[0]),
+            num_keypoints=matched.num_keypoints,
+            seconds=matched.seconds + estimate_s,
+            seconds_by_step={"match": matched.seconds, "estimate": estimate_s},
+            level=matched.level,
+            num_levels=matched.num_levels,
         )
 
     def _failed(self, pair: EvaluationPair, failure: str = "") -> PairResult:
         """Return the result of a pair that has no matches."""
-        lost = [self.features.failures.get(image.name, "") for image in pair.images]
-        why = failure or pair.problem or "; ".join(filter(None, lost))
+        failures = self.features.failures
+        lost = [failures[image.name] for image in pair.images if image.name in failures]
+        why = failure or pair.problem or "; ".join(lost)
         score = PairScore(math.inf, 0)
         if not pair.problem and not failure:
             score = self.protocol.score(pair, NOTHING, NOTHING, self.options.random_seed)
-        return PairResult(pair.name, pair.category, score, 0, 0.0, failure=why)
+        return PairResult(**vars(score), name=pair.name, category=pair.category, failure=why)
 
     def summarized(
         self, results: Sequence[PairResult], baseline: Sequence[PairResult] | None
@@ -311,65 +284,70 @@ class _Run:
         for pair, result in zip(self.pairs, results, strict=True):
             for image in pair.images:
                 num_levels[image.name] = max(num_levels.get(image.name, 0), result.num_levels)
-        costs = list(self.features.costs(num_levels).values())
+        costs = self.features.costs(num_levels)
+        cost = ImageCost.mean(costs)
         seconds = sum(cost.total_s for cost in costs) + sum(result.seconds for result in results)
         seed = self.options.random_seed
-        successes = [self.protocol.success(result.score) for result in results]
+        successes = self._successes(results)
         p_value = None
         if baseline is not None and baseline is not results:
-            others = [self.protocol.success(result.score) for result in baseline]
-            p_value = paired_test(successes, others, seed)
-        recipe = _recipe(self.method)
+            p_value = paired_test(successes, self._successes(baseline), seed)
+        (interval,) = bootstrap_intervals(len(results), lambda rows: [successes[rows].mean()], seed)
         return RecipeResult(
             name=self.method.label,
-            description=recipe.summary,
-            pairs=tuple(results),
+            description=self.recipe.summary,
             summary={**self.protocol.summarize(results), SECONDS: seconds},
             intervals=_intervals(self.protocol, results, seed),
-            solved=(float(np.mean(successes)), bootstrap_interval(successes, _mean, seed)),
+            solved=Solved(float(successes.mean()), interval),
             solved_by_category={
-                category: float(np.mean([successes[row] for row in rows]))
+                category: float(successes[rows].mean())
                 for category, rows in _by_category(results).items()
             },
             p_value=p_value,
-            cost=ImageCost.mean(costs),
             num_images=len(costs),
+            complexity=cost.complexity(),
+            seconds_per_step={**cost.seconds(), **_seconds_per_pair(results)},
             failures=self.features.failures,
             warnings=self.features.warnings,
+            pairs=tuple(results),
         )
 
-
-def _recipe(method: Method) -> Recipe:
-    """Return the recipe of a method that has been checked to have one."""
-    if method.recipe is None:
-        raise OptionError(f"{method.label} is no recipe")
-    return method.recipe
+    def _successes(self, results: Sequence[PairResult]) -> NDArray[np.float64]:
+        return np.array([self.protocol.success(result) for result in results])
 
 
-def _mean(values: NDArray[np.float64]) -> float:
-    return float(values.mean())
+def _seconds_per_pair(results: Sequence[PairResult]) -> dict[str, float]:
+    """Return mean seconds by step, of the pairs that were matched."""
+    timed = [result.seconds_by_step for result in results if result.seconds_by_step]
+    return {
+        step: math.fsum(seconds[step] for seconds in timed) / max(1, len(timed))
+        for step in PAIR_STEPS
+    }
 
 
 def _intervals(
     protocol: EvaluationProtocol, results: Sequence[PairResult], seed: int
 ) -> dict[str, Interval]:
     """Return bootstrap intervals of the columns; those of a category over its pairs."""
-    summaries: dict[bytes, dict[str, float]] = {}
-    categories = _by_category(results)
-    columns = protocol.summarize(results)
+    by_category = _by_category(results)
+    columns = list(protocol.summarize(results))
 
-    def interval(column: str) -> Interval:
-        rows = categories.get(column.rpartition(GROUP)[2], list(range(len(results))))
+    def of_resampled(
+        rows: Sequence[int], names: Sequence[str], picked: NDArray[np.int64]
+    ) -> list[float]:
+        summary = protocol.summarize([results[rows[place]] for place in picked])
+        return [summary.get(name, 0.0) for name in names]
 
-        def statistic(picked: NDArray[np.float64]) -> float:
-            key = picked.tobytes()  # columns of the same pairs are resampled alike
-            if key not in summaries:
-                summaries[key] = protocol.summarize([results[int(row)] for row in picked])
-            return summaries[key].get(column, 0.0)
-
-        return bootstrap_interval(list(map(float, rows)), statistic, seed)
-
-    return {column: interval(column) for column in columns}
+    groups: dict[str, list[str]] = {}
+    for name in columns:
+        category = name.rpartition(GROUP)[2]
+        groups.setdefault(category if category in by_category else "", []).append(name)
+    found: dict[str, Interval] = {}
+    for category, names in groups.items():
+        rows = by_category.get(category, range(len(results)))
+        intervals = bootstrap_intervals(len(rows), partial(of_resampled, rows, names), seed)
+        found |= zip(names, intervals, strict=True)
+    return {name: found[name] for name in columns}
 
 
 def _by_category(results: Sequence[PairResult]) -> dict[str, list[int]]:
@@ -382,20 +360,6 @@ def _by_category(results: Sequence[PairResult]) -> dict[str, list[int]]:
 
 
 def _fingerprint(truth: Any) -> str:
-    """Return what a truth of any type can be recognised by."""
-    digest = hashlib.sha256()
-    _update(digest.update, truth)
-    return digest.hexdigest()
-
-
-def _update(update: Callable[[bytes], None], value: Any) -> None:
-    if isinstance(value, np.ndarray):
-        update(str(value.shape).encode() + np.ascontiguousarray(value).tobytes())
-    elif dataclasses.is_dataclass(value):
-        for item in dataclasses.fields(value):
-            _update(update, getattr(value, item.name))
-    elif isinstance(value, list | tuple):
-        for item in value:
-            _update(update, item)
-    else:
-        update(repr(value).encode())
+    """Return what a truth of any type can be recognised by: all of its numbers, in words."""
+    with np.printoptions(floatmode="unique", threshold=sys.maxsize):
+        return hashlib.sha256(repr(truth).encode()).hexdigest()

@@ -17,28 +17,34 @@ K is COLMAP's: the origin is the corner of the image. Where it is plainly that o
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.comparison.metrics import Pose
-from colmap_affrect.errors import EvaluationError, ImageError
-from colmap_affrect.evaluation.protocol import Dataset, EvaluationPair
-from colmap_affrect.evaluation.relative_pose import (
-    PosedImage,
-    RelativePoseProtocol,
-    category_start,
-    posed_image,
-    posed_pair,
+from colmap_affrect.colmap.poses import Pose
+from colmap_affrect.errors import EvaluationError
+from colmap_affrect.evaluation.posed_scenes import (
+    Names,
+    PosedScenes,
+    missing_notes,
+    posed_pairs,
+    scene_images,
 )
-from colmap_affrect.evaluation.truth_checks import contradictions, counted, rotation_fault
-from colmap_affrect.executor import available_cores, map_ordered
-from colmap_affrect.imaging import IMAGE_SUFFIXES, read_gray
+from colmap_affrect.evaluation.protocol import Dataset
+from colmap_affrect.evaluation.relative_pose import PosedImage, posed_image
+from colmap_affrect.evaluation.truth_checks import (
+    counted,
+    image_size,
+    pose_contradictions,
+    rotation_fault,
+)
+from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 SET_FOLDER = "set_100"
 LIST_FOLDER = "new-vis-pairs"
@@ -52,47 +58,58 @@ MAX_OFF_CENTRE = 1.15
 MAX_QUATERNION_ERROR = 1e-3
 """Largest difference of an element of R from that of the quaternion beside it."""
 
-Names = tuple[str, str]
-"""Of the images of a pair, without suffix."""
-
 
 @dataclass(frozen=True)
-class Imc(RelativePoseProtocol):
+class Imc(PosedScenes):
     """Share of pairs with a rotation error below 5 degrees, by covisibility."""
 
     name = "imc"
     category_title = "covisibility, from"
+    scene_pattern = f"{SET_FOLDER}/{LIST_FOLDER}"
+    dataset_title = "the Phototourism sets"
 
-    def load(self, dataset_path: Path) -> Dataset:
-        """Read a scene, or all scenes in a folder.
+    def load_scene(self, lists_path: Path) -> Dataset:
+        """Read a scene by the folder of its lists of pairs."""
+        root, scene = lists_path.parent, lists_path.absolute().parents[1].name
+        lists, list_notes = _read_lists(lists_path)
+        calibrations, faults = _read_calibrations(root / "calibration")
+        files = scene_images(root / "images")
+        bins: dict[Names, str] = {}
+        unclear = []
+        for key, limit in disjoint_bins(lists).items():
+            names = _split(key, calibrations.keys() | faults.keys() | files.keys())
+            if names is None:
+                unclear.append(key)
+            else:
+                bins[names] = f"{limit / 10:.1f}"
+        posed, size_notes = _posed(scene, files, calibrations)
+        pairs = posed_pairs(bins, posed, lambda names: bins[names])
+        wanted = sorted({name for names in bins for name in names})
+        lacking = {
+            name: faults.get(name, "no file")
+            for name in wanted
+            if name in files and name not in calibrations
+        }
+        used = {pair.category for pair in pairs}
+        empty = ", ".join(name for limit in BINS[1:] if (name := f"{limit / 10:.1f}") not in used)
+        notes = [
+            *list_notes,
+            *counted(unclear, "listed pairs are of images that are not there", unclear),
+            *missing_notes(list(bins), wanted, files, lacking, "calibration"),
+            *_doubt_notes(wanted, calibrations),
+            *size_notes,
+            *(pose_contradictions(pairs[::-1]) if self.check_truth else ()),
+            *([f"no pairs with a covisibility from {empty}"] if empty else []),
+        ]
+        return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
 
-        Raises:
-            EvaluationError: when there is no scene, or no pair can be evaluated.
-        """
-        folders = [dataset_path, *sorted(dataset_path.glob("*/"))]
-        scenes = [folder for folder in folders if (folder / SET_FOLDER / LIST_FOLDER).is_dir()]
-        if not scenes:
-            raise EvaluationError(
-                f"{dataset_path}: has no {SET_FOLDER}/{LIST_FOLDER}, nor has a folder in it; give "
-                "a scene of the Phototourism sets, or the folder of its scenes"
-            )
-        loaded = [_load_scene(folder, check_truth=self.check_truth) for folder in scenes]
-        return Dataset.united(loaded, dataset_path)
 
-
-@dataclass(frozen=True)
-class Calibration:
-    """What a calibration file says, after all checks.
-
-    Attributes:
-        matrix: (3, 3) K, px with the origin in the corner.
-        pose: camera_from_world.
-        doubt: what is odd though usable; empty for nothing.
-    """
+class Calibration(NamedTuple):
+    """What a calibration file says: (3, 3) K, camera_from_world, and what is odd though usable."""
 
     matrix: NDArray[np.float64]
     pose: Pose
-    doubt: str = ""
+    doubt: str
 
 
 def disjoint_bins(lists: Mapping[int, list[str]]) -> dict[str, int]:
@@ -150,50 +167,6 @@ def _quaternion_doubt(rotation: NDArray[np.float64], q: NDArray[np.float64] | No
     return "R and the quaternion beside it differ"
 
 
-def _load_scene(folder: Path, *, check_truth: bool) -> Dataset:
-    root, scene = folder / SET_FOLDER, folder.absolute().name
-    lists, notes = _read_lists(root / LIST_FOLDER)
-    calibrations, faults = _read_calibrations(root / "calibration")
-    files = {
-        path.stem: path
-        for path in sorted((root / "images").glob("*"))
-        if path.suffix.lower() in IMAGE_SUFFIXES
-    }
-    bins: dict[Names, int] = {}
-    unclear = []
-    for key, limit in disjoint_bins(lists).items():
-        names = _split(key, calibrations.keys() | faults.keys() | files.keys())
-        if names is None:
-            unclear.append(key)
-        else:
-            bins[names] = limit
-    posed, size_notes = _posed(scene, files, calibrations)
-    pairs = [
-        posed_pair(posed[names[0]], posed[names[1]], f"{limit / 10:.1f}")
-        for names, limit in bins.items()
-        if all(name in posed for name in names)
-    ]
-    pairs.sort(key=lambda pair: (category_start(pair.category), pair.name))
-    wanted = {name for names in bins for name in names}
-    without_file = sorted(wanted - files.keys())
-    uncalibrated = sorted(wanted & files.keys() - calibrations.keys())
-    notes += [
-        *_left_out_notes(bins, posed),
-        *counted(unclear, "listed pairs are of images that are not there", unclear),
-        *counted(without_file, f"of {len(wanted)} listed images are not in images/", without_file),
-        *counted(
-            uncalibrated,
-            f"of {len(wanted)} listed images have no usable calibration",
-            [f"{name} ({faults.get(name, 'no file')})" for name in uncalibrated],
-        ),
-        *_doubt_notes(calibrations, wanted),
-        *size_notes,
-        *(contradictions(pairs[::-1]) if check_truth else ()),
-        *_empty_notes(pairs),
-    ]
-    return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
-
-
 def _read_lists(folder: Path) -> tuple[dict[int, list[str]], list[str]]:
     """Read the cumulative lists by their limits, and say what is odd about them."""
     lists: dict[int, list[str]] = {}
@@ -201,17 +174,14 @@ def _read_lists(folder: Path) -> tuple[dict[int, list[str]], list[str]]:
     for limit in BINS:
         path = folder / f"keys-th-0.{limit}.npy"
         try:
-            values = np.load(path, allow_pickle=False)
+            lists[limit] = list(map(str, np.load(path, allow_pickle=False).ravel()))
+            continue
         except FileNotFoundError:
-            if limit:
-                notes.append(f"{path.name} is missing: its pairs count as of less covisibility")
-            continue
+            fault = "is missing" if limit else ""
         except (OSError, ValueError, EOFError) as error:
-            notes.append(
-                f"{path.name} cannot be read ({error}): its pairs count as of less covisibility"
-            )
-            continue
-        lists[limit] = [str(value) for value in values.ravel()]
+            fault = f"cannot be read ({error})"
+        if fault:
+            notes.append(f"{path.name} {fault}: its pairs count as of less covisibility")
     for lower, upper in itertools.pairwise(sorted(lists)):
         extra = sorted(set(lists[upper]) - set(lists[lower]))
         notes += counted(extra, f"pairs of list 0.{upper} are not in list 0.{lower}", extra)
@@ -246,7 +216,7 @@ def _posed(
 ) -> tuple[dict[str, PosedImage], list[str]]:
     """Give images their cameras; also say whose intrinsics are of another size."""
     names = sorted(files.keys() & calibrations.keys())
-    sizes = map_ordered(lambda name: _size(files[name]), names, available_cores())
+    sizes = map_ordered(lambda name: image_size(files[name]), names, available_cores())
     found: dict[str, PosedImage] = {}
     scaled, unfitting = [], []
     for name, size in zip(names, sizes, strict=True):
@@ -263,24 +233,10 @@ def _posed(
         params = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
         found[name] = posed_image(f"{scene}/{path.name}", path, camera, calibrations[name].pose)
-    notes = [
-        *counted(
-            scaled,
-            "images are of another size than their K, which is scaled",
-            scaled,
-        ),
+    return found, [
+        *counted(scaled, "images are of another size than their K, which is scaled", scaled),
         *counted(unfitting, "images are of another shape than their K", unfitting),
     ]
-    return found, notes
-
-
-def _size(path: Path) -> tuple[int, int] | None:
-    """Return (width, height) of an image, None if it cannot be read: it fails when it is used."""
-    try:
-        height, width = read_gray(path).shape
-    except ImageError:
-        return None
-    return width, height
 
 
 def _scale(matrix: NDArray[np.float64], width: int, height: int) -> float | None:
@@ -293,24 +249,11 @@ def _scale(matrix: NDArray[np.float64], width: int, height: int) -> float | None
     return float(ratios[0])
 
 
-def _doubt_notes(calibrations: Mapping[str, Calibration], wanted: set[str]) -> Iterator[str]:
-    by_doubt: dict[str, list[str]] = {}
-    for name in sorted(wanted & calibrations.keys()):
-        by_doubt.setdefault(calibrations[name].doubt, []).append(name)
-    for doubt in sorted(by_doubt.keys() - {""}):
-        names = by_doubt[doubt]
-        yield from counted(names, f"of {len(wanted)} calibrations: {doubt}", names)
-
-
-def _left_out_notes(bins: Mapping[Names, int], posed: Mapping[str, PosedImage]) -> Iterator[str]:
-    lost = [names for names in bins if any(name not in posed for name in names)]
-    if lost:
-        yield f"{len(lost)} of {len(bins)} listed pairs are left out"
-
-
-def _empty_notes(pairs: list[EvaluationPair]) -> Iterator[str]:
-    """Name the bins without pairs."""
-    left = {pair.category for pair in pairs}
-    empty = [f"{limit / 10:.1f}" for limit in BINS[1:] if f"{limit / 10:.1f}" not in left]
-    if empty:
-        yield "no pairs with a covisibility from " + ", ".join(empty)
+def _doubt_notes(wanted: Sequence[str], calibrations: Mapping[str, Calibration]) -> list[str]:
+    """Count the calibrations that are odd in one way or another."""
+    doubts = {name: calibrations[name].doubt for name in wanted if name in calibrations}
+    notes = []
+    for doubt in sorted(set(doubts.values()) - {""}):
+        names = [name for name in doubts if doubts[name] == doubt]
+        notes += counted(names, f"of {len(wanted)} calibrations: {doubt}", names)
+    return notes

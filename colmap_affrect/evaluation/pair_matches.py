@@ -16,16 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.verification import REJECTED, two_view_options
-from colmap_affrect.conventions import DEFAULT_FOCAL_RATIO, colmap_from_pixel
-from colmap_affrect.escalation import open_pairs
+from colmap_affrect.colmap.verification import (
+    VerificationOptions,
+    num_two_view_inliers,
+    two_view_options,
+)
+from colmap_affrect.conventions import DEFAULT_FOCAL_RATIO
 from colmap_affrect.evaluation.protocol import EvaluationPair
 from colmap_affrect.evaluation.recipe_features import RecipeFeatures
-from colmap_affrect.executor import available_cores, map_ordered
-from colmap_affrect.matching.nearest import match_features
-from colmap_affrect.options import VerificationOptions
-from colmap_affrect.pair_tasks import MatchableCache
+from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
+from colmap_affrect.recipes import Recipe
+from colmap_affrect.stages.escalate import open_pairs
+from colmap_affrect.stages.one_pair import CachedMatcher
 
 VERIFICATION_SEED = 0
 
@@ -40,7 +43,8 @@ class MatchedPair:
         pair: the pair.
         points: (M, 2) pixel-centre px of the matches in each image.
         num_keypoints: features of the two images that were matched.
-        level: of escalation; None when no level was verified, or without escalation.
+        level: rectifier of the level of escalation that counts, ``none`` when no level was
+            verified; empty without escalation.
         num_levels: that were tried.
         verified_inliers: of COLMAP's two-view geometry; 0 if a run would not take it, or without
             escalation.
@@ -50,10 +54,16 @@ class MatchedPair:
     pair: EvaluationPair
     points: tuple[NDArray[np.float64], NDArray[np.float64]]
     num_keypoints: tuple[int, int]
-    level: int | None
+    level: str
     num_levels: int
     verified_inliers: int
     seconds: float
+
+    def better(self, new: MatchedPair) -> MatchedPair:
+        """Choose the one with more verified inliers, the new one if none has any; add times."""
+        takes_new = new.verified_inliers > self.verified_inliers or not self.verified_inliers
+        seconds = self.seconds + new.seconds
+        return replace(new if takes_new else self, seconds=seconds, num_levels=new.num_levels)
 
 
 @dataclass(frozen=True)
@@ -61,12 +71,14 @@ class PairMatcher:
     """Matches pairs by the features of a recipe.
 
     Attributes:
+        recipe: how to match.
         features: of the recipe.
         max_num_keypoints: of each image, the strongest of all its features; None for all.
         title: of the recipe, for progress.
         progress: where to show progress.
     """
 
+    recipe: Recipe
     features: RecipeFeatures
     max_num_keypoints: int | None
     title: str
@@ -80,24 +92,25 @@ class PairMatcher:
         It is called in parallel, as soon as the matches of a pair are decided. Pairs of images that
         cannot be used (``features.failures``) are left out.
         """
-        rectifiers = self.features.recipe.extraction.rectifiers
+        rectifiers = self.recipe.extraction.rectifiers
         todo, best = list(pairs), dict[str, MatchedPair]()
         for level, rectifier in enumerate(rectifiers):
             names = sorted({image.name for pair in todo for image in pair.images})
             title = f"{self.title}, {rectifier.name}" if len(rectifiers) > 1 else self.title
             self.features.extract(names, level, title, self.progress)
             lost = [pair for pair in todo if self._is_lost(pair)]
-            yield from (finish(best.pop(pair.name)) for pair in lost if pair.name in best)
+            yield from (finish(best[pair.name]) for pair in lost if pair.name in best)
             todo = [pair for pair in todo if not self._is_lost(pair)]
             with self.progress.stage(title, len(todo), "pairs") as advance:
+                climbing = []
                 for found, result in self._level(level, todo, best, finish):
-                    if result is not None:
-                        best.pop(found.pair.name, None)
-                        yield result
+                    best[found.pair.name] = found
+                    if result is None:
+                        climbing.append(found.pair)
                     else:
-                        best[found.pair.name] = found
+                        yield result
                     advance(1)
-            todo = [pair for pair in todo if pair.name in best]
+            todo = climbing
 
     def _is_lost(self, pair: EvaluationPair) -> bool:
         return any(image.name in self.features.failures for image in pair.images)
@@ -110,45 +123,44 @@ class PairMatcher:
         finish: Callable[[MatchedPair], Result],
     ) -> Iterator[tuple[MatchedPair, Result | None]]:
         """Yield the best matches of each pair so far, with a result if it need not climb on."""
-        extraction, matching = self.features.recipe.extraction, self.features.recipe.matching
-        num_levels = len(extraction.rectifiers)
-        cache = MatchableCache(self.features.store, matching, level, self.max_num_keypoints)
+        extraction, matching = self.recipe.extraction, self.recipe.matching
+        prepared = CachedMatcher(
+            self.features.store,
+            matching,
+            level=level,
+            max_num_features=self.max_num_keypoints,
+            resources=self.features.resources,
+            extractor=extraction.features.name,
+        )
         sizes = self.features.store.image_sizes()
 
         def match(pair: EvaluationPair) -> tuple[MatchedPair, Result | None]:
-            names = tuple(image.name for image in pair.images)
-            (image1, _), (image2, _) = cache[names[0]], cache[names[1]]
+            name1, name2 = (image.name for image in pair.images)
+            image1, image2 = prepared.prepared(name1), prepared.prepared(name2)
             start = time.perf_counter()
-            rows1, rows2 = match_features(image1, image2, matching).indices.T
-            points = image1.keypoints[rows1], image2.keypoints[rows2]
-            count = 0
-            if num_levels > 1:
-                count = verified_inliers(*points, sizes[names[0]], sizes[names[1]])
+            rows1, rows2 = prepared.match(image1, image2).indices.T
+            points1, points2 = image1.keypoints[rows1], image2.keypoints[rows2]
+            count, decided = 0, ""
+            if extraction.escalation:
+                count = verified_inliers(points1, points2, sizes[name1], sizes[name2])
+                decided = extraction.rectifiers[level].name if count else "none"
             found = MatchedPair(
                 pair,
-                (points[0].astype(np.float64), points[1].astype(np.float64)),
+                (points1.astype(np.float64), points2.astype(np.float64)),
                 (len(image1.keypoints), len(image2.keypoints)),
-                level if count else None,
+                decided,
                 level + 1,
                 count,
                 time.perf_counter() - start,
             )
-            found = _better(best.get(pair.name), found)
-            counts = {("1", "2"): found.verified_inliers}
-            strong = extraction.escalation_strong_num_inliers
-            climbs = level + 1 < num_levels and bool(open_pairs(counts, strong))
+            if pair.name in best:
+                found = best[pair.name].better(found)
+            inliers = {(name1, name2): found.verified_inliers}
+            is_open = bool(open_pairs(inliers, self.recipe.escalate.strong_num_inliers))
+            climbs = is_open and level < len(extraction.escalation)
             return found, None if climbs else finish(found)
 
         return map_ordered(match, pairs, available_cores())
-
-
-def _better(known: MatchedPair | None, new: MatchedPair) -> MatchedPair:
-    """Choose the one with more verified inliers, the new one if none has any; add their times."""
-    if known is None:
-        return new
-    takes_new = new.verified_inliers > known.verified_inliers or not known.verified_inliers
-    seconds = known.seconds + new.seconds
-    return replace(new if takes_new else known, seconds=seconds, num_levels=new.num_levels)
 
 
 def verified_inliers(
@@ -165,25 +177,15 @@ def verified_inliers(
         size1: (width, height) of image 1 in px.
         size2: (width, height) of image 2 in px.
     """
-    options = VerificationOptions()
-    geometry = pycolmap.estimate_two_view_geometry(
-        _unknown_camera(1, size1),
-        colmap_from_pixel(points1),
-        _unknown_camera(2, size2),
-        colmap_from_pixel(points2),
-        np.stack([np.arange(len(points1))] * 2, axis=1),
-        two_view_options(options, VERIFICATION_SEED),
-    )
-    if geometry.config in REJECTED:
-        return 0
-    count = len(geometry.inlier_matches)
+    options = VerificationOptions(random_seed=VERIFICATION_SEED)
+    cameras = [
+        # What COLMAP assumes of an image without EXIF: a camera of its own, of unknown focus. The
+        # id matters: two images of one camera are verified in another way.
+        pycolmap.Camera.create_from_model_name(
+            camera_id, "SIMPLE_RADIAL", DEFAULT_FOCAL_RATIO * max(size), *size
+        )
+        for camera_id, size in enumerate((size1, size2), 1)
+    ]
+    rows = np.stack([np.arange(len(points1))] * 2, axis=1)
+    count = num_two_view_inliers(cameras, (points1, points2), rows, two_view_options(options))
     return count if count >= options.min_num_inliers else 0
-
-
-def _unknown_camera(camera_id: int, size: tuple[int, int]) -> pycolmap.Camera:
-    """Return what COLMAP assumes of an image without EXIF: a camera of its own, of unknown focus.
-
-    The id matters: two images of one camera are verified in another way.
-    """
-    focal_px = DEFAULT_FOCAL_RATIO * max(size)
-    return pycolmap.Camera.create_from_model_name(camera_id, "SIMPLE_RADIAL", focal_px, *size)

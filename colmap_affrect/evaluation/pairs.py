@@ -32,63 +32,64 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
-from statistics import fmean
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.checks import is_unsafe
 from colmap_affrect.conventions import colmap_from_pixel, pixel_from_colmap
-from colmap_affrect.errors import AffrectError, EvaluationError
-from colmap_affrect.evaluation.correspondences import (
-    SHOWN_THRESHOLDS_PX,
-    FundamentalEstimator,
-    checked_correspondences,
-    correspondence_doubts,
-    score_correspondences,
-)
+from colmap_affrect.errors import EvaluationError
+from colmap_affrect.evaluation.correspondences import CorrespondenceProtocol, mean_recalls
 from colmap_affrect.evaluation.homographies import (
-    HomographyEstimator,
+    HomographyProtocol,
     TrueHomography,
     checked_homography,
-    homography_counts,
-    score_homography,
-    true_homography,
 )
 from colmap_affrect.evaluation.protocol import (
+    GROUP,
     Dataset,
     EvaluationImage,
     EvaluationPair,
     PairResult,
     PairScore,
+    finite_numbers,
+    read_numbers,
+    with_truth,
 )
 from colmap_affrect.evaluation.relative_pose import RelativePoseProtocol, posed_image
-from colmap_affrect.evaluation.tables import GROUP
-from colmap_affrect.evaluation.truth_checks import contradictions, rotation_fault
-from colmap_affrect.executor import available_cores, map_ordered
-from colmap_affrect.imaging import read_gray
+from colmap_affrect.evaluation.truth_checks import (
+    correspondence_doubts,
+    pose_contradictions,
+    rotation_fault,
+    size_of,
+    true_homography,
+)
+from colmap_affrect.evaluation.two_views import Points, RansacSettings
+from colmap_affrect.images.reading import read_gray
+from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 LIST = "pairs.json"
 KINDS = ("homography", "correspondences", "relative_pose")
 KEYS = ("name", "image1", "image2", "category", *KINDS)
-POSE_KEYS = ("rotation", "translation", "intrinsics1", "intrinsics2")
+POSE_SHAPES = {
+    "rotation": (3, 3),
+    "translation": (3,),
+    "intrinsics1": (3, 3),
+    "intrinsics2": (3, 3),
+}
 ORIGINS = ("center", "corner")
-NO_CATEGORY = "0°"
-"""Of all poses, whose categories here are no angles."""
 
 MAX_OFF_CENTRE = 0.25
 """A principal point further from the middle, in image sizes, does not fit the image."""
 
 
 @dataclass(frozen=True)
-class Pairs:
+class Pairs(RansacSettings):
     """Homographies, epipolar geometries and relative poses of any pairs.
 
     Attributes:
-        threshold_px: inliers of RANSAC for homographies and essential matrices, as the paper.
-        confidence: of all estimators.
-        max_num_iterations: of all estimators.
         magsac_threshold_px: largest noise that USAC_MAGSAC reckons with for homographies.
         epipolar_threshold_px: the same for fundamental matrices.
         num_magsac_estimates: of so many orders of the matches the one of median error counts.
@@ -101,9 +102,6 @@ class Pairs:
     error_title = "error (px; poses: degrees)"
     category_title = "category"
 
-    threshold_px: float = 0.5
-    confidence: float = 0.9999
-    max_num_iterations: int = 100_000
     magsac_threshold_px: float = 5.0
     epipolar_threshold_px: float = 1.0
     num_magsac_estimates: int = 5
@@ -115,54 +113,43 @@ class Pairs:
         """See :class:`EvaluationProtocol`."""
         entries, offset_px = _read_list(dataset_path / LIST)
 
-        def load_pair(entry: Mapping[str, Any]) -> tuple[EvaluationPair, list[str]]:
-            return _load_pair(entry, dataset_path, offset_px, check=self.check_truth)
+        def load_pair(entry: Mapping[str, Any]) -> Dataset:
+            return _Entry(entry, dataset_path, offset_px, self.check_truth).load()
 
-        loaded = list(map_ordered(load_pair, entries, available_cores()))
-        notes = [note for _, found in loaded for note in found]
-        pairs = [pair for pair, _ in loaded]
-        posed = [pair for pair in pairs if isinstance(pair.truth, tuple)]
-        if self.check_truth and posed:
-            notes += contradictions(posed)
-        return Dataset(tuple(pairs), tuple(notes))
+        dataset = Dataset.united(map_ordered(load_pair, entries, available_cores()))
+        posed = [pair for pair in dataset.pairs if isinstance(pair.truth, tuple)]
+        notes = pose_contradictions(posed) if self.check_truth and posed else []
+        return Dataset(dataset.pairs, (*dataset.notes, *notes))
 
     def score(
-        self,
-        pair: EvaluationPair,
-        points1: NDArray[np.float64],
-        points2: NDArray[np.float64],
-        random_seed: int,
+        self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
     ) -> PairScore:
         """See :class:`EvaluationProtocol`."""
+        protocol: HomographyProtocol | CorrespondenceProtocol | RelativePoseProtocol
         if isinstance(pair.truth, TrueHomography):
-            return score_homography(pair.truth, points1, points2, self._homographies, random_seed)
-        if isinstance(pair.truth, tuple):
-            return self._poses.score(pair, points1, points2, random_seed)
-        estimator = FundamentalEstimator(
-            self.epipolar_threshold_px,
-            self.confidence,
-            self.max_num_iterations,
-            self.num_magsac_estimates,
-        )
-        return score_correspondences(pair.truth, points1, points2, estimator, random_seed)
+            protocol = self._homographies
+        elif isinstance(pair.truth, tuple):
+            protocol = self._poses
+        else:
+            protocol = CorrespondenceProtocol(
+                self.epipolar_threshold_px, *self._limits, self.num_magsac_estimates
+            )
+        return protocol.score(pair, points1, points2, random_seed)
 
     @property
-    def _homographies(self) -> HomographyEstimator:
-        return HomographyEstimator(
-            self.threshold_px,
-            self.confidence,
-            self.max_num_iterations,
-            self.magsac_threshold_px,
-            self.num_magsac_estimates,
+    def _limits(self) -> tuple[float, int]:
+        return self.confidence, self.max_num_iterations
+
+    @property
+    def _homographies(self) -> HomographyProtocol:
+        return HomographyProtocol(
+            self.threshold_px, *self._limits, self.magsac_threshold_px, self.num_magsac_estimates
         )
 
     @property
     def _poses(self) -> RelativePoseProtocol:
         return RelativePoseProtocol(
-            self.threshold_px,
-            self.confidence,
-            self.max_num_iterations,
-            max_error_deg=self.max_error_deg,
+            self.threshold_px, *self._limits, max_error_deg=self.max_error_deg
         )
 
     def success(self, score: PairScore) -> float:
@@ -177,26 +164,22 @@ class Pairs:
 
         Pairs whose truth cannot be read are in none of them; they count in the mean success.
         """
+
+        def having(detail: str) -> list[PairResult]:
+            return [result for result in results if detail in result.details]
+
         columns: dict[str, float] = {}
-        homographies = [result for result in results if "magsac_error" in result.score.details]
-        if homographies:
-            columns |= homography_counts(homographies, "homographies: ")
-        marked = [result.score.details for result in results]
-        marked = [details for details in marked if "wxbs_score" in details]
-        if marked:
-            keys = {"WxBS score": "wxbs_score"}
-            keys |= {f"within {limit} px": f"recall_{limit}px" for limit in SHOWN_THRESHOLDS_PX}
+        if homographies := having("magsac_error"):
+            counts = self._homographies.summarize(homographies)
+            columns |= {f"homographies: {name}": count for name, count in counts.items()}
+        if marked := having("wxbs_score"):
             columns |= {
-                f"correspondences: {name}": fmean(details[key] for details in marked)
-                for name, key in keys.items()
+                f"correspondences: {name}": share for name, share in mean_recalls(marked).items()
             }
-        poses = [result for result in results if "direction_error_deg" in result.score.details]
-        if poses:
-            together = [replace(result, category=NO_CATEGORY) for result in poses]
+        if poses := having("direction_error_deg"):
             columns |= {
-                f"poses, {name}" if GROUP in name else f"poses{GROUP}{name}": value
-                for name, value in self._poses.summarize(together).items()
-                if name.rpartition(GROUP)[2] != NO_CATEGORY
+                f"poses, {name}" if GROUP in name else f"poses{GROUP}{name}": share
+                for name, share in self._poses.columns(poses, {}).items()
             }
         return columns
 
@@ -251,7 +234,7 @@ def _named(entry: Any, path: Path, number: int) -> str:
     if unknown:
         raise EvaluationError(f"{where}: unknown key '{unknown[0]}'; known are {', '.join(KEYS)}")
     for key in ("image1", "image2"):
-        if not isinstance(entry.get(key), str) or not _stays_below(entry[key]):
+        if not isinstance(entry.get(key), str) or is_unsafe(entry[key]):
             raise EvaluationError(f"{where}: {key} must be the path of an image in the folder")
     kinds = [kind for kind in KINDS if kind in entry]
     if len(kinds) != 1:
@@ -262,97 +245,92 @@ def _named(entry: Any, path: Path, number: int) -> str:
     return str(entry.get("name") or " ".join(stems))
 
 
-def _stays_below(name: str) -> bool:
-    return ".." not in PurePosixPath(name).parts and not name.startswith("/")
+@dataclass(frozen=True)
+class _Entry:
+    """An entry of the list.
+
+    Attributes:
+        values: by key.
+        folder: of the images.
+        offset_px: what must be added to coordinates for pixel centres.
+        check: see whether the images confirm the truth.
+    """
+
+    values: Mapping[str, Any]
+    folder: Path
+    offset_px: float
+    check: bool
+
+    def load(self) -> Dataset:
+        """Return the pair, and notes where there is something to say about it."""
+        first, second = (
+            EvaluationImage(self.values[key], self.folder / self.values[key])
+            for key in ("image1", "image2")
+        )
+        category = str(self.values.get("category", ""))
+        pair = EvaluationPair(self.values["name"], (first, second), category)
+        readers = dict(
+            zip(KINDS, (self._homography, self._correspondences, self._pose), strict=True)
+        )
+        (kind,) = self.values.keys() & set(KINDS)
+        return with_truth(pair, [first.path, second.path], readers[kind])
+
+    def _numbers(self, key: str) -> Any:
+        """Return numbers, out of a text file where its name is given."""
+        given = self.values[key]
+        if not isinstance(given, str):
+            return given
+        if is_unsafe(given):
+            raise EvaluationError(f"{given}: must be a file in the folder of the pairs")
+        return read_numbers(self.folder / given)
+
+    def _homography(self, pair: EvaluationPair) -> tuple[EvaluationPair, list[str]]:
+        matrix = checked_homography(self._numbers("homography"), f"{pair.name}: homography")
+        offset_px = self.offset_px
+        center = np.array([[1.0, 0.0, offset_px], [0.0, 1.0, offset_px], [0.0, 0.0, 1.0]])
+        matrix = center @ matrix @ np.linalg.inv(center)
+        paths = [image.path for image in pair.images]
+        truth, doubt = true_homography(matrix, paths, check=self.check)
+        return replace(pair, truth=truth), [f"its homography {doubt}"] if doubt else []
+
+    def _correspondences(self, pair: EvaluationPair) -> tuple[EvaluationPair, list[str]]:
+        values = finite_numbers(
+            self._numbers("correspondences"), (-1, 4), f"{pair.name}: the array of correspondences"
+        )
+        truth = values + self.offset_px
+        paths = [image.path for image in pair.images]
+        doubt = correspondence_doubts(truth, paths) if self.check else ""
+        return replace(pair, truth=truth), [f"its correspondences {doubt}"] if doubt else []
+
+    def _pose(self, pair: EvaluationPair) -> tuple[EvaluationPair, list[str]]:
+        """Return a pair with a relative pose: the first camera stands at the origin."""
+        values = _pose_values(self.values["relative_pose"], pair.name)
+        poses = (np.eye(3), np.zeros(3)), (values["rotation"], values["translation"])
+        doubts, posed = [], []
+        for number, (image, pose) in enumerate(zip(pair.images, poses, strict=True), 1):
+            matrix = values[f"intrinsics{number}"]
+            principal = matrix[:2, 2] + self.offset_px
+            width, height = size_of(read_gray(image.path))
+            if np.abs(principal / (width, height) - 1 / 2).max() > MAX_OFF_CENTRE:
+                doubts.append(
+                    f"the principal point of intrinsics{number} is far from the middle of the "
+                    f"{width} x {height} px of {image.name}"
+                )
+            params = [matrix[0, 0], matrix[1, 1], *colmap_from_pixel(principal)]
+            camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+            posed.append(posed_image(image.name, image.path, camera, pose))
+        images = posed[0].image, posed[1].image
+        return replace(pair, images=images, truth=(posed[0], posed[1])), doubts
 
 
-def _load_pair(
-    entry: Mapping[str, Any], folder: Path, offset_px: float, *, check: bool
-) -> tuple[EvaluationPair, list[str]]:
-    """Return a pair, and notes where there is something to say about it."""
-    images = [EvaluationImage(entry[key], folder / entry[key]) for key in ("image1", "image2")]
-    name, category = entry["name"], str(entry.get("category", ""))
-    pair = EvaluationPair(name, (images[0], images[1]), category)
-    try:
-        for image in images:
-            if not image.path.is_file():
-                raise EvaluationError(f"{image.path}: missing")
-        if "relative_pose" in entry:
-            return _posed(pair, entry["relative_pose"], offset_px)
-        if "homography" in entry:
-            doubtful, doubt = _homography(pair, entry["homography"], folder, offset_px, check=check)
-            what = "its homography"
-        else:
-            values = _numbers(entry["correspondences"], folder)
-            truth = checked_correspondences(values, name) + offset_px
-            doubtful = replace(pair, truth=truth)
-            doubt = correspondence_doubts(truth, [i.path for i in images]) if check else ""
-            what = "its correspondences"
-    except AffrectError as error:
-        note = f"{name}: cannot be evaluated and counts as failed: {error}"
-        return replace(pair, problem=str(error)), [note]
-    return doubtful, [f"{name}: {what} {doubt}"] if doubt else []
-
-
-def _homography(
-    pair: EvaluationPair, given: Any, folder: Path, offset_px: float, *, check: bool
-) -> tuple[EvaluationPair, str]:
-    matrix = checked_homography(_numbers(given, folder), pair.name)
-    center = np.array([[1.0, 0.0, offset_px], [0.0, 1.0, offset_px], [0.0, 0.0, 1.0]])
-    matrix = center @ matrix @ np.linalg.inv(center)
-    paths = pair.images[0].path, pair.images[1].path
-    truth, doubt = true_homography(matrix, paths, check=check)
-    return replace(pair, truth=truth), doubt
-
-
-def _numbers(given: Any, folder: Path) -> Any:
-    """Return numbers, out of a text file where its name is given."""
-    if not isinstance(given, str):
-        return given
-    if not _stays_below(given):
-        raise EvaluationError(f"{given}: must be a file in the folder of the pairs")
-    try:
-        return np.loadtxt(folder / given, dtype=np.float64, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise EvaluationError(f"{folder / given}: cannot be read as numbers ({error})") from error
-
-
-def _posed(pair: EvaluationPair, given: Any, offset_px: float) -> tuple[EvaluationPair, list[str]]:
-    """Return a pair with a relative pose: the first camera stands at the origin."""
-    if not isinstance(given, dict) or given.keys() != set(POSE_KEYS):
-        raise EvaluationError(f"{pair.name}: relative_pose needs {', '.join(POSE_KEYS)}")
-    shapes = {"rotation": (3, 3), "translation": (3,), "intrinsics1": (3, 3), "intrinsics2": (3, 3)}
-    arrays: dict[str, NDArray[np.float64]] = {}
-    for key, shape in shapes.items():
-        try:
-            arrays[key] = np.asarray(given[key], dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise EvaluationError(f"{pair.name}: {key} is not numbers") from error
-        if arrays[key].shape != shape or not np.isfinite(arrays[key]).all():
-            raise EvaluationError(f"{pair.name}: {key} is not {shape} finite numbers")
-    fault = rotation_fault(arrays["rotation"])
-    if fault:
-        raise EvaluationError(f"{pair.name}: {fault}")
-    nowhere = (np.eye(3), np.zeros(3))
-    poses = (nowhere, (arrays["rotation"], arrays["translation"]))
-    notes, posed = [], []
-    for image, key, pose in zip(pair.images, POSE_KEYS[2:], poses, strict=True):
-        matrix = arrays[key].copy()
-        matrix[:2, 2] += offset_px
-        height, width = read_gray(image.path).shape
-        offset = matrix[:2, 2] / (width, height) - 1 / 2
-        if np.abs(offset).max() > MAX_OFF_CENTRE:
-            notes.append(
-                f"{pair.name}: the principal point of {key} is far from the middle of the "
-                f"{width} x {height} px of {image.name}"
-            )
-        posed.append(posed_image(image.name, image.path, _camera(matrix, (width, height)), pose))
-    images = (posed[0].image, posed[1].image)
-    return replace(pair, images=images, truth=(posed[0], posed[1])), notes
-
-
-def _camera(matrix: NDArray[np.float64], size: tuple[int, int]) -> pycolmap.Camera:
-    """Return a pinhole camera of (3, 3) intrinsics in pixel-centre px."""
-    center = colmap_from_pixel(matrix[:2, 2])
-    params = [matrix[0, 0], matrix[1, 1], *center]
-    return pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=params)
+def _pose_values(given: Any, where: str) -> dict[str, NDArray[np.float64]]:
+    """Return the arrays of a relative pose, after all checks."""
+    if not isinstance(given, dict) or given.keys() != POSE_SHAPES.keys():
+        raise EvaluationError(f"{where}: relative_pose needs {', '.join(POSE_SHAPES)}")
+    arrays = {
+        key: finite_numbers(given[key], shape, f"{where}: {key}")
+        for key, shape in POSE_SHAPES.items()
+    }
+    if fault := rotation_fault(arrays["rotation"]):
+        raise EvaluationError(f"{where}: {fault}")
+    return arrays

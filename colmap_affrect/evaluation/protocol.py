@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Annotated, Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator
 
-from colmap_affrect.errors import EvaluationError
+from colmap_affrect.errors import AffrectError, EvaluationError
+
+Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value is None else value)]
+"""Infinite where JSON has null."""
+
+GROUP = ": "
+"""Separates the name of a table from that of its column in the names of columns."""
 
 
 @dataclass(frozen=True)
@@ -59,23 +67,22 @@ class PairScore:
         details: further figures by name.
     """
 
-    error: float
+    error: Number
     num_inliers: int
     num_correct: int | None = None
-    details: Mapping[str, float] = field(default_factory=dict)
+    details: Mapping[str, Number] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class PairResult:
-    """One pair and one recipe: what ``evaluation.json`` lists.
+@dataclass(frozen=True, kw_only=True)
+class PairResult(PairScore):
+    """The score of one pair by one recipe: what ``evaluation.json`` lists.
 
     Attributes:
         name: of the pair.
         category: of the pair.
-        score: of its matches.
         num_matches: before the estimation.
-        seconds: matching and estimation.
         num_keypoints: features of the two images that were matched.
+        seconds: matching and estimation.
         seconds_by_step: the same by step, ``match`` and ``estimate``.
         level: rectifier of the level of escalation that decided; empty without escalation.
         num_levels: levels whose features were extracted for the pair, 1 without escalation.
@@ -84,11 +91,10 @@ class PairResult:
     """
 
     name: str
-    category: str
-    score: PairScore
-    num_matches: int
-    seconds: float
+    category: str = ""
+    num_matches: int = 0
     num_keypoints: tuple[int, int] = (0, 0)
+    seconds: float = 0.0
     seconds_by_step: Mapping[str, float] = field(default_factory=dict)
     level: str = ""
     num_levels: int = 0
@@ -109,17 +115,13 @@ class Dataset:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def united(cls, scenes: Sequence[Dataset], dataset_path: Path) -> Self:
-        """Return the pairs and notes of all scenes of a folder.
-
-        Raises:
-            EvaluationError: when there is no pair.
-        """
-        pairs = tuple(pair for scene in scenes for pair in scene.pairs)
-        notes = tuple(note for scene in scenes for note in scene.notes)
-        if not pairs:
-            raise EvaluationError(f"{dataset_path}: no pair can be evaluated; {'; '.join(notes)}")
-        return cls(pairs, notes)
+    def united(cls, parts: Iterable[Dataset]) -> Self:
+        """Return the pairs and notes of all parts of a dataset."""
+        parts = list(parts)
+        return cls(
+            tuple(pair for part in parts for pair in part.pairs),
+            tuple(note for part in parts for note in part.notes),
+        )
 
 
 class EvaluationProtocol(Protocol):
@@ -173,3 +175,59 @@ class EvaluationProtocol(Protocol):
 
     def settings(self) -> dict[str, Any]:
         """Return everything that decides scores, for the record."""
+
+
+def with_truth(
+    pair: EvaluationPair,
+    paths: Sequence[Path],
+    read: Callable[[EvaluationPair], tuple[EvaluationPair, Sequence[str]]],
+) -> Dataset:
+    """Return a pair with its truth; one that cannot be used with its problem, which is a note too.
+
+    Args:
+        pair: without truth.
+        paths: of files that must be there.
+        read: returns the pair with its truth, and what is odd about it: texts, or empty ones.
+    """
+    try:
+        for path in paths:
+            if not path.is_file():
+                raise EvaluationError(f"{path}: missing")
+        pair, doubts = read(pair)
+    except AffrectError as error:
+        note = f"{pair.name}: cannot be evaluated and counts as failed: {error}"
+        return Dataset((replace(pair, problem=str(error)),), (note,))
+    return Dataset((pair,), tuple(f"{pair.name}: {doubt}" for doubt in doubts if doubt))
+
+
+def read_numbers(path: Path) -> NDArray[np.float64]:
+    """Read a table of numbers from text.
+
+    Raises:
+        EvaluationError: when it is none.
+    """
+    try:
+        return np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"{path}: cannot be read as numbers ({error})") from error
+
+
+def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
+    """Return an array of some shape, -1 in it for any number of rows but none.
+
+    Raises:
+        EvaluationError: saying what is wrong.
+    """
+    try:
+        values = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise EvaluationError(f"{what} is not numbers") from error
+    fits = values.ndim == len(shape) and all(
+        wanted in (has, -1) for has, wanted in zip(values.shape, shape, strict=True)
+    )
+    if not fits or not values.size:
+        expected = str(shape).replace("-1", "N")
+        raise EvaluationError(f"{what} has shape {values.shape}, expected {expected}")
+    if not np.isfinite(values).all():
+        raise EvaluationError(f"{what} has values that are not finite")
+    return values

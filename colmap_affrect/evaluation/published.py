@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from functools import cache
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
 
 DATA = Path(__file__).with_name("published.toml")
 
@@ -14,7 +13,8 @@ COMPLEXITY = "complexity"
 """Stands for a protocol: the paper's table of areas, keypoints, regions and warps per image."""
 
 
-class PublishedRow(NamedTuple):
+@dataclass(frozen=True)
+class PublishedRow:
     """What a table of the paper says of one method.
 
     Attributes:
@@ -34,12 +34,7 @@ def published(protocol: str) -> list[PublishedRow]:
         PublishedRow(
             method, dict(zip(table["columns"], map(float, values), strict=True)), table["label"]
         )
-        for table in _tables()
+        for table in tomllib.loads(DATA.read_text(encoding="utf-8"))["tables"]
         if table["protocol"] == protocol
         for method, values in table["values"].items()
     ]
-
-
-@cache
-def _tables() -> list[dict[str, Any]]:
-    return list(tomllib.loads(DATA.read_text(encoding="utf-8"))["tables"])

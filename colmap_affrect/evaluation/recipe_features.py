@@ -9,16 +9,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.comparison.methods import Method
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.evaluation.costs import ImageCost, extract_measured
 from colmap_affrect.evaluation.protocol import EvaluationImage
 from colmap_affrect.evaluation.records import RecordFile
-from colmap_affrect.extraction import ImageExtractor, Resources, prepare
 from colmap_affrect.features.weights import file_sha256
 from colmap_affrect.progress import Progress
-from colmap_affrect.recipes import Recipe
-from colmap_affrect.store import FeatureStore
+from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.recipes import ExtractionOptions
+from colmap_affrect.stages.context import Resources
+from colmap_affrect.stages.one_image import prepare
 
 logger = logging.getLogger(__name__)
 
@@ -30,18 +30,17 @@ class RecipeFeatures:
     written first, so that its features never lack it.
 
     Attributes:
-        recipe: what to extract.
         store: the features; other options than those on record are refused.
         settings: what the features depend on.
+        resources: weights and device.
         failures: images that could not be used in this run, with the reason.
     """
 
     def __init__(
         self,
-        folder: Path,
-        method: Method,
-        recipe: Recipe,
-        images: Sequence[EvaluationImage],
+        path: Path,
+        options: ExtractionOptions,
+        images: Mapping[str, EvaluationImage],
         inputs: Mapping[str, Any],
         resources: Resources,
         *,
@@ -50,10 +49,9 @@ class RecipeFeatures:
         """Find everything that the recipe needs.
 
         Args:
-            folder: of the features of all recipes.
-            method: names the files.
-            recipe: of the method.
-            images: of the dataset.
+            path: of the files, without suffix.
+            options: what to extract.
+            images: of the dataset, by name.
             inputs: what the images depend on, for the record.
             resources: weights and device of networks.
             overwrite: discard what is there.
@@ -62,14 +60,13 @@ class RecipeFeatures:
             StaleStoreError: when features of other options are there.
             AffrectError: when weights, a device or all depth maps are missing.
         """
-        self.recipe = recipe
-        self._images = {image.name: image for image in images}
-        self._extractor: ImageExtractor = prepare(recipe.extraction, resources, list(self._images))
+        self._images, self.resources = images, resources
+        self._extractor = prepare(options, resources, list(images))
         weights = {path.name: file_sha256(path) for path in self._extractor.weights.values()}
-        self.settings = {**inputs, **recipe.extraction.to_mapping(), "weights": weights}
+        self.settings = {**inputs, **options.to_mapping(), "weights": weights}
         digest = hashlib.sha256(json.dumps(self.settings, sort_keys=True).encode()).hexdigest()
         features_path, costs_path = (
-            folder / f"{method.folder_name}.{suffix}" for suffix in ("h5", "jsonl")
+            path.with_name(f"{path.name}{suffix}") for suffix in (".h5", ".jsonl")
         )
         if overwrite:
             features_path.unlink(missing_ok=True)
@@ -84,17 +81,14 @@ class RecipeFeatures:
         records = self._costs.records
         return {record["image"]: record["warning"] for record in records if record["warning"]}
 
-    def costs(self, num_levels: Mapping[str, int]) -> dict[str, ImageCost]:
+    def costs(self, num_levels: Mapping[str, int]) -> list[ImageCost]:
         """Return what images cost, by name, each with so many of its levels together."""
-        by_level = {
-            (record["image"], record["level"]): ImageCost.from_mapping(record["cost"])
-            for record in self._costs.records
-        }
-        found: dict[str, ImageCost] = {}
-        for (name, level), cost in by_level.items():
-            if level < num_levels.get(name, 0):
-                found[name] = found.get(name, ImageCost()) + cost
-        return found
+        levels: dict[str, dict[int, ImageCost]] = {}
+        for record in self._costs.records:
+            if record["level"] < num_levels.get(record["image"], 0):
+                cost = ImageCost(**record["cost"])
+                levels.setdefault(record["image"], {})[record["level"]] = cost
+        return [ImageCost.total(list(costs.values())) for costs in levels.values()]
 
     def extract(self, names: Sequence[str], level: int, title: str, progress: Progress) -> None:
         """Extract the features that images lack up to a level; what fails goes to ``failures``."""
@@ -120,7 +114,7 @@ class RecipeFeatures:
         if found.warning:
             logger.warning("%s: %s", name, found.warning)
         self._costs.append(
-            {"image": name, "level": level, "cost": cost.to_mapping(), "warning": found.warning}
+            {"image": name, "level": level, "cost": vars(cost), "warning": found.warning}
         )
         if level:
             self.store.extend(name, found.features)

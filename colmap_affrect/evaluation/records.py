@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from colmap_affrect.errors import StaleStoreError
-from colmap_affrect.files import cannot_write, replace_bytes
-from colmap_affrect.workspace import first_difference
+from colmap_affrect.project.atomic_files import cannot_write, replace_bytes
+from colmap_affrect.project.workspace import first_difference
 
 
 class RecordFile:

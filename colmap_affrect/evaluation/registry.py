@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -13,6 +12,7 @@ from colmap_affrect.evaluation.imc import Imc
 from colmap_affrect.evaluation.pairs import Pairs
 from colmap_affrect.evaluation.protocol import EvaluationProtocol
 from colmap_affrect.evaluation.svp import Svp
+from colmap_affrect.options import suggestion
 
 PROTOCOLS: Mapping[str, Callable[..., EvaluationProtocol]] = {
     "evd": Evd,
@@ -42,9 +42,7 @@ def make_protocol(name: str, settings: Sequence[str] = ()) -> EvaluationProtocol
         if not separator:
             raise OptionError(f"{setting}: expected KEY=VALUE")
         if key not in known:
-            close = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean '{close[0]}'?" if close else f"known are {', '.join(known)}"
-            raise OptionError(f"{name} has no setting '{key}': {hint}")
+            raise OptionError(f"{name} has no setting '{key}'{suggestion(key, known)}")
         changes[key] = _value(text, known[key], f"{name}: {setting}")
     changed: EvaluationProtocol = dataclasses.replace(protocol, **changes)
     return changed

@@ -1,19 +1,41 @@
-"""What an evaluation found, for programs: JSON and CSV; tables are in :mod:`tables`."""
+"""What an evaluation found: as JSON and CSV for programs, as tables for people."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Self
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Annotated, Any, Self
 
-from colmap_affrect.evaluation import tables
-from colmap_affrect.evaluation.costs import PAIR_STEPS, ImageCost
-from colmap_affrect.evaluation.protocol import PairResult, PairScore
+from pydantic import Field, TypeAdapter
+
+from colmap_affrect.comparison.tables import aligned
+from colmap_affrect.evaluation.costs import STEPS
+from colmap_affrect.evaluation.protocol import GROUP, Number, PairResult
 from colmap_affrect.evaluation.published import PublishedRow
+from colmap_affrect.project.report import csv_text
 
-Interval = tuple[float, float]
+Interval = tuple[Number, Number]
+
+PAIR_RESULT = TypeAdapter(PairResult)
+"""Reads and writes results of pairs as JSON; infinite errors are null."""
+
+SECONDS = "seconds"
+"""The column of all time that a recipe took."""
+
+WIDTH = 100
+MAX_NOTES = 12
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Mean of the protocol's success over the pairs, and its bootstrap interval (95 %)."""
+
+    mean: float
+    interval: Interval
 
 
 @dataclass(frozen=True)
@@ -23,93 +45,38 @@ class RecipeResult:
     Attributes:
         name: label of the recipe.
         description: one line for people.
-        pairs: in the order of the dataset; failed ones among them.
         summary: columns of the protocol's table by name, and ``seconds``, of all steps of all
             images and pairs together.
         intervals: bootstrap intervals (95 %) over pairs of the columns, where there are any.
-        solved: mean of the protocol's success over the pairs, and its interval.
+        solved: share of the pairs that count as solved.
         solved_by_category: mean success by category, of pairs that have one.
         p_value: of the paired test of success against the baseline; None without.
-        cost: mean per image.
         num_images: that have features.
+        complexity: mean per image, as :meth:`ImageCost.complexity`.
+        seconds_per_step: means; of images per image, of pairs per pair.
         failures: images that cannot be used, with the reason.
         warnings: images that were not rectified though they were to be, with the reason.
+        pairs: in the order of the dataset; failed ones among them.
     """
 
     name: str
     description: str
-    pairs: tuple[PairResult, ...]
-    summary: Mapping[str, float]
+    summary: Mapping[str, Number]
     intervals: Mapping[str, Interval]
-    solved: tuple[float, Interval]
+    solved: Solved
     solved_by_category: Mapping[str, float]
     p_value: float | None
-    cost: ImageCost
     num_images: int
-    failures: Mapping[str, str] = field(default_factory=dict)
-    warnings: Mapping[str, str] = field(default_factory=dict)
+    complexity: Mapping[str, float]
+    seconds_per_step: Mapping[str, float]
+    failures: Mapping[str, str]
+    warnings: Mapping[str, str]
+    pairs: tuple[PairResult, ...]
 
     @property
     def num_failed(self) -> int:
         """Pairs that could not be matched or scored at all."""
         return sum(bool(pair.failure) for pair in self.pairs)
-
-    def seconds_per_step(self) -> dict[str, float]:
-        """Return mean seconds by step: those of images per image, those of pairs per pair."""
-        timed = [pair.seconds_by_step for pair in self.pairs if pair.seconds_by_step]
-        per_pair = {
-            step: math.fsum(seconds[step] for seconds in timed) / max(1, len(timed))
-            for step in PAIR_STEPS
-        }
-        return {**self.cost.seconds(), **per_pair}
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON; what is infinite becomes None."""
-        return {
-            "description": self.description,
-            "summary": _plain(self.summary),
-            "intervals": {name: _plain(limits) for name, limits in self.intervals.items()},
-            "solved": {"mean": self.solved[0], "interval": list(self.solved[1])},
-            "solved_by_category": dict(self.solved_by_category),
-            "p_value": self.p_value,
-            "num_images": self.num_images,
-            "complexity": {
-                "area_mpx": self.cost.area_mpx,
-                "num_keypoints": self.cost.num_keypoints,
-                "num_regions": self.cost.num_regions,
-                "num_warps": self.cost.num_warps,
-                "warps_per_region": self.cost.warps_per_region,
-            },
-            "seconds_per_step": self.seconds_per_step(),
-            "failures": dict(self.failures),
-            "warnings": dict(self.warnings),
-            "pairs": [pair_to_mapping(pair) for pair in self.pairs],
-        }
-
-    @classmethod
-    def from_mapping(cls, name: str, values: Mapping[str, Any]) -> Self:
-        """Read :meth:`to_mapping`."""
-        size = dict(values["complexity"])
-        del size["warps_per_region"]
-        seconds = values["seconds_per_step"]
-        steps = {f"{step}_s": seconds[step] for step in ImageCost().seconds()}
-        return cls(
-            name,
-            values["description"],
-            tuple(pair_from_mapping(pair) for pair in values["pairs"]),
-            {key: _number(value) for key, value in values["summary"].items()},
-            {
-                key: (_number(low), _number(high))
-                for key, (low, high) in values["intervals"].items()
-            },
-            (values["solved"]["mean"], _limits(values["solved"]["interval"])),
-            values["solved_by_category"],
-            values["p_value"],
-            ImageCost(**size, **steps),
-            values["num_images"],
-            values["failures"],
-            values["warnings"],
-        )
 
 
 @dataclass(frozen=True)
@@ -122,142 +89,178 @@ class Evaluation:
         category_title: what the categories are; empty without.
         dataset_path: the dataset.
         settings: everything that decides scores.
-        recipes: in the order given.
-        notes: what is missing or odd in the dataset.
         baseline: label of the recipe that the others are tested against; empty for none.
+        notes: what is missing or odd in the dataset.
+        recipes: in the order given.
         published: rows of the paper's tables for the same protocol.
         published_complexity: those of its table of complexity.
         versions: of libraries.
     """
 
     protocol: str
-    error_title: str
-    category_title: str
+    error_title: Annotated[str, Field(alias="error")]
+    category_title: Annotated[str, Field(alias="category")]
     dataset_path: str
     settings: Mapping[str, Any]
+    baseline: str
+    notes: tuple[str, ...]
     recipes: tuple[RecipeResult, ...]
-    notes: tuple[str, ...] = ()
-    baseline: str = ""
-    published: tuple[PublishedRow, ...] = ()
-    published_complexity: tuple[PublishedRow, ...] = ()
-    versions: Mapping[str, str] = field(default_factory=dict)
+    published: tuple[PublishedRow, ...]
+    published_complexity: tuple[PublishedRow, ...]
+    versions: Mapping[str, str]
 
     @property
     def num_pairs(self) -> int:
         """Pairs of the dataset."""
         return len(self.recipes[0].pairs)
 
-    def summary(self) -> str:
-        """Return tables for the terminal."""
-        return tables.summary(self)
-
-    def to_csv(self) -> str:
-        """Return a row for each recipe and pair."""
-        return tables.evaluation_csv(self)
-
     def to_json(self) -> str:
-        """Return everything as JSON; infinite errors are null."""
-        return json.dumps(
-            {
-                "protocol": self.protocol,
-                "error": self.error_title,
-                "category": self.category_title,
-                "dataset_path": self.dataset_path,
-                "settings": self.settings,
-                "baseline": self.baseline,
-                "notes": self.notes,
-                "recipes": {recipe.name: recipe.to_mapping() for recipe in self.recipes},
-                "published": [_row_to_mapping(row) for row in self.published],
-                "published_complexity": [_row_to_mapping(row) for row in self.published_complexity],
-                "versions": self.versions,
-            },
-            indent=1,
-            ensure_ascii=False,
-            allow_nan=False,
-        )
+        """Return everything as JSON, recipes by name; infinite errors are null."""
+        values = json.loads(TypeAdapter(Evaluation).dump_json(self, by_alias=True))
+        for recipe in values["recipes"]:  # names first, for people
+            recipe["pairs"] = [{"name": pair["name"], **pair} for pair in recipe["pairs"]]
+        values["recipes"] = {recipe.pop("name"): recipe for recipe in values["recipes"]}
+        return json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Read :meth:`to_json`."""
         values = json.loads(text)
-        return cls(
-            values["protocol"],
-            values["error"],
-            values["category"],
-            values["dataset_path"],
-            values["settings"],
-            tuple(
-                RecipeResult.from_mapping(name, recipe)
-                for name, recipe in values["recipes"].items()
-            ),
-            tuple(values["notes"]),
-            values["baseline"],
-            tuple(PublishedRow(**row) for row in values["published"]),
-            tuple(PublishedRow(**row) for row in values["published_complexity"]),
-            values["versions"],
-        )
+        recipes = [{"name": name, **recipe} for name, recipe in values["recipes"].items()]
+        return TypeAdapter(cls).validate_python({**values, "recipes": recipes})
+
+    def to_csv(self) -> str:
+        """Return a row for each recipe and pair."""
+        rows: list[dict[str, Any]] = []
+        for recipe in self.recipes:
+            for pair in recipe.pairs:
+                row = {
+                    "recipe": recipe.name,
+                    "pair": pair.name,
+                    "category": pair.category,
+                    "error": pair.error,
+                    "num_inliers": pair.num_inliers,
+                    "num_correct": pair.num_correct,
+                    "num_matches": pair.num_matches,
+                    "num_keypoints1": pair.num_keypoints[0],
+                    "num_keypoints2": pair.num_keypoints[1],
+                    "seconds": pair.seconds,
+                    "level": pair.level,
+                    "failure": pair.failure,
+                }
+                rows.append({**row, **pair.details})
+        return csv_text(rows)
+
+    def summary(self) -> str:
+        """Return the protocol's tables with the paper's numbers, costs, and notes."""
+        notes = [*self.notes, *_failures(self.recipes, "\n".join(self.notes))]
+        if len(notes) > MAX_NOTES:
+            more = f"and {len(notes) - MAX_NOTES} more notes in evaluation.json"
+            notes = [*notes[:MAX_NOTES], more]
+        wrapped = [textwrap.fill(note, WIDTH, subsequent_indent="  ") for note in notes]
+        tables = [_score_table(self, *group) for group in _groups(self)]
+        parts = [
+            f"{self.protocol}: {self.num_pairs} pairs",
+            *tables,
+            _chance_table(self),
+            _cost_table(self),
+            "\n".join(wrapped),
+        ]
+        return "\n\n".join(filter(None, parts))
 
 
-def pair_to_mapping(pair: PairResult) -> dict[str, Any]:
-    """Return plain values for JSON; infinite errors become None."""
+def _groups(evaluation: Evaluation) -> list[tuple[str, list[str]]]:
+    """Split the columns of all recipes into tables, by what stands before the colon."""
+    columns = dict.fromkeys(name for recipe in evaluation.recipes for name in recipe.summary)
+    groups: dict[str, list[str]] = {}
+    for column in columns:
+        title, separator, _ = column.rpartition(GROUP)
+        groups.setdefault(title if separator else "", []).append(column)
+    if groups.get("") == [SECONDS]:  # time stands in another table then
+        del groups[""]
+    return list(groups.items())
+
+
+def _score_table(evaluation: Evaluation, title: str, columns: Sequence[str]) -> str:
+    rows = [
+        [recipe.name, *(_cell(recipe.summary.get(column), column) for column in columns)]
+        for recipe in evaluation.recipes
+    ]
+    head = [title or "recipe", *(column.rpartition(GROUP)[2] for column in columns)]
+    return aligned([head, *rows, *_published_rows(evaluation.published, columns)])
+
+
+def _published_rows(published: Iterable[PublishedRow], columns: Sequence[str]) -> list[list[str]]:
+    """Return the paper's rows that have some of the columns."""
+    return [
+        [
+            f"paper: {row.method} ({row.table})",
+            *(_cell(row.values.get(column), column) for column in columns),
+        ]
+        for row in published
+        if set(columns) & row.values.keys() - {SECONDS}
+    ]
+
+
+def _chance_table(evaluation: Evaluation) -> str:
+    """Return how many pairs count as solved, what chance may have to do with it, and means."""
+    test = f"p against {evaluation.baseline}" if evaluation.baseline else ""
+    means = ["keypoints", "matches", "inliers"]
+    rows = [["recipe", "solved", "95 %", *([test] if test else []), "failed", *means]]
+    for recipe in evaluation.recipes:
+        low, high = recipe.solved.interval
+        p_value = ["-" if recipe.p_value is None else f"{recipe.p_value:.3f}"] if test else []
+        interval = f"{low:.2f}-{high:.2f}"
+        used = [
+            fmean(fmean(pair.num_keypoints) for pair in recipe.pairs),
+            fmean(pair.num_matches for pair in recipe.pairs),
+            fmean(pair.num_inliers for pair in recipe.pairs),
+        ]
+        cells = [f"{recipe.solved.mean:.2f}", interval, *p_value, str(recipe.num_failed)]
+        rows.append([recipe.name, *cells, *(f"{value:.0f}" for value in used)])
+    return aligned(rows)
+
+
+def complexity_columns(recipe: RecipeResult) -> dict[str, float]:
+    """Return the columns of the paper's table of complexity."""
     return {
-        "name": pair.name,
-        "category": pair.category,
-        "error": _finite(pair.score.error),
-        "num_inliers": pair.score.num_inliers,
-        "num_correct": pair.score.num_correct,
-        "num_matches": pair.num_matches,
-        "num_keypoints": list(pair.num_keypoints),
-        "seconds": pair.seconds,
-        "seconds_by_step": dict(pair.seconds_by_step),
-        "level": pair.level,
-        "num_levels": pair.num_levels,
-        "failure": pair.failure,
-        "details": {key: _finite(value) for key, value in pair.score.details.items()},
+        "warped Mpx": recipe.complexity["area_mpx"],
+        "keypoints [K]": recipe.complexity["num_keypoints"] / 1000,
+        "regions": recipe.complexity["num_regions"],
+        "warps per region": recipe.complexity["warps_per_region"],
     }
 
 
-def pair_from_mapping(values: Mapping[str, Any]) -> PairResult:
-    """Read :func:`pair_to_mapping`."""
-    score = PairScore(
-        _number(values["error"]),
-        values["num_inliers"],
-        values["num_correct"],
-        {key: _number(value) for key, value in values["details"].items()},
-    )
-    first, second = values["num_keypoints"]
-    return PairResult(
-        values["name"],
-        values["category"],
-        score,
-        values["num_matches"],
-        values["seconds"],
-        (first, second),
-        values["seconds_by_step"],
-        values["level"],
-        values["num_levels"],
-        values["failure"],
-    )
+def _cost_table(evaluation: Evaluation) -> str:
+    """Return complexity per image, as the paper's table, and seconds by step."""
+    columns = list(complexity_columns(evaluation.recipes[0]))
+    head = ["per image (match, estimate: per pair)", *columns, *(f"{step} [s]" for step in STEPS)]
+    rows = []
+    for recipe in evaluation.recipes:
+        seconds = [recipe.seconds_per_step[step] for step in STEPS]
+        values = [*complexity_columns(recipe).values(), *seconds]
+        rows.append([recipe.name, *(f"{value:.2f}" for value in values)])
+    paper = _published_rows(evaluation.published_complexity, columns)
+    return aligned([head, *rows, *([*row, *[""] * len(STEPS)] for row in paper)])
 
 
-def _row_to_mapping(row: PublishedRow) -> dict[str, Any]:
-    return {"method": row.method, "values": dict(row.values), "table": row.table}
+def _failures(recipes: Iterable[RecipeResult], said: str) -> list[str]:
+    """Say what failed, once for all recipes, unless it has been said."""
+    texts: dict[str, list[str]] = {}
+    for recipe in recipes:
+        for name, why in {**recipe.failures, **recipe.warnings}.items():
+            texts.setdefault(f"{name}: {why}", []).append(recipe.name)
+        for pair in recipe.pairs:
+            known = [said, *recipe.failures.values()]
+            if pair.failure and not any(pair.failure in text for text in known):
+                texts.setdefault(f"{pair.name} failed: {pair.failure}", []).append(recipe.name)
+    return [f"{text} ({', '.join(names)})" for text, names in texts.items()]
 
 
-def _plain(values: Mapping[str, float] | Sequence[float]) -> Any:
-    if isinstance(values, Mapping):
-        return {key: _finite(value) for key, value in values.items()}
-    return [_finite(value) for value in values]
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _number(value: float | None) -> float:
-    return math.inf if value is None else value
-
-
-def _limits(values: Sequence[float]) -> Interval:
-    low, high = values
-    return low, high
+def _cell(value: float | None, column: str) -> str:
+    """Format a count, a share or seconds."""
+    if value is None:
+        return ""
+    if column == SECONDS:
+        return f"{value:.1f}"
+    return f"{value:.0f}" if value == math.floor(value) and "px" in column else f"{value:.2f}"

@@ -16,35 +16,34 @@ MAX_ENUMERATED = 14
 
 NUM_RANDOM_SIGNS = 9999
 
-Statistic = Callable[[NDArray[np.float64]], float]
 
-
-def bootstrap_interval(
-    values: Sequence[float], statistic: Statistic, seed: int
-) -> tuple[float, float]:
-    """Compute the percentile bootstrap interval of a statistic of one value per pair.
+def bootstrap_intervals(
+    count: int, statistics: Callable[[NDArray[np.int64]], Sequence[float]], seed: int
+) -> list[tuple[float, float]]:
+    """Compute the percentile bootstrap intervals of statistics of some items.
 
     Args:
-        values: one or more; infinite ones are fine if the statistic takes them.
-        statistic: of a (N,) array, such as a mean.
+        count: of the items, at least one.
+        statistics: of some of them, given as (count,) indices, which may repeat.
         seed: of the resamples.
 
     Returns:
-        Limits of the interval that holds ``CONFIDENCE`` of the statistics of resampled values.
+        For each statistic the limits that hold ``CONFIDENCE`` of its values on resampled items.
 
     Raises:
-        ValueError: without values.
+        ValueError: without items.
     """
-    if not len(values):
+    if not count:
         raise ValueError("no values to resample")
-    array = np.asarray(values, dtype=np.float64)
-    picks = np.random.default_rng(seed).integers(len(array), size=(NUM_RESAMPLES, len(array)))
-    found = np.sort([statistic(array[pick]) for pick in picks])
+    picks = np.random.default_rng(seed).integers(count, size=(NUM_RESAMPLES, count))
+    found = np.sort([statistics(pick) for pick in picks], axis=0)
     tail = int((1 - CONFIDENCE) / 2 * NUM_RESAMPLES)
-    return float(found[tail]), float(found[-1 - tail])
+    return list(zip(found[tail].tolist(), found[-1 - tail].tolist(), strict=True))
 
 
-def paired_test(a: Sequence[float], b: Sequence[float], seed: int) -> float:
+def paired_test(
+    a: Sequence[float] | NDArray[np.float64], b: Sequence[float] | NDArray[np.float64], seed: int
+) -> float:
     """Test whether two methods differ, by their values of the same pairs.
 
     Sign-flip permutation test on signed ranks (Wilcoxon's statistic): if the methods did not
@@ -69,8 +68,6 @@ def paired_test(a: Sequence[float], b: Sequence[float], seed: int) -> float:
     differing = first != second
     differences = first[differing] - second[differing]
     count = len(differences)
-    if not count:
-        return 1.0
     ranks = _mean_ranks(np.abs(differences))
     observed = abs(float(np.sign(differences) @ ranks))
     if count <= MAX_ENUMERATED:

@@ -13,27 +13,35 @@ so are their depth maps. Names in the lists and files may differ in their suffix
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.comparison.metrics import Pose, relative_pose
+from colmap_affrect.colmap.poses import Pose, relative_pose
 from colmap_affrect.errors import EvaluationError
+from colmap_affrect.evaluation.posed_scenes import (
+    Names,
+    PosedScenes,
+    missing_notes,
+    posed_pairs,
+    scene_images,
+    stem,
+)
 from colmap_affrect.evaluation.protocol import Dataset, EvaluationPair
 from colmap_affrect.evaluation.relative_pose import (
     PosedImage,
-    RelativePoseProtocol,
     category_start,
     posed_image,
-    posed_pair,
     rotation_angle_deg,
 )
-from colmap_affrect.evaluation.truth_checks import contradictions, counted, size_notes
-from colmap_affrect.imaging import IMAGE_SUFFIXES
+from colmap_affrect.evaluation.truth_checks import counted, image_size, pose_contradictions
+from colmap_affrect.images.reading import IMAGE_SUFFIXES
+from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
 CATEGORY_DEG = 10
@@ -42,51 +50,51 @@ MAX_NOT_UNIT = 1e-3
 
 
 @dataclass(frozen=True)
-class Svp(RelativePoseProtocol):
+class Svp(PosedScenes):
     """Share of pairs with a rotation error below 5 degrees, by relative rotation."""
 
     name = "svp"
     category_title = "relative rotation, from [deg]"
+    scene_pattern = f"*{PAIR_LIST_SUFFIX}"
+    dataset_title = "the Strong ViewPoint Changes dataset"
 
-    def load(self, dataset_path: Path) -> Dataset:
-        """Read a scene, or all scenes in a folder.
-
-        Raises:
-            EvaluationError: when there is no pair list, a file of the model is missing or no pair
-                can be evaluated.
-        """
-        folders = (dataset_path, *sorted(dataset_path.glob("*/")))
-        lists = [path for folder in folders for path in sorted(folder.glob(f"*{PAIR_LIST_SUFFIX}"))]
-        if not lists:
-            raise EvaluationError(
-                f"{dataset_path}: has no *{PAIR_LIST_SUFFIX}, nor has a folder in it; give a scene "
-                "of the Strong ViewPoint Changes dataset, or the folder of its scenes"
+    def load_scene(self, list_path: Path) -> Dataset:
+        """Read a scene by its list of pairs."""
+        folder, scene = list_path.parent, list_path.name.removesuffix(PAIR_LIST_SUFFIX)
+        listed, bad_lines = read_pair_list(list_path)
+        cameras, faults = read_camera_poses(folder / "0")
+        poses = {name: pose for name, (_, pose) in cameras.items()}
+        files = scene_images(folder / "images")
+        posed = {
+            name: posed_image(
+                f"{scene}/{path.relative_to(folder / 'images').as_posix()}", path, *cameras[name]
             )
-        scenes = [_load_scene(path, check_truth=self.check_truth) for path in lists]
-        return Dataset.united(scenes, dataset_path)
+            for name, path in files.items()
+            if name in cameras
+        }
+        listed_names = [pair.names for pair in listed]
+        pairs = posed_pairs(
+            listed_names, posed, lambda names: f"{CATEGORY_DEG * difficulty(poses, *names)}°"
+        )
+        names = list(dict.fromkeys(name for pair in listed_names for name in pair))
+        lacking = {n: faults.get(n, "not in images.txt") for n in names if n not in cameras}
+        bad = [f"line {number}" for number in bad_lines]
+        notes = [
+            *counted(bad, f"lines that are no pair of {list_path.name}", bad),
+            *missing_notes(listed_names, names, files, lacking, "pose or camera"),
+            *_difficulty_notes(listed, poses),
+            *_size_notes(pairs),
+            *(pose_contradictions(pairs) if self.check_truth else ()),
+            *_empty_notes(listed, pairs),
+        ]
+        return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
 
 
-@dataclass(frozen=True)
-class ListedPair:
+class ListedPair(NamedTuple):
     """A line of a pair list: names without suffix, and the category as listed, if it is."""
 
-    names: tuple[str, str]
+    names: Names
     difficulty: int | None
-
-
-@dataclass(frozen=True)
-class CameraPoses:
-    """What the text files of a model say.
-
-    Attributes:
-        cameras: usable ones by image name without suffix.
-        poses: usable ones by the same.
-        faults: why others are not usable, by the same.
-    """
-
-    cameras: Mapping[str, pycolmap.Camera]
-    poses: Mapping[str, Pose]
-    faults: Mapping[str, str] = field(default_factory=dict)
 
 
 def difficulty(poses: Mapping[str, Pose], name1: str, name2: str) -> int:
@@ -100,175 +108,109 @@ def read_pair_list(path: Path) -> tuple[list[ListedPair], list[int]]:
     pairs, bad = [], []
     for number, line in _lines(path):
         words = line.split()
-        if len(words) == 3 and words[2].isdigit():
-            pairs.append(ListedPair((_stem(words[0]), _stem(words[1])), int(words[2])))
-        elif len(words) == 2:
-            pairs.append(ListedPair((_stem(words[0]), _stem(words[1])), None))
+        if len(words) == 2 or (len(words) == 3 and words[2].isdigit()):
+            listed = int(words[2]) if len(words) == 3 else None
+            pairs.append(ListedPair((stem(words[0]), stem(words[1])), listed))
         else:
             bad.append(number)
     return pairs, bad
 
 
-def read_camera_poses(model_path: Path) -> CameraPoses:
+def read_camera_poses(
+    model_path: Path,
+) -> tuple[dict[str, tuple[pycolmap.Camera, Pose]], dict[str, str]]:
     """Read ``images.txt`` and ``cameras.txt`` of a folder.
 
+    Returns:
+        Cameras and cam_from_world poses by image name without suffix; why others are not usable.
+
     Raises:
-        EvaluationError: when one of them cannot be read.
+        EvaluationError: when one of the files cannot be read.
     """
-    read: dict[str, pycolmap.Camera | str] = {}
-    for _, line in _lines(model_path / "cameras.txt"):
-        camera_id, *rest = line.split()
-        read[camera_id] = _camera(rest)
-    cameras: dict[str, pycolmap.Camera] = {}
-    poses: dict[str, Pose] = {}
+    lines = (line.split() for _, line in _lines(model_path / "cameras.txt"))
+    cameras = {camera_id: words for camera_id, *words in lines}
+    found: dict[str, tuple[pycolmap.Camera, Pose]] = {}
     faults: dict[str, str] = {}
     for _, line in _lines(model_path / "images.txt"):
         words = line.split(maxsplit=9)
         # Lines of points end in a number.
         if len(words) < 10 or not line.lower().endswith(IMAGE_SUFFIXES):
             continue
-        name = _stem(words[9])
-        camera = read.get(words[8], "has no camera")
-        pose = _pose(words[1:8])
-        if isinstance(camera, str) or isinstance(pose, str):
-            faults[name] = camera if isinstance(camera, str) else str(pose)
-        else:
-            cameras[name], poses[name] = camera, pose
-    return CameraPoses(cameras, poses, faults)
+        name = stem(words[9])
+        try:
+            found[name] = _camera(cameras.get(words[8])), _pose(words[1:8])
+        except EvaluationError as error:
+            faults[name] = str(error)
+    return found, faults
 
 
-def _load_scene(list_path: Path, *, check_truth: bool) -> Dataset:
-    folder, scene = list_path.parent, list_path.name.removesuffix(PAIR_LIST_SUFFIX)
-    listed, bad_lines = read_pair_list(list_path)
-    known = read_camera_poses(folder / "0")
-    files = {
-        _stem(path.relative_to(folder / "images").as_posix()): path
-        for path in sorted((folder / "images").rglob("*"))
-        if path.suffix.lower() in IMAGE_SUFFIXES
-    }
-    posed = {
-        name: posed_image(
-            f"{scene}/{path.relative_to(folder / 'images').as_posix()}",
-            path,
-            known.cameras[name],
-            known.poses[name],
-        )
-        for name, path in files.items()
-        if name in known.poses
-    }
-    pairs = [
-        posed_pair(
-            posed[first], posed[second], f"{CATEGORY_DEG * difficulty(known.poses, first, second)}°"
-        )
-        for first, second in (pair.names for pair in listed)
-        if first in posed and second in posed
-    ]
-    pairs = sorted({pair.name: pair for pair in pairs}.values(), key=_order)
-    notes = [
-        *counted(
-            bad_lines,
-            f"lines that are no pair of {list_path.name}",
-            [f"line {number}" for number in bad_lines],
-        ),
-        *_missing_notes(listed, files, known),
-        *_difficulty_notes(listed, known.poses),
-        *size_notes(_images_of(pairs)),
-        *(contradictions(pairs) if check_truth else ()),
-        *_empty_notes(listed, pairs),
-    ]
-    return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
-
-
-def _order(pair: EvaluationPair) -> tuple[float, str]:
-    return category_start(pair.category), pair.name
-
-
-def _images_of(pairs: Iterable[EvaluationPair]) -> list[PosedImage]:
-    """Return the images of pairs, each once."""
-    return list({image.image.name: image for pair in pairs for image in pair.truth}.values())
-
-
-def _missing_notes(
-    listed: list[ListedPair], files: Mapping[str, Path], known: CameraPoses
-) -> Iterator[str]:
-    """Count what is listed and not there."""
-    names = list(dict.fromkeys(name for pair in listed for name in pair.names))
-    without_file = [name for name in names if name not in files]
-    without_pose = [name for name in names if name not in known.poses]
-    lost = [
-        pair
-        for pair in listed
-        if any(name not in files or name not in known.poses for name in pair.names)
-    ]
-    if lost:
-        yield f"{len(lost)} of {len(listed)} listed pairs are left out"
-    yield from counted(
-        without_file, f"of {len(names)} listed images are not in images/", without_file
-    )
-    yield from counted(
-        without_pose,
-        f"of {len(names)} listed images have no usable pose or camera",
-        [f"{name} ({known.faults.get(name, 'not in images.txt')})" for name in without_pose],
-    )
-
-
-def _difficulty_notes(listed: list[ListedPair], poses: Mapping[str, Pose]) -> Iterator[str]:
-    """Say which listed categories contradict the poses, of all listed pairs with poses."""
-    wrong = [
-        f"{' '.join(pair.names)} (listed {pair.difficulty}, by its poses {found})"
-        for pair in listed
-        if pair.difficulty is not None and all(name in poses for name in pair.names)
-        for found in [difficulty(poses, *pair.names)]
-        if found != pair.difficulty
-    ]
-    yield from counted(
-        wrong, f"of {len(listed)} listed difficulties contradict the poses, which are used", wrong
-    )
-
-
-def _empty_notes(listed: list[ListedPair], pairs: list[EvaluationPair]) -> Iterator[str]:
-    """Name the listed categories of which no pair is left."""
-    wanted = {pair.difficulty for pair in listed if pair.difficulty is not None}
-    left = {int(category_start(pair.category)) // CATEGORY_DEG for pair in pairs}
-    empty = sorted(wanted - left)
-    if empty:
-        yield "no pairs are left from " + ", ".join(f"{k * CATEGORY_DEG}°" for k in empty)
-
-
-def _camera(words: list[str]) -> pycolmap.Camera | str:
-    """Return the camera of a line without its id, or what is wrong with it."""
+def _camera(words: list[str] | None) -> pycolmap.Camera:
+    """Return the camera of a line without its id; say what is wrong with it."""
+    if words is None:
+        raise EvaluationError("has no camera")
     try:
         model, width, height, *params = words
         values = [float(value) for value in params]
         if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
-            return f"its camera is of the unknown model {model}"
+            raise EvaluationError(f"its camera is of the unknown model {model}")
         camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=values)
-    except ValueError:
-        return "its camera cannot be read"
+    except ValueError as error:
+        raise EvaluationError("its camera cannot be read") from error
     if not np.isfinite(values).all():
-        return "its camera has values that are not finite"
+        raise EvaluationError("its camera has values that are not finite")
     if not camera.verify_params() or camera.mean_focal_length() <= 0:
-        return f"its camera has wrong parameters for {model}"
+        raise EvaluationError(f"its camera has wrong parameters for {model}")
     return camera
 
 
-def _pose(words: list[str]) -> Pose | str:
-    """Return the pose QW QX QY QZ TX TY TZ, or what is wrong with it."""
+def _pose(words: list[str]) -> Pose:
+    """Return the pose QW QX QY QZ TX TY TZ; say what is wrong with it."""
     try:
         values: NDArray[np.float64] = np.array([float(value) for value in words])
-    except ValueError:
-        return "its pose cannot be read"
+    except ValueError as error:
+        raise EvaluationError("its pose cannot be read") from error
     length = float(np.linalg.norm(values[:4]))
     if not np.isfinite(values).all():
-        return "its pose has values that are not finite"
+        raise EvaluationError("its pose has values that are not finite")
     if abs(length - 1.0) > MAX_NOT_UNIT:
-        return f"its quaternion has length {length:.3g}"
+        raise EvaluationError(f"its quaternion has length {length:.3g}")
     rotation = pycolmap.Rotation3d(values[[1, 2, 3, 0]] / length).matrix()
     return np.asarray(rotation), values[4:]
 
 
-def _stem(name: str) -> str:
-    return PurePosixPath(name).with_suffix("").as_posix()
+def _difficulty_notes(listed: Sequence[ListedPair], poses: Mapping[str, Pose]) -> list[str]:
+    """Say which listed categories contradict the poses, of all listed pairs with poses."""
+    wrong = [
+        f"{' '.join(pair.names)} (listed {pair.difficulty}, by its poses {found})"
+        for pair in listed
+        if pair.difficulty is not None and poses.keys() >= set(pair.names)
+        if (found := difficulty(poses, *pair.names)) != pair.difficulty
+    ]
+    what = f"of {len(listed)} listed difficulties contradict the poses, which are used"
+    return counted(wrong, what, wrong)
+
+
+def _size_notes(pairs: Sequence[EvaluationPair]) -> list[str]:
+    """Count images that have another size in px than their intrinsics are for."""
+    images: list[PosedImage] = list(
+        {posed.image.name: posed for pair in pairs for posed in pair.truth}.values()
+    )
+    sizes = map_ordered(lambda posed: image_size(posed.image.path), images, available_cores())
+    wrong = [
+        f"{posed.image.name} ({size[0]} x {size[1]} px, intrinsics for "
+        f"{posed.camera.width} x {posed.camera.height} px)"
+        for posed, size in zip(images, sizes, strict=True)
+        if size and size != (posed.camera.width, posed.camera.height)
+    ]
+    return counted(wrong, "images are of another size than their intrinsics", wrong)
+
+
+def _empty_notes(listed: Sequence[ListedPair], pairs: Sequence[EvaluationPair]) -> list[str]:
+    """Name the listed categories of which no pair is left."""
+    wanted = {pair.difficulty for pair in listed if pair.difficulty is not None}
+    left = {int(category_start(pair.category)) // CATEGORY_DEG for pair in pairs}
+    empty = ", ".join(f"{tens * CATEGORY_DEG}°" for tens in sorted(wanted - left))
+    return [f"no pairs are left from {empty}"] if empty else []
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:

@@ -1,67 +1,99 @@
-"""Sanity checks of poses and intrinsics that a dataset gives as truth.
+"""Sanity checks of what a dataset gives as truth.
 
 A dataset that was converted wrongly makes every method look bad. What can be seen from the numbers
 alone (rotations that are none, intrinsics of another image size) is looked for in every image; what
-only the images show (rotations transposed, poses inverted), in a few easy pairs of them.
+only the images show (homographies inverted, coordinates exchanged, rotations transposed), in the
+matches of plain features: of every homography and of marked correspondences, and of a few easy
+pairs where the truth is of poses.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.comparison.metrics import Pose, relative_pose
+from colmap_affrect.colmap.poses import Pose, relative_pose
+from colmap_affrect.conventions import is_inside
+from colmap_affrect.data import GrayImage, Rectification
 from colmap_affrect.errors import ImageError
-from colmap_affrect.evaluation.protocol import EvaluationPair
-from colmap_affrect.evaluation.relative_pose import (
-    CORRECT_PX,
-    PosedImage,
-    Ransac,
-    estimate_relative_pose,
-    mean_focal_px,
-    rays,
-    sampson_distances,
+from colmap_affrect.evaluation.homographies import (
+    Homography,
+    Size,
+    TrueHomography,
+    oriented,
+    visible_points,
 )
-from colmap_affrect.executor import available_cores, map_ordered
-from colmap_affrect.extraction import prepare
-from colmap_affrect.imaging import read_gray
-from colmap_affrect.matching.nearest import MatchableImage, match_features, matchable
-from colmap_affrect.options import MatchingOptions
-from colmap_affrect.recipes import Recipe, load_recipe
+from colmap_affrect.evaluation.protocol import EvaluationPair
+from colmap_affrect.evaluation.relative_pose import CORRECT_PX, PosedImage, mean_focal_px, rays
+from colmap_affrect.evaluation.two_views import (
+    Points,
+    Ransac,
+    sampson_distances,
+    symmetric_epipolar_distances,
+)
+from colmap_affrect.images.reading import read_gray
+from colmap_affrect.images.warping import warp
+from colmap_affrect.matchers.nearest import (
+    MatchableImage,
+    NearestOptions,
+    match_features,
+    matchable,
+)
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.stages.one_image import extract_image, prepare
 
-MAX_NOT_ORTHONORMAL = 1e-3
-"""Largest element of R Rᵀ - I of what passes for a rotation."""
-
-MAX_CHECKED_PAIRS = 8
-"""Per scene."""
-
-CHECK_IMAGE_SIZE_PX = 800
-"""Longer side of the images that the check looks at."""
-
-MIN_CONSENSUS = 30
-MIN_CONSENSUS_FRAC = 0.3
-"""Inliers of an essential matrix that prove that the matches of a pair are right."""
-
-MIN_AGREEING_FRAC = 0.5
-"""Share of such inliers that agree with the truth; where fewer do, the truth is wrong."""
-
-MIN_EXPLAINED_FRAC = 0.9
-"""Share that must agree with poses mistaken in a known way, for this to be named."""
+CHECK_RECIPE = "unrectified-rootsift"
 
 MAX_NAMES = 3
 """Examples in a note."""
 
-MISTAKES: dict[str, Callable[[Pose], Pose]] = {
+MAX_NOT_ORTHONORMAL = 1e-3
+"""Largest element of R Rᵀ - I of what passes for a rotation."""
+
+MIN_SUPPORT = 8
+MIN_SUPPORT_FRAC = 0.25
+"""Matches of the rectified pair that confirm a homography."""
+SUPPORT_PX = 5.0
+RESIZED = (0.5, 2.0)
+"""Sizes of an image that a truth might be of, in the place of its own."""
+
+EPIPOLAR_NOISE_PX = 1.0
+MIN_EPIPOLAR_CONSENSUS = 40
+MIN_EPIPOLAR_CONSENSUS_FRAC = 0.5
+"""Inliers of a fundamental matrix that prove that the matches of a pair are right."""
+MAX_MEDIAN_PX = 10.0
+"""Correspondences that disagree by more on average are doubted: they are a few px accurate."""
+
+MAX_CHECKED_PAIRS = 8
+"""Per scene."""
+CHECK_IMAGE_SIZE_PX = 800
+"""Longer side of the images in which poses are checked."""
+MIN_POSE_CONSENSUS = 30
+MIN_POSE_CONSENSUS_FRAC = 0.3
+"""Inliers of an essential matrix that prove that the matches of a pair are right."""
+MIN_AGREEING_FRAC = 0.5
+"""Share of such inliers that agree with the truth; where fewer do, the truth is wrong."""
+MIN_EXPLAINED_FRAC = 0.9
+"""Share that must agree with poses mistaken in a known way, for this to be named."""
+
+POSE_MISTAKES: dict[str, Callable[[Pose], Pose]] = {
     "": lambda pose: pose,
     "rotation transposed": lambda pose: (pose[0].T, pose[1]),
     "pose inverted (world_from_camera)": lambda pose: (pose[0].T, -pose[0].T @ pose[1]),
     "translation is the position of the camera": lambda pose: (pose[0], -pose[0] @ pose[1]),
 }
 """What turns a pose that was stored in a wrong way into the right one."""
+
+
+def counted(items: Sequence[object], what: str, examples: Iterable[str]) -> list[str]:
+    """Return a note of how many there are of something, with examples; nothing of nothing."""
+    return [f"{len(items)} {what}: {such_as(examples)}"] if items else []
 
 
 def such_as(names: Iterable[str]) -> str:
@@ -73,11 +105,6 @@ def such_as(names: Iterable[str]) -> str:
     listed = list(names)
     more = f" and {len(listed) - MAX_NAMES} more" if len(listed) > MAX_NAMES else ""
     return ", ".join(listed[:MAX_NAMES]) + more
-
-
-def counted(items: Sequence[object], what: str, examples: Iterable[str]) -> list[str]:
-    """Return a note of how many there are of something, with examples; nothing of nothing."""
-    return [f"{len(items)} {what}: {such_as(examples)}"] if items else []
 
 
 def rotation_fault(rotation: NDArray[np.float64]) -> str:
@@ -99,30 +126,141 @@ def rotation_fault(rotation: NDArray[np.float64]) -> str:
     return "the rotation is not orthogonal"
 
 
-def size_notes(images: Sequence[PosedImage]) -> list[str]:
-    """Count images that have another size in px than their intrinsics are for.
+def image_size(path: Path) -> Size | None:
+    """Return (width, height) of an image, None if it cannot be read: it fails when it is used."""
+    try:
+        return size_of(read_gray(path))
+    except ImageError:
+        return None
 
-    Images that cannot be read are passed over: they fail in the evaluation.
+
+def size_of(image: GrayImage) -> Size:
+    """Return (width, height) of an (H, W) image."""
+    return image.shape[1], image.shape[0]
+
+
+def plain_features(image: GrayImage) -> MatchableImage:
+    """Return features of an (H, W) uint8 image that are not rectified, ready for matching."""
+    recipe = load_recipe(CHECK_RECIPE)
+    found = extract_image(image, recipe.extraction)
+    return matchable(found.descriptors, found.keypoints, NearestOptions())
+
+
+def matched_points(
+    image1: MatchableImage, image2: MatchableImage
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Match plain features; return (M, 2) points of each image."""
+    rows1, rows2 = match_features(image1, image2, NearestOptions()).indices.T
+    return image1.keypoints[rows1], image2.keypoints[rows2]
+
+
+def true_homography(
+    matrix: Homography, paths: Sequence[Path], *, check: bool
+) -> tuple[TrueHomography, str]:
+    """Return the truth of two images, and what speaks against it (:func:`homography_doubts`).
+
+    Args:
+        matrix: (3, 3) image2_from_image1 of any scale and sign.
+        paths: of the two images.
+        check: look for doubts.
+
+    Raises:
+        ImageError: when an image cannot be read.
     """
-
-    def mismatch(posed: PosedImage) -> str:
-        try:
-            height, width = read_gray(posed.image.path).shape
-        except ImageError:
-            return ""
-        camera = posed.camera
-        if (camera.width, camera.height) == (width, height):
-            return ""
-        return (
-            f"{posed.image.name} ({width} x {height} px, intrinsics for "
-            f"{camera.width} x {camera.height} px)"
-        )
-
-    found = [text for text in map_ordered(mismatch, images, available_cores()) if text]
-    return counted(found, "images are of another size than their intrinsics", found)
+    image1, image2 = (read_gray(path) for path in paths)
+    size1, size2 = size_of(image1), size_of(image2)
+    truth = TrueHomography(oriented(matrix, size1, size2), size1, size2)
+    return truth, homography_doubts(matrix, image1, image2) if check else ""
 
 
-def contradictions(pairs: Sequence[EvaluationPair]) -> list[str]:
+def homography_doubts(matrix: Homography, image1: GrayImage, image2: GrayImage) -> str:
+    """Say what speaks against a true homography; empty if the images confirm it.
+
+    Image 1 is warped by it, so that even extreme views become easy to match: if it is right,
+    features of the warp and of image 2 agree in their places. If they do not, the same is tried
+    with what people confuse it with.
+
+    Args:
+        matrix: (3, 3) finite.
+        image1: (H, W) uint8.
+        image2: (H, W) uint8.
+    """
+    size1, size2 = size_of(image1), size_of(image2)
+    features2 = plain_features(image2)
+
+    def support(matrix: Homography) -> int:
+        """Count features of the warp that image 2 has at their place; 0 if too few to confirm."""
+        matrix = oriented(matrix, size1, size2)
+        if not len(visible_points(matrix, size1, size2)):
+            return 0
+        warped = plain_features(warp(image1, Rectification(matrix, size2, None, 1.0, 0.0)))
+        points1, points2 = matched_points(warped, features2)
+        count = int((np.linalg.norm(points1 - points2, axis=1) < SUPPORT_PX).sum())
+        return count if count >= max(MIN_SUPPORT, MIN_SUPPORT_FRAC * len(points1)) else 0
+
+    if not len(visible_points(oriented(matrix, size1, size2), size1, size2)):
+        doubt = "shows no part of image 1 in image 2"
+    elif support(matrix):
+        return ""
+    else:
+        doubt = "is not confirmed by features of the images"
+    supports = {mistake: support(suspect) for mistake, suspect in _homography_mistakes(matrix)}
+    best = max(supports, key=lambda mistake: supports[mistake])
+    return f"{doubt}; it is {best}" if supports[best] else doubt
+
+
+def _homography_mistakes(matrix: Homography) -> Iterator[tuple[str, Homography]]:
+    """Yield what a wrong homography may be, with the right one."""
+    if abs(np.linalg.det(matrix)) > 0.0:
+        yield "inverted: from image 2 to image 1", np.asarray(np.linalg.inv(matrix))
+    yield "transposed", matrix.T
+    for scale in RESIZED:
+        resize: Homography = np.diag([scale, scale, 1.0])
+        shrink = np.diag([1 / scale, 1 / scale, 1.0])
+        of_size = f"of images {1 / scale:g} times as large"
+        yield of_size, resize @ matrix @ shrink
+        yield f"{of_size}, in image 1", matrix @ shrink
+        yield f"{of_size}, in image 2", resize @ matrix
+
+
+def correspondence_doubts(correspondences: Points, paths: Sequence[Path]) -> str:
+    """Say what speaks against (N, 4) correspondences of two images; empty if nothing does.
+
+    They must lie in the images. Where plain features match beyond doubt, they must agree with the
+    epipolar geometry of these; pairs that are too hard for them cannot be checked.
+
+    Raises:
+        ImageError: when an image cannot be read.
+    """
+    images = [read_gray(path) for path in paths]
+    sides = np.hsplit(correspondences, 2)
+    for number, (image, points) in enumerate(zip(images, sides, strict=True), 1):
+        outside = int((~is_inside(points, size_of(image))).sum())
+        if outside:
+            return f"{outside} of {len(points)} lie outside of image {number}"
+    points1, points2 = matched_points(*map(plain_features, images))
+    ransac = Ransac(cv2.USAC_MAGSAC, EPIPOLAR_NOISE_PX, 0.999, 10_000)
+    matrix, count = ransac.fundamental_matrix(points1, points2)
+    if count < max(MIN_EPIPOLAR_CONSENSUS, MIN_EPIPOLAR_CONSENSUS_FRAC * len(points1)):
+        return ""
+    mistakes = {
+        "": correspondences,
+        "; x and y are exchanged": correspondences[:, [1, 0, 3, 2]],
+        "; the images are exchanged": correspondences[:, [2, 3, 0, 1]],
+        **{f"; they are of images {1 / s:g} times as large": s * correspondences for s in RESIZED},
+    }
+    medians = {
+        what: float(np.median(symmetric_epipolar_distances(matrix, *np.hsplit(points, 2))))
+        for what, points in mistakes.items()
+    }
+    if medians[""] <= MAX_MEDIAN_PX:
+        return ""
+    best = min(medians, key=lambda what: medians[what])
+    doubt = f"contradict the matches of plain features, by {medians['']:.0f} px in the median"
+    return doubt + (best if medians[best] <= MAX_MEDIAN_PX else "")
+
+
+def pose_contradictions(pairs: Sequence[EvaluationPair]) -> list[str]:
     """Match a few pairs and name those whose matches are plainly right and not of the true pose.
 
     Args:
@@ -131,13 +269,17 @@ def contradictions(pairs: Sequence[EvaluationPair]) -> list[str]:
     Returns:
         One note for every way in which the truth seems wrong.
     """
-    chosen = _spread(pairs)
-    recipe = load_recipe("unrectified-rootsift", [f"max_image_size_px={CHECK_IMAGE_SIZE_PX}"])
-    paths = {image.image.path: None for pair in chosen for image in pair.truth}
-    features = _features(list(paths), recipe)
+    chosen: list[EvaluationPair] = []
+    seen: dict[str, Path] = {}
+    for pair in pairs:
+        images = {image.name: image.path for image in pair.images}
+        if len(chosen) < MAX_CHECKED_PAIRS and not images.keys() <= seen.keys():
+            chosen.append(pair)
+            seen |= images
+    features = dict(zip(seen, _small_features(list(seen.values())), strict=True))
     found: dict[str, list[str]] = {}
     for pair in chosen:
-        mistake = _mistake(pair.truth, features, recipe.matching)
+        mistake = _pose_mistake(pair.truth, features)
         if mistake is not None:
             found.setdefault(mistake, []).append(pair.name)
     return [
@@ -147,20 +289,9 @@ def contradictions(pairs: Sequence[EvaluationPair]) -> list[str]:
     ]
 
 
-def _spread(pairs: Sequence[EvaluationPair]) -> list[EvaluationPair]:
-    """Choose the first pairs that each have an image that the chosen ones do not have."""
-    chosen: list[EvaluationPair] = []
-    seen: set[str] = set()
-    for pair in pairs:
-        names = {image.name for image in pair.images}
-        if not names <= seen and len(chosen) < MAX_CHECKED_PAIRS:
-            chosen.append(pair)
-            seen |= names
-    return chosen
-
-
-def _features(paths: Sequence[Path], recipe: Recipe) -> Mapping[Path, MatchableImage]:
-    """Extract the features of all images that can be read."""
+def _small_features(paths: Sequence[Path]) -> Iterator[MatchableImage | None]:
+    """Yield the plain features of shrunk images; None of those that cannot be read."""
+    recipe = load_recipe(CHECK_RECIPE, [f"max_image_size_px={CHECK_IMAGE_SIZE_PX}"])
     extractor = prepare(recipe.extraction)
 
     def extract(path: Path) -> MatchableImage | None:
@@ -168,38 +299,36 @@ def _features(paths: Sequence[Path], recipe: Recipe) -> Mapping[Path, MatchableI
             found = extractor.extract_file(path).features
         except ImageError:
             return None
-        return matchable(found.descriptors, found.keypoints, recipe.matching)
+        return matchable(found.descriptors, found.keypoints, NearestOptions())
 
-    images = zip(paths, map_ordered(extract, paths, available_cores()), strict=True)
-    return {path: image for path, image in images if image is not None}
+    return map_ordered(extract, paths, available_cores())
 
 
-def _mistake(
-    truth: tuple[PosedImage, PosedImage],
-    features: Mapping[Path, MatchableImage],
-    options: MatchingOptions,
+def _pose_mistake(
+    truth: tuple[PosedImage, PosedImage], features: Mapping[str, MatchableImage | None]
 ) -> str | None:
     """Return what is wrong with the truth of a pair: None for nothing, empty for unknown."""
-    first, second = (features.get(image.image.path) for image in truth)
+    first, second = (features[posed.image.name] for posed in truth)
     if first is None or second is None:
         return None
-    matches = match_features(first, second, options).indices
+    points1, points2 = matched_points(first, second)
     cameras = (truth[0].camera, truth[1].camera)
-    rays1 = rays(cameras[0], first.keypoints[matches[:, 0]])
-    rays2 = rays(cameras[1], second.keypoints[matches[:, 1]])
+    rays1, rays2 = rays(cameras[0], points1), rays(cameras[1], points2)
     tolerance = CORRECT_PX / mean_focal_px(cameras)
-    _, inliers = estimate_relative_pose(rays1, rays2, Ransac(tolerance, 0.999, 1000))
-    if inliers.sum() < max(MIN_CONSENSUS, MIN_CONSENSUS_FRAC * len(matches)):
+    _, inliers = Ransac(cv2.RANSAC, tolerance, 0.999, 1000).relative_pose(rays1, rays2)
+    if inliers.sum() < max(MIN_POSE_CONSENSUS, MIN_POSE_CONSENSUS_FRAC * len(points1)):
         return None
     rays1, rays2 = rays1[inliers], rays2[inliers]
 
     def agreeing(mistake1: str, mistake2: str) -> float:
-        pose = relative_pose(MISTAKES[mistake1](truth[0].pose), MISTAKES[mistake2](truth[1].pose))
+        pose = relative_pose(
+            POSE_MISTAKES[mistake1](truth[0].pose), POSE_MISTAKES[mistake2](truth[1].pose)
+        )
         return float((sampson_distances(pose, rays1, rays2) < tolerance).mean())
 
     if agreeing("", "") >= MIN_AGREEING_FRAC:
         return None
-    shares = {pair: agreeing(*pair) for pair in itertools.product(MISTAKES, repeat=2)}
+    shares = {pair: agreeing(*pair) for pair in itertools.product(POSE_MISTAKES, repeat=2)}
     best = max(shares, key=lambda pair: shares[pair])
     if shares[best] < MIN_EXPLAINED_FRAC:
         return ""

@@ -1,12 +1,10 @@
-"""Feature profile ``affnet-hardnet``: a detector, AffNet, OriNet and a learned descriptor.
+"""Features ``affnet-hardnet``: a detector, AffNet, OriNet and a learned descriptor.
 
 The chain of the paper (Sec. 3): an upright patch round each keypoint gives its affine shape, the
 patch of that shape its orientation, the patch of both its descriptor. AffNet here drops the
 orientation it is given and keeps the area.
 
-Patches are sampled from a pyramid whose level has steps of 1 to 2 px. Coarser levels, or levels for
-the longer axis of the frame, change the number of right matches by less than 6 %, up or down
-(Graffiti 1-3 and 1-5, Wall 1-3).
+Patches are sampled from a pyramid whose level has steps of 1 to 2 px.
 """
 
 from __future__ import annotations
@@ -14,29 +12,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import torch
-from kornia.feature import MultiResolutionDetector, ScaleSpaceDetector
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from colmap_affrect.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS
-from colmap_affrect.features.dog import detect_dog, is_searchable
-from colmap_affrect.features.networks import (
-    DESCRIPTOR_SIZE,
-    AffineShapes,
-    load_affnet,
-    load_descriptor,
-    load_keynet,
-    load_orinet,
-    resolve_device,
-)
-from colmap_affrect.features.patches import PatchSampler
+from colmap_affrect.data import GrayImage, LocalFeatures, View, in_mask, union
+from colmap_affrect.features.base import NetworkContext
+from colmap_affrect.features.sift import DogOptions, detect_dog, is_searchable
 from colmap_affrect.geometry.affine import determinants, lafs_from_keypoints, rotation
-from colmap_affrect.options import AffNetHardNetOptions
-from colmap_affrect.types import GrayImage, LocalFeatures, View, in_mask, union
+from colmap_affrect.options import within
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor, nn
 
 MIN_DETECTABLE_PX = 32
 """kornia's detectors look for nothing within 15 px of a border, and Key.Net fails on less."""
@@ -52,29 +42,63 @@ MAX_TILT = 20.0
 """More is degenerate. AffNet's shapes on photographs stay under 6 (Graffiti)."""
 
 BATCH_MULTIPLE = 64
-"""Batches are filled up to multiples of this many patches. Measured on a CPU: other sizes change
-the last bits of the results, so that an image alone would differ from one among others."""
+"""Batches are filled up to multiples of this many patches: other sizes change the last bits of the
+results on a CPU, so that an image alone would differ from one among others."""
+
+
+class AffNetHardNetOptions(DogOptions):
+    """Features ``affnet-hardnet``: detector, AffNet, OriNet and a learned descriptor."""
+
+    name: Literal["affnet-hardnet"] = "affnet-hardnet"
+    detector: Literal["dog", "keynet", "hessian"] = "dog"
+    """``dog`` (OpenCV, as in the paper), ``keynet`` or ``hessian``."""
+    descriptor: Literal["hardnet", "hardnet8", "hynet", "sosnet", "tfeat", "mkd", "hardtfeat"] = (
+        "hardnet"
+    )
+    affine_shape: bool = True
+    """Estimate affine shapes by AffNet; otherwise measurement regions are circles."""
+    patch_sigmas: Annotated[float, within(1.0, 100.0)] = 12.0
+    """Half width of a patch in units of the feature's sigma (12 as in the paper, for DoG)."""
+    batch_size: Annotated[int, within(1, 1_000_000)] = 256
+    """Patches that go through a network at once."""
+    dtype: Literal["float32", "float16", "bfloat16"] = "float32"
+    """Arithmetic of the networks: ``float32``, or ``float16`` and ``bfloat16`` where the device
+    is faster with them."""
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Keys of the files of weights that the networks read."""
+        shape = ("affnet",) if self.affine_shape else ()
+        detector = ("keynet",) if self.detector == "keynet" else ()
+        return (*shape, "orinet", self.descriptor, *detector)
 
 
 class AffNetHardNet:
     """Learned features; the networks are loaded here, from files found beforehand."""
 
-    descriptor_size = DESCRIPTOR_SIZE
+    Options = AffNetHardNetOptions
+    descriptor_size = 128
 
-    def __init__(
-        self, options: AffNetHardNetOptions, weights: Mapping[str, Path], device: str = "auto"
-    ) -> None:
+    def __init__(self, options: AffNetHardNetOptions, network: NetworkContext) -> None:
         """Load the networks.
 
         Args:
             options: detector, descriptor and how they run.
-            weights: files by the keys of :func:`colmap_affrect.features.weights.profile_weights`.
-            device: as in :func:`colmap_affrect.features.networks.resolve_device`.
+            network: files of weights, and the device.
 
         Raises:
             WeightsError: when a file is damaged or belongs to another network.
             DeviceError: when the device is not there.
         """
+        from colmap_affrect.features.networks import (
+            AffineShapes,
+            load_affnet,
+            load_descriptor,
+            load_orinet,
+            resolve_device,
+        )
+
+        weights, device = network.weights, network.device
         self.options = options
         self.device = resolve_device(device)
         self.affine_shapes = None
@@ -96,6 +120,8 @@ class AffNetHardNet:
             return detect_dog(image, self.options, mask)
         if min(image.shape) < MIN_DETECTABLE_PX or not is_searchable(image, mask):
             return LocalFeatures.empty()
+        import torch
+
         allowed = np.ones(image.shape, dtype=bool) if mask is None else mask > 0
         with torch.inference_mode():
             lafs, strengths = self.detector(
@@ -131,6 +157,8 @@ class AffNetHardNet:
         counts = [len(features) for features in detected]
         if not sum(counts):
             return [LocalFeatures.empty(self.descriptor_size) for _ in detected]
+        import torch
+
         found = union(list(detected))
         with torch.inference_mode():
             shapes, descriptors = self._describe(_Patches(images, counts, self.device), found)
@@ -167,6 +195,9 @@ class AffNetHardNet:
 
     def _run(self, network: nn.Module, patches: Tensor) -> NDArray[np.float32]:
         """Run a network on (N, 1, 32, 32) patches, in batches."""
+        import torch
+        from torch.nn.functional import pad
+
         size = self.options.batch_size
         outputs = []
         with self._arithmetic():
@@ -179,6 +210,8 @@ class AffNetHardNet:
     def _arithmetic(self) -> AbstractContextManager[object]:
         if self.options.dtype == "float32":
             return nullcontext()
+        import torch
+
         return torch.autocast(self.device.type, getattr(torch, self.options.dtype))
 
 
@@ -189,12 +222,16 @@ class _Patches:
         self, images: Sequence[GrayImage], counts: Sequence[int], device: torch.device
     ) -> None:
         """Take the images, and how many features each has."""
+        from colmap_affrect.features.patches import PatchSampler
+
         pairs = [pair for pair in zip(images, counts, strict=True) if pair[1]]
         self.samplers = [PatchSampler(_unit_range(image), device) for image, _ in pairs]
         self.ends = np.cumsum([count for _, count in pairs])
 
     def sample(self, lafs: NDArray[np.float64]) -> Tensor:
         """Return (N, 1, 32, 32) float32 patches of the (N, 2, 3) frames of all images in turn."""
+        import torch
+
         parts = np.split(lafs, self.ends[:-1])
         return torch.cat([s.sample(part) for s, part in zip(self.samplers, parts, strict=True)])
 
@@ -240,12 +277,16 @@ def _detector(
     options: AffNetHardNetOptions, weights: Mapping[str, Path], device: str
 ) -> nn.Module | None:
     """Build one of kornia's detectors; None stands for OpenCV's."""
+    if options.detector == "dog":
+        return None
+    from kornia.feature import MultiResolutionDetector, ScaleSpaceDetector
+
+    from colmap_affrect.features.networks import load_keynet, resolve_device
+
     count = options.max_num_features
     if options.detector == "keynet":
         return MultiResolutionDetector(load_keynet(weights["keynet"], device), count)
-    if options.detector == "hessian":
-        return ScaleSpaceDetector(count, MEASUREMENT_SIGMAS).to(resolve_device(device))
-    return None
+    return ScaleSpaceDetector(count, MEASUREMENT_SIGMAS).to(resolve_device(device))
 
 
 def _centers_from_keynet(

@@ -19,12 +19,10 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from colmap_affrect.errors import DeviceError, WeightsError
+from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict
 
 Network = TypeVar("Network", bound=nn.Module)
-
-PATCH_SIZE_PX = 32
-"""Side of the patches that all networks take."""
 
 DESCRIPTOR_SIZE = 128
 """Width of all descriptors."""

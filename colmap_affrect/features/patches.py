@@ -15,9 +15,9 @@ from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
 from colmap_affrect.conventions import HALF_PIXEL
-from colmap_affrect.features.networks import PATCH_SIZE_PX
+from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.geometry.affine import determinants
-from colmap_affrect.imaging import halved
+from colmap_affrect.images.warping import halved
 
 PATCHES_AT_ONCE = 512
 

@@ -15,15 +15,15 @@ import hashlib
 import os
 import pickle
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from http.client import HTTPException
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
 
 from colmap_affrect.errors import WeightsError
-from colmap_affrect.options import AffNetHardNetOptions
 from colmap_affrect.progress import SILENT, Progress
 
 ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
@@ -44,69 +44,54 @@ class WeightFile:
     Attributes:
         file_name: upstream's.
         used_for: the option that needs it, for people.
+        kornia: where kornia has its address: a module of ``kornia.feature``, a name in it, and
+            perhaps a key; empty if kornia does not have the file.
         licence: of the repository that publishes it; empty if it states none.
         sha256: of the file, where it could be computed; else empty.
     """
 
     file_name: str
     used_for: str
+    kornia: tuple[str, ...]
     licence: str = ""
     sha256: str = ""
 
 
 WEIGHT_FILES: dict[str, WeightFile] = {
-    "affnet": WeightFile(
-        "AffNet.pth",
-        "affine shapes",
-        "MIT",
-        "65c8bb2cf71e913818522d09dcc4262bcbcef5d756baa86a41f28526c2d61160",
-    ),
-    "orinet": WeightFile(
-        "OriNet.pth",
-        "orientation of learned features",
-        "MIT",
-        "030e7964ae3e136d00431c7e11c6b67df40ad299f02ac384fee0f1c3fd1dcb30",
-    ),
-    "hardnet": WeightFile("checkpoint_liberty_with_aug.pth", "descriptor hardnet", "MIT"),
-    "hardnet8": WeightFile("hardnet8v2.pt", "descriptor hardnet8", "MIT"),
-    "hynet": WeightFile("HyNet_LIB.pth", "descriptor hynet", "MIT"),
-    "sosnet": WeightFile("sosnet_32x32_liberty.pth", "descriptor sosnet"),
-    "tfeat": WeightFile("tfeat-liberty.params", "descriptor tfeat", "MIT"),
-    "mkd": WeightFile("mkd-concat-64.pth", "descriptor mkd", "MIT"),
-    "hardtfeat": WeightFile(
-        "HardTFeat.pth",
-        "descriptor hardtfeat",
-        "MIT",
-        "cd935728293309b666c20525696c8d323be5ffdac07b3340f4c1c1314e0b6542",
-    ),
-    "keynet": WeightFile("keynet_pytorch.pth", "detector keynet"),
-}
+    "affnet": WeightFile("AffNet.pth", "affine shapes", ("affine_shape", "urls", "affnet"), "MIT",
+        "65c8bb2cf71e913818522d09dcc4262bcbcef5d756baa86a41f28526c2d61160"),
+    "orinet": WeightFile("OriNet.pth", "orientation of learned features",
+        ("orientation", "urls", "orinet"), "MIT",
+        "030e7964ae3e136d00431c7e11c6b67df40ad299f02ac384fee0f1c3fd1dcb30"),
+    "hardnet": WeightFile("checkpoint_liberty_with_aug.pth", "descriptor hardnet",
+        ("hardnet", "urls", "liberty_aug"), "MIT"),
+    "hardnet8": WeightFile("hardnet8v2.pt", "descriptor hardnet8",
+        ("hardnet", "urls", "hardnet8v2"), "MIT"),
+    "hynet": WeightFile("HyNet_LIB.pth", "descriptor hynet", ("hynet", "urls", "liberty"), "MIT"),
+    "sosnet": WeightFile("sosnet_32x32_liberty.pth", "descriptor sosnet",
+        ("sosnet", "urls", "lib")),
+    "tfeat": WeightFile("tfeat-liberty.params", "descriptor tfeat",
+        ("tfeat", "urls", "liberty"), "MIT"),
+    "mkd": WeightFile("mkd-concat-64.pth", "descriptor mkd", ("mkd", "urls", "concat"), "MIT"),
+    "hardtfeat": WeightFile("HardTFeat.pth", "descriptor hardtfeat", (), "MIT",
+        "cd935728293309b666c20525696c8d323be5ffdac07b3340f4c1c1314e0b6542"),
+    "keynet": WeightFile("keynet_pytorch.pth", "detector keynet", ("keynet", "KeyNet_URL")),
+}  # fmt: skip
 """Published files by key; the key of a descriptor is its name in the options."""
 
-
-def profile_weights(options: AffNetHardNetOptions) -> tuple[str, ...]:
-    """Return the keys of the files that a learned feature profile reads."""
-    shape = ("affnet",) if options.affine_shape else ()
-    detector = ("keynet",) if options.detector == "keynet" else ()
-    return (*shape, "orinet", options.descriptor, *detector)
+HARDTFEAT_URL = "https://github.com/ducha-aiki/affnet/raw/789419aa70cc4419284a23463db2be214f143c74/HardTFeat.pth"
+"""A fixed commit of the repository of AffNet's author."""
 
 
 def resolve(
-    keys: Iterable[str],
-    weights_path: Path | None = None,
-    *,
-    download: bool = True,
-    progress: Progress = SILENT,
-    weightless_recipes: Sequence[str] = WEIGHTLESS_RECIPES,
+    keys: Iterable[str], weights_path: Path | None = None, *, progress: Progress = SILENT
 ) -> dict[str, Path]:
     """Find files of weights, or download them into torch's cache.
 
     Args:
         keys: of :data:`WEIGHT_FILES`.
         weights_path: folder to look into first.
-        download: whether files that are nowhere may be downloaded.
         progress: where the progress of downloads goes.
-        weightless_recipes: recipes that the error recommends.
 
     Returns:
         The path of each key.
@@ -117,19 +102,18 @@ def resolve(
     if weights_path is not None and not weights_path.is_dir():
         raise WeightsError(f"--weights {weights_path}: not a folder")
     found = {key: _find(key, weights_path) for key in keys}
-    missing = [key for key, path in found.items() if path is None]
-    reason = "downloads are off"
     try:
-        if download:
-            for key in missing:
-                found[key] = _download(key, cache_folder(), progress)
-            missing = []
+        return {k: path or _download(k, cache_folder(), progress) for k, path in found.items()}
     except WeightsError as error:
-        missing = [key for key in missing if found[key] is None]
-        reason = str(error)
-    if missing:
-        raise _missing_error(missing, weights_path, reason, weightless_recipes)
-    return {key: path for key, path in found.items() if path is not None}
+        missing = [WEIGHT_FILES[k].file_name for k in found if not _find(k, weights_path)]
+        given = weights_path or "not given"
+        variable = os.environ.get(ENVIRONMENT_VARIABLE) or "not set"
+        raise WeightsError(
+            f"weights not found: {', '.join(missing)}; looked in --weights ({given}), "
+            f"{ENVIRONMENT_VARIABLE} ({variable}) and {cache_folder()}; {error}; put the files "
+            f"into one of these folders, or use a recipe that needs no weights: "
+            f"{', '.join(WEIGHTLESS_RECIPES)}"
+        ) from error
 
 
 def fetch(
@@ -140,15 +124,14 @@ def fetch(
     Raises:
         WeightsError: for an unknown key, or when a download fails.
     """
-    keys = list(keys)
+    keys, folder = list(keys), folder or cache_folder()
     for key in keys:
         if key not in WEIGHT_FILES:
             raise WeightsError(f"unknown weights '{key}' (known: {', '.join(WEIGHT_FILES)})")
-    target = cache_folder() if folder is None else folder
-    paths = {}
-    for key in keys:
-        path = target / WEIGHT_FILES[key].file_name
-        paths[key] = path if path.is_file() else _download(key, target, progress)
+    paths = {key: folder / WEIGHT_FILES[key].file_name for key in keys}
+    for key, path in paths.items():
+        if not path.is_file():
+            _download(key, folder, progress)
     return paths
 
 
@@ -158,34 +141,26 @@ class WeightStatus:
 
     Attributes:
         key: of :data:`WEIGHT_FILES`.
-        file_name, used_for, licence: as published.
+        published: the file as it should be.
         path: where it was found; None if nowhere.
         verified: whether its sha256 is that of the published file; None if there is no file
             or no sha256 to compare with.
     """
 
     key: str
-    file_name: str
-    used_for: str
-    licence: str
+    published: WeightFile
     path: Path | None
     verified: bool | None
 
 
 def describe_weights(weights_path: Path | None = None) -> list[WeightStatus]:
     """Look for all files of weights, without downloading any."""
-    return [_status(key, weights_path) for key in WEIGHT_FILES]
-
-
-def _status(key: str, weights_path: Path | None) -> WeightStatus:
-    published = WEIGHT_FILES[key]
-    path = _find(key, weights_path)
-    verified = None
-    if path is not None and published.sha256:
-        verified = file_sha256(path) == published.sha256
-    return WeightStatus(
-        key, published.file_name, published.used_for, published.licence, path, verified
-    )
+    rows = []
+    for key, file in WEIGHT_FILES.items():
+        path = _find(key, weights_path)
+        verified = file_sha256(path) == file.sha256 if path and file.sha256 else None
+        rows.append(WeightStatus(key, file, path, verified))
+    return rows
 
 
 def file_sha256(path: Path) -> str:
@@ -242,65 +217,21 @@ def cache_folder() -> Path:
 
 
 def download_urls(key: str) -> tuple[str, ...]:
-    """Return the addresses of a file, best first: those of kornia's own tables.
-
-    ``hardtfeat`` is not in kornia; its address is a fixed commit of the AffNet author's
-    repository.
-    """
-    from kornia.feature import (
-        affine_shape,
-        hardnet,
-        hynet,
-        keynet,
-        mkd,
-        orientation,
-        sosnet,
-        tfeat,
-    )
-
-    urls: dict[str, str | list[str]] = {
-        "affnet": affine_shape.urls["affnet"],
-        "orinet": orientation.urls["orinet"],
-        "hardnet": hardnet.urls["liberty_aug"],
-        "hardnet8": hardnet.urls["hardnet8v2"],
-        "hynet": hynet.urls["liberty"],
-        "sosnet": sosnet.urls["lib"],
-        "tfeat": tfeat.urls["liberty"],
-        "mkd": mkd.urls["concat"],
-        "hardtfeat": (
-            "https://github.com/ducha-aiki/affnet/raw/"
-            "789419aa70cc4419284a23463db2be214f143c74/HardTFeat.pth"
-        ),
-        "keynet": keynet.KeyNet_URL,
-    }
-    found = urls[key]
+    """Return the addresses of a file, best first: those that kornia has."""
+    if not WEIGHT_FILES[key].kornia:
+        return (HARDTFEAT_URL,)
+    module, name, *keys = WEIGHT_FILES[key].kornia
+    found = getattr(import_module(f"kornia.feature.{module}"), name)
+    for part in keys:
+        found = found[part]
     return (found,) if isinstance(found, str) else tuple(found)
 
 
-def _folders(weights_path: Path | None) -> Iterator[Path]:
-    if weights_path is not None:
-        yield weights_path
-    if folder := os.environ.get(ENVIRONMENT_VARIABLE):
-        yield Path(folder).expanduser()
-    yield cache_folder()
-
-
 def _find(key: str, weights_path: Path | None) -> Path | None:
-    paths = (folder / WEIGHT_FILES[key].file_name for folder in _folders(weights_path))
+    variable = os.environ.get(ENVIRONMENT_VARIABLE)
+    folders = [weights_path, variable and Path(variable).expanduser(), cache_folder()]
+    paths = (folder / WEIGHT_FILES[key].file_name for folder in folders if folder)
     return next((path for path in paths if path.is_file()), None)
-
-
-def _missing_error(
-    missing: Sequence[str], weights_path: Path | None, reason: str, recipes: Sequence[str]
-) -> WeightsError:
-    names = ", ".join(WEIGHT_FILES[key].file_name for key in missing)
-    given = weights_path or "not given"
-    variable = os.environ.get(ENVIRONMENT_VARIABLE) or "not set"
-    return WeightsError(
-        f"weights not found: {names}; looked in --weights ({given}), {ENVIRONMENT_VARIABLE} "
-        f"({variable}) and {cache_folder()}; {reason}; put the files into one of these folders, "
-        f"or use a recipe that needs no weights: {', '.join(recipes)}"
-    )
 
 
 def _download(key: str, folder: Path, progress: Progress) -> Path:

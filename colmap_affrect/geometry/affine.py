@@ -1,11 +1,9 @@
-"""Affine maps, their decomposition into tilt coordinates, and local affine frames."""
+"""Affine maps from tilt coordinates, and local affine frames."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 
 
 def rotation(angle_rad: ArrayLike) -> NDArray[np.float64]:
@@ -15,7 +13,7 @@ def rotation(angle_rad: ArrayLike) -> NDArray[np.float64]:
 
 
 def determinants(matrices: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the (...) determinants of (..., 2, 2) matrices, 14 times as fast as numpy for 100."""
+    """Return the (...) determinants of (..., 2, 2) matrices, faster than numpy for few of them."""
     return np.asarray(
         matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0]
     )
@@ -29,23 +27,6 @@ def compose_affine(
     stretch = np.stack([tilt, np.ones_like(tilt)], -1)[..., :, None]
     matrix = rotation(psi_rad) @ (stretch * rotation(phi_rad))
     return np.asarray(np.asarray(scale, dtype=np.float64)[..., None, None] * matrix)
-
-
-def decompose_affine(
-    matrices: NDArray[np.floating],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Invert :func:`compose_affine` for (..., 2, 2) matrices of positive determinant.
-
-    Returns:
-        scale > 0, psi in (-pi, pi], tilt >= 1, phi in [0, pi); angles in radians. At
-        tilt 1 only psi + phi has a meaning.
-    """
-    matrices = np.asarray(matrices, dtype=np.float64)
-    tilt, phi = tilts_from_metrics(unit_metrics(matrices))
-    scale = np.sqrt(determinants(matrices) / tilt)
-    unrotated = matrices @ rotation(-phi)
-    psi = np.arctan2(-unrotated[..., 0, 1], unrotated[..., 1, 1])
-    return scale, psi, tilt, phi
 
 
 def project(homography: NDArray[np.floating], points: NDArray[np.floating]) -> NDArray[np.float64]:

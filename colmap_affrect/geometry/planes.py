@@ -229,8 +229,8 @@ def fronto_parallel_homography(
 ) -> NDArray[np.float64]:
     """Return the (3, 3) map to the view that a camera turned towards a plane would have.
 
-    It is K R K^-1 with R the smallest rotation that turns the plane's normal onto the optical
-    axis. Its third coordinate at a pixel (x, y, 1) is -n . r with the pixel's ray
+    It is K R K^-1 with R the smallest rotation that turns -n, which points into the plane, onto
+    the optical axis. Its third coordinate at a pixel (x, y, 1) is -n . r with the pixel's ray
     r = K^-1 (x, y, 1): positive where the pixel can see the front of the plane.
 
     Args:

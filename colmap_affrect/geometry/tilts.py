@@ -73,15 +73,6 @@ def cosh_distances(
     return np.asarray(metrics1 @ swapped.T) / 2.0
 
 
-def tilt_distance(tilt1: float, angle1_rad: float, tilt2: float, angle2_rad: float) -> float:
-    """Return d = log tau, the log of the transition tilt between two classes.
-
-    cosh d = ((t1/t2 + t2/t1) cos^2 D + (t1 t2 + 1/(t1 t2)) sin^2 D) / 2 with D = phi1 - phi2.
-    """
-    metrics = metrics_from_tilts([tilt1, tilt2], [angle1_rad, angle2_rad])
-    return float(np.arccosh(np.maximum(cosh_distances(metrics[:1], metrics[1:])[0, 0], 1.0)))
-
-
 def ball_threshold(radius: float) -> float:
     """Return cosh(log r): a class is in the r-ball of another when cosh d is below it.
 

@@ -5,12 +5,21 @@ The paper's DepthAffNet (Sec. 3): segments as in ``depth-planes``, maps as in ``
 
 from __future__ import annotations
 
-from colmap_affrect.interfaces import Sources
-from colmap_affrect.options import DepthAffNetOptions
-from colmap_affrect.rectifiers.covers import covering_centers
-from colmap_affrect.rectifiers.depth_planes import planar_segments
+from typing import ClassVar, Literal
+
+from colmap_affrect.data import Photograph, Rectification, RectificationPlan
+from colmap_affrect.rectifiers.base import CoverOptions, RectifierInputs
+from colmap_affrect.rectifiers.depth_planes import PlaneOptions, planar_segments
 from colmap_affrect.rectifiers.regions import affine_rectification
-from colmap_affrect.types import Photograph, Rectification, RectificationPlan
+from colmap_affrect.rectifiers.whole_image import covering_centers
+
+
+class DepthAffNetOptions(CoverOptions):
+    """Planar regions from depth, each warped by a cover of the shapes inside it."""
+
+    name: Literal["depth-affnet"] = "depth-affnet"
+    planes: PlaneOptions = PlaneOptions()
+    uses_depth: ClassVar[bool] = True
 
 
 class DepthAffNet:
@@ -18,8 +27,8 @@ class DepthAffNet:
 
     Options = DepthAffNetOptions
 
-    def __init__(self, options: DepthAffNetOptions, sources: Sources) -> None:
-        """See :mod:`colmap_affrect.interfaces`."""
+    def __init__(self, options: DepthAffNetOptions, sources: RectifierInputs) -> None:
+        """See :mod:`colmap_affrect.rectifiers.base`."""
         self.options = options
         self.shapes = sources.required_shapes()
         self.source = sources.required_depth()

@@ -7,11 +7,13 @@ map, their clusters on the sphere, connected segments of each cluster.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.conventions import resized_from_original
+from colmap_affrect.data import Mask, Photograph, RectificationPlan
 from colmap_affrect.geometry.planes import (
     cluster_normals,
     fronto_parallel_homography,
@@ -19,11 +21,10 @@ from colmap_affrect.geometry.planes import (
     shrink_depth,
     viewing_cosines,
 )
-from colmap_affrect.imaging import connected_regions
-from colmap_affrect.interfaces import Sources
-from colmap_affrect.options import DepthPlanesOptions, PlaneOptions
+from colmap_affrect.images.masks import connected_regions
+from colmap_affrect.options import Options, within
+from colmap_affrect.rectifiers.base import RectifierInputs, RectifierOptions
 from colmap_affrect.rectifiers.regions import Region, homography_rectification
-from colmap_affrect.types import Mask, Photograph, RectificationPlan
 
 MAX_DEPTH_SIZE_PX = 640
 """Larger depth maps are shrunk to this: windows of 5 x 5 px of them see too little of a plane,
@@ -43,13 +44,46 @@ class PlanarSegment:
     normal: NDArray[np.float64]
 
 
+class PlaneOptions(Options):
+    """Planes from the normals of a depth map (the paper's depth-map-based method)."""
+
+    num_candidates: Annotated[int, within(10, 100_000)] = 500
+    """Candidate normals, on a spiral over the whole sphere. Paper: 500."""
+    bin_angle_deg: Annotated[float, within(1.0, 89.0)] = 35.0
+    """Normals at most this far from a candidate vote for it."""
+    min_separation_deg: Annotated[float, within(0.0, 180.0)] = 87.5
+    """Planes are at least this far apart."""
+    max_num_planes: Annotated[int, within(1, 100)] = 3
+    min_votes_frac: Annotated[float, within(0.0, 1.0)] = 0.15
+    """Share of the pixels that a plane must have."""
+    max_angle_deg: Annotated[float, within(0.0, 85.0)] = 75.0
+    """Planes seen at a larger angle are not rectified."""
+    min_region_frac: Annotated[float, within(0.0, 1.0)] = 0.03
+    """Connected regions of a smaller share of the image are not rectified."""
+    orthogonal: bool = False
+    """Turn the normals of up to three planes into exactly orthogonal ones."""
+    antipodal: bool = False
+    """Count opposite normals as one plane."""
+
+
+class DepthPlanesOptions(RectifierOptions):
+    """One homography per planar region, as if seen from the front."""
+
+    name: Literal["depth-planes"] = "depth-planes"
+    planes: PlaneOptions = PlaneOptions()
+    keep_original: Literal["everywhere", "outside"] = "everywhere"
+    """Features of the photograph itself are kept ``everywhere`` or ``outside`` of the rectified
+    regions (the paper)."""
+    uses_depth: ClassVar[bool] = True
+
+
 class DepthPlanes:
     """Planar segments as if seen from the front."""
 
     Options = DepthPlanesOptions
 
-    def __init__(self, options: DepthPlanesOptions, sources: Sources) -> None:
-        """See :mod:`colmap_affrect.interfaces`."""
+    def __init__(self, options: DepthPlanesOptions, sources: RectifierInputs) -> None:
+        """See :mod:`colmap_affrect.rectifiers.base`."""
         self.options = options
         self.source = sources.required_depth()
 

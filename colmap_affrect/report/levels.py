@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from time import perf_counter
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.extraction import MIN_RECTIFIABLE_PX, ImageExtractor
-from colmap_affrect.interfaces import DepthSource, FeatureProfile, ShapeSource
-from colmap_affrect.options import DenseShapesOptions, RectifierOptions
-from colmap_affrect.types import (
+from colmap_affrect.data import (
     GrayImage,
     LocalFeatures,
     Photograph,
@@ -22,22 +18,15 @@ from colmap_affrect.types import (
     ShapeSamples,
     View,
 )
+from colmap_affrect.features.base import FeatureExtractor, ShapeSource
+from colmap_affrect.images.depth import DepthSource
+from colmap_affrect.project.stopwatch import Stopwatch
+from colmap_affrect.rectifiers.base import RectifierOptions
+from colmap_affrect.rectifiers.dense import DenseShapesOptions
+from colmap_affrect.report.regions import bounding_box, region_area_px
+from colmap_affrect.stages.one_image import MIN_RECTIFIABLE_PX, ImageExtractor
 
 PIXELS_PER_MEGAPIXEL = 1_000_000
-
-
-@runtime_checkable
-class ReadsShapes(Protocol):
-    """A rectifier whose warps follow affine shapes; one without this attribute shows none."""
-
-    shapes: ShapeSource | None
-
-
-@runtime_checkable
-class ReadsDepth(Protocol):
-    """A rectifier whose regions follow a depth map; one without this attribute shows none."""
-
-    source: DepthSource | None
 
 
 @dataclass(frozen=True)
@@ -47,7 +36,7 @@ class InspectedLevel:
     Attributes:
         number: 0 for the level that every image gets.
         options: of its rectifier.
-        profile_name: of the features.
+        extractor_name: of the features.
         photograph: at the size of processing; coordinates are px of it where nothing else is said.
         plan: of the rectifier.
         warning: why it was not rectified though it was to be; empty if all went well.
@@ -61,7 +50,7 @@ class InspectedLevel:
 
     number: int
     options: RectifierOptions
-    profile_name: str
+    extractor_name: str
     photograph: Photograph
     plan: RectificationPlan
     warning: str
@@ -85,20 +74,19 @@ class InspectedLevel:
 
 def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int) -> InspectedLevel:
     """Carry out level ``number`` of a recipe as extraction does, and keep all that passes by."""
-    start = perf_counter()
-    plan, warning = extractor.plan_or_warn(photograph, number)
-    planned = perf_counter()
-    recorder = _Recorder(extractor.profile)
-    recording = replace(extractor, profile=recorder)
-    features = recording.execute(
-        photograph.gray, plan, with_original=number == 0, mask=photograph.mask
-    )
-    executed = perf_counter()
+    watch = Stopwatch("plan", "warp and choose", "detect", "describe")
+    with watch.step("plan"):
+        plan, warning = extractor.plan_or_warn(photograph, number)
+    recorder = _Recorder(extractor.extractor, watch)
+    with watch.step("warp and choose"):
+        features = replace(extractor, extractor=recorder).execute(
+            photograph, plan, with_original=number == 0
+        )
     first_id = 0 if number == 0 else 1
     return InspectedLevel(
         number,
         extractor.options.rectifiers[number],
-        extractor.options.features.profile,
+        extractor.options.features.name,
         photograph,
         plan,
         warning,
@@ -107,64 +95,67 @@ def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int
         features,
         _shapes(extractor, photograph, number),
         None if warning else _depth(extractor, photograph, number),
-        {
-            "plan": planned - start,
-            "warp and choose": executed - planned - recorder.detect_s - recorder.describe_s,
-            "detect": recorder.detect_s,
-            "describe": recorder.describe_s,
-        },
+        watch.seconds,
     )
 
 
-class _Recorder:
-    """A feature profile that keeps, in order, what another one is shown and finds in it."""
+class TimedFeatures:
+    """A feature extractor that takes the time of the steps of another one."""
 
-    def __init__(self, profile: FeatureProfile) -> None:
-        self.profile = profile
-        self.descriptor_size = profile.descriptor_size
-        self.views: list[View] = []
-        self.found: list[LocalFeatures] = []
-        self.detect_s = self.describe_s = 0.0
+    def __init__(self, extractor: FeatureExtractor, watch: Stopwatch) -> None:
+        self.extractor, self.watch = extractor, watch
+        self.descriptor_size = extractor.descriptor_size
 
     def detect(self, view: View) -> LocalFeatures:
-        start = perf_counter()
-        found = self.profile.detect(view)
-        self.detect_s += perf_counter() - start
-        self.views.append(view)
-        self.found.append(found)
-        return found
+        """See :class:`FeatureExtractor`."""
+        with self.watch.step("detect"):
+            return self.extractor.detect(view)
 
     def describe(
         self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
     ) -> list[LocalFeatures]:
-        start = perf_counter()
-        described = self.profile.describe(images, detected)
-        self.describe_s += perf_counter() - start
-        return described
+        """See :class:`FeatureExtractor`."""
+        with self.watch.step("describe"):
+            return self.extractor.describe(images, detected)
+
+
+class _Recorder(TimedFeatures):
+    """Keeps too, in order, what the extractor is shown and finds in it."""
+
+    def __init__(self, extractor: FeatureExtractor, watch: Stopwatch) -> None:
+        super().__init__(extractor, watch)
+        self.views: list[View] = []
+        self.found: list[LocalFeatures] = []
+
+    def detect(self, view: View) -> LocalFeatures:
+        self.views.append(view)
+        self.found.append(super().detect(view))
+        return self.found[-1]
 
 
 def _shapes(extractor: ImageExtractor, photograph: Photograph, number: int) -> ShapeSamples | None:
-    """Read the affine shapes again that the rectifier of a level has read."""
-    rectifier = extractor.rectifiers[number]
-    if not isinstance(rectifier, ReadsShapes) or rectifier.shapes is None:
-        return None
-    if min(photograph.size) < MIN_RECTIFIABLE_PX:
+    """Read the affine shapes again that the rectifier of a level has read; None for none."""
+    source: ShapeSource | None = _read_by(extractor, photograph, number, "shapes")
+    if source is None:
         return None
     if isinstance(extractor.options.rectifiers[number], DenseShapesOptions):
-        return rectifier.shapes.grid(photograph.gray).samples()
-    return rectifier.shapes.samples(photograph.gray)
+        return source.grid(photograph.gray).samples()
+    return source.samples(photograph.gray)
 
 
 def _depth(
     extractor: ImageExtractor, photograph: Photograph, number: int
 ) -> NDArray[np.floating] | None:
-    """Read the depth map again that the rectifier of a level has read."""
-    rectifier = extractor.rectifiers[number]
-    if not isinstance(rectifier, ReadsDepth) or rectifier.source is None:
-        return None
+    """Read the depth map again that the rectifier of a level has read; None for none."""
+    source: DepthSource | None = _read_by(extractor, photograph, number, "source")
+    return source.depth(photograph) if source else None
+
+
+def _read_by(extractor: ImageExtractor, photograph: Photograph, number: int, name: str) -> Any:
+    """Return an attribute of the rectifier of a level, None if it does without or is not asked."""
     if min(photograph.size) < MIN_RECTIFIABLE_PX:
         return None
-    return rectifier.source.depth(photograph)
+    return getattr(extractor.rectifiers[number], name, None)
 
 
 def describe_level(level: InspectedLevel) -> dict[str, Any]:
@@ -178,7 +169,7 @@ def describe_level(level: InspectedLevel) -> dict[str, Any]:
     return {
         "level": level.number,
         "rectifier": level.options.name,
-        "features": level.profile_name,
+        "features": level.extractor_name,
         "warning": level.warning,
         "original": {
             "features_found": len(level.found[0]) if 0 in level.found else 0,
@@ -215,23 +206,6 @@ def _describe_warp(level: InspectedLevel, warp_id: int, item: Rectification) -> 
         "features_found": len(level.found[warp_id]),
         "features_kept": len(level.kept_of(warp_id)),
     }
-
-
-def region_area_px(item: Rectification, image_size: tuple[int, int]) -> int:
-    """Count the pixels of a region in an image of (width, height)."""
-    if item.region is None:
-        return image_size[0] * image_size[1]
-    return int(np.count_nonzero(item.region))
-
-
-def bounding_box(item: Rectification, image_size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return left, top, width and height of a region in an image of (width, height), in px."""
-    if item.region is None:
-        return (0, 0, *image_size)
-    columns = np.flatnonzero(item.region.any(axis=0))
-    rows = np.flatnonzero(item.region.any(axis=1))
-    left, top = item.region_origin[0] + int(columns[0]), item.region_origin[1] + int(rows[0])
-    return left, top, int(columns[-1] - columns[0]) + 1, int(rows[-1] - rows[0]) + 1
 
 
 def summary(level: InspectedLevel) -> str:

@@ -11,11 +11,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.data import ColorImage, GrayImage
 from colmap_affrect.errors import ImageError
-from colmap_affrect.executor import available_cores, map_ordered
-from colmap_affrect.imaging import encode_jpeg, encode_png, read_color
+from colmap_affrect.images.reading import encode_jpeg, encode_png, read_color
+from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.types import ColorImage, GrayImage
 
 JPEG_QUALITY = 70
 

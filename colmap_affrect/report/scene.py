@@ -1,17 +1,17 @@
-"""Cameras and points of the models of several methods, in one frame, to be drawn in a page."""
+"""Cameras and points of models, in one frame, to be drawn in a page."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import registered_names
-from colmap_affrect.comparison.results import MethodResult
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.report.pictures import Picture, base64_text
 
@@ -36,21 +36,17 @@ STILL_SIZE_PX = (800, 600)
 
 @dataclass(frozen=True)
 class View3D:
-    """The model of one method, ready for the page; lengths in units of the view's radius.
+    """A model ready for the page; lengths in units of the view's radius.
 
     Attributes:
-        method: its name.
-        seed: whose model it is.
         num_points: points in ``points``.
         points: (N, 3) uint16 positions from -1 to 1 and then (N, 3) uint8 colours, as base64.
         cameras: name and (5, 3) centre and corners of the pyramid of each camera.
-        still: the points from above.
+        still: the points from above; None without a model.
         pyramids: SVG path of each camera by name, in px of the still picture.
         note: what is special about it; empty if nothing is.
     """
 
-    method: str
-    seed: int = 0
     num_points: int = 0
     points: str = ""
     cameras: tuple[tuple[str, Array], ...] = ()
@@ -61,15 +57,30 @@ class View3D:
 
 @dataclass(frozen=True)
 class Scene:
-    """The models of all methods.
+    """Models to be shown side by side.
 
     Attributes:
-        views: one per method.
+        views: one per model.
         zoom: with which they fill the view from above.
     """
 
     views: tuple[View3D, ...]
     zoom: float
+
+    def script_data(self) -> dict[str, Any]:
+        """Return what the script of the page reads."""
+        views = [
+            {
+                "points": view.points,
+                "count": view.num_points,
+                "cameras": [
+                    {"name": name, "corners": corners.round(4).ravel().tolist()}
+                    for name, corners in view.cameras
+                ],
+            }
+            for view in self.views
+        ]
+        return {"zoom": self.zoom, "views": views}
 
 
 @dataclass(frozen=True)
@@ -82,7 +93,6 @@ class Model:
         axes: (M, 3, 3) rotations world_from_camera.
         half_sizes: (M, 2) half width and height of the view at depth 1.
         points, colors: (N, 3) and (N, 3) uint8; at most ``MAX_NUM_POINTS``.
-        seed: that it was made with.
     """
 
     names: tuple[str, ...]
@@ -91,7 +101,6 @@ class Model:
     half_sizes: Array
     points: Array
     colors: NDArray[np.uint8]
-    seed: int
 
     def transformed(self, scale: float, rotation: Array, translation: Array) -> Model:
         """Return it after x -> scale rotation x + translation."""
@@ -103,48 +112,37 @@ class Model:
         )
 
 
-def read_scene(methods: Sequence[MethodResult], output_path: Path) -> Scene:
-    """Read the models, bring them into the frame of the largest, and prepare them for the page.
+def read_scene(paths: Mapping[str, Path | None]) -> Scene:
+    """Read models, bring them into the frame of the largest, and prepare them for the page.
 
     Args:
-        methods: each is shown with the first seed that has a model.
-        output_path: folder of the comparison.
+        paths: folders of the models by the names that they have on the page; None for no model.
     """
-    models, notes = read_models(methods, output_path)
+    models, notes = read_models(paths)
     zoom = _zoom_from_above(list(models.values()))
-    views = []
-    for method in methods:
-        note = notes.get(method.name, "")
-        if method.name in models:
-            views.append(_view(method.name, models[method.name], note, zoom))
-        else:
-            views.append(View3D(method.name, note=note))
-    return Scene(tuple(views), zoom)
+    views = {name: _view(model, notes.get(name, ""), zoom) for name, model in models.items()}
+    return Scene(tuple(views.get(name) or View3D(note=notes[name]) for name in paths), zoom)
 
 
-def read_models(
-    methods: Sequence[MethodResult], output_path: Path
-) -> tuple[dict[str, Model], dict[str, str]]:
-    """Read the models of methods and bring them into the frame of the largest.
+def read_models(paths: Mapping[str, Path | None]) -> tuple[dict[str, Model], dict[str, str]]:
+    """Read models and bring them into the frame of the largest.
 
     Args:
-        methods: each with the first seed that has a model.
-        output_path: folder of the comparison.
+        paths: folders of the models by name; None for no model.
 
     Returns:
-        The models, and what is special about them or why they are missing, by method.
+        The models, and what is special about them or why they are missing, by name.
     """
     models: dict[str, Model] = {}
     notes: dict[str, str] = {}
-    for method in methods:
-        seed = next((seed for seed in method.seeds if seed.model_path), None)
-        if seed is None:
-            notes[method.name] = "There is no model."
+    for name, path in paths.items():
+        if path is None:
+            notes[name] = "There is no model."
             continue
         try:
-            models[method.name] = _read(output_path / seed.model_path, seed.seed)
+            models[name] = _read(path)
         except AffrectError as error:
-            notes[method.name] = f"The model cannot be shown: {error}"
+            notes[name] = f"The model cannot be shown: {error}"
     return (_in_one_frame(models, notes) if models else {}), notes
 
 
@@ -166,7 +164,7 @@ def _zoom_from_above(models: Sequence[Model]) -> float:
     return float(np.clip(zoom, 1.0, 3.0))
 
 
-def _read(path: Path, seed: int) -> Model:
+def _read(path: Path) -> Model:
     registered_names(path)
     model = pycolmap.Reconstruction(path)
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
@@ -186,7 +184,6 @@ def _read(path: Path, seed: int) -> Model:
         np.array(sizes),
         np.array([point.xyz for point in points]).reshape(-1, 3),
         np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
-        seed,
     )
 
 
@@ -262,7 +259,7 @@ def _upright(model: Model) -> Model:
     return model.transformed(1 / radius, rotation, -middle / radius)
 
 
-def _view(method: str, model: Model, note: str, zoom: float) -> View3D:
+def _view(model: Model, note: str, zoom: float) -> View3D:
     inside = np.abs(model.points).max(axis=1, initial=0.0) <= 1.0
     points, colors = model.points[inside], model.colors[inside]
     if not colors.any():
@@ -271,8 +268,6 @@ def _view(method: str, model: Model, note: str, zoom: float) -> View3D:
     quantised = np.rint((points + 1.0) / 2.0 * np.iinfo(np.uint16).max).astype("<u2")
     cameras = tuple(zip(model.names, _pyramids(model), strict=True))
     return View3D(
-        method,
-        model.seed,
         len(points),
         base64_text(quantised.tobytes() + colors.tobytes()),
         cameras,

@@ -7,18 +7,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.patches import Arc, Polygon, Wedge
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
+from colmap_affrect.data import ShapeSamples
 from colmap_affrect.geometry.affine import compose_affine
 from colmap_affrect.geometry.canvas import rectifying_affine
-from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
-
-Color = tuple[float, float, float]
+from colmap_affrect.geometry.tilts import (
+    IDENTITY_LABEL,
+    nearest_centers,
+    tilts_from_metrics,
+    unit_metrics,
+)
+from colmap_affrect.rectifiers.base import CoverOptions
+from colmap_affrect.report.levels import InspectedLevel
+from colmap_affrect.report.regions import Color
 
 TICKS = (2, 3, 4, 6, 8, 12, 20)
 """Tilts written along the diameter."""
@@ -28,7 +37,8 @@ SIDE, BELOW, ABOVE = 1.10, 0.10, 1.12
 
 HEIGHT_PER_WIDTH = (BELOW + ABOVE) / (2 * SIDE)
 
-DARK, GRID = "#333333", "#CCCCCC"
+DARK, GRID, FAINT = "#333333", "#CCCCCC", "#999999"
+MAX_NUM_SHAPES = 6000
 
 
 @dataclass(frozen=True)
@@ -47,16 +57,14 @@ class TiltClass:
     color: Color
 
 
-def ball_outline(
-    tilt: float, angle_rad: float, radius: float, num_points: int = 361
-) -> NDArray[np.float64]:
+def ball_outline(tilt: float, angle_rad: float, radius: float) -> NDArray[np.float64]:
     """Return (N, 2) rows (tilt, angle_rad) of classes whose transition tilt to one is ``radius``.
 
     They are the classes of diag(r, 1) R(a) M for all a, where M is a map of the class: the
     transition tilt does not change when both maps are multiplied by M from the right. Angles run
     on without jumps, beyond [0, pi) too; the curve ends at the class where it began.
     """
-    turns = np.linspace(0.0, np.pi, num_points)
+    turns = np.linspace(0.0, np.pi, 361)
     maps = compose_affine(1.0, 0.0, radius, turns) @ rectifying_affine(tilt, angle_rad)
     tilts, angles = tilts_from_metrics(unit_metrics(maps))
     return np.stack([tilts, np.unwrap(angles, period=np.pi)], axis=1)
@@ -68,28 +76,34 @@ def plane_points(classes: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.stack([np.log(tilts) * np.cos(angles), np.log(tilts) * np.sin(angles)], axis=1)
 
 
+def tilt_space_captions(level: InspectedLevel) -> tuple[str, str]:
+    """Return two lines that say how to read the space of tilts of a level."""
+    maps = "dots: maps of the warps" if level.plan.items else "no maps are needed"
+    axes = "radius: log tilt; angle: direction that the warp stretches"
+    if level.shapes is None or not isinstance(level.options, CoverOptions):
+        return axes, maps
+    options = level.options
+    balls = (
+        f"closed curves: balls r = {options.tilt_radius:g} round the maps; inner half circle: that"
+        f" of the identity; dashed: largest tilt {options.max_tilt:g}"
+    )
+    owner = "region" if any(item.region is not None for item in level.plan.items) else "ball"
+    return f"{axes}; {maps}; points: shapes, coloured as their {owner}", balls
+
+
 def draw_tilt_space(
-    axes: Axes,
-    largest_tilt: float,
-    classes: Sequence[TiltClass],
-    *,
-    shapes: NDArray[np.floating],
-    shape_colors: Sequence[Color],
-    radius: float | None,
-    max_tilt: float | None,
+    axes: Axes, level: InspectedLevel, classes: Sequence[TiltClass], colors: Sequence[Color]
 ) -> None:
-    """Draw shapes, classes of maps and their balls into axes of ``HEIGHT_PER_WIDTH``.
+    """Draw the shapes and maps of a level, and the balls of its cover, if it has one.
 
     Args:
-        axes: empty ones.
-        largest_tilt: where the disc ends.
+        axes: empty ones of ``HEIGHT_PER_WIDTH``.
+        level: its shapes are drawn as points.
         classes: maps to mark.
-        shapes: (N, 2) rows (tilt, angle_rad), drawn as points.
-        shape_colors: N colours.
-        radius: r of the balls, as a tilt ratio; None draws none.
-        max_tilt: drawn as a dashed half circle; None draws none.
+        colors: of the warps.
     """
-    edge = float(np.log(largest_tilt))
+    cover = level.options if isinstance(level.options, CoverOptions) else None
+    edge = np.log(1.2 * max([cover.max_tilt if cover else 2.0, *(item.tilt for item in classes)]))
     axes.set_xlim(-SIDE * edge, SIDE * edge)
     axes.set_ylim(-BELOW * edge, ABOVE * edge)
     axes.set_aspect("equal")
@@ -97,17 +111,36 @@ def draw_tilt_space(
     disc = Wedge((0.0, 0.0), edge, 0.0, 180.0, facecolor="white", edgecolor=GRID, linewidth=1.0)
     axes.add_patch(disc)
     _draw_grid(axes, edge)
-    x, y = plane_points(shapes).T
-    points = axes.scatter(x, y, s=5, c=shape_colors, alpha=0.45, linewidths=0)
-    points.set_clip_path(disc)
-    if radius is not None:
-        _draw_half_circle(axes, float(np.log(radius)), "-")
+    if level.shapes is not None:
+        every = max(1, -(-len(level.shapes.points) // MAX_NUM_SHAPES))
+        shapes = ShapeSamples(level.shapes.points[::every], level.shapes.metrics[::every])
+        x, y = plane_points(np.stack(tilts_from_metrics(shapes.metrics), axis=1)).T
+        shown = axes.scatter(
+            x, y, s=5, c=shape_colors(shapes, level, colors), alpha=0.45, linewidths=0
+        )
+        shown.set_clip_path(disc)
+    if cover:
+        _draw_half_circle(axes, np.log(cover.tilt_radius), "-")
         for item in classes:
-            _draw_ball(axes, item, radius, disc)
-    if max_tilt is not None:
-        _draw_half_circle(axes, float(np.log(max_tilt)), "--")
+            _draw_ball(axes, item, cover.tilt_radius, disc)
+        _draw_half_circle(axes, np.log(cover.max_tilt), "--")
     for item in classes:
         _draw_mark(axes, item)
+
+
+def shape_colors(
+    shapes: ShapeSamples, level: InspectedLevel, colors: Sequence[Color]
+) -> list[Color]:
+    """Colour shapes as the region they lie in, or as the ball where warps show the whole image."""
+    items = level.plan.items
+    owners = np.full(len(shapes.points), IDENTITY_LABEL)
+    if any(item.region is not None for item in items):
+        for index, item in enumerate(items):
+            owners[item.in_region(shapes.points)] = index
+    elif items and isinstance(level.options, CoverOptions):
+        centers = np.array([[item.tilt, item.tilt_angle_rad] for item in items])
+        owners = nearest_centers(shapes.metrics, centers, level.options.tilt_radius)
+    return [colors[owner] if owner >= 0 else to_rgb(FAINT) for owner in owners.tolist()]
 
 
 def _draw_grid(axes: Axes, edge: float) -> None:
@@ -127,17 +160,8 @@ def _draw_grid(axes: Axes, edge: float) -> None:
 def _draw_half_circle(
     axes: Axes, radius: float, linestyle: str, color: str = DARK, linewidth: float = 1.4
 ) -> None:
-    axes.add_patch(
-        Arc(
-            (0.0, 0.0),
-            2 * radius,
-            2 * radius,
-            theta2=180.0,
-            linestyle=linestyle,
-            color=color,
-            linewidth=linewidth,
-        )
-    )
+    style: dict[str, Any] = {"linestyle": linestyle, "color": color, "linewidth": linewidth}
+    axes.add_patch(Arc((0.0, 0.0), 2 * radius, 2 * radius, theta2=180.0, **style))
 
 
 def _draw_ball(axes: Axes, item: TiltClass, radius: float, disc: Wedge) -> None:

@@ -10,7 +10,7 @@ import networkx
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.comparison.results import Pair
+from colmap_affrect.pairs.base import Pair
 from colmap_affrect.report.pictures import Picture, base64_text
 
 CLASS_STARTS = (1, 30, 60, 120, 240, 480)
@@ -56,8 +56,27 @@ def class_labels() -> list[str]:
 
 
 @dataclass(frozen=True)
+class Node:
+    """A photograph in a view graph.
+
+    Attributes:
+        number: from 1, the same everywhere on the page.
+        name: of the image.
+        state: ``always``, ``sometimes`` or ``never`` registered, over the seeds.
+        is_wrong: registered, but at a wrong place with some seed.
+        text: the same in words.
+    """
+
+    number: int
+    name: str
+    state: str
+    is_wrong: bool
+    text: str
+
+
+@dataclass(frozen=True)
 class Layout:
-    """Where the photographs are in the view graphs of all methods.
+    """Where the photographs are in all view graphs of a page.
 
     Attributes:
         centers: (N, 2) in ``GRAPH_SIZE``.
@@ -124,7 +143,7 @@ def edge_paths(
 
 @dataclass(frozen=True)
 class Matrix:
-    """Verified inliers of all pairs of one method.
+    """Verified inliers of all pairs of one graph.
 
     Attributes:
         counts: (N * N) uint16, row by row, little-endian, as base64.

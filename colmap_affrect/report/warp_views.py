@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from colmap_affrect.extraction import ImageExtractor, Resources, prepare
-from colmap_affrect.imaging import shrink_to, warp
-from colmap_affrect.photographs import Photographs
+from colmap_affrect.data import ColorImage, Photograph, RectificationPlan
+from colmap_affrect.images.reading import shrink_to
+from colmap_affrect.images.warping import warp
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.pictures import Picture
-from colmap_affrect.report.sheet import warp_colors
-from colmap_affrect.types import ColorImage, Photograph, RectificationPlan
-from colmap_affrect.workspace import Workspace
+from colmap_affrect.report.regions import region_pixels, warp_colors
+from colmap_affrect.stages.context import Resources
+from colmap_affrect.stages.extract import Inputs, image_tasks, recorded_extraction
+from colmap_affrect.stages.one_image import prepare
 
 MAP_SIZE_PX = 480
 WARP_SIZE_PX = 200
@@ -65,10 +66,10 @@ class WarpedPhotograph:
 def warped_photographs(
     workspace: Workspace, names: Sequence[str], resources: Resources | None = None
 ) -> list[WarpedPhotograph]:
-    """Plan the warps of photographs again; those without any are left out.
+    """Plan the warps of photographs again, of each those of the first level that has any.
 
     Args:
-        workspace: folder of the method.
+        workspace: where the photographs were extracted.
         names: of the photographs.
         resources: weights and device; depth maps of networks are taken from the workspace.
 
@@ -76,28 +77,20 @@ def warped_photographs(
         AffrectError: when what the recipe needs, or a photograph, cannot be used.
     """
     resources = resources or Resources(depth_cache_path=workspace.depth)
-    extractor = prepare(workspace.extraction_options(), resources)
-    photographs = Photographs.recorded(workspace)
-    found = (_warped(extractor, photographs, name) for name in names)
-    return [item for item in found if item is not None]
-
-
-def _warped(
-    extractor: ImageExtractor, photographs: Photographs, name: str
-) -> WarpedPhotograph | None:
-    """Return the first level that has warps."""
-    camera = photographs.known.get(name)
-    photograph, _ = extractor.photograph(
-        photographs.folder / name,
-        name,
-        camera.matrix if camera else None,
-        photographs.mask(name),
-    )
-    for level, options in enumerate(extractor.options.rectifiers):
-        plan, _ = extractor.plan_or_warn(photograph, level)
-        if plan.items:
-            return _view(photograph, plan, level, options.name)
-    return None
+    extractor = prepare(recorded_extraction(workspace), resources)
+    inputs = Inputs.recorded(workspace)
+    found = []
+    for task in image_tasks(workspace, inputs, extractor.options, [(name, 0) for name in names]):
+        photographs = task.photographs
+        photograph, _ = extractor.photograph(
+            photographs.folder / task.name, task.name, task.intrinsics, photographs.mask(task.name)
+        )
+        for level, options in enumerate(extractor.options.rectifiers):
+            plan, _ = extractor.plan_or_warn(photograph, level)
+            if plan.items:
+                found.append(_view(photograph, plan, level, options.name))
+                break
+    return found
 
 
 def _view(
@@ -132,18 +125,14 @@ def tinted(photograph: Photograph, plan: RectificationPlan) -> ColorImage:
     """Return the (H, W, 3) photograph with each region in the colour of its warp."""
     image = np.repeat(photograph.gray[:, :, None], 3, axis=2)
     for item, color in zip(plan.items, warp_colors(plan), strict=True):
-        if item.region is not None:
-            rows, columns = np.nonzero(item.region)
-            rows, columns = rows + item.region_origin[1], columns + item.region_origin[0]
-            gray = photograph.gray[rows, columns, None]
-            mixed = (1.0 - TINT) * gray + TINT * 255.0 * np.array(color)
-            image[rows, columns] = np.rint(mixed).astype(np.uint8)
+        pixels = region_pixels(item)
+        mixed = (1.0 - TINT) * photograph.gray[pixels][:, None] + TINT * 255.0 * np.array(color)
+        image[pixels] = np.rint(mixed).astype(np.uint8)
     return image
 
 
-def rectifies(output_path: Path, folder: str) -> bool:
-    """Tell whether the method of a folder warps photographs; those of SIFT do not."""
-    workspace = Workspace(output_path / folder)
-    if not folder or "extract" not in workspace.recorded():
+def rectifies(workspace: Workspace) -> bool:
+    """Tell whether photographs are warped there; COLMAP's SIFT leaves no record and warps none."""
+    if workspace.planned("extract") is None:
         return False
-    return any(item.name != "identity" for item in workspace.extraction_options().rectifiers)
+    return any(item.name != "identity" for item in recorded_extraction(workspace).rectifiers)

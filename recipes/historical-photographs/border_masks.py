@@ -15,8 +15,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from colmap_affrect.imaging import read_gray
-from colmap_affrect.photographs import list_images
+from colmap_affrect.images.photographs import list_images
+from colmap_affrect.images.reading import read_gray
 
 
 def border_mask(width: int, height: int, border: float, caption: float) -> np.ndarray:

@@ -4,21 +4,19 @@
 
 Extracts each image by the recipe ``dense-affnet`` and by the same recipe whose features are
 described by kornia's ``LAFAffNetShapeEstimator``, ``LAFOrienter`` and ``LAFDescriptor``, view by
-view, as the code of the paper does. Prints the seconds of describing and of everything, medians of
-rounds, their ratios, and how far both are from the descriptors that kornia's modules give in 64
-bits: OriNet's angle is the quotient of two outputs that may both be near zero, so that rounding
-alone moves a few descriptors by more than ``TOLERANCE``.
+view, as the code of the paper does. Prints the seconds of describing and of all but reading,
+medians of rounds, their ratios, and how far both are from the descriptors that kornia's modules
+give in 64 bits: OriNet's angle is the quotient of two outputs that may both be near zero, so that
+rounding alone moves a few descriptors by more than ``TOLERANCE``.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import numpy as np
 import torch
@@ -26,38 +24,17 @@ from kornia import feature
 from machine import describe_machine
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.extraction import ImageExtractor, Resources, prepare
+from colmap_affrect.data import GrayImage, LocalFeatures, View
+from colmap_affrect.evaluation.costs import ImageCost, extract_measured
 from colmap_affrect.features.affnet_hardnet import AffNetHardNet
 from colmap_affrect.features.networks import DESCRIPTOR_NETWORKS
 from colmap_affrect.features.weights import load_state_dict
-from colmap_affrect.photographs import list_images
+from colmap_affrect.images.photographs import list_images
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.types import GrayImage, LocalFeatures, View
+from colmap_affrect.stages.context import Resources
+from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
 TOLERANCE = 1e-3
-
-
-class Stopwatch:
-    """A feature profile whose description is timed."""
-
-    def __init__(self, profile: Any) -> None:
-        """Take the profile."""
-        self.profile, self.descriptor_size = profile, profile.descriptor_size
-        self.seconds = 0.0
-
-    def detect(self, view: View) -> LocalFeatures:
-        """Detect."""
-        found: LocalFeatures = self.profile.detect(view)
-        return found
-
-    def describe(
-        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
-    ) -> list[LocalFeatures]:
-        """Describe, and remember how long that took."""
-        start = time.perf_counter()
-        described: list[LocalFeatures] = self.profile.describe(images, detected)
-        self.seconds = time.perf_counter() - start
-        return described
 
 
 class KorniaChain:
@@ -72,11 +49,8 @@ class KorniaChain:
         affnet = feature.LAFAffNetShapeEstimator(pretrained=False, preserve_orientation=False)
         orinet = feature.OriNet(pretrained=False)
         network = DESCRIPTOR_NETWORKS[ours.options.descriptor]()
-        for part, key in (
-            (affnet, "affnet"),
-            (orinet, "orinet"),
-            (network, ours.options.descriptor),
-        ):
+        parts = {"affnet": affnet, "orinet": orinet, ours.options.descriptor: network}
+        for key, part in parts.items():
             part.load_state_dict(load_state_dict(weights[key]), strict=False)
             part.eval().to(dtype)
         self.shape, self.orientation = affnet, feature.LAFOrienter(32, angle_detector=orinet)
@@ -117,40 +91,31 @@ def main() -> None:
     arguments = parser.parse_args()
     recipe = load_recipe("dense-affnet", [f"features.descriptor={arguments.descriptor}"])
     extractor = prepare(recipe.extraction, Resources(arguments.weights, "cpu"))
-    if not isinstance(extractor.profile, AffNetHardNet):
+    if not isinstance(extractor.extractor, AffNetHardNet):
         raise SystemExit("dense-affnet has other features")
-    ours, kornia = (
-        Stopwatch(extractor.profile),
-        Stopwatch(KorniaChain(extractor.profile, extractor)),
-    )
-    ways = [replace(extractor, profile=profile) for profile in (ours, kornia)]
-    exact = replace(extractor, profile=KorniaChain(extractor.profile, extractor, torch.float64))
+    ways = [extractor, replace(extractor, extractor=KorniaChain(extractor.extractor, extractor))]
+    exact = replace(extractor, extractor=KorniaChain(extractor.extractor, extractor, torch.float64))
     names = list_images(arguments.image_path)[: arguments.max_num_images]
     print(describe_machine())
     for name in names:
-        whole: list[list[float]] = []
-        described: list[list[float]] = []
+        rounds: list[list[ImageCost]] = []
         for _ in range(arguments.rounds):
-            rows, seconds = [], []
-            for way in ways:
-                start = time.perf_counter()
-                rows.append(way.extract_file(arguments.image_path / name).features.descriptors)
-                seconds.append(time.perf_counter() - start)
-            whole.append(seconds)
-            described.append([ours.seconds, kornia.seconds])
+            found = [extract_measured(way, arguments.image_path / name) for way in ways]
+            rounds.append([cost for _, cost in found])
         expected = exact.extract_file(arguments.image_path / name).features.descriptors
         print(f"{name}: {len(expected)} features; from kornia's in 64 bits")
-        for whose, found in zip(("ours", "kornia's in 32"), rows, strict=True):
-            differences = np.abs(found - expected).max(axis=1)
+        for whose, (image, _) in zip(("ours", "kornia's in 32"), found, strict=True):
+            differences = np.abs(image.features.descriptors - expected).max(axis=1)
             print(
                 f"{whose} differ by {np.median(differences):.1e}, at most {differences.max():.1e}, "
                 f"{np.count_nonzero(differences > TOLERANCE)} by over {TOLERANCE}"
             )
-        for what, pairs in (("describing", described), ("everything", whole)):
+        for what in ("describe_s", "total_s"):
+            pairs = [[getattr(cost, what) for cost in costs] for costs in rounds]
             first, second = (median(column) for column in zip(*pairs, strict=True))
             ratios = sorted(kornia_s / ours_s for ours_s, kornia_s in pairs)
             print(
-                f"{what}: ours {first:.1f} s, kornia {second:.1f} s, kornia takes "
+                f"{what[:-2]}: ours {first:.1f} s, kornia {second:.1f} s, kornia takes "
                 f"{median(ratios):.2f} [{ratios[0]:.2f}-{ratios[-1]:.2f}] times as long"
             )
 

@@ -15,75 +15,52 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
-from machine import describe_machine
-from speed_report import table
+from machine import describe_machine, table
 from street import FOCAL_LENGTH_PX, IMAGE_SIZE, take_photographs, view_of
 
-from colmap_affrect.comparison.metrics import pose_scores, read_poses
+from colmap_affrect.colmap.poses import pose_scores, read_poses
 
 INTERVAL_S = 0.1
 PROGRESS = re.compile(r"^([\w ()-]+): \d+/\d+ \w+")
 
 
-@dataclass
-class StageMemory:
-    """What one stage took.
-
-    Attributes:
-        name: as in the progress of the command.
-        first_s, last_s: since the start of the command.
-        first_bytes, peak_bytes: resident memory at its begin and at most.
-    """
-
-    name: str
-    first_s: float
-    last_s: float
-    first_bytes: int
-    peak_bytes: int
-
-
-def memory_bytes(process_id: int) -> int:
+def resident_mib(process_id: int) -> int:
     """Return the resident memory of a process, 0 when it has ended."""
     try:
         status = Path(f"/proc/{process_id}/status").read_text(encoding="ascii", errors="replace")
     except OSError:
         return 0
-    return next((int(s.split()[1]) << 10 for s in status.splitlines() if s[:5] == "VmRSS"), 0)
+    return next((int(s.split()[1]) >> 10 for s in status.splitlines() if s[:5] == "VmRSS"), 0)
 
 
-def watched(command: Sequence[str]) -> Iterator[StageMemory]:
-    """Run a command; yield its stages as they begin, which change while they last.
+def watch(command: Sequence[str]) -> dict[str, list[tuple[float, int]]]:
+    """Run a command; return for each stage of its progress (seconds, resident MiB) at moments.
 
     Raises:
         CalledProcessError: when it fails.
     """
-    start = time.perf_counter()
+    start, stages = time.perf_counter(), ["start"]
+    moments: dict[str, list[tuple[float, int]]] = {}
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        current = StageMemory("start", 0.0, 0.0, 0, 0)
 
-        def watch() -> None:
+        def look() -> None:
             while process.poll() is None:
-                now = memory_bytes(process.pid)
-                current.last_s = time.perf_counter() - start
-                current.peak_bytes = max(current.peak_bytes, now)
+                now = (time.perf_counter() - start, resident_mib(process.pid))
+                moments.setdefault(stages[-1], []).append(now)
                 time.sleep(INTERVAL_S)
 
-        threading.Thread(target=watch, daemon=True).start()
-        yield current
+        threading.Thread(target=look, daemon=True).start()
         for line in process.stderr or ():
-            found = PROGRESS.match(line)
-            if found is None:
+            if found := PROGRESS.match(line):
+                stages.append(found[1])
+            else:
                 print(line, end="", file=sys.stderr)
-            elif found[1] != current.name:
-                seconds, here = time.perf_counter() - start, memory_bytes(process.pid)
-                current = StageMemory(found[1], seconds, seconds, here, here)
-                yield current
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, command)
+    return moments
 
 
 def scores(model_path: Path, count: int) -> str:
@@ -115,18 +92,11 @@ def main() -> None:
         *(arguments.options or ("--pairs", "retrieval")),
     ]
     print(describe_machine())
-    stages = list(watched(command))
-    header = ("stage", "seconds", "memory at its begin (MiB)", "at most (MiB)")
     rows = [
-        (
-            stage.name,
-            f"{stage.last_s - stage.first_s:.0f}",
-            f"{stage.first_bytes / 2**20:.0f}",
-            f"{stage.peak_bytes / 2**20:.0f}",
-        )
-        for stage in stages
+        (name, f"{seen[-1][0] - seen[0][0]:.0f}", f"{max(mib for _, mib in seen)}")
+        for name, seen in watch(command).items()
     ]
-    print(table(header, rows))
+    print(table(("stage", "seconds", "memory at most (MiB)"), rows))
     print(scores(arguments.output_path / "run" / "sparse" / "0", arguments.num_images))
 
 

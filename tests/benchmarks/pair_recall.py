@@ -21,18 +21,18 @@ from pathlib import Path
 
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import verified_pairs
-from colmap_affrect.matching.nearest import MatchableImage
-from colmap_affrect.matching.pairs import Pair, sequence_pairs
-from colmap_affrect.options import MatchingOptions
-from colmap_affrect.pair_selection import NUM_STRONGEST, low_resolution_pairs, retrieved_pairs
-from colmap_affrect.pair_tasks import MatchableCache
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.matchers.base import MatcherContext, Matches
+from colmap_affrect.matchers.nearest import MatchableImage, NearestNeighbors, NearestOptions
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import sequence_pairs
+from colmap_affrect.pairs.low_resolution import NUM_STRONGEST, low_resolution_pairs
+from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.progress import SILENT
-from colmap_affrect.stages import feature_store
-from colmap_affrect.types import LocalFeatures
-from colmap_affrect.workspace import Workspace
-
-Choose = Callable[[int], Sequence[Pair]]
-"""Choose pairs such that images have so many neighbours on average."""
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.one_pair import CachedMatcher
+from colmap_affrect.stages.verify import recorded_verification
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class MatchedSet:
 
     Attributes:
         name: in the table.
-        folder_of: the folder of each image.
+        folder_of: the folder of each image, whose name is that of the folder and that within it.
         inliers: of the pairs that verify.
     """
 
@@ -49,75 +49,68 @@ class MatchedSet:
     folder_of: dict[str, Workspace]
     inliers: dict[Pair, int]
 
-    @property
-    def names(self) -> list[str]:
-        """Names of the images: that of the folder and that within it."""
-        return sorted(self.folder_of)
-
-    def ways(self) -> dict[str, Choose]:
-        """Return the ways to choose pairs."""
-        stores = {folder.path: feature_store(folder) for folder in self.folder_of.values()}
-        options = MatchingOptions()
-        caches = {
-            path: MatchableCache(store, options, 0, NUM_STRONGEST) for path, store in stores.items()
-        }
-
-        def found(name: str) -> tuple[Path, str]:
-            return self.folder_of[name].path, name.partition(":")[2]
-
-        def read(name: str) -> LocalFeatures:
-            path, inner = found(name)
-            return stores[path].read(inner)
-
-        def strongest(name: str) -> MatchableImage:
-            path, inner = found(name)
-            return caches[path][inner][0]
-
-        def retrieved(num: int) -> list[Pair]:
-            return retrieved_pairs(self.names, read, num, SILENT)
-
-        def low_resolution(num: int) -> list[Pair]:
-            return low_resolution_pairs(self.names, strongest, options, num, SILENT)
-
-        def either(num: int) -> list[Pair]:
-            half = -(-num // 2)
-            return sorted({*retrieved(half), *low_resolution(half)})
-
-        return {
-            "retrieval": retrieved,
-            "low-resolution": low_resolution,
-            "either of both": either,
-            "sequence": lambda num: sequence_pairs(self.names, -(-num // 2)),
-        }
-
 
 def read_set(path: Path) -> MatchedSet:
     """Read the pairs that verify in an output folder."""
     workspace = Workspace(path)
-    verification, _ = workspace.verification_options()
-    folder_of = {f"{path.name}:{name}": workspace for name in feature_store(workspace).names()}
-    inliers = {}
+    verification = recorded_verification(workspace)
+    folder_of = {f"{path.name}:{name}": workspace for name in Context(workspace).features.names()}
     with open_database(workspace.database) as database:
         names = {i.image_id: f"{path.name}:{i.name}" for i in database.read_all_images()}
-        for pair in verified_pairs(workspace.database, verification.min_num_inliers):
-            first, second = sorted(names[image_id] for image_id in pair)
-            geometry = database.read_two_view_geometry(*pair)
-            inliers[first, second] = len(geometry.inlier_matches)
+    verified = verified_pairs(workspace.database, verification.min_num_inliers)
+    inliers = {}
+    for (id1, id2), count in verified.items():
+        first, second = sorted((names[id1], names[id2]))
+        inliers[first, second] = count
     return MatchedSet(path.name, folder_of, inliers)
 
 
-def join(sets: Sequence[MatchedSet]) -> MatchedSet:
-    """Make one set of several."""
-    folder_of = {name: folder for each in sets for name, folder in each.folder_of.items()}
-    inliers = {pair: count for each in sets for pair, count in each.inliers.items()}
-    return MatchedSet("all together", folder_of, inliers)
+def ways_to_choose(folder_of: dict[str, Workspace]) -> dict[str, Callable[[int], Sequence[Pair]]]:
+    """Return the ways to choose pairs such that images have so many neighbours on average."""
+    names, options = sorted(folder_of), NearestOptions()
+    matcher = NearestNeighbors(options, MatcherContext())
+    stores = {folder.path: Context(folder).features for folder in folder_of.values()}
+    caches = {
+        path: CachedMatcher(store, options, max_num_features=NUM_STRONGEST)
+        for path, store in stores.items()
+    }
+
+    def read(name: str) -> LocalFeatures:
+        return stores[folder_of[name].path].read(name.partition(":")[2])
+
+    def strongest(name: str) -> MatchableImage:
+        image: MatchableImage = (
+            caches[folder_of[name].path].prepared(name.partition(":")[2]).content
+        )
+        return image
+
+    def match(pair: Pair) -> Matches:
+        return matcher.match(strongest(pair[0]), strongest(pair[1]))
+
+    def retrieved(num: int) -> list[Pair]:
+        return retrieved_pairs(names, read, num, SILENT)
+
+    def low_resolution(num: int) -> list[Pair]:
+        return low_resolution_pairs(names, match, num, SILENT)
+
+    def either(num: int) -> list[Pair]:
+        half = -(-num // 2)
+        return sorted({*retrieved(half), *low_resolution(half)})
+
+    return {
+        "retrieval": retrieved,
+        "low-resolution": low_resolution,
+        "either of both": either,
+        "sequence": lambda num: sequence_pairs(names, -(-num // 2)),
+    }
 
 
 def measure(images: MatchedSet, shares: Sequence[float]) -> None:
     """Print the rows of one set."""
-    num_images, num_right = len(images.names), len(images.inliers)
+    num_images, num_right = len(images.folder_of), len(images.inliers)
     num_pairs = num_images * (num_images - 1) // 2
-    for (way, choose), share in itertools.product(images.ways().items(), shares):
+    ways = ways_to_choose(images.folder_of)
+    for (way, choose), share in itertools.product(ways.items(), shares):
         start = time.perf_counter()
         chosen = choose(max(1, round(share * (num_images - 1))))
         seconds = time.perf_counter() - start
@@ -130,23 +123,22 @@ def measure(images: MatchedSet, shares: Sequence[float]) -> None:
         )
 
 
-def parse_arguments() -> argparse.Namespace:
-    """Parse the command line."""
+def main() -> None:
+    """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("output_paths", type=Path, nargs="+", help="folders of finished runs")
     parser.add_argument("--shares", type=float, nargs="+", default=[0.1, 0.2, 0.3])
-    return parser.parse_args()
-
-
-def main() -> None:
-    """Print the table."""
-    arguments = parse_arguments()
+    arguments = parser.parse_args()
     sets = [read_set(path) for path in arguments.output_paths]
+    if len(sets) > 1:
+        folder_of = {name: folder for each in sets for name, folder in each.folder_of.items()}
+        inliers = {pair: count for each in sets for pair, count in each.inliers.items()}
+        sets.append(MatchedSet("all together", folder_of, inliers))
     print(
         "| photographs | images | verify | chosen by | chosen | recall | possible | inliers | s |"
         "\n|---|--:|--:|---|--:|--:|--:|--:|--:|"
     )
-    for images in [*sets, join(sets)] if len(sets) > 1 else sets:
+    for images in sets:
         if images.inliers:
             measure(images, arguments.shares)
 

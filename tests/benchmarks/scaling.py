@@ -1,32 +1,37 @@
 """What many photographs would take: pairs, storage, time and money, from measured unit costs.
 
-Reads the unit costs from the section ``images`` of ``speed.py`` and machines from a TOML file.
+Measures a recipe on a quarter, half and all of the first images of a folder, and multiplies. Costs
+that are in --costs-path already are not measured again.
+
 Assumed: extraction is linear in images, matching and verification in pairs, both keep all cores of
 the measured machine busy and share out over any number of cores; machines have its speed per
 core. Each image meets its nearest ``--num-neighbors`` by retrieval; comparing the vectors of all
-images to find them is counted at the measured peak, computing and sorting are not. Every pair
+images to find them is counted at the measured peak, network and sorting are not. Every pair
 costs what those measured do, most of which overlap. Incremental mapping runs on one core and
 grows with the power of the number of images that was measured on a few: it is not for a million,
 which needs a hierarchical or global mapper. In clusters it is linear; joining them is not counted.
 Usage:
 
-    python tests/benchmarks/scaling.py --costs-path out/speed.json --recipe default
+    python tests/benchmarks/scaling.py --image-path PHOTOS --costs-path out/costs.json
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from speed_growth import growth_exponent
-from speed_report import table
+from machine import core_gflops, describe_machine, table
+from speed import growth_exponent, run_commands
 
-from colmap_affrect.matching.retrieval import NUM_WORDS
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.comparison.methods import parse_method
+from colmap_affrect.pairs.retrieval import NUM_WORDS
+from colmap_affrect.parallel.executor import available_cores
+from colmap_affrect.stages.context import Resources
 
 SECONDS_PER_HOUR = 3600.0
 HOURS_PER_DAY = 24.0
@@ -38,75 +43,18 @@ IMAGE_VECTOR_SIZE = 128 * NUM_WORDS
 IMAGE_VECTOR_BYTES = 2 * IMAGE_VECTOR_SIZE
 
 
-@dataclass(frozen=True)
-class UnitCosts:
-    """What one image and one pair cost.
-
-    Attributes:
-        extract_s: core seconds per image.
-        match_s, verify_s: core seconds per pair.
-        map_s: seconds on one core of mapping ``num_mapped`` images.
-        num_mapped: images that were mapped.
-        map_exponent: power of the number of images that mapping grows with.
-        features_bytes: of features.h5 per image.
-        matches_bytes: of matches.h5 per pair.
-        database_image_bytes, database_pair_bytes: of the database per image and per pair.
-        core_gflops: of one core, for the comparison of image vectors.
-    """
-
-    extract_s: float
-    match_s: float
-    verify_s: float
-    map_s: float
-    num_mapped: int
-    map_exponent: float
-    features_bytes: float
-    matches_bytes: float
-    database_image_bytes: float
-    database_pair_bytes: float
-    core_gflops: float
-
-    @classmethod
-    def from_results(cls, results: Mapping[str, Any], recipe: str) -> UnitCosts:
-        """Read the results of ``speed.py``; unit costs are those of the largest run."""
-        rows = results["images"][recipe]
-        largest, cores = rows[-1], results["cores"]
-        keypoints_bytes = KEYPOINT_BYTES * largest["features"]
-        return cls(
-            extract_s=cores * largest["extract_s"] / largest["images"],
-            match_s=cores * largest["match_s"] / largest["pairs"],
-            verify_s=cores * largest["verify_s"] / largest["pairs"],
-            map_s=largest["map_s"],
-            num_mapped=int(largest["registered"]),
-            map_exponent=growth_exponent([(row["registered"], row["map_s"]) for row in rows]),
-            features_bytes=largest["features_bytes"] / largest["images"],
-            matches_bytes=largest["matches_bytes"] / largest["pairs"],
-            database_image_bytes=keypoints_bytes / largest["images"],
-            database_pair_bytes=(largest["database_bytes"] - keypoints_bytes) / largest["pairs"],
-            core_gflops=results["peaks"]["gflops_one"],
-        )
-
-    def mapping_hours(self, num_images: int) -> float:
-        """Return the hours of one core for one model of so many images."""
-        growth = (num_images / self.num_mapped) ** self.map_exponent
-        return float(self.map_s * growth / SECONDS_PER_HOUR)
-
-
-@dataclass(frozen=True)
-class Machine:
-    """A machine to rent.
-
-    Attributes:
-        name: for people.
-        cores: of the speed of those that were measured.
-        memory_gib: of all cores together.
-        usd_per_hour: price.
-    """
-
-    name: str
-    cores: int
-    memory_gib: float
-    usd_per_hour: float
+def measure(recipe: str, paths: Sequence[Path]) -> dict[str, Any]:
+    """Run a recipe on a quarter, half and all of some images."""
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    counts = sorted({max(2, len(paths) // part) for part in (4, 2, 1)})
+    method = parse_method(recipe)
+    return {
+        "machine": describe_machine(),
+        "recipe": recipe,
+        "cores": available_cores(),
+        "core_gflops": core_gflops(),
+        "runs": [run_commands(method, paths[:count], Resources()) for count in counts],
+    }
 
 
 @dataclass(frozen=True)
@@ -114,68 +62,64 @@ class Load:
     """What a collection takes with one choice of pairs.
 
     Attributes:
-        num_images: photographs.
         num_pairs: to match and verify.
-        pairs_hours: core hours of choosing the pairs.
-        extract_hours, match_hours, verify_hours: core hours.
-        map_hours: hours of one core for one incremental model of all images.
-        cluster_hours: core hours for incremental models of clusters of images.
-        vectors_bytes: memory of the vectors that retrieval compares, 0 for all pairs.
-        features_bytes, matches_bytes, database_bytes: sizes of the files.
+        num_bytes: sizes of the files, and of the vectors that retrieval compares in memory.
+        core_hours: by step, of what shares out over cores; mapping in clusters.
+        one_map_hours: of one core for one incremental model of all images.
     """
 
-    num_images: int
     num_pairs: int
-    pairs_hours: float
-    extract_hours: float
-    match_hours: float
-    verify_hours: float
-    map_hours: float
-    cluster_hours: float
-    vectors_bytes: float
-    features_bytes: float
-    matches_bytes: float
-    database_bytes: float
-
-    @property
-    def shared_hours(self) -> float:
-        """Core hours of everything that shares out over cores, clusters in the place of one map."""
-        steps = (self.pairs_hours, self.extract_hours, self.match_hours, self.verify_hours)
-        return sum(steps) + self.cluster_hours
+    num_bytes: Mapping[str, float]
+    core_hours: Mapping[str, float]
+    one_map_hours: float
 
 
 def simulate(
-    costs: UnitCosts, num_images: int, num_neighbors: int | None, cluster_size: int
+    costs: Mapping[str, Any], num_images: int, num_neighbors: int | None, cluster_size: int
 ) -> Load:
-    """Multiply unit costs.
+    """Multiply the unit costs of the largest run.
 
     Args:
-        costs: measured.
+        costs: as :func:`measure` returns them.
         num_images: photographs.
         num_neighbors: images that each one meets; None for all.
         cluster_size: images that are mapped together, where not all are.
     """
+    runs, run = costs["runs"], costs["runs"][-1]
     num_pairs = num_images * (num_images - 1) // 2
-    comparisons = 0
+    num_vectors = 0
     if num_neighbors is not None:
-        comparisons = num_images**2
-        num_pairs = min(num_pairs, num_images * num_neighbors)
-    comparing_s = 2.0 * comparisons * IMAGE_VECTOR_SIZE / (costs.core_gflops * 1e9)
+        num_vectors, num_pairs = num_images, min(num_pairs, num_images * num_neighbors)
+    image_runs, pair_runs = num_images / run["images"], num_pairs / run["pairs"]
+    core_hours_of_run = {
+        stage: costs["cores"] * run[f"{stage}_s"] / SECONDS_PER_HOUR
+        for stage in ("extract", "match", "verify")
+    }
+    comparing_s = 2.0 * num_vectors**2 * IMAGE_VECTOR_SIZE / (costs["core_gflops"] * 1e9)
+    keypoints_bytes = KEYPOINT_BYTES * run["features"]
+    exponent = growth_exponent([(each["registered"], each["map_s"]) for each in runs])
+
+    def mapping_hours(size: int) -> float:
+        return float(run["map_s"] * (size / run["registered"]) ** exponent / SECONDS_PER_HOUR)
+
     cluster_size = min(cluster_size, num_images)
     return Load(
-        num_images=num_images,
-        num_pairs=num_pairs,
-        pairs_hours=comparing_s / SECONDS_PER_HOUR,
-        extract_hours=num_images * costs.extract_s / SECONDS_PER_HOUR,
-        match_hours=num_pairs * costs.match_s / SECONDS_PER_HOUR,
-        verify_hours=num_pairs * costs.verify_s / SECONDS_PER_HOUR,
-        map_hours=costs.mapping_hours(num_images),
-        cluster_hours=num_images / cluster_size * costs.mapping_hours(cluster_size),
-        vectors_bytes=0.0 if num_neighbors is None else num_images * IMAGE_VECTOR_BYTES,
-        features_bytes=num_images * costs.features_bytes,
-        matches_bytes=num_pairs * costs.matches_bytes,
-        database_bytes=num_images * costs.database_image_bytes
-        + num_pairs * costs.database_pair_bytes,
+        num_pairs,
+        {
+            "`features.h5`": image_runs * run["features_bytes"],
+            "`matches.h5`": pair_runs * run["matches_bytes"],
+            "`database.db`": image_runs * keypoints_bytes
+            + pair_runs * (run["database_bytes"] - keypoints_bytes),
+            "image vectors in memory": num_vectors * IMAGE_VECTOR_BYTES,
+        },
+        {
+            "choosing pairs": comparing_s / SECONDS_PER_HOUR,
+            "extracting": image_runs * core_hours_of_run["extract"],
+            "matching": pair_runs * core_hours_of_run["match"],
+            "verifying": pair_runs * core_hours_of_run["verify"],
+            "mapping, in clusters": num_images / cluster_size * mapping_hours(cluster_size),
+        },
+        mapping_hours(num_images),
     )
 
 
@@ -206,100 +150,64 @@ def size(num_bytes: float) -> str:
     return f"{num_bytes / 1000**exponent:.3g} {'_kMGTP'[exponent]}B"
 
 
-def loads_table(loads: Sequence[tuple[str, Load]]) -> str:
-    """Show what collections take, a column for each; hours are of one core."""
-    lines: dict[str, Callable[[Load], str]] = {
-        "photographs": lambda load: f"{load.num_images:,}",
-        "pairs": lambda load: f"{load.num_pairs:,}",
-        "`features.h5`": lambda load: size(load.features_bytes),
-        "`matches.h5`": lambda load: size(load.matches_bytes),
-        "`database.db`": lambda load: size(load.database_bytes),
-        "image vectors in memory": lambda load: (
-            size(load.vectors_bytes) if load.vectors_bytes else "-"
-        ),
-        "choosing pairs": lambda load: duration(load.pairs_hours) if load.pairs_hours else "-",
-        "extracting": lambda load: duration(load.extract_hours),
-        "matching": lambda load: duration(load.match_hours),
-        "verifying": lambda load: duration(load.verify_hours),
-        "mapping, one incremental model": lambda load: duration(load.map_hours),
-        "mapping, in clusters": lambda load: duration(load.cluster_hours),
-    }
-    rows = [(name, *(text(load) for _, load in loads)) for name, text in lines.items()]
-    return table(("", *(name for name, _ in loads)), rows)
-
-
-def machines_table(machines: Sequence[Machine], loads: Sequence[tuple[str, Load]]) -> str:
-    """Show hours and money of all steps on one machine of each type, mapping in clusters."""
-    header = ["machine", *(f"{name}, {load.num_images:,}" for name, load in loads)]
-    rows = []
-    for machine in machines:
-        cells = []
-        for _, load in loads:
-            hours = load.shared_hours / machine.cores
-            cells.append(f"{duration(hours)}, {hours * machine.usd_per_hour:,.0f} USD")
-        price = f"{machine.usd_per_hour:.2f} USD/h, {machine.memory_gib:g} GiB"
-        rows.append((f"{machine.name} ({price})", *cells))
-    return table(header, rows)
-
-
-def memory_table(machines: Sequence[Machine], loads: Sequence[tuple[str, Load]]) -> str:
-    """Show how many times the memory of each machine the database is, which a mapper holds."""
-    rows = [
-        (machine.name, *(f"{load.database_bytes / (machine.memory_gib * 2**30):.2g}"
-                         for _, load in loads))
-        for machine in machines
-    ]  # fmt: skip
-    return table(["machine", *(f"{name}, {load.num_images:,}" for name, load in loads)], rows)
-
-
-def read_machines(path: Path) -> list[Machine]:
-    """Read the ``[[machine]]`` tables of a TOML file."""
-    with path.open("rb") as file:
-        return [Machine(**values) for values in tomllib.load(file)["machine"]]
+def report(loads: Mapping[str, Load], cores: int, usd_per_hour: float) -> str:
+    """Show what collections take, a column for each; hours are of one core but in the last row."""
+    columns = loads.values()
+    first = next(iter(columns))
+    rows = [("pairs", *(f"{load.num_pairs:,}" for load in columns))]
+    rows += [(key, *(size(load.num_bytes[key]) for load in columns)) for key in first.num_bytes]
+    rows += [
+        (key, *(duration(load.core_hours[key]) for load in columns)) for key in first.core_hours
+    ]
+    rows.append(("mapping, one model", *(duration(load.one_map_hours) for load in columns)))
+    hours = [sum(load.core_hours.values()) / cores for load in columns]
+    cells = [f"{duration(count)}, {count * usd_per_hour:,.0f} USD" for count in hours]
+    rows.append((f"all of it on {cores} cores at {usd_per_hour:.2f} USD an hour", *cells))
+    return table(("photographs", *loads), rows)
 
 
 def parse_arguments() -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--costs-path", type=Path, required=True, help="JSON file of speed.py")
-    parser.add_argument("--recipe", default="default")
+    parser.add_argument("--costs-path", type=Path, required=True, help="JSON file of costs")
+    parser.add_argument("--image-path", type=Path, help="folder of images to measure costs on")
+    parser.add_argument("--max-num-images", type=int, default=16, help="to measure costs on")
+    parser.add_argument("--recipe", default="default", help="to measure costs of")
     parser.add_argument("--num-images", type=int, nargs="+", default=[10_000, 1_000_000])
     parser.add_argument("--num-neighbors", type=int, default=30, help="pairs per image")
     parser.add_argument("--cluster-size", type=int, default=200, help="images mapped together")
-    parser.add_argument(
-        "--machines-path", type=Path, default=Path(__file__).with_name("machines.toml")
-    )
-    return parser.parse_args()
+    parser.add_argument("--cores", type=int, default=64, help="of the machine to rent")
+    parser.add_argument("--usd-per-hour", type=float, default=2.80, help="its price, an example")
+    arguments = parser.parse_args()
+    if not (arguments.costs_path.exists() or arguments.image_path):
+        parser.error(f"{arguments.costs_path} is not there: give --image-path to measure costs")
+    return arguments
 
 
 def main() -> None:
-    """Print the tables."""
+    """Measure what is not known, and print the table."""
     arguments = parse_arguments()
-    results = json.loads(arguments.costs_path.read_text())
-    costs = UnitCosts.from_results(results, arguments.recipe)
-    machines = read_machines(arguments.machines_path)
-    loads = [
-        (name, simulate(costs, count, neighbors, arguments.cluster_size))
+    if not arguments.costs_path.exists():
+        paths = sorted(arguments.image_path.iterdir())[: arguments.max_num_images]
+        arguments.costs_path.write_text(json.dumps(measure(arguments.recipe, paths), indent=1))
+    costs = json.loads(arguments.costs_path.read_text())
+    run, cores = costs["runs"][-1], costs["cores"]
+    print(
+        f"`{costs['recipe']}` on {costs['machine'].splitlines()[0]}: "
+        f"{cores * run['extract_s'] / run['images']:.2f} core seconds per image, "
+        f"{cores * run['match_s'] / run['pairs']:.2f} per pair matched, "
+        f"{cores * run['verify_s'] / run['pairs']:.3f} verified; mapping {run['registered']} "
+        f"images takes {run['map_s']:.1f} s.\n"
+    )
+    loads = {
+        f"{count:,}, {name}": simulate(costs, count, neighbors, arguments.cluster_size)
         for count in arguments.num_images
         for name, neighbors in (
             ("all pairs", None),
             (f"{arguments.num_neighbors} neighbours", arguments.num_neighbors),
         )
-    ]
-    print(
-        f"Unit costs of `{arguments.recipe}` on {results['machine'].splitlines()[0]}: "
-        f"{costs.extract_s:.2f} core seconds per image, {costs.match_s:.2f} per pair matched, "
-        f"{costs.verify_s:.3f} verified; {size(costs.features_bytes)} of features per image, "
-        f"{costs.matches_bytes / 1000:.0f} kB of matches per pair; mapping "
-        f"{costs.num_mapped} images takes {costs.map_s:.1f} s and "
-        f"grows with the power {costs.map_exponent:.2f}. "
-        f"Times of one core; clusters have {arguments.cluster_size} images.\n"
-    )
-    print(loads_table(loads))
-    print("All steps on one machine, mapping in clusters:\n")
-    print(machines_table(machines, loads))
-    print("Size of the database in units of the memory:\n")
-    print(memory_table(machines, loads))
+    }
+    print(report(loads, arguments.cores, arguments.usd_per_hour))
 
 
 if __name__ == "__main__":

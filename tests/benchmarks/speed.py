@@ -1,12 +1,11 @@
-"""Speed beside COLMAP's SIFT: whole commands, stages against the machine's peak, growth.
+"""Speed beside COLMAP's SIFT: whole commands, stages of extraction, growth.
 
 All methods run on the same photographs in one process, in turn, in several rounds. Sections:
 
-    commands  extract, match, verify and map by the whole commands on all cores
-    stages    each stage in core seconds, its counted work against what a core can do at most
-    pixels    extraction of one picture at 320 to 2400 px, core seconds
-    features  matching of 1000 to 16000 features, ours and COLMAP's, core seconds
-    images    the whole commands on more and more images, and the size of the files
+    commands  extraction and matching by the whole commands, on all cores
+    stages    where the time of extraction goes, in core seconds; recipes with RootSIFT
+    pixels    extraction of one picture at 320 to 2400 px, in core seconds
+    features  matching of 1000 to 16000 features, ours and COLMAP's, in core seconds
 
 Prints Markdown of everything in the JSON file; sections that are not run this time are kept. Other
 load on the machine shows in the ranges. Usage:
@@ -19,72 +18,192 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
-from machine import describe_machine, measure_peaks
-from speed_growth import feature_growth, image_growth, pixel_growth
-from speed_measure import SIFT_METHODS, Method, StageMeasurement, measure_commands
-from speed_report import report
-from speed_stages import PAIR_STAGES
-from stage_clock import StageClock
+import numpy as np
+from machine import describe_machine, table
+from speed_by_core import feature_growth, pixel_growth, stage_seconds
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.executor import available_cores
-from colmap_affrect.extraction import Resources
+from colmap_affrect.colmap.database import import_images, open_database
+from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
+from colmap_affrect.comparison.methods import SIFT, SIFT_AFFINE_DSP, Method, parse_method
+from colmap_affrect.comparison.sift import extract_sift, match_sift
+from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+from colmap_affrect.pairs.lists import exhaustive_pairs
+from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.recipes import Recipe
+from colmap_affrect.stages.context import Resources
 
-SECTIONS = ("commands", "stages", "pixels", "features", "images")
-DEFAULT_METHODS = [*SIFT_METHODS, "unrectified-rootsift", "default"]
-SLOW_SIFT = [name for name in SIFT_METHODS if name != "sift"]
+Row = dict[str, float]
+
+SECTIONS = ("commands", "stages", "pixels", "features")
+DEFAULT_METHODS = [SIFT, SIFT_AFFINE_DSP, "unrectified-rootsift", "default"]
+SEED = 0
 
 
-def run_commands(methods: Sequence[Method], paths: Sequence[Path], num_rounds: int) -> Any:
-    """Return for each method a row of costs for each round."""
-    rows: dict[str, list[dict[str, float]]] = {method.name: [] for method in methods}
-    for _ in range(num_rounds):
-        for method in methods:
-            rows[method.name].append(measure_commands(method, paths))
-    return rows
+def run_commands(method: Method, paths: Sequence[Path], resources: Resources) -> Row:
+    """Extract, match and verify images by the whole commands, and map those of a recipe.
 
-
-def run_stages(methods: Sequence[Method], paths: Sequence[Path], num_rounds: int) -> Any:
-    """Return for each method the seconds of stages for each round, and their work."""
-    measurements = {method.name: StageMeasurement(method, paths) for method in methods}
-    clocks: dict[str, list[StageClock]] = {name: [] for name in measurements}
-    for _ in range(num_rounds):
-        for name, measurement in measurements.items():
-            clocks[name].append(measurement.run())
-    num_pairs = len(paths) * (len(paths) - 1) // 2
-    counts = {name: num_pairs for name in PAIR_STAGES if not name.startswith("prepare")}
-    return {
-        name: {
-            "seconds": [
-                {stage: s / counts.get(stage, len(paths)) for stage, s in clock.seconds.items()}
-                for clock in of_rounds
-            ],
-            "work": {
-                stage: [value / counts.get(stage, len(paths)) for value in asdict(work).values()]
-                for stage, work in of_rounds[0].work.items()
-            },
+    Returns:
+        Seconds of each stage as ``extract_s``, ``match_s``, ``verify_s``, ``map_s``; numbers of
+        ``images``, ``pairs``, ``features``, ``inliers`` (of all verified pairs), ``registered``
+        (in the largest model); sizes of the files as ``features_bytes``, ``matches_bytes``,
+        ``database_bytes``.
+    """
+    image_path, names = paths[0].parent, [path.name for path in paths]
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        if method.recipe is None:
+            row = run_sift(folder, image_path, names, affine=method.label == SIFT_AFFINE_DSP)
+        else:
+            row = run_recipe(folder, image_path, names, method.recipe, resources)
+        database_path = folder / "database.db"
+        inliers = verified_pairs(database_path, VerificationOptions().min_num_inliers)
+        with open_database(database_path) as database:
+            num_features = database.num_keypoints()
+        sizes = {
+            f"{path.stem}_bytes": path.stat().st_size
+            for path in (folder / "features.h5", folder / "matches.h5", database_path)
+            if path.exists()
         }
-        for name, of_rounds in clocks.items()
+    return {
+        **row,
+        **sizes,
+        "images": len(names),
+        "pairs": len(names) * (len(names) - 1) // 2,
+        "features": num_features,
+        "inliers": sum(inliers.values()),
     }
+
+
+def run_sift(folder: Path, image_path: Path, names: Sequence[str], *, affine: bool) -> Row:
+    """Run COLMAP's SIFT up to verification; return seconds."""
+    database_path = folder / "database.db"
+    import_images(database_path, image_path, list(names), CameraOptions())
+    times = [time.perf_counter()]
+    extract_sift(database_path, image_path, names, MaskOptions(), affine=affine)
+    times.append(time.perf_counter())
+    match_sift(database_path, exhaustive_pairs(names), folder / "pairs.txt")
+    times.append(time.perf_counter())
+    verify(database_path, VerificationOptions(random_seed=SEED))
+    times.append(time.perf_counter())
+    return dict(zip(("extract_s", "match_s", "verify_s"), np.diff(times).tolist(), strict=True))
+
+
+def run_recipe(
+    folder: Path, image_path: Path, names: Sequence[str], recipe: Recipe, resources: Resources
+) -> Row:
+    """Run a recipe; return seconds, and the number of images registered."""
+    list_path = folder / "names.txt"
+    list_path.write_text("\n".join(names) + "\n", encoding="utf-8")
+    options = RunOptions(
+        recipe=recipe, image_list_path=list_path, resources=resources, random_seed=SEED
+    )
+    report = run(image_path, folder, options)
+    row: Row = {f"{stage.name}_s": stage.wall_s for stage in report.stages}
+    row["match_s"] += row.pop("escalate_s", 0.0)
+    return {**row, "registered": len(report.registered_names)}
+
+
+def with_ratio(values: Sequence[float], references: Sequence[float]) -> str:
+    """Format the median over rounds, and median and range of the ratios by round.
+
+    >>> with_ratio([3.0, 8.0, 2.0], [1.0, 4.0, 4.0])
+    '3 s, 2.00 [0.50-3.00]'
+    """
+    ratios = [mine / other for mine, other in zip(values, references, strict=True)]
+    spread = f"{median(ratios):.2f} [{min(ratios):.2f}-{max(ratios):.2f}]"
+    return f"{median(values):.3g} s, {spread}"
+
+
+def commands_table(results: dict[str, list[Row]]) -> str:
+    """Compare the whole commands; the first method is the reference of the ratios."""
+
+    def each(rounds: Iterable[Row], key: str, unit: str) -> list[float]:
+        return [row[key] / row[unit] for row in rounds]
+
+    reference = next(iter(results.values()))
+    rows = [
+        (
+            name,
+            with_ratio(each(rounds, "extract_s", "images"), each(reference, "extract_s", "images")),
+            with_ratio(each(rounds, "match_s", "pairs"), each(reference, "match_s", "pairs")),
+            f"{median(each(rounds, 'features', 'images')):.0f}",
+            f"{median(each(rounds, 'inliers', 'pairs')):.0f}",
+        )
+        for name, rounds in results.items()
+    ]
+    header = (
+        "method", "extraction per image", "matching per pair", "features per image",
+        "inliers per pair",
+    )  # fmt: skip
+    return (
+        f"Whole commands on all cores: {reference[0]['images']:.0f} images, {len(reference)} "
+        "rounds in turn. Median, then median [range] of the ratio to the first method in the same "
+        "round.\n\n" + table(header, rows)
+    )
+
+
+def stages_table(results: dict[str, list[Row]]) -> str:
+    """Show where the time of each method goes."""
+    rows = [
+        (name, stage, f"{median(s):.3f} [{min(s):.3f}-{max(s):.3f}]")
+        for name, rounds in results.items()
+        for stage in rounds[0]
+        for s in [[seconds[stage] for seconds in rounds]]
+    ]
+    title = "Core seconds of extraction per image by stage, median [range] over rounds.\n\n"
+    return title + table(("method", "stage", "core seconds"), rows)
+
+
+def growth_exponent(curve: Iterable[Sequence[float]]) -> float:
+    """Return p of seconds ~ size^p, by least squares of logarithms.
+
+    >>> round(growth_exponent([(size, 0.5 * size**1.5) for size in (1.0, 3.0, 10.0)]), 6)
+    1.5
+    """
+    sizes, seconds = np.log(np.array(list(curve), dtype=np.float64)).T
+    return float(np.polyfit(sizes, seconds, 1)[0])
+
+
+def growth_table(results: dict[str, Sequence[Sequence[float]]], size_name: str) -> str:
+    """Show core seconds by size, and the exponents of growth."""
+    rows = [
+        (f"{points[0][0]:.0f}", *(f"{point[1]:.3g} s" for point in points))
+        for points in zip(*results.values(), strict=True)
+    ]
+    rows.append(("exponent", *(f"{growth_exponent(curve):.2f}" for curve in results.values())))
+    return f"Core seconds by {size_name}.\n\n" + table((size_name, *results), rows)
+
+
+def report(results: dict[str, Any]) -> str:
+    """Format all sections that there are results of."""
+    tables: dict[str, Callable[[Any], str]] = {
+        "commands": commands_table,
+        "stages": stages_table,
+        "pixels": lambda curves: growth_table(curves, "pixels of an image"),
+        "features": lambda curves: growth_table(curves, "features of each image of a pair"),
+    }
+    parts = [tables[section](results[section]) for section in SECTIONS if section in results]
+    return "\n".join([results["machine"] + "\n", *parts])
 
 
 def parse_arguments() -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--image-path", type=Path, required=True, help="folder of images")
-    parser.add_argument(
-        "--num-images", type=int, default=4, help="the first so many; all sections but images"
-    )
-    parser.add_argument("--max-num-images", type=int, default=12, help="of the section images")
+    parser.add_argument("--num-images", type=int, default=4, help="the first so many")
     parser.add_argument("--num-rounds", type=int, default=3)
     parser.add_argument(
         "--methods", nargs="+", default=DEFAULT_METHODS, metavar="METHOD",
-        help=f"{', '.join(SIFT_METHODS)} or RECIPE[:KEY=VALUE[,...]]; the first is the reference",
+        help=f"{SIFT}, {SIFT_AFFINE_DSP} or [LABEL=]RECIPE[:KEY=VALUE[,...]]; the first is the "
+        "reference",
     )  # fmt: skip
     parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=SECTIONS)
     parser.add_argument("--weights", type=Path, help="folder of the networks' weights")
@@ -96,26 +215,28 @@ def main() -> None:
     """Run the sections and print the tables."""
     arguments = parse_arguments()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    output_path, num_rounds = arguments.output_path, arguments.num_rounds
-    all_paths = sorted(arguments.image_path.iterdir())
-    paths = all_paths[: arguments.num_images]
-    methods = [Method(name, Resources(arguments.weights)) for name in arguments.methods]
-    fast = [method for method in methods if method.name not in SLOW_SIFT]
-    run: dict[str, Callable[[], Any]] = {
-        "commands": lambda: run_commands(methods, paths, num_rounds),
-        "stages": lambda: run_stages(fast, paths, num_rounds),
-        "pixels": lambda: pixel_growth(fast, paths, num_rounds),
-        "features": lambda: feature_growth(paths, num_rounds),
-        "images": lambda: image_growth(fast, all_paths, arguments.max_num_images),
+    output_path, rounds = arguments.output_path, range(arguments.num_rounds)
+    paths = sorted(arguments.image_path.iterdir())[: arguments.num_images]
+    methods = [parse_method(text) for text in arguments.methods]
+    resources = Resources(arguments.weights)
+    fast = [method for method in methods if method.label != SIFT_AFFINE_DSP]
+
+    def in_turn(measure: Callable[[Method], Row], methods: Sequence[Method]) -> Any:
+        rows = [[measure(method) for method in methods] for _ in rounds]
+        return {m.label: list(of) for m, of in zip(methods, zip(*rows, strict=True), strict=True)}
+
+    sections: dict[str, Callable[[], Any]] = {
+        "commands": lambda: in_turn(lambda m: run_commands(m, paths, resources), methods),
+        "stages": lambda: in_turn(
+            lambda m: stage_seconds(m, paths), [m for m in methods if m.recipe]
+        ),
+        "pixels": lambda: pixel_growth(fast, paths, len(rounds), resources),
+        "features": lambda: feature_growth(paths, len(rounds)),
     }
     results = json.loads(output_path.read_text()) if output_path.exists() else {}
-    results |= {
-        "machine": describe_machine(),
-        "cores": available_cores(),
-        "peaks": asdict(measure_peaks()),
-    }
+    results["machine"] = describe_machine()
     for section in arguments.sections:
-        results[section] = run[section]()
+        results[section] = sections[section]()
         output_path.write_text(json.dumps(results, indent=1) + "\n")
     print(report(results))
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from colmap_affrect.executor import available_cores
+from colmap_affrect.parallel.executor import available_cores
 
 sys.path.append(str(Path(__file__).parents[2] / "sample_scenes"))
 

@@ -17,16 +17,18 @@ from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.stages.extract import extract_images
+from colmap_affrect.stages.one_image import ImageExtractor, prepare
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
+
 
 from local_cluster import local_cluster
 from machine import describe_machine
 
-from colmap_affrect.cluster import Cluster, connected
-from colmap_affrect.extraction import ImageExtractor, prepare
-from colmap_affrect.image_tasks import extract_images
-from colmap_affrect.options import CameraOptions
-from colmap_affrect.photographs import Photographs, list_images
+from colmap_affrect.images.photographs import Photographs, list_images
+from colmap_affrect.parallel.cluster import Cluster, connected
 from colmap_affrect.recipes import load_recipe
 
 

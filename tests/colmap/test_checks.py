@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import random
 import sqlite3
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import (
-    CHECKS,
-    SEVERITIES,
-    Kind,
-    Problem,
     check_database,
     check_image_files,
     is_unsafe,
@@ -68,7 +62,10 @@ def database_path(tmp_path: Path) -> Path:
     return write_database(tmp_path / "database.db")
 
 
-def execute(path: Path, *statements: tuple[str, list[object]] | str) -> None:
+Statement = tuple[str, list[object]] | str
+
+
+def execute(path: Path, *statements: Statement) -> None:
     with closing(sqlite3.connect(path)) as connection:
         for statement in statements:
             query, values = (statement, []) if isinstance(statement, str) else statement
@@ -80,7 +77,7 @@ def pair_id(first: int, second: int) -> int:
     return int(pycolmap.image_pair_to_pair_id(first, second))
 
 
-def replace_data(table: str, key: int, array: np.ndarray) -> tuple[str, list[object]]:
+def replace_data(table: str, key: int, array: np.ndarray) -> Statement:
     column = "image_id" if table == "keypoints" else "pair_id"
     return (
         f"UPDATE {table} SET rows = ?, cols = ?, data = ? WHERE {column} = ?",
@@ -88,25 +85,23 @@ def replace_data(table: str, key: int, array: np.ndarray) -> tuple[str, list[obj
     )
 
 
-def changed_keypoint(row: int, column: int, value: float) -> tuple[str, list[object]]:
+def changed_keypoint(row: int, column: int, value: float) -> Statement:
     keypoints = np.full((7, 6), 20, np.float32)
     keypoints[row, column] = value
     return replace_data("keypoints", 2, keypoints)
 
 
-def new_matches(
-    first: int, second: int, indices: list[list[int]], table: str = "matches"
-) -> tuple[str, list[object]]:
-    array = np.array(indices, np.uint32)
+def new_matches(first: int, second: int, table: str = "matches") -> Statement:
+    indices = np.array([[0, 1]], np.uint32)
     columns = "pair_id, rows, cols, data" + (", config" * (table != "matches"))
-    values = [first * (2**31 - 1) + second, *array.shape, array.tobytes()]
+    values = [first * (2**31 - 1) + second, *indices.shape, indices.tobytes()]
     values += [3] * (table != "matches")
     return (f"INSERT INTO {table} ({columns}) VALUES ({', '.join('?' * len(values))})", values)
 
 
 def test_healthy_database_has_no_problem(database_path: Path) -> None:
     tables, problems = check_database(database_path)
-    assert problems == []
+    assert problems == {}
     assert tables.summary() == ("3 images, 1 cameras, 21 keypoints, 3 matched and 3 verified pairs")
     assert tables.num_keypoints() == dict(zip(NAMES, NUM_KEYPOINTS, strict=True))
     assert tables.matched_pairs() == {
@@ -114,13 +109,13 @@ def test_healthy_database_has_no_problem(database_path: Path) -> None:
     }  # fmt: skip
 
 
-BROKEN: list[tuple[Kind, list[tuple[str, list[object]] | str], tuple[str, ...]]] = [
-    ("no-camera", ["UPDATE images SET camera_id = 9 WHERE image_id = 2"], ("b c.png",)),
-    ("no-prior-focal", ["UPDATE cameras SET prior_focal_length = 0"], ("camera 1 (90 x 60)",)),
-    ("no-frame", ["DELETE FROM frame_data WHERE data_id = 3"], ("side/č.png",)),
-    ("no-frame", ["UPDATE frame_data SET sensor_type = 1 WHERE data_id = 3"], ("side/č.png",)),
-    ("unsafe-name", ["UPDATE images SET name = 'x/../../y' WHERE image_id = 1"], ("x/../../y",)),
-    ("unsafe-name", ["UPDATE images SET name = '/etc/x' WHERE image_id = 1"], ("/etc/x",)),
+BROKEN: list[tuple[str, list[Statement], list[str]]] = [
+    ("no-camera", ["UPDATE images SET camera_id = 9 WHERE image_id = 2"], ["b c.png"]),
+    ("no-prior-focal", ["UPDATE cameras SET prior_focal_length = 0"], ["camera 1 (90 x 60)"]),
+    ("no-frame", ["DELETE FROM frame_data WHERE data_id = 3"], ["side/č.png"]),
+    ("no-frame", ["UPDATE frame_data SET sensor_type = 1 WHERE data_id = 3"], ["side/č.png"]),
+    ("unsafe-name", ["UPDATE images SET name = 'x/../../y' WHERE image_id = 1"], ["x/../../y"]),
+    ("unsafe-name", ["UPDATE images SET name = '/etc/x' WHERE image_id = 1"], ["/etc/x"]),
     (
         "no-keypoints",
         [
@@ -128,79 +123,74 @@ BROKEN: list[tuple[Kind, list[tuple[str, list[object]] | str], tuple[str, ...]]]
             f"DELETE FROM matches WHERE pair_id < {pair_id(2, 3)}",
             f"DELETE FROM two_view_geometries WHERE pair_id < {pair_id(2, 3)}",
         ],
-        ("a.png",),
+        ["a.png"],
     ),
     (
         "keypoint-columns",
         [replace_data("keypoints", 2, np.ones((7, 3), np.float32))],
-        ("b c.png has 3",),
+        ["b c.png has 3"],
     ),
     (
         "keypoint-data",
         ["UPDATE keypoints SET data = substr(data, 1, 167) WHERE image_id = 2"],
-        ("b c.png",),
+        ["b c.png"],
     ),
-    ("keypoint-data", ["UPDATE keypoints SET data = NULL WHERE image_id = 2"], ("b c.png",)),
-    ("keypoint-data", ["UPDATE keypoints SET data = 'text' WHERE image_id = 2"], ("b c.png",)),
-    ("keypoints-not-finite", [changed_keypoint(6, 1, np.nan)], ("b c.png",)),
-    ("keypoints-not-finite", [changed_keypoint(0, 5, np.inf)], ("b c.png",)),
-    ("keypoints-outside", [changed_keypoint(3, 0, 91.5)], ("b c.png",)),
-    ("keypoints-outside", [changed_keypoint(3, 1, 61.5)], ("b c.png",)),
-    ("keypoints-outside", [changed_keypoint(3, 1, -1.5)], ("b c.png",)),
-    ("no-matches", ["DELETE FROM matches", "DELETE FROM two_view_geometries"], ()),
+    ("keypoint-data", ["UPDATE keypoints SET data = NULL WHERE image_id = 2"], ["b c.png"]),
+    ("keypoint-data", ["UPDATE keypoints SET data = 'text' WHERE image_id = 2"], ["b c.png"]),
+    ("keypoints-not-finite", [changed_keypoint(6, 1, np.nan)], ["b c.png"]),
+    ("keypoints-outside", [changed_keypoint(3, 0, 91.5)], ["b c.png"]),
+    ("keypoints-outside", [changed_keypoint(3, 1, 61.5)], ["b c.png"]),
+    ("keypoints-outside", [changed_keypoint(3, 1, -1.5)], ["b c.png"]),
+    ("no-matches", ["DELETE FROM matches", "DELETE FROM two_view_geometries"], []),
     (
         "match-data",
         [f"UPDATE matches SET rows = 3 WHERE pair_id = {pair_id(1, 3)}"],
-        ("a.png - side/č.png (raw matches)",),
+        ["a.png - side/č.png (raw matches)"],
     ),
     (
         "match-data",
         [replace_data("two_view_geometries", pair_id(1, 3), np.ones((1, 3), np.uint32))],
-        ("a.png - side/č.png (inliers)",),
+        ["a.png - side/č.png (inliers)"],
     ),
     (
         "match-range",
         [replace_data("matches", pair_id(1, 2), np.array([[5, 0]], np.uint32))],
-        ("a.png - b c.png (raw matches)",),
+        ["a.png - b c.png (raw matches)"],
     ),
     (
         "match-range",
         [replace_data("two_view_geometries", pair_id(2, 3), np.array([[0, 9]], np.uint32))],
-        ("b c.png - side/č.png (inliers)",),
+        ["b c.png - side/č.png (inliers)"],
     ),
     (
         "self-pair",
-        [new_matches(2, 2, [[0, 1]]), new_matches(2, 2, [[0, 1]], "two_view_geometries")],
-        ("b c.png - b c.png (raw matches)", "b c.png - b c.png (inliers)"),
+        [new_matches(2, 2), new_matches(2, 2, "two_view_geometries")],
+        ["b c.png - b c.png (raw matches)", "b c.png - b c.png (inliers)"],
     ),
     (
         "unknown-pair",
-        [new_matches(2, 8, [[0, 1]], "two_view_geometries")],
-        ("b c.png - image 8 (inliers)",),
+        [new_matches(2, 8, "two_view_geometries")],
+        ["b c.png - image 8 (inliers)"],
     ),
     (
         "no-geometry",
         [f"DELETE FROM two_view_geometries WHERE pair_id = {pair_id(1, 3)}"],
-        ("a.png - side/č.png",),
+        ["a.png - side/č.png"],
     ),
     (
         "undefined-geometry",
         [f"UPDATE two_view_geometries SET config = 0 WHERE pair_id = {pair_id(2, 3)}"],
-        ("b c.png - side/č.png",),
+        ["b c.png - side/č.png"],
     ),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("kind", "statements", "items"), BROKEN)
 def test_what_is_broken_is_found_and_nothing_else(
-    database_path: Path,
-    kind: Kind,
-    statements: list[tuple[str, list[object]] | str],
-    items: tuple[str, ...],
+    database_path: Path, kind: str, statements: list[Statement], items: list[str]
 ) -> None:
     execute(database_path, *statements)
-    _, problems = check_database(database_path)
-    assert problems == [Problem(kind, items)]
+    assert check_database(database_path)[1] == {kind: items}
 
 
 @pytest.mark.parametrize(
@@ -217,26 +207,24 @@ def test_what_is_broken_is_found_and_nothing_else(
         f"DELETE FROM matches WHERE pair_id = {pair_id(1, 2)}",  # inliers alone were imported
     ],
 )
-def test_what_is_allowed_is_no_problem(
-    tmp_path: Path, statement: tuple[str, list[object]] | str
-) -> None:
+def test_what_is_allowed_is_no_problem(tmp_path: Path, statement: Statement) -> None:
     path = write_database(tmp_path / "database.db", descriptors=True)
     execute(path, "DELETE FROM frame_data" if "frames" in statement else "SELECT 1", statement)
-    assert check_database(path)[1] == []
+    assert check_database(path)[1] == {}
 
 
 def test_descriptors_of_another_number_or_of_several_types_are_found(tmp_path: Path) -> None:
     path = write_database(tmp_path / "database.db", descriptors=True)
     execute(path, "UPDATE descriptors SET rows = 6 WHERE image_id = 2")
-    assert check_database(path)[1] == [Problem("descriptor-count", ("b c.png has 6 of 7",))]
+    assert check_database(path)[1] == {"descriptor-count": ["b c.png has 6 of 7"]}
     execute(path, "UPDATE descriptors SET rows = 7, type = 1 WHERE image_id = 2")
-    assert check_database(path)[1] == [Problem("descriptor-types", ("type 0", "type 1"))]
+    assert check_database(path)[1] == {"descriptor-types": ["type 0", "type 1"]}
 
 
 def test_database_without_images_is_one_problem(tmp_path: Path) -> None:
     with open_database(tmp_path / "database.db"):
         pass
-    assert check_database(tmp_path / "database.db")[1] == [Problem("no-images")]
+    assert check_database(tmp_path / "database.db")[1] == {"no-images": []}
 
 
 def test_files_that_are_missing_unreadable_or_of_another_size_are_found(
@@ -247,24 +235,14 @@ def test_files_that_are_missing_unreadable_or_of_another_size_are_found(
     for name in NAMES:
         (tmp_path / name).touch()
     sizes: dict[str, tuple[int, int] | None] = dict.fromkeys(NAMES, SIZE)
-    assert check_image_files(tables, tmp_path, sizes) == []
+    assert check_image_files(tables, tmp_path, sizes) == {}
     sizes[NAMES[0]], sizes[NAMES[1]] = SIZE[::-1], None
     (tmp_path / NAMES[2]).unlink()
-    assert check_image_files(tables, tmp_path, sizes) == [
-        Problem("file-missing", (NAMES[2],)),
-        Problem("file-unreadable", (NAMES[1],)),
-        Problem("file-size", ("a.png is 60 x 90, its camera 90 x 60",)),
-    ]
-
-
-def test_every_kind_of_problem_has_its_severity_and_advice_and_is_tested() -> None:
-    assert set(CHECKS) == set(get_args(Kind))
-    assert {severity for severity, _, _ in CHECKS.values()} == set(SEVERITIES)
-    elsewhere = {
-        "no-images", "descriptor-count", "descriptor-types",
-        "file-missing", "file-unreadable", "file-size",
-    }  # fmt: skip
-    assert {kind for kind, _, _ in BROKEN} | elsewhere == set(CHECKS)
+    assert check_image_files(tables, tmp_path, sizes) == {
+        "file-missing": [NAMES[2]],
+        "file-unreadable": [NAMES[1]],
+        "file-size": ["a.png is 60 x 90, its camera 90 x 60"],
+    }
 
 
 @pytest.mark.parametrize(("first", "second"), [(1, 2), (7, 2**31 - 2), (2**31 - 3, 2**31 - 2)])
@@ -280,35 +258,20 @@ def test_unsafe_names_lead_out_of_the_folder(name: str, unsafe: bool) -> None:
     assert is_unsafe(name) == unsafe
 
 
-def random_bytes(_: bytes, rng: random.Random) -> bytes:
-    return rng.randbytes(rng.randrange(4000))
-
-
-def truncated(data: bytes, rng: random.Random) -> bytes:
-    return data[: rng.randrange(len(data))]
-
-
-def mutated(data: bytes, rng: random.Random) -> bytes:
-    changed = bytearray(data)
-    for _ in range(rng.choice([1, 10, 100])):
-        changed[rng.randrange(len(changed))] = rng.randrange(256)
-    return bytes(changed)
-
-
-@pytest.mark.parametrize("damage", [random_bytes, truncated, mutated])
-def test_damaged_file_is_a_database_error_or_problems(
-    tmp_path: Path, database_path: Path, damage: Callable[[bytes, random.Random], bytes]
-) -> None:
+def test_damaged_file_is_a_database_error_or_problems(tmp_path: Path, database_path: Path) -> None:
     execute(database_path, "PRAGMA journal_mode = DELETE")
     data = database_path.read_bytes()
     rng = random.Random(7)
     errors = []
-    for number in range(60):
+    for number in range(90):
+        changed = bytearray(data)
+        for _ in range(rng.choice([1, 10, 100])):
+            changed[rng.randrange(len(changed))] = rng.randrange(256)
         path = tmp_path / f"{number}.db"
-        path.write_bytes(damage(data, rng))
+        path.write_bytes(changed if number % 3 else data[: rng.randrange(len(data))])
         try:
             check_database(path)
         except DatabaseError as error:
             errors.append(str(error).startswith(f"{path}: damaged ("))
-    assert len(errors) > 20
+    assert len(errors) > 40
     assert all(errors)

@@ -19,7 +19,7 @@ from colmap_affrect.colmap.database import (
     write_descriptors,
 )
 from colmap_affrect.errors import DatabaseError
-from colmap_affrect.store import FeatureStore
+from colmap_affrect.project.stores import FeatureStore
 
 MAX_RATIO = 0.8
 Matches = set[tuple[int, int]]
@@ -93,14 +93,10 @@ def test_rows_have_the_length_that_colmap_expects() -> None:
         np.testing.assert_allclose(lengths, 512.0, atol=4.0)
 
 
-def test_positive_descriptors_keep_their_values() -> None:
-    row = np.zeros((1, 128))
+def test_positive_descriptors_keep_their_values_and_none_or_zero_are_no_trouble() -> None:
+    row = np.full((1, 128), np.sqrt((1.0 - 0.26) / 125))
     row[0, :3] = 0.3, 0.4, 0.1
-    row[0, 3:] = np.sqrt((1.0 - 0.26) / 125)
     assert colmap_descriptors(row)[0, :3].tolist() == [154, 205, 51]
-
-
-def test_no_features_and_zero_rows_are_no_trouble() -> None:
     assert colmap_descriptors(np.zeros((0, 128))).shape == (0, 128)
     assert not colmap_descriptors(np.zeros((2, 128))).any()
 
@@ -110,7 +106,7 @@ def test_descriptors_of_another_size_are_refused() -> None:
         colmap_descriptors(np.ones((3, 64)))
 
 
-def test_descriptors_of_before_an_escalation_are_written_anew(tmp_path: Path) -> None:
+def test_descriptors_are_written_anew_after_an_escalation(tmp_path: Path) -> None:
     write_photographs(tmp_path / "photos", 2)
     arguments = ["--image-path", str(tmp_path / "photos"), "--output-path", str(tmp_path / "out")]
     chosen = ["--recipe", "on-demand", "--database-descriptors", "-q"]

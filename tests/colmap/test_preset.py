@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +13,19 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database, write_keypoints, write_matches
-from colmap_affrect.colmap.mapping import global_options, mapping_differences, pipeline_options
 from colmap_affrect.colmap.native_options import flat_values
-from colmap_affrect.colmap.verification import two_view_options, verification_differences
+from colmap_affrect.colmap.verification import (
+    VerificationOptions,
+    two_view_options,
+    verification_differences,
+    verified_pairs,
+    verify,
+)
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, pixel_from_colmap
 from colmap_affrect.errors import OptionError
-from colmap_affrect.options import MAPPERS, PRESETS, MappingOptions, VerificationOptions
+from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.mappers.incremental import IncrementalOptions
+from colmap_affrect.options import PRESETS
 
 SEED = 3
 
@@ -48,16 +56,16 @@ def synthesize(
 
 def write_scene(
     path: Path,
-    cameras: list[pycolmap.Camera],
-    images: list[pycolmap.Image],
+    truth: pycolmap.Reconstruction,
     keypoints: dict[int, NDArray[np.floating]],
     matches: Matches,
 ) -> Path:
-    """Write a database through our writer, from keypoints with COLMAP's corner origin."""
+    """Write a scene through our writer, from keypoints with COLMAP's corner origin."""
     with open_database(path) as database:
-        for camera in cameras:
+        for camera in truth.cameras.values():
             database.write_camera(camera, use_camera_id=True)
-        for image in images:
+        for image_id, found in sorted(truth.images.items()):
+            image = pycolmap.Image(name=found.name, image_id=image_id, camera_id=found.camera_id)
             database.write_image(image, use_image_id=True)
         for image_id, points in keypoints.items():
             lafs = np.zeros((len(points), 2, 3))
@@ -67,14 +75,6 @@ def write_scene(
         for pair, indices in matches.items():
             write_matches(database, *pair, indices)
     return path
-
-
-def bare_images(truth: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    """Images with the names, ids and cameras of a model and nothing else."""
-    return [
-        pycolmap.Image(name=image.name, image_id=image_id, camera_id=image.camera_id)
-        for image_id, image in sorted(truth.images.items())
-    ]
 
 
 def rewrite(
@@ -91,9 +91,7 @@ def rewrite(
     truth, keypoints, matches = synthesize(folder / "source.db", num_images, num_points)
     if kept is not None:
         matches = {pair: of_points(truth, pair, matches[pair], kept[pair]) for pair in kept}
-    cameras = list(truth.cameras.values())
-    path = write_scene(folder / "ours.db", cameras, bare_images(truth), keypoints, matches)
-    return path, truth
+    return write_scene(folder / "ours.db", truth, keypoints, matches), truth
 
 
 def of_points(
@@ -105,17 +103,15 @@ def of_points(
     return matches[[point_id in ranks and ranks[point_id] in points for point_id in seen]]
 
 
-def verify(path: Path, options: pycolmap.TwoViewGeometryOptions | None = None) -> dict[Pair, int]:
+def verified(path: Path) -> dict[Pair, int]:
     """Verify a database and return the inliers of each pair that passed."""
-    chosen = two_view_options(VerificationOptions(), SEED) if options is None else options
-    pycolmap.geometric_verification(path, two_view_geometry_options=chosen)
-    with open_database(path) as database:
-        pair_ids, counts = database.read_two_view_geometry_num_inliers()
-    return {
-        pycolmap.pair_id_to_image_pair(pair_id): int(count)
-        for pair_id, count in zip(pair_ids, counts, strict=True)
-        if count
-    }
+    verify(path, VerificationOptions(random_seed=SEED))
+    return verified_pairs(path, 1)
+
+
+def mapper_of(name: str, preset: str = "sparse", **values: Any) -> Any:
+    options = MAPPERS.part(name).Options.preset(preset, random_seed=SEED, **values)
+    return MAPPERS.make(options)
 
 
 def reconstruct(
@@ -124,7 +120,7 @@ def reconstruct(
     """Map a verified database; models by falling number of images."""
     output = path.parent / "sparse"
     output.mkdir(exist_ok=True)
-    ours = pipeline_options(MappingOptions(), SEED, intrinsics_given=False)
+    ours = mapper_of("incremental").native(SEED, intrinsics_given=False)
     chosen = ours if options is None else options
     models = pycolmap.incremental_mapping(path, path.parent, output, options=chosen)
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
@@ -154,8 +150,7 @@ def test_synthetic_scene_through_our_writer_registers_all_images_in_place(
     tmp_path: Path,
 ) -> None:
     path, truth = rewrite(tmp_path, num_images=5, num_points=150)
-    verified = verify(path)
-    assert len(verified) == 10
+    assert len(verified(path)) == 10
     (model,) = reconstruct(path)
     assert registered(model) == sorted(image.name for image in truth.images.values())
     assert model.num_points3D() >= 140
@@ -176,20 +171,18 @@ def test_pairs_given_in_either_order_verify_the_same(tmp_path: Path, order: str)
     truth, keypoints, matches = synthesize(tmp_path / "source.db", 3, 100)
     if order == "reversed":
         matches = {pair[::-1]: indices[:, ::-1] for pair, indices in matches.items()}
-    path = write_scene(
-        tmp_path / "ours.db", list(truth.cameras.values()), bare_images(truth), keypoints, matches
-    )
+    path = write_scene(tmp_path / "ours.db", truth, keypoints, matches)
     expected = {(1, 2): 90, (1, 3): 90, (2, 3): 90}
-    verified = verify(path)
-    assert verified.keys() == expected.keys()
-    assert all(verified[pair] >= count for pair, count in expected.items())
+    found = verified(path)
+    assert found.keys() == expected.keys()
+    assert all(found[pair] >= count for pair, count in expected.items())
 
 
 def test_two_images_register_with_our_preset_and_not_with_colmaps_default(
     tmp_path: Path,
 ) -> None:
     path, truth = rewrite(tmp_path, num_images=2, num_points=400)
-    verify(path)
+    verified(path)
     assert reconstruct(path, pycolmap.IncrementalPipelineOptions(random_seed=SEED)) == []
     (model,) = reconstruct(path)
     assert registered(model) == sorted(image.name for image in truth.images.values())
@@ -202,51 +195,12 @@ def test_two_view_tracks_only_register_with_our_preset_and_not_with_colmaps_defa
     # A chain of images; each pair sees other points, so no track is longer than two.
     thirds = {(1, 2): range(0, 200), (2, 3): range(200, 400), (3, 4): range(400, 600)}
     path, _ = rewrite(tmp_path, num_images=4, num_points=600, kept=thirds)
-    assert verify(path).keys() == thirds.keys()
+    assert verified(path).keys() == thirds.keys()
     assert reconstruct(path, pycolmap.IncrementalPipelineOptions(random_seed=SEED)) == []
     models = reconstruct(path)
     assert models
     assert models[0].num_reg_images() >= 2
     assert {point.track.length() for point in models[0].points3D.values()} == {2}
-
-
-def test_same_seed_registers_the_same_images_in_the_same_models(tmp_path: Path) -> None:
-    results = []
-    for run in ("first", "second"):
-        (tmp_path / run).mkdir()
-        pairs = {(1, 2): range(0, 150), (2, 3): range(50, 200), (3, 4): range(100, 250)}
-        path, _ = rewrite(tmp_path / run, num_images=4, num_points=250, kept=pairs)
-        inliers = verify(path)
-        models = reconstruct(path)
-        results.append((inliers, [(registered(model), model.num_points3D()) for model in models]))
-    assert results[0] == results[1]
-    assert len(results[0][1][0][0]) >= 3
-
-
-def random_pairs(folder: Path, count: int, num_pairs: int) -> Path:
-    """Pairs of images whose correspondences are uniformly random."""
-    rng = np.random.default_rng(count)
-    width, height = SIZE
-    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.2 * width, width, height)
-    ids = range(1, 2 * num_pairs + 1)
-    images = [pycolmap.Image(name=f"{i:02}.png", image_id=i, camera_id=1) for i in ids]
-    keypoints = {i: rng.uniform(0, SIZE, (count, 2)) for i in ids}
-    same = np.stack([np.arange(count)] * 2, axis=1)
-    matches: Matches = {(i, i + 1): same for i in ids[::2]}
-    return write_scene(folder / f"random{count}.db", [camera], images, keypoints, matches)
-
-
-@pytest.mark.parametrize(("count", "num_pairs"), [(200, 2), (1000, 1), (5000, 1)])
-def test_random_matches_are_rejected_by_our_preset(
-    tmp_path: Path, count: int, num_pairs: int
-) -> None:
-    assert verify(random_pairs(tmp_path, count, num_pairs)) == {}
-
-
-def test_random_matches_are_accepted_by_colmaps_default(tmp_path: Path) -> None:
-    # What the preset is for; and proof that the pairs of the test above can pass.
-    path = random_pairs(tmp_path, 1000, 1)
-    assert len(verify(path, pycolmap.TwoViewGeometryOptions(ransac=dict(random_seed=1)))) == 1
 
 
 def test_random_matches_among_true_ones_are_sorted_out(tmp_path: Path) -> None:
@@ -255,14 +209,9 @@ def test_random_matches_among_true_ones_are_sorted_out(tmp_path: Path) -> None:
     true_pairs = matches[1, 2]
     wrong = np.stack([rng.permutation(len(keypoints[i]))[:200] for i in (1, 2)], axis=1)
     wrong = wrong[~(wrong[:, None] == true_pairs[None]).all(axis=2).any(axis=1)]
-    path = write_scene(
-        tmp_path / "ours.db",
-        list(truth.cameras.values()),
-        bare_images(truth),
-        keypoints,
-        {(1, 2): np.concatenate([true_pairs, wrong])},
-    )
-    verify(path)
+    both = {(1, 2): np.concatenate([true_pairs, wrong])}
+    path = write_scene(tmp_path / "ours.db", truth, keypoints, both)
+    verified(path)
     with open_database(path) as database:
         inliers = database.read_two_view_geometry(1, 2).inlier_matches
     correct = (inliers[:, None] == true_pairs[None]).all(axis=2).any(axis=1)
@@ -278,8 +227,9 @@ def test_two_view_options_pass_every_value_on() -> None:
         min_inlier_ratio=0.17,
         max_num_trials=777,
         ransac_min_inlier_ratio=0.13,
+        random_seed=5,
     )
-    passed = two_view_options(options, 5)
+    passed = two_view_options(options)
     assert (passed.min_num_inliers, passed.min_inlier_ratio) == (21, 0.17)
     ransac = passed.ransac
     assert (ransac.max_error, ransac.min_inlier_ratio) == (3.0, 0.13)
@@ -287,21 +237,22 @@ def test_two_view_options_pass_every_value_on() -> None:
 
 
 def test_pipeline_options_pass_every_value_on() -> None:
-    options = MappingOptions(
+    mapper = mapper_of(
+        "incremental",
         ignore_two_view_tracks=True,
         init_min_tri_angle_deg=7.0,
         init_min_num_inliers=44,
         abs_pose_min_num_inliers=17,
         min_model_size=6,
     )
-    passed = pipeline_options(options, 5, intrinsics_given=False)
+    passed = mapper.native(5, intrinsics_given=False)
     assert (passed.min_model_size, passed.random_seed) == (6, 5)
-    mapper = passed.mapper
-    assert (mapper.init_min_tri_angle, mapper.init_min_num_inliers) == (7.0, 44)
-    assert (mapper.abs_pose_min_num_inliers, mapper.random_seed) == (17, 5)
+    native = passed.mapper
+    assert (native.init_min_tri_angle, native.init_min_num_inliers) == (7.0, 44)
+    assert (native.abs_pose_min_num_inliers, native.random_seed) == (17, 5)
     assert passed.triangulation.ignore_two_view_tracks is True
     assert passed.triangulation.random_seed == 5
-    defaults = pipeline_options(MappingOptions(), 0, intrinsics_given=False)
+    defaults = mapper_of("incremental").native(0, intrinsics_given=False)
     assert defaults.triangulation.ignore_two_view_tracks is False
 
 
@@ -312,8 +263,8 @@ def test_pipeline_options_pass_every_value_on() -> None:
 def test_pipeline_options_leave_given_intrinsics_alone_if_asked_to(
     given: bool, keep: bool, refined: bool
 ) -> None:
-    options = MappingOptions(keep_given_intrinsics=keep)
-    passed = pipeline_options(options, 0, intrinsics_given=given)
+    mapper = mapper_of("incremental", keep_given_intrinsics=keep)
+    passed = mapper.native(0, intrinsics_given=given)
     assert passed.ba_refine_focal_length is refined
     assert passed.ba_refine_extra_params is refined
     assert passed.mapper.abs_pose_refine_focal_length is refined
@@ -368,39 +319,38 @@ def repeatable(mapper: str) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("intrinsics_given", [False, True])
-@pytest.mark.parametrize("mapper", MAPPERS)
+@pytest.mark.parametrize("mapper", MAPPERS.names())
 def test_sparse_preset_is_the_default_and_differs_from_colmap_in_exactly_this(
     mapper: str, intrinsics_given: bool
 ) -> None:
     assert VerificationOptions.preset("sparse") == VerificationOptions()
-    assert MappingOptions.preset("sparse") == MappingOptions()
-    assert verification_differences(VerificationOptions(), SEED) == {
+    assert mapper_of(mapper).options == MAPPERS.options({"name": mapper, "random_seed": SEED})
+    assert verification_differences(VerificationOptions(random_seed=SEED)) == {
         **SPARSE_VERIFICATION,
         "ransac.random_seed": SEED,
     }
-    options = MappingOptions.preset("sparse", mapper=mapper)
-    differs = mapping_differences(options, SEED, intrinsics_given=intrinsics_given)
+    differs = mapper_of(mapper).differences(intrinsics_given=intrinsics_given)
     fixed = FIXED_INTRINSICS[mapper] if intrinsics_given else {}
     assert differs == {**SPARSE_MAPPING[mapper], **fixed, **repeatable(mapper)}
 
 
 @pytest.mark.parametrize("intrinsics_given", [False, True])
-@pytest.mark.parametrize("mapper", MAPPERS)
+@pytest.mark.parametrize("mapper", MAPPERS.names())
 def test_colmap_preset_is_what_pycolmap_has_by_default(mapper: str, intrinsics_given: bool) -> None:
-    verification = VerificationOptions.preset("colmap")
-    assert verification_differences(verification, SEED) == {"ransac.random_seed": SEED}
-    options = MappingOptions.preset("colmap", mapper=mapper)
-    differs = mapping_differences(options, SEED, intrinsics_given=intrinsics_given)
+    verification = VerificationOptions.preset("colmap", random_seed=SEED)
+    assert verification_differences(verification) == {"ransac.random_seed": SEED}
+    made = mapper_of(mapper, "colmap")
+    differs = made.differences(intrinsics_given=intrinsics_given)
     assert differs == repeatable(mapper)
-    assert options.num_attempts == 1
+    assert made.options.max_num_attempts == 1
 
 
 def test_differences_are_those_of_the_options_that_pycolmap_is_given() -> None:
-    for mapper, translate in zip(MAPPERS, (pipeline_options, global_options), strict=True):
-        options = MappingOptions.preset("sparse", mapper=mapper)
-        native = flat_values(translate(options, SEED, intrinsics_given=True))
+    for mapper in MAPPERS.names():
+        made = mapper_of(mapper)
+        native = flat_values(made.native(SEED, intrinsics_given=True))
         default = flat_values(NATIVE[mapper]())
-        differs = mapping_differences(options, SEED, intrinsics_given=True)
+        differs = made.differences(intrinsics_given=True)
         for key, value in native.items():
             assert np.array_equal(value, differs.get(key, default[key])), key
 
@@ -408,17 +358,16 @@ def test_differences_are_those_of_the_options_that_pycolmap_is_given() -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_preset_knows_its_name(name: str) -> None:
     assert VerificationOptions.preset(name).preset_name == name
-    for mapper in MAPPERS:
-        options = MappingOptions.preset(name, mapper=mapper, mapper_options={"min_model_size": 4})
+    for mapper in MAPPERS.names():
+        options = mapper_of(mapper, name, mapper_options={"min_num_matches": 4}).options
         assert options.preset_name == name
-        changed = MappingOptions(**{**options.to_mapping(), "init_min_num_inliers": 51})
-        assert changed.preset_name == "custom"
+        assert options.changed(min_model_size=51).preset_name == "custom"
     assert VerificationOptions(min_num_inliers=21).preset_name == "custom"
 
 
 def test_unknown_preset_and_mapper_are_refused() -> None:
-    for make in (VerificationOptions.preset, MappingOptions.preset):
+    for make in (VerificationOptions.preset, IncrementalOptions.preset):
         with pytest.raises(OptionError, match="preset 'dense' is not one of sparse, colmap"):
             make("dense")
-    with pytest.raises(OptionError, match="mapper='glomap' is not one of incremental, global"):
-        MappingOptions(mapper="glomap")
+    with pytest.raises(OptionError, match=r"unknown mapper 'glomap' .did you mean 'global'"):
+        MAPPERS.options("glomap")

@@ -17,17 +17,27 @@ from command import FAST, run_in_process_of_its_own, start
 from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.copies import open_copy
+from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.comparison import compare as module
+from colmap_affrect.comparison import worker
 from colmap_affrect.comparison.compare import CompareOptions, compare
-from colmap_affrect.comparison.results import MEASURES, Comparison
+from colmap_affrect.comparison.request import Request
+from colmap_affrect.comparison.results import MEASURES, Comparison, MethodResult
+from colmap_affrect.comparison.tables import summary
+from colmap_affrect.comparison.verdict import verdict
 from colmap_affrect.errors import (
     ComparisonError,
+    DeviceError,
     OptionError,
     PairListError,
     StaleStoreError,
 )
-from colmap_affrect.options import CameraOptions, MappingOptions
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.mappers.incremental import IncrementalOptions
+from colmap_affrect.matchers import nearest
+from colmap_affrect.pairs.base import PairOptions
+from colmap_affrect.progress import Progress
+from colmap_affrect.stages.context import Resources
 
 CAMERAS = CameraOptions(mode="per-image", model="PINHOLE", params=INTRINSICS)
 NUM_IMAGES = 3
@@ -38,24 +48,19 @@ MIN_NUM_INLIERS = 20
 
 def write_ground_truth(folder: Path, suffix: str = ".png") -> None:
     """Write the true poses of the small scene as a COLMAP model."""
-    folder.mkdir()
-    lines = []
-    for index in range(NUM_IMAGES):
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 300.0, 320, 240)
+    model.add_camera_with_trivial_rig(camera)
+    for index, name in enumerate(GIVEN[:NUM_IMAGES]):
         yaw = np.deg2rad(-5.0 * (index - 1.5))
         position = np.array([0.55 * (index - 1.5), -0.1 * index, 0.1 * index])
         rotation = np.array(
             [[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]]
         )
-        pose = [np.cos(yaw / 2), 0, -np.sin(yaw / 2), 0, *(-rotation @ position)]
-        lines.append(f"{index + 1} {' '.join(map(repr, map(float, pose)))} 1 {index}\n\n")
-    (folder / "images.txt").write_text("".join(lines))
-    (folder / "cameras.txt").write_text(f"1 PINHOLE 320 240 {INTRINSICS.replace(',', ' ')}\n")
-    (folder / "points3D.txt").write_text("")
-    model = pycolmap.Reconstruction(folder)
-    for image in model.images.values():  # the text format cannot hold a name with a space
-        image.name = GIVEN[int(image.name)].replace(".png", suffix)
-    for path in folder.iterdir():
-        path.unlink()
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ position)
+        image = pycolmap.Image(name.replace(".png", suffix), [], 1, index + 1)
+        model.add_image_with_trivial_frame(image, pose)
+    folder.mkdir()
     model.write(folder)
 
 
@@ -120,8 +125,8 @@ def test_methods_register_the_scene_and_one_fails_with_its_reason(compared) -> N
     assert "depth" in failed.failed
     assert "Traceback" not in failed.failed
     assert comparison.registered_by_none == ("broken.png",)
-    assert comparison.verdict[0].startswith("No benefit on this set")
-    assert any(text.startswith("depth-planes-recommended failed: ") for text in comparison.verdict)
+    assert verdict(comparison)[0].startswith("No benefit on this set")
+    assert any(text.startswith("depth-planes-recommended failed: ") for text in verdict(comparison))
 
 
 def test_poses_are_measured_against_ground_truth(compared) -> None:
@@ -183,7 +188,7 @@ def test_json_and_csv_hold_the_same_figures(compared) -> None:
     text = (out / "comparison.json").read_text(encoding="utf-8")
     assert Comparison.from_json(text) == comparison
     values = json.loads(text)
-    assert values["verdict"] == list(comparison.verdict)
+    assert values["verdict"] == list(verdict(comparison))
     assert values["registered_by_none"] == ["broken.png"]
     assert next(iter(values["methods"]["depth-planes-recommended"])) == "failed"
     with (out / "comparison.csv").open(encoding="utf-8", newline="") as file:
@@ -208,8 +213,7 @@ def test_json_and_csv_hold_the_same_figures(compared) -> None:
 
 
 def test_summary_shows_every_method_and_the_verdict(compared) -> None:
-    summary = compared[0].summary()
-    table, _, text = summary.partition("\n\n")
+    table, _, text = summary(compared[0]).partition("\n\n")
     assert max(map(len, text.splitlines())) <= 88
     assert [line.split()[0] for line in table.splitlines()] == ["method", *METHODS]
     assert "3 of 4" in table.splitlines()[1]
@@ -229,7 +233,10 @@ def test_finished_methods_are_not_run_again(scene, options, compared) -> None:
     ("changes", "message"),
     [
         ({"cameras": CameraOptions()}, r"compared there with camera.mode='per-image', and it is"),
-        ({"mapping": MappingOptions(min_model_size=3)}, "mapping.min_model_size=2, and it is 3"),
+        (
+            {"mapping": IncrementalOptions(min_model_size=3)},
+            "mapping.min_model_size=2, and it is 3",
+        ),
         (
             {"methods": ["default=unrectified-rootsift"]},
             r"default was run there with recipe.rectifier.name='dense-shapes', and it is",
@@ -248,8 +255,14 @@ def test_other_options_than_before_are_refused(scene, options, compared, changes
         ({"methods": ["sift", "defualt"]}, OptionError, "did you mean 'default'"),
         ({"seeds": (1, 1)}, OptionError, "give different seeds"),
         ({"seeds": ()}, OptionError, "give different seeds"),
+        ({"resources": Resources(device="cuda:99")}, DeviceError, "--device cuda:99"),
+        ({"seeds": (0, -5)}, OptionError, "random_seed=-5 is outside .-1, 2e.09."),
         ({"ground_truth_path": Path("nowhere")}, ComparisonError, "nowhere: not a COLMAP model"),
-        ({"match_list_path": Path("nowhere")}, PairListError, "nowhere: cannot be read"),
+        (
+            {"pairs": PairOptions(match_list_path="nowhere")},
+            PairListError,
+            "nowhere: cannot be read",
+        ),
         ({"cameras": CameraOptions(model="PINHOLES")}, OptionError, "--camera-model PINHOLES"),
     ],
 )
@@ -261,6 +274,7 @@ def test_bad_input_is_refused_before_any_work(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("no_processes")
 def test_ground_truth_of_other_images_is_refused(scene, options, tmp_path) -> None:
     write_ground_truth(tmp_path / "truth", ".jpg")
     options = replace(options, ground_truth_path=tmp_path / "truth")
@@ -291,8 +305,24 @@ def test_folders_that_were_not_made_here_are_left_alone(scene, options, tmp_path
     ]
 
 
+@pytest.mark.usefixtures("no_page")
+def test_device_reaches_matching(scene, options, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By way of the request that a method's process reads."""
+
+    def run_here(request: Request, progress: Progress) -> MethodResult:
+        worker.compute(Request.from_json(request.path.read_text(encoding="utf-8")), progress)
+        return module._finished(request)
+
+    devices: list[str] = []
+    monkeypatch.setattr(nearest, "coarse_descriptors", lambda _, device: devices.append(device))
+    monkeypatch.setattr(module, "_run", run_here)
+    changes = {"methods": ["default"], "seeds": (0,), "resources": Resources(device="cpu")}
+    compare(scene / "images", tmp_path / "out", replace(options, **changes))
+    assert devices == ["cpu"]
+
+
 DYING = """
-import os, signal, sys
+import os, signal
 print('{"stage": "extract", "total": 4, "unit": "images"}', flush=True)
 os.kill(os.getpid(), signal.SIGSEGV)
 """

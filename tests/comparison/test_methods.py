@@ -8,7 +8,8 @@ import pytest
 from small_scene import NAMES, write_photographs
 
 from colmap_affrect.colmap.database import image_ids, import_images, open_database
-from colmap_affrect.comparison.methods import DEFAULT_METHODS, parse_methods
+from colmap_affrect.comparison import DEFAULT_METHODS
+from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.comparison.sift import (
     describe_options,
     extract_sift,
@@ -16,7 +17,7 @@ from colmap_affrect.comparison.sift import (
     rename_images,
 )
 from colmap_affrect.errors import OptionError
-from colmap_affrect.options import CameraOptions, MaskOptions
+from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 
 
 def test_default_methods_are_known():

@@ -6,8 +6,8 @@ import numpy as np
 from contracts.rectifier_contract import IMAGES, photograph_of
 from numpy.testing import assert_array_equal
 
-from colmap_affrect.interfaces import DepthSource
-from colmap_affrect.types import Photograph
+from colmap_affrect.data import Photograph
+from colmap_affrect.images.depth import DepthSource
 
 
 class DepthContract:

@@ -1,4 +1,4 @@
-"""Every depth source keeps the contract."""
+"""Depth maps of files keep the contract, whatever they hold."""
 
 from __future__ import annotations
 
@@ -9,33 +9,20 @@ import pytest
 from contracts.depth_contract import DepthContract
 from contracts.rectifier_contract import IMAGES
 
-from colmap_affrect.depth import depth_source
-from colmap_affrect.interfaces import DepthSource
-from colmap_affrect.options import DepthOptions
+from colmap_affrect.images.depth import DepthFiles, DepthFilesOptions, DepthSource
 
 
+@pytest.mark.parametrize("kind", ["z", "ray", "inverse"])
 class TestDepthFiles(DepthContract):
-    kind = "z"
-
     @pytest.fixture(autouse=True)
-    def _maps(self, tmp_path: Path) -> None:
+    def _maps(self, tmp_path: Path, kind: str) -> None:
         """One map of half the size of the image, with a hole."""
         height, width = IMAGES["textured"].shape
         depth = np.random.default_rng(3).uniform(0.5, 4.0, (height // 2, width // 2))
         depth[3:9, 5:20] = 0.0
         (tmp_path / "folder").mkdir()
         np.save(tmp_path / "folder" / "name.npy", depth)
-        self.folder = tmp_path
+        self.folder, self.kind = tmp_path, kind
 
     def make(self) -> DepthSource:
-        source = depth_source(DepthOptions(path=str(self.folder), kind=self.kind), None, "cpu")
-        assert source is not None
-        return source
-
-
-class TestRayLengths(TestDepthFiles):
-    kind = "ray"
-
-
-class TestInverseDepth(TestDepthFiles):
-    kind = "inverse"
+        return DepthFiles(DepthFilesOptions(path=str(self.folder), kind=self.kind))

@@ -1,21 +1,22 @@
-"""Every registered rectifier keeps the contract, with either shape source where it reads one."""
+"""Every registered rectifier keeps the contract, also with options of the paper and no depth."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from contracts.rectifier_contract import RectifierContract
 from numpy.typing import NDArray
 
-from colmap_affrect.features.second_moment import SecondMoment
-from colmap_affrect.interfaces import Rectifier, Sources
-from colmap_affrect.options import (
-    RECTIFIER_OPTIONS,
-    AsiftOptions,
-    DepthPlanesOptions,
-    SecondMomentOptions,
+from colmap_affrect.data import Photograph
+from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
+from colmap_affrect.rectifiers.base import (
+    RECTIFIERS,
+    Rectifier,
+    RectifierInputs,
+    RectifierOptions,
 )
-from colmap_affrect.rectifiers.registry import BUILT_IN, make_rectifier
-from colmap_affrect.types import Photograph
+from colmap_affrect.rectifiers.depth_planes import DepthPlanesOptions
+from colmap_affrect.rectifiers.whole_image import AsiftOptions
 
 
 class Corner:
@@ -23,9 +24,8 @@ class Corner:
 
     def depth(self, photograph: Photograph) -> NDArray[np.float32]:
         width, height = photograph.size
-        columns = (np.arange(width) - photograph.camera_matrix[0, 2]) / photograph.camera_matrix[
-            0, 0
-        ]
+        camera = photograph.camera_matrix
+        columns = (np.arange(width) - camera[0, 2]) / camera[0, 0]
         row = 4.0 / (1.0 + np.sqrt(3.0) * np.abs(columns))
         return np.tile(row, (height, 1)).astype(np.float32)
 
@@ -37,60 +37,21 @@ class NoDepth:
         return np.full(photograph.gray.shape, np.nan, np.float32)
 
 
-SOURCES = Sources(SecondMoment(SecondMomentOptions()), Corner())
+SOURCES = RectifierInputs(SecondMoment(SecondMomentOptions()), Corner())
+
+CASES: dict[str, tuple[RectifierOptions, RectifierInputs]] = {
+    **{name: (RECTIFIERS.options(name), SOURCES) for name in RECTIFIERS.names()},
+    "asift of the paper": (AsiftOptions(covering="asift", area_preserving=False), SOURCES),
+    "depth-planes of the paper": (DepthPlanesOptions(keep_original="outside"), SOURCES),
+    "depth-planes without depth": (DepthPlanesOptions(), RectifierInputs(None, NoDepth())),
+}
 
 
-def test_every_registered_rectifier_is_here() -> None:
-    tested = {cls.__name__ for cls in RectifierContract.__subclasses__()}
-    for name in BUILT_IN:
-        assert "Test" + name.title().replace("-", "") in tested
-    assert set(BUILT_IN) == set(RECTIFIER_OPTIONS)
+@pytest.mark.parametrize("name", CASES)
+class TestRectifier(RectifierContract):
+    @pytest.fixture(autouse=True)
+    def _name(self, name: str) -> None:
+        self.options, self.sources = CASES[name]
 
-
-def rectifier(name: str) -> Rectifier:
-    return make_rectifier(RECTIFIER_OPTIONS[name](), SOURCES)
-
-
-class TestIdentity(RectifierContract):
     def make(self) -> Rectifier:
-        return rectifier("identity")
-
-
-class TestAsift(RectifierContract):
-    def make(self) -> Rectifier:
-        return rectifier("asift")
-
-
-class TestAsiftOfThePaper(RectifierContract):
-    def make(self) -> Rectifier:
-        return make_rectifier(AsiftOptions(covering="asift", area_preserving=False), SOURCES)
-
-
-class TestAffnetShapes(RectifierContract):
-    def make(self) -> Rectifier:
-        return rectifier("affnet-shapes")
-
-
-class TestDenseShapes(RectifierContract):
-    def make(self) -> Rectifier:
-        return rectifier("dense-shapes")
-
-
-class TestDepthPlanes(RectifierContract):
-    def make(self) -> Rectifier:
-        return rectifier("depth-planes")
-
-
-class TestDepthPlanesOfThePaper(RectifierContract):
-    def make(self) -> Rectifier:
-        return make_rectifier(DepthPlanesOptions(keep_original="outside"), SOURCES)
-
-
-class TestDepthPlanesWithoutDepth(RectifierContract):
-    def make(self) -> Rectifier:
-        return make_rectifier(DepthPlanesOptions(), Sources(None, NoDepth()))
-
-
-class TestDepthAffnet(RectifierContract):
-    def make(self) -> Rectifier:
-        return rectifier("depth-affnet")
+        return RECTIFIERS.make(self.options, self.sources)

@@ -10,23 +10,20 @@ from contracts.rectifier_contract import RectifierContract, photograph_of
 from synthetic import texture
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.extraction import prepare
-from colmap_affrect.geometry.canvas import fit_canvas, image_corners, rectifying_affine
-from colmap_affrect.interfaces import Rectifier
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.types import Photograph, Rectification, RectificationPlan
+from colmap_affrect.rectifiers.base import RECTIFIERS, Rectifier, RectifierInputs
+from colmap_affrect.stages.one_image import prepare
 
 MODULE = """
-    from dataclasses import dataclass
+    from typing import Literal
 
     from colmap_affrect.geometry.canvas import fit_canvas, image_corners, rectifying_affine
-    from colmap_affrect.options import RectifierOptions
-    from colmap_affrect.types import Rectification, RectificationPlan
+    from colmap_affrect.rectifiers.base import RectifierOptions
+    from colmap_affrect.data import Rectification, RectificationPlan
 
 
-    @dataclass(frozen=True, kw_only=True)
     class SkewOptions(RectifierOptions):
-        name: str = "skew"
+        name: Literal["skew"] = "skew"
         tilt: float = 2.0
 
 
@@ -44,20 +41,6 @@ MODULE = """
 """
 
 
-class Skew:
-    """One warp of the whole image; what the module above does."""
-
-    def plan(self, photograph: Photograph) -> RectificationPlan:
-        linear = rectifying_affine(2.0, 0.5)
-        matrix, canvas = fit_canvas(linear, image_corners(photograph.size), 0.0)
-        return RectificationPlan(photograph.size, (Rectification(matrix, canvas, None, 2.0, 0.5),))
-
-
-class TestSkew(RectifierContract):
-    def make(self) -> Rectifier:
-        return Skew()
-
-
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A package ``skew-affrect`` on the path, as pip leaves it."""
@@ -72,13 +55,20 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("installed")
+class TestSkew(RectifierContract):
+    def make(self) -> Rectifier:
+        options = load_recipe("default", ["rectifier.name=skew"]).extraction.rectifier
+        return RECTIFIERS.make(options, RectifierInputs())
+
+
+@pytest.mark.usefixtures("installed")
 def test_rectifier_of_another_package_is_chosen_by_its_name() -> None:
     recipe = load_recipe("default", ["rectifier.name=skew", "rectifier.tilt=3.0"])
     extractor = prepare(recipe.extraction)
-    image = texture((140, 105), 4)
-    plan = extractor.plan(photograph_of(image))
+    photograph = photograph_of(texture((140, 105), 4))
+    plan = extractor.plan(photograph)
     assert [item.tilt for item in plan.items] == [3.0]
-    features = extractor.execute(image, plan)
+    features = extractor.execute(photograph, plan)
     assert (features.rectification_ids == 1).any()
 
 
@@ -86,5 +76,5 @@ def test_rectifier_of_another_package_is_chosen_by_its_name() -> None:
 def test_options_of_another_package_are_checked_as_our_own() -> None:
     with pytest.raises(OptionError, match=r"unknown option 'tlit' .did you mean 'tilt'"):
         load_recipe("default", ["rectifier.name=skew", "rectifier.tlit=3.0"])
-    with pytest.raises(OptionError, match=r"unknown 'skev' .did you mean 'skew'"):
+    with pytest.raises(OptionError, match=r"unknown rectifier 'skev' .did you mean 'skew'"):
         load_recipe("default", ["rectifier.name=skev"])

@@ -10,14 +10,10 @@ from planar_pairs import TRUTH, write_extreme_views, write_pair
 
 from colmap_affrect.errors import EvaluationError, OptionError
 from colmap_affrect.evaluation.evd import Evd
-from colmap_affrect.evaluation.protocol import EvaluationPair, PairScore
+from colmap_affrect.evaluation.protocol import PairScore
 from colmap_affrect.evaluation.registry import PROTOCOLS, make_protocol
 
 UNCHECKED = Evd(check_truth=False)
-
-
-def pair_by_name(pairs: tuple[EvaluationPair, ...]) -> dict[str, EvaluationPair]:
-    return {pair.name: pair for pair in pairs}
 
 
 def test_layout_of_the_extreme_view_dataset(tmp_path: Path) -> None:

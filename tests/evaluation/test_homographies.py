@@ -7,22 +7,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from planar_pairs import SIZE, write_pair
 from planar_pairs import TRUTH as PLANAR_TRUTH
+from planar_pairs import write_pair
 
+from colmap_affrect.evaluation.evd import Evd
 from colmap_affrect.evaluation.homographies import (
-    HomographyEstimator,
+    HomographyProtocol,
     TrueHomography,
-    doubts,
-    homography_counts,
     oriented,
-    score_homography,
     transfer_errors,
     visible_points,
 )
-from colmap_affrect.evaluation.protocol import PairResult, PairScore
-from colmap_affrect.evaluation.registry import PROTOCOLS
-from colmap_affrect.imaging import read_gray
+from colmap_affrect.evaluation.protocol import EvaluationPair, PairResult, PairScore
+from colmap_affrect.evaluation.truth_checks import homography_doubts
+from colmap_affrect.images.reading import read_gray
 
 SHARED_PAIRS = Path(__file__).resolve().parents[3] / "shared" / "pairs"
 
@@ -36,6 +34,10 @@ def shift(x: float, y: float) -> np.ndarray:
     return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
 
 
+BEHIND = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.01, 0.0, 1.0]])
+"""Carries points right of x = 100 behind the camera."""
+
+
 def error_px(estimate: np.ndarray | None, truth: np.ndarray = TRUTH) -> float:
     return TrueHomography(truth, SIZE1, SIZE2).error_px(estimate)
 
@@ -47,33 +49,30 @@ def test_transfer_error_of_one_match_by_hand() -> None:
     np.testing.assert_allclose(errors, [5.0], atol=ROUNDING_PX)
 
 
-def test_transfer_error_is_measured_in_image_2() -> None:
+def test_error_in_image_2_and_never_behind_the_camera() -> None:
     doubling = np.diag([2.0, 2.0, 1.0])
     errors = transfer_errors(doubling, np.array([[11.0, 5.0]]), np.array([[20.0, 10.0]]))
     np.testing.assert_allclose(errors, [2.0], atol=ROUNDING_PX)
-
-
-def test_points_behind_the_camera_are_never_correct() -> None:
-    behind = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.01, 0.0, 1.0]])
     points = np.array([[200.0, 40.0], [100.0, 7.0]])
-    assert np.isinf(transfer_errors(behind, points, np.array([[-200.0, -40.0], [0.0, 0.0]]))).all()
+    errors = transfer_errors(BEHIND, points, np.array([[-200.0, -40.0], [0.0, 0.0]]))
+    assert np.isinf(errors).all()
 
 
-def test_visible_points_are_those_that_land_in_image_2() -> None:
-    points = visible_points(shift(-100.0, 40.0), SIZE1, SIZE2)
-    assert (points.min(axis=0) == [100, 0]).all()
-    assert (points.max(axis=0) == [316, 196]).all()
-    assert len(points) == 55 * 50
-
-
-def test_visible_points_end_with_image_2() -> None:
-    points = visible_points(shift(0.0, 100.0), SIZE1, SIZE2)
-    assert (points.max(axis=0) == [236, 156]).all()
-
-
-def test_nothing_behind_the_camera_is_visible() -> None:
-    behind = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.01, 0.0, 1.0]])
-    assert visible_points(behind, SIZE1, (10_000, 10_000))[:, 0].max() == 96
+@pytest.mark.parametrize(
+    ("truth", "size2", "first", "last"),
+    [
+        (shift(-100.0, 40.0), SIZE2, (100, 0), (316, 196)),
+        (shift(0.0, 100.0), SIZE2, (0, 0), (236, 156)),
+        (BEHIND, (10_000, 10_000), (0, 0), (96, 196)),
+    ],
+)
+def test_visible_points_are_those_that_land_in_image_2(
+    truth: np.ndarray, size2: tuple[int, int], first: tuple[int, int], last: tuple[int, int]
+) -> None:
+    points = visible_points(truth, SIZE1, size2)
+    np.testing.assert_array_equal(points.min(axis=0), first)
+    np.testing.assert_array_equal(points.max(axis=0), last)
+    assert len(points) == np.prod((np.array(last) - first) // 4 + 1)
 
 
 def test_error_of_a_shift_is_its_euclidean_length() -> None:
@@ -109,36 +108,36 @@ def test_estimate_with_its_horizon_in_the_image_has_infinite_error() -> None:
 def test_counts_are_of_both_estimators() -> None:
     errors = [(0.5, 4.0), (3.0, 2.9), (float("inf"), 12.0)]
     results = [
-        PairResult(str(error), "", PairScore(error, 9, 9, {"magsac_error": other}), 9, 1.0)
-        for error, other in errors
+        PairResult(error, 9, 9, {"magsac_error": other}, name=str(error)) for error, other in errors
     ]
-    failed = PairResult("failed", "", PairScore(float("inf"), 0), 0, 0.0, failure="unreadable")
-    counts = homography_counts([*results, failed])
+    failed = PairResult(float("inf"), 0, name="failed", failure="unreadable")
+    counts = HomographyProtocol().summarize([*results, failed])
     assert list(counts.values()) == [1, 1, 1, 2, 2, 2, 0, 0, 1, 2, 2, 3]
     assert list(counts)[2:7:4] == ["< 3 px", "MAGSAC: < 1 px"]
+
+
+def score(points1: np.ndarray, points2: np.ndarray) -> PairScore:
+    pair = EvaluationPair("", (None, None), truth=TrueHomography(TRUTH, SIZE1, SIZE2))
+    return HomographyProtocol().score(pair, points1, points2, 3)
 
 
 def test_matches_of_which_half_are_wrong_give_the_homography() -> None:
     rng = np.random.default_rng(5)
     points1 = rng.uniform(0, SIZE1, (60, 2))
-    mapped = np.hstack([points1, np.ones((60, 1))]) @ TRUTH.T
-    points2 = mapped[:, :2] / mapped[:, 2:]
+    points2 = cv2.perspectiveTransform(points1[:, None], TRUTH)[:, 0]
     points2[::2] += rng.uniform(30, 60, (30, 2))
-    truth = TrueHomography(TRUTH, SIZE1, SIZE2)
-    score = score_homography(truth, points1, points2, HomographyEstimator(), 3)
-    assert score.error < 1e-3
-    assert score.details["magsac_error"] < 1e-2
-    assert (score.num_inliers, score.num_correct) == (30, 30)
-    swapped = score_homography(truth, points2, points1, HomographyEstimator(), 3)
-    assert swapped.error > 10.0
+    found = score(points1, points2)
+    assert found.error < 1e-3
+    assert found.details["magsac_error"] < 1e-2
+    assert (found.num_inliers, found.num_correct) == (30, 30)
+    assert score(points2, points1).error > 10.0
 
 
 def test_too_few_matches_give_no_homography() -> None:
     three = np.array([[1.0, 2.0], [30.0, 4.0], [5.0, 60.0]])
-    truth = TrueHomography(TRUTH, SIZE1, SIZE2)
-    score = score_homography(truth, three, three, HomographyEstimator(), 0)
-    assert (score.error, score.num_inliers) == (float("inf"), 0)
-    assert score.details == {"magsac_error": float("inf"), "magsac_num_inliers": 0}
+    found = score(three, three)
+    assert (found.error, found.num_inliers) == (float("inf"), 0)
+    assert found.details == {"magsac_error": float("inf"), "magsac_num_inliers": 0}
 
 
 @pytest.mark.parametrize(
@@ -156,14 +155,9 @@ def test_too_few_matches_give_no_homography() -> None:
 def test_wrong_truth_is_noticed_and_named(given: np.ndarray, note: str, tmp_path: Path) -> None:
     paths = tmp_path / "1.png", tmp_path / "2.png"
     write_pair(*paths, seed=7)
-    found = doubts(given, read_gray(paths[0]), read_gray(paths[1]))
+    found = homography_doubts(given, read_gray(paths[0]), read_gray(paths[1]))
     assert note in found
     assert bool(note) == bool(found)
-
-
-def test_planar_pair_is_as_large_as_it_says(tmp_path: Path) -> None:
-    write_pair(tmp_path / "1.png", tmp_path / "2.png", seed=7)
-    assert read_gray(tmp_path / "2.png").shape == SIZE[::-1]
 
 
 @pytest.mark.shared
@@ -171,6 +165,6 @@ def test_planar_pair_is_as_large_as_it_says(tmp_path: Path) -> None:
     ("name", "count"), [("evd_sample", 7), ("oxford_graf", 5), ("oxford_wall", 5)]
 )
 def test_real_homographies_are_confirmed(name: str, count: int) -> None:
-    dataset = PROTOCOLS["evd"]().load(SHARED_PAIRS / name)
+    dataset = Evd().load(SHARED_PAIRS / name)
     assert len(dataset.pairs) == count
     assert not [note for note in dataset.notes if "homography" in note]

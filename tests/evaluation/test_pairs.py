@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from planar_pairs import SIZE, TRUTH, write_pair
@@ -13,15 +14,11 @@ from small_scene import FOCAL_PX, IMAGE_SIZE, photograph
 from synthetic import write_image
 
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.correspondences import (
-    FundamentalEstimator,
-    correspondence_doubts,
-    recalls,
-    score_correspondences,
-    symmetric_epipolar_distances,
-)
+from colmap_affrect.evaluation.correspondences import CorrespondenceProtocol, recalls
 from colmap_affrect.evaluation.pairs import Pairs
-from colmap_affrect.evaluation.protocol import Dataset, PairResult
+from colmap_affrect.evaluation.protocol import Dataset, EvaluationPair, PairResult
+from colmap_affrect.evaluation.truth_checks import correspondence_doubts
+from colmap_affrect.evaluation.two_views import symmetric_epipolar_distances
 
 SHARED_PAIRS = Path(__file__).resolve().parents[3] / "shared" / "pairs"
 UNCHECKED = Pairs(check_truth=False)
@@ -34,6 +31,9 @@ INTRINSICS = [
     [0, FOCAL_PX, IMAGE_SIZE[1] / 2 - 0.5],
     [0, 0, 1],
 ]
+
+FIRST, SECOND = ((0.0, 0.0, 0.0), 0.0), ((0.6, -0.1, 0.2), -9.0)
+"""Positions and angles of two photographs."""
 
 
 def load(
@@ -50,22 +50,14 @@ def planar(tmp_path: Path) -> dict[str, Any]:
     return {"image1": "a.png", "image2": "b.png"}
 
 
-def project(points: np.ndarray) -> np.ndarray:
-    mapped = np.hstack([points, np.ones((len(points), 1))]) @ TRUTH.T
-    return mapped[:, :2] / mapped[:, 2:]
-
-
 def test_epipolar_distances_by_hand() -> None:
-    pairs = np.array([[5.0, 7.0, 90.0, 7.0], [5.0, 7.0, 90.0, 10.0]])
-    distances = symmetric_epipolar_distances(SHIFT_X, pairs)
+    points1, points2 = np.array([[5.0, 7.0]] * 2), np.array([[90.0, 7.0], [90.0, 10.0]])
+    distances = symmetric_epipolar_distances(SHIFT_X, points1, points2)
     np.testing.assert_allclose(distances, [0.0, 3.0 * np.sqrt(2.0)])
-    assert np.isinf(symmetric_epipolar_distances(None, pairs)).all()
-
-
-def test_distances_in_the_two_images_are_weighted_by_their_own_lines() -> None:
-    # Image 2 is three times as large: 3 px off there are 1 px in image 1.
+    assert np.isinf(symmetric_epipolar_distances(None, points1, points2)).all()
+    # Image 2 three times as large: 3 px off there are 1 px in image 1.
     larger = np.diag([1 / 3, 1 / 3, 1.0]) @ SHIFT_X
-    distances = symmetric_epipolar_distances(larger, np.array([[5.0, 7.0, 90.0, 24.0]]))
+    distances = symmetric_epipolar_distances(larger, points1[:1], np.array([[90.0, 24.0]]))
     np.testing.assert_allclose(distances, [np.hypot(3.0, 1.0)])
 
 
@@ -81,14 +73,14 @@ def test_matches_of_another_geometry_score_worse() -> None:
     points1 = rng.uniform((0, 0), (320, 200), (200, 2))
     points2 = points1 + np.stack([300.0 / depths, np.zeros(200)], axis=1)
     truth = np.hstack([points1[:30], points2[:30]])
-    estimator = FundamentalEstimator(1.0, 0.9999, 10_000, 3)
-    right = score_correspondences(truth, points1[30:], points2[30:], estimator, 0)
+    pair = EvaluationPair("", (None, None), truth=truth)
+    protocol = CorrespondenceProtocol(1.0, 0.9999, 10_000, 3)
+    right = protocol.score(pair, points1[30:], points2[30:], 0)
     assert right.error < 0.01
     assert right.details["wxbs_score"] >= 19 / 20 - 1e-9  # all but the threshold 0
     turned = np.stack([points1[30:, 0], points1[30:, 1] + 300.0 / depths[30:]], axis=1)
-    wrong = score_correspondences(truth, points1[30:], turned, estimator, 0)
-    assert wrong.error > 10.0
-    none = score_correspondences(truth, points1[:7], points2[:7], estimator, 0)
+    assert protocol.score(pair, points1[30:], turned, 0).error > 10.0
+    none = protocol.score(pair, points1[:7], points2[:7], 0)
     assert (none.error, none.details["wxbs_score"]) == (float("inf"), 0.0)
 
 
@@ -101,47 +93,75 @@ def test_homography_in_a_file_and_pixels_from_the_corner(
     np.testing.assert_allclose(pair.truth.matrix, TRUTH, atol=1e-9)
     assert pair.name == "a b"
     points = np.random.default_rng(0).uniform(0, SIZE, (40, 2))
-    score = UNCHECKED.score(pair, points, project(points), 0)
+    carried = cv2.perspectiveTransform(points[:, None], TRUTH)[:, 0]
+    score = UNCHECKED.score(pair, points, carried, 0)
     assert score.error < 1e-3
     assert UNCHECKED.success(score) == 1.0
 
 
-def test_relative_pose_is_that_of_the_photographs(tmp_path: Path) -> None:
-    position, yaw_deg = np.array([0.6, -0.1, 0.2]), -9.0
-    write_image(tmp_path / "a.png", photograph((0.0, 0.0, 0.0), 0.0))
-    write_image(tmp_path / "b.png", photograph(tuple(position), yaw_deg))
-    yaw = np.deg2rad(yaw_deg)
-    rotation = np.array([[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]])
+def view(position: tuple[float, float, float], yaw_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return (3, 3) rotation and (3,) translation, camera_from_world, of a photograph."""
+    rotation, _ = cv2.Rodrigues(np.array([0.0, -np.deg2rad(yaw_deg), 0.0]))
+    return rotation, -rotation @ np.array(position)
+
+
+def seen(points: np.ndarray, position: tuple[float, float, float], yaw_deg: float) -> np.ndarray:
+    """Return the px of (N, 3) points in a photograph."""
+    rotation, translation = view(position, yaw_deg)
+    pixels = (points @ rotation.T + translation) @ np.array(INTRINSICS).T
+    return pixels[:, :2] / pixels[:, 2:]
+
+
+@pytest.fixture
+def posed(tmp_path: Path) -> dict[str, Any]:
+    for name, where in (("a.png", FIRST), ("b.png", SECOND)):
+        write_image(tmp_path / name, photograph(*where))
+    rotation, translation = view(*SECOND)
     pose = {
         "rotation": rotation.tolist(),
-        "translation": (-rotation @ position).tolist(),
+        "translation": translation.tolist(),
         "intrinsics1": INTRINSICS,
         "intrinsics2": INTRINSICS,
     }
-    entry = {"image1": "a.png", "image2": "b.png", "relative_pose": pose}
-    dataset = load(tmp_path, entry)
+    return {"image1": "a.png", "image2": "b.png", "relative_pose": pose}
+
+
+def test_relative_pose_is_that_of_the_photographs(tmp_path: Path, posed: dict[str, Any]) -> None:
+    dataset = load(tmp_path, posed)
     assert dataset.notes == ()
-    rng = np.random.default_rng(1)
-    points3d = rng.uniform((-1.5, -1, 4), (1.5, 1, 7), (50, 3))
-    projected = []
-    for points in (points3d, (points3d - position) @ rotation.T):
-        pixels = points @ np.array(INTRINSICS).T
-        projected.append(pixels[:, :2] / pixels[:, 2:])
-    score = UNCHECKED.score(dataset.pairs[0], projected[0], projected[1], 0)
+    points = np.random.default_rng(1).uniform((-1.5, -1, 4), (1.5, 1, 7), (50, 3))
+    score = UNCHECKED.score(dataset.pairs[0], seen(points, *FIRST), seen(points, *SECOND), 0)
     assert score.error < 0.05
     assert score.details["direction_error_deg"] < 0.5
-    result = PairResult("a b", "indoors", score, 50, 0.1)
-    columns = UNCHECKED.summarize([result])
+    columns = UNCHECKED.summarize([PairResult(**vars(score), name="a b", category="indoors")])
     assert min(columns.values()) > 0.999
-    assert {"poses: all", "poses, GC-RANSAC: all < 10°", "poses: pose AUC 10°"} <= columns.keys()
-    assert not [name for name in columns if name.endswith(": 0°")]
-    off = {**pose, "intrinsics2": [[FOCAL_PX, 0, 30], [0, FOCAL_PX, 110], [0, 0, 1]]}
-    assert (
-        "principal point of intrinsics2" in load(tmp_path, {**entry, "relative_pose": off}).notes[0]
-    )
-    scaled = {**pose, "rotation": (2 * rotation).tolist()}
-    (pair,) = load(tmp_path, {**entry, "relative_pose": scaled}).pairs
+    names = ["all", "all < 10°", "all < 20°", "pose AUC 10°"]
+    groups = ["poses: ", "poses, GC-RANSAC: "]
+    assert list(columns) == [group + name for group in groups for name in names]
+
+
+def test_wrong_poses_are_noticed(tmp_path: Path, posed: dict[str, Any]) -> None:
+    pose = posed["relative_pose"]
+    off = [[FOCAL_PX, 0, 30], [0, FOCAL_PX, 110], [0, 0, 1]]
+    dataset = load(tmp_path, {**posed, "relative_pose": {**pose, "intrinsics2": off}})
+    assert "principal point of intrinsics2" in dataset.notes[0]
+    scaled = (2 * np.array(pose["rotation"])).tolist()
+    (pair,) = load(tmp_path, {**posed, "relative_pose": {**pose, "rotation": scaled}}).pairs
     assert "scaled by 2" in pair.problem
+    transposed = np.array(pose["rotation"]).T.tolist()
+    changed = {**posed, "relative_pose": {**pose, "rotation": transposed}}
+    assert "contradict their true poses" in load(tmp_path, changed, protocol=Pairs()).notes[0]
+    assert load(tmp_path, posed, protocol=Pairs()).notes == ()
+
+
+def test_pixels_from_the_corner_are_moved(
+    tmp_path: Path, planar: dict[str, Any], posed: dict[str, Any]
+) -> None:
+    marked = {**planar, "name": "c", "correspondences": [[10, 20, 30, 40]]}
+    poses, points = load(tmp_path, posed, marked, pixel_origin="corner").pairs
+    np.testing.assert_array_equal(points.truth, [[9.5, 19.5, 29.5, 39.5]])
+    principal = np.array(INTRINSICS)[:2, 2]
+    np.testing.assert_array_equal(poses.images[0].intrinsics[:2, 2], principal - 0.5)
 
 
 def test_tables_are_by_kind_of_truth(tmp_path: Path, planar: dict[str, Any]) -> None:
@@ -156,7 +176,7 @@ def test_tables_are_by_kind_of_truth(tmp_path: Path, planar: dict[str, Any]) -> 
     assert "bad: cannot be evaluated and counts as failed" in dataset.notes[0]
     nothing = np.zeros((0, 2))
     results = [
-        PairResult(pair.name, pair.category, UNCHECKED.score(pair, nothing, nothing, 0), 0, 0.0)
+        PairResult(**vars(UNCHECKED.score(pair, nothing, nothing, 0)), name=pair.name)
         for pair in dataset.pairs[:2]
     ]
     columns = UNCHECKED.summarize(results)
@@ -176,24 +196,15 @@ def test_tables_are_by_kind_of_truth(tmp_path: Path, planar: dict[str, Any]) -> 
 )
 def test_wrong_correspondences_are_noticed(change: np.ndarray, note: str, tmp_path: Path) -> None:
     paths = tmp_path / "a.png", tmp_path / "b.png"
-    write_image(paths[0], photograph((0.0, 0.0, 0.0), 0.0))
-    write_image(paths[1], photograph((0.0, -0.6, 0.2), 8.0))
-    found = correspondence_doubts(wall_correspondences() @ change.T, paths)
+    views = ((0.0, 0.0, 0.0), 0.0), ((0.0, -0.6, 0.2), 8.0)
+    for path, where in zip(paths, views, strict=True):
+        write_image(path, photograph(*where))
+    x, y = np.meshgrid([-1.1, -0.2, 0.7, 1.3], [-1.2, -0.6, 0.1])
+    wall = np.stack([x.ravel(), y.ravel(), np.full(x.size, 7.0)], axis=1)
+    marked = np.hstack([seen(wall, *where) for where in views])
+    found = correspondence_doubts(marked @ change.T, paths)
     assert note in found
     assert bool(note) == bool(found)
-
-
-def wall_correspondences() -> np.ndarray:
-    """Points on the wall behind, at z = 7, in both photographs."""
-    grid = np.stack(np.meshgrid([-1.1, -0.2, 0.7, 1.3], [-1.2, -0.6, 0.1]), axis=-1).reshape(-1, 2)
-    points = np.hstack([grid, np.full((len(grid), 1), 7.0)])
-    yaw = np.deg2rad(8.0)
-    rotation = np.array([[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]])
-    sides = []
-    for seen in (points, (points - [0.0, -0.6, 0.2]) @ rotation.T):
-        pixels = seen @ np.array(INTRINSICS).T
-        sides.append(pixels[:, :2] / pixels[:, 2:])
-    return np.hstack(sides)
 
 
 @pytest.mark.parametrize(

@@ -12,18 +12,18 @@ import pytest
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.conventions import pixel_from_colmap
-from colmap_affrect.evaluation.protocol import EvaluationPair, PairResult, PairScore
+from colmap_affrect.evaluation.protocol import EvaluationPair, PairResult
 from colmap_affrect.evaluation.relative_pose import (
-    PAPER_CODE_MAX_NUM_ITERATIONS,
-    Ransac,
     RelativePoseProtocol,
-    estimate_relative_pose,
     posed_image,
     posed_pair,
     rays,
     rotation_angle_deg,
-    sampson_distances,
     true_pose,
+)
+from colmap_affrect.evaluation.two_views import (
+    Ransac,
+    sampson_distances,
 )
 
 
@@ -57,11 +57,6 @@ def matches(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Positions of points in a cube, pixel-centre px of both images."""
     points = np.random.default_rng(seed).uniform(-1, 1, (count, 3))
     return project(CAMERA1, POSE1, points), project(CAMERA2, POSE2, points)
-
-
-def test_plain_intrinsics_of_an_image_are_pixel_centre() -> None:
-    expected = [[800, 0, 459.5], [0, 800, 339.5], [0, 0, 1]]
-    np.testing.assert_array_equal(make_pair().images[0].intrinsics, expected)
 
 
 def test_exact_matches_give_the_pose() -> None:
@@ -122,7 +117,7 @@ def test_hundred_thousand_iterations_find_what_a_thousand_do_not() -> None:
     points2[30:] = np.random.default_rng(5).uniform(0, 600, (90, 2))
     # A quarter of the matches is right: a thousand samples miss a good one four times in ten.
     many = RelativePoseProtocol(confidence=0.99)
-    few = dataclasses.replace(many, max_num_iterations=PAPER_CODE_MAX_NUM_ITERATIONS)
+    few = dataclasses.replace(many, max_num_iterations=1_000)
     assert few.score(make_pair(), points1, points2, 1).error > 5
     score = many.score(make_pair(), points1, points2, 1)
     assert score.error < 0.1
@@ -140,24 +135,24 @@ def test_seed_decides_the_result() -> None:
     assert first != other
 
 
-@pytest.mark.parametrize("count", [0, 4, 5])
+@pytest.mark.parametrize("count", [0, 5])
 def test_too_few_matches_are_a_failure(count: int) -> None:
     score = RelativePoseProtocol().score(make_pair(), *matches(count), 0)
     assert (score.error, score.num_inliers) == (math.inf, 0)
     assert RelativePoseProtocol().success(score) == 0
 
 
-def test_all_matches_in_one_place_are_a_failure_or_a_bad_pose_but_no_crash() -> None:
+def test_all_matches_in_one_place_never_count_as_a_right_pose() -> None:
     points = np.full((20, 2), 100.0)
     score = RelativePoseProtocol().score(make_pair(), points, points, 0)
-    assert score.error > 0
+    assert RelativePoseProtocol().success(score) == 0
 
 
 def test_points_that_are_not_finite_are_never_inliers() -> None:
     points1, points2 = matches(60)
     points1[3] = np.nan
-    cameras_rays = rays(CAMERA1, points1), rays(CAMERA2, points2)
-    pose, inliers = estimate_relative_pose(*cameras_rays, Ransac(1e-3, 0.9999, 1000))
+    ransac = Ransac(cv2.RANSAC, 1e-3, 0.9999, 1000)
+    pose, inliers = ransac.relative_pose(rays(CAMERA1, points1), rays(CAMERA2, points2))
     assert pose is not None
     assert np.flatnonzero(~inliers).tolist() == [3]
 
@@ -181,8 +176,7 @@ def result(category: str, error: float, direction_error: float) -> PairResult:
         "gc_error": error / 2,
         "gc_direction_error_deg": 0.0,
     }
-    score = PairScore(error, 50, None, details)
-    return PairResult("p", category, score, 100, 0.1)
+    return PairResult(error, 50, None, details, name="p", category=category)
 
 
 def test_summary_has_shares_by_category_in_order_and_counts_failures() -> None:
@@ -200,11 +194,6 @@ def test_summary_has_shares_by_category_in_order_and_counts_failures() -> None:
     assert list(summary.values()) == pytest.approx([*expected, *refined])
 
 
-def test_pair_without_features_counts_as_failed() -> None:
-    failed = PairResult("p", "20°", PairScore(math.inf, 0), 0, 0.0)
-    assert set(RelativePoseProtocol().summarize([failed]).values()) == {0.0}
-
-
 def test_refinement_on_all_inliers_beats_one_sample_of_them() -> None:
     points1, points2 = matches(300)
     noise = np.random.default_rng(4).normal(0, 1.0, (2, *points1.shape))
@@ -212,7 +201,3 @@ def test_refinement_on_all_inliers_beats_one_sample_of_them() -> None:
         make_pair(), points1 + noise[0], points2 + noise[1], 0
     )
     assert score.details["gc_error"] < 0.7 * score.error
-
-
-def test_summary_of_nothing_is_zero() -> None:
-    assert set(RelativePoseProtocol().summarize([]).values()) == {0.0}

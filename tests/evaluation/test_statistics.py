@@ -7,38 +7,41 @@ import math
 import numpy as np
 import pytest
 
-from colmap_affrect.evaluation.statistics import bootstrap_interval, paired_test
+from colmap_affrect.evaluation.statistics import bootstrap_intervals, paired_test
+
+
+def interval_of_mean(values: np.ndarray, seed: int) -> tuple[float, float]:
+    (interval,) = bootstrap_intervals(len(values), lambda rows: [values[rows].mean()], seed)
+    return interval
 
 
 def test_interval_of_a_mean_is_that_of_the_normal_distribution() -> None:
     values = np.random.default_rng(3).normal(5.0, 2.0, 400)
-    low, high = bootstrap_interval(values.tolist(), lambda array: float(array.mean()), 0)
     half_width = 1.96 * values.std() / math.sqrt(400)
-    assert low == pytest.approx(values.mean() - half_width, abs=0.04)
-    assert high == pytest.approx(values.mean() + half_width, abs=0.04)
+    expected = values.mean() - half_width, values.mean() + half_width
+    assert interval_of_mean(values, 0) == pytest.approx(expected, abs=0.02)
 
 
 def test_interval_covers_the_truth_about_as_often_as_it_says() -> None:
     rng = np.random.default_rng(0)
-    covered = 0
-    for seed in range(40):
-        values = (rng.random(80) < 0.3).astype(float)
-        low, high = bootstrap_interval(values.tolist(), lambda array: float(array.mean()), seed)
-        covered += low <= 0.3 <= high
-    assert 34 <= covered <= 40
+    intervals = [interval_of_mean(rng.random(80) < 0.3, seed) for seed in range(40)]
+    assert 34 <= sum(low <= 0.3 <= high for low, high in intervals) <= 40
 
 
-def test_interval_depends_on_the_seed_only() -> None:
-    def share(array):
-        return float((array < 5).mean())
+def test_intervals_of_several_statistics_do_not_mix() -> None:
+    values = np.array([1.0, math.inf, 3.0, 8.0, 2.0, math.inf, 4.0])
 
-    values = [1.0, math.inf, 3.0, 8.0, 2.0, math.inf, 4.0]
-    intervals = [bootstrap_interval(values, share, seed) for seed in (0, 0)]
-    assert intervals[0] == intervals[1]
-    assert 0 <= intervals[0][0] < 4 / 7 < intervals[0][1] <= 1
-    assert bootstrap_interval([2.0], share, 1) == (1.0, 1.0)
+    def shares(rows: np.ndarray) -> list[float]:
+        return [float((values[rows] < limit).mean()) for limit in (5, math.inf)]
+
+    below, finite = bootstrap_intervals(7, shares, 0)
+    assert 0 <= below[0] < 4 / 7 < below[1] <= 1
+    assert 0 < finite[0] < 5 / 7 < finite[1] <= 1
+    assert finite > below
+    assert bootstrap_intervals(7, shares, 0) == [below, finite]
+    assert bootstrap_intervals(1, shares, 1) == [(1.0, 1.0)] * 2
     with pytest.raises(ValueError, match="no values"):
-        bootstrap_interval([], share, 0)
+        bootstrap_intervals(0, shares, 0)
 
 
 def test_paired_test_of_ones_and_zeros_is_the_sign_test() -> None:

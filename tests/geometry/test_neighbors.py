@@ -52,12 +52,6 @@ def test_neighbors_within_includes_points_at_exactly_the_radius_and_the_point_it
     assert sorted(lists.of(np.array([2]))[1].tolist()) == [1, 2]
 
 
-def test_neighbors_within_keeps_points_of_the_same_place_apart() -> None:
-    lists = neighbors_within(np.array([[7.0, 2.0]] * 3 + [[2.0, 7.0]]), 1.0)
-    assert sorted(lists.of(np.array([1]))[1].tolist()) == [0, 1, 2]
-    assert lists.of(np.array([3]))[1].tolist() == [3]
-
-
 def test_neighbors_within_does_not_join_row_ends_with_the_next_row() -> None:
     # The last cell of one row of cells and the first of the next have neighbouring keys.
     xs, ys = np.meshgrid(np.arange(0.0, 50.0, 0.5), np.arange(0.0, 5.0, 0.5))
@@ -65,9 +59,3 @@ def test_neighbors_within_does_not_join_row_ends_with_the_next_row() -> None:
     rows, neighbors = neighbors_within(points, 1.0).of(np.arange(len(points)))
     assert np.linalg.norm(points[rows] - points[neighbors], axis=1).max() <= 1.0
     assert len(rows) == sum(map(len, all_neighbors(points, 1.0)))
-
-
-def test_neighbors_within_of_no_points_is_empty() -> None:
-    lists = neighbors_within(np.zeros((0, 2)), 3.0)
-    rows, neighbors = lists.of(np.zeros(0, dtype=int))
-    assert len(rows) == len(neighbors) == 0

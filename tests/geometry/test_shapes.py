@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from strategies import Array, affine_shapes, classes, tilt_angles
+from strategies import Array, affine_shapes, classes
 
 from colmap_affrect.geometry.shapes import log_metrics, metrics_from_log, rectifying_metrics
 from colmap_affrect.geometry.tilts import metrics_from_tilts, tilts_from_metrics, unit_metrics
@@ -34,15 +34,6 @@ def test_rectifying_metrics_of_a_long_frame_stretch_across_it() -> None:
     assert_allclose(rectifying_metrics(np.diag([6.0, 2.0])), [1 / 3, 3.0, 0.0])
 
 
-@given(affine_shapes(), tilt_angles)
-def test_rectifying_metrics_do_not_depend_on_the_orientation_of_a_frame(
-    shape: Array, angle: float
-) -> None:
-    cos, sin = np.cos(angle), np.sin(angle)
-    turned = shape @ np.array([[cos, -sin], [sin, cos]])
-    assert_allclose(rectifying_metrics(turned), rectifying_metrics(shape), rtol=1e-9, atol=1e-9)
-
-
 @given(classes(), st.floats(1e-3, 1e3))
 def test_log_metrics_are_matrix_logarithms_whatever_the_scale(shape: Class, scale: float) -> None:
     metric = metrics_from_tilts(*shape)
@@ -56,19 +47,6 @@ def test_log_metrics_are_matrix_logarithms_whatever_the_scale(shape: Class, scal
 def test_metrics_from_log_inverts_log_metrics(shape: Class) -> None:
     metric = metrics_from_tilts(*shape)
     assert_allclose(metrics_from_log(log_metrics(metric)), metric, rtol=SINGLE, atol=SINGLE)
-
-
-def test_log_metrics_keep_the_shape_of_a_grid() -> None:
-    metrics = metrics_from_tilts([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], 0.3)
-    logs = log_metrics(metrics)
-    assert logs.shape == (2, 3, 2)
-    assert logs.dtype == np.float32
-    assert_allclose(metrics_from_log(logs), metrics, rtol=SINGLE)
-
-
-def test_mean_of_logs_of_opposite_stretches_is_the_identity() -> None:
-    metrics = metrics_from_tilts(3.0, [0.2, 0.2 + np.pi / 2])
-    assert_allclose(metrics_from_log(log_metrics(metrics).mean(axis=0)), [1, 1, 0], atol=SINGLE)
 
 
 def test_mean_of_logs_along_one_direction_is_the_geometric_mean_of_tilts() -> None:

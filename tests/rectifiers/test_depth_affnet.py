@@ -3,38 +3,19 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from planar_scenes import FixedDepth, corner_room, slanted_wall
-from strategies import Array
+from planar_scenes import FixedDepth, FixedShapes, corner_room, slanted_wall
+from strategies import Array, tilt_distance
 
+from colmap_affrect.data import RectificationPlan
 from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.canvas import rectifying_affine
-from colmap_affrect.geometry.tilts import metrics_from_tilts, tilt_distance
-from colmap_affrect.interfaces import Sources
-from colmap_affrect.options import DepthAffNetOptions, PlaneOptions
-from colmap_affrect.rectifiers.depth_affnet import DepthAffNet
-from colmap_affrect.rectifiers.depth_planes import PlanarSegment, planar_segments
-from colmap_affrect.types import GrayImage, RectificationPlan, ShapeGrid, ShapeSamples
-
-
-@dataclass
-class FixedShapes:
-    """Shape source that knows its shapes beforehand, as rows (x, y, tilt, angle)."""
-
-    rows: Array
-
-    def grid(self, image: GrayImage) -> ShapeGrid:
-        """Not for this rectifier."""
-        raise NotImplementedError
-
-    def samples(self, image: GrayImage) -> ShapeSamples:
-        """The shapes."""
-        del image
-        return ShapeSamples(self.rows[:, :2], metrics_from_tilts(self.rows[:, 2], self.rows[:, 3]))
+from colmap_affrect.rectifiers.base import RectifierInputs
+from colmap_affrect.rectifiers.depth_affnet import DepthAffNet, DepthAffNetOptions
+from colmap_affrect.rectifiers.depth_planes import PlanarSegment, PlaneOptions, planar_segments
 
 
 def shapes_at(points: Array, tilt: float, angle_rad: float) -> Array:
@@ -54,7 +35,7 @@ def room_segments() -> list[PlanarSegment]:
 
 def plan_room(shapes: Array, **options: object) -> RectificationPlan:
     """Plan for the room with given shapes."""
-    sources = Sources(FixedShapes(shapes), FixedDepth(DEPTH))
+    sources = RectifierInputs(FixedShapes(shapes), FixedDepth(DEPTH))
     return DepthAffNet(DepthAffNetOptions(**options), sources).plan(ROOM.photograph())
 
 
@@ -123,7 +104,7 @@ def test_warps_magnify_nothing_if_they_need_not_keep_the_area() -> None:
 
 def test_an_image_without_planes_has_no_warps() -> None:
     wall = slanted_wall([0.2, 0.1, -1.0])
-    sources = Sources(
+    sources = RectifierInputs(
         FixedShapes(shapes_at(np.full((50, 2), 30.0), 3.0, 0.5)),
         FixedDepth(np.full((30, 40), np.nan)),
     )
@@ -135,4 +116,4 @@ def test_an_image_without_planes_has_no_warps() -> None:
 def test_depth_affnet_without_a_source_is_an_option_error(missing: str) -> None:
     sources = {"shapes": FixedShapes(np.zeros((0, 4))), "depth": FixedDepth(np.ones((3, 4)))}
     with pytest.raises(OptionError, match=missing):
-        DepthAffNet(DepthAffNetOptions(), Sources(**{**sources, missing: None}))
+        DepthAffNet(DepthAffNetOptions(), RectifierInputs(**{**sources, missing: None}))

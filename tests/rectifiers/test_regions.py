@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from strategies import classes
 
+from colmap_affrect.data import Mask, Rectification
 from colmap_affrect.geometry.affine import project, transform_frames
 from colmap_affrect.geometry.canvas import rectifying_affine
 from colmap_affrect.geometry.planes import fronto_parallel_homography
@@ -20,7 +21,6 @@ from colmap_affrect.rectifiers.regions import (
     affine_rectification,
     homography_rectification,
 )
-from colmap_affrect.types import Mask, Rectification
 
 CAMERA = np.array([[300.0, 0.0, 95.0], [0.0, 320.0, 70.0], [0.0, 0.0, 1.0]])
 

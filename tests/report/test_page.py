@@ -1,278 +1,63 @@
+"""The parts of pages, put together on a page that knows nothing of comparisons."""
+
 from __future__ import annotations
 
-import base64
-import json
-import re
-import struct
-from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
-import numpy as np
-import pytest
-from small_comparison import IMAGE_SIZE, NAMES, make_comparison
-from synthetic import texture, write_image
+from synthetic import texture
 
-from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.copies import open_copy
-from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
-from colmap_affrect.report.match_plots import PLOT_HEIGHT, choose_pairs, plot_pairs
+from colmap_affrect.report import view_graph
+from colmap_affrect.report.match_plots import MatchPlot, SideBySide
 from colmap_affrect.report.page import write_page
 from colmap_affrect.report.pictures import Picture
-from colmap_affrect.report.view_graph import GRAPH_SIZE, lay_out
+from colmap_affrect.report.scene import read_scene
+from colmap_affrect.report.warp_views import WarpedPhotograph, WarpView
 
-VOID = {"meta", "img", "link", "br", "hr", "input"}
-
-
-class Page(HTMLParser):
-    """Reads a page; fails on tags that are not balanced.
-
-    Attributes:
-        text: all that is shown or run.
-        attributes: (tag, name, value) of all tags.
-        cells: text of the table of methods by metric and method.
-        data: what the script reads.
-    """
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.text = ""
-        self.attributes: list[tuple[str, str, str]] = []
-        self.cells: dict[tuple[str, str], str] = {}
-        self.ids: list[str] = []
-        self._cell: tuple[str, str] | None = None
-        self._data = ""
-        self._in_data = False
-        self.feed(html)
-        self.close()
-        assert self.open == []
-        assert len(self.ids) == len(set(self.ids))
-        self.data = json.loads(self._data)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.handle_startendtag(tag, attrs)
-        if tag not in VOID:
-            self.open.append(tag)
-        values = dict(attrs)
-        if "data-metric" in values:
-            self._cell = (str(values["data-metric"]), str(values["data-method"]))
-            self.cells[self._cell] = ""
-        self._in_data = values.get("id") == "data"
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.attributes += [(tag, name, value or "") for name, value in attrs]
-        self.ids += [str(value) for name, value in attrs if name == "id"]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-        self._cell, self._in_data = None, False
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-        if self._cell:
-            self.cells[self._cell] += data
-        if self._in_data:
-            self._data += data
-
-    def number(self, metric: str, method: str) -> float:
-        return float(self.cells[metric, method].split()[0].replace(",", ""))
+TEMPLATE = """{% extends "base.html" %}
+{% import "parts.html" as parts with context %}
+{% block title %}A run{% endblock %}
+{% block body %}
+{{ parts.image_list(image_index) }}{{ parts.options({"seed": 3}) }}
+{{ parts.class_legend() }}{{ parts.thumbnail_definitions() }}
+{{ parts.view_graph("graph", layout, edges, nodes) }}{{ parts.inlier_matrix("m", matrix, 0) }}
+{{ parts.pair_picture_definitions() }}{{ parts.match_plot("run", side_by_side, plot) }}
+{{ parts.warped_photograph(warped) }}
+{{ parts.model_buttons() }}{{ parts.model("run", views[0], 0, "#123456") }}
+{% endblock %}
+"""
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("comparison")
-
-
-@pytest.fixture(scope="module")
-def comparison(folder: Path) -> Comparison:
-    return make_comparison(folder)
-
-
-@pytest.fixture(scope="module")
-def page(comparison: Comparison, folder: Path) -> Page:
-    return Page(write_page(comparison, folder).read_text(encoding="utf-8"))
-
-
-def test_numbers_are_those_of_the_comparison(page: Page, comparison: Comparison) -> None:
-    by_method = comparison.to_mapping()["methods"]
-    for name in ("sift", "default"):
-        values = by_method[name]
-        for metric in (
-            "registered", "correct", "verified_pairs", "inliers", "points3D",
-            "mean_track_length", "mean_observations", "mean_reprojection_error_px",
-        ):  # fmt: skip
-            mean = values[metric]["mean"]
-            assert page.number(metric, name) == pytest.approx(mean, abs=0.5, rel=0), metric
-        assert page.number("mean_reprojection_error_px", name) == pytest.approx(0.215, abs=0.0051)
-        assert page.number("total_s", name) == pytest.approx(values["total_s"], abs=0.051)
-        for stage, seconds in values["wall_s"].items():
-            assert page.number(f"{stage}_s", name) == pytest.approx(seconds, abs=0.051)
-        scores = [seed["scores"] for seed in values["seeds"]]
-        for limit in ("1", "3", "5", "10"):
-            auc = np.mean([score["auc"][limit] for score in scores])
-            assert page.number(f"auc_{limit}", name) == pytest.approx(auc, abs=0.00051)
-        for metric in ("median_rotation_error_deg", "median_direction_error_deg"):
-            mean = np.mean([score[metric] for score in scores])
-            assert page.number(metric, name) == pytest.approx(mean, abs=0.0051)
-        assert page.number("peak_memory_bytes", name) == 123
-    assert page.cells["registered", "default"] == "4.5 (4-5)"
-    assert page.cells["correct", "default"] == "4.5 (4-5)"
-    assert page.cells["models", "default"] == "seed 0: 5; seed 1: 4 + 2"
-    assert page.cells["registered", "sift"] == "4"
-
-
-def test_verdict_failures_and_settings_are_told(page: Page, comparison: Comparison) -> None:
-    assert all(paragraph in page.text for paragraph in comparison.verdict)
-    assert "broken failed: weights <affnet> & more are missing" in page.text
-    assert "not a <readable> image" in page.text
-    assert "camera.mode" in page.text
-    assert pycolmap.__version__ in page.text
-
-
-def test_marks_say_what_each_method_does_with_a_photograph(page: Page) -> None:
-    titles = [value for tag, name, value in page.attributes if (tag, name) == ("span", "title")]
-    assert titles.count("sift: registered, correctly") == 4
-    assert titles.count("sift: not registered") == 2
-    assert titles.count("default: registered, correctly") == 4
-    assert titles.count("default: registered with 1 of 2 seeds, wrongly") == 1
-    groups = [value for _, name, value in page.attributes if name == "data-groups"]
-    assert sum("seeds" in group for group in groups) == 1
-    assert sum("wrong" in group for group in groups) == 1
-    assert sum("none" in group for group in groups) == 2
-    assert sum("differ" in group.split() for group in groups) == 0  # "usually": not with half
-
-
-def test_names_of_images_are_never_markup(page: Page) -> None:
-    assert not any(name.startswith("on") for _, name, _ in page.attributes)
-    tags = [tag for tag, name, value in page.attributes if (name, value) == ("src", "x")]
-    assert tags == []
-    assert NAMES[0] in page.text
-
-
-def test_page_loads_nothing(page: Page, folder: Path) -> None:
-    for tag, name, value in page.attributes:
-        if name in ("src", "href", "action", "data", "poster", "srcset", "xlink:href"):
-            assert value.startswith(("data:", "#")), (tag, name, value[:50])
-    html = (folder / "report.html").read_text(encoding="utf-8")
-    assert re.findall(r"https?://[^\s\"'<]*", html) == []
-    assert "url(" not in html
-    assert "@import" not in html
-    assert "default-src 'none'" in html
-
-
-def test_every_picture_has_a_text_and_every_table_headers(page: Page) -> None:
-    images = [
-        index
-        for index, (tag, name, _) in enumerate(page.attributes)
-        if (tag, name) == ("img", "src")
-    ]
-    assert len(images) == sum((tag, name) == ("img", "alt") for tag, name, _ in page.attributes)
-    labels = [v for tag, name, v in page.attributes if (tag, name) == ("svg", "aria-label")]
-    roles = [v for tag, name, v in page.attributes if (tag, name) == ("svg", "role")]
-    assert len(labels) == len(roles) > 6
-    assert {v for tag, name, v in page.attributes if tag == "th"} == {"col", "row"}
-
-
-def test_matrices_of_the_script_have_the_inliers(page: Page, comparison: Comparison) -> None:
-    names = comparison.image_names
-    for text, method in zip(page.data["matrices"], comparison.finished, strict=True):
-        counts = np.frombuffer(base64.b64decode(text), "<u2").reshape(len(names), len(names))
-        for row, name1 in enumerate(names):
-            for column, name2 in enumerate(names):
-                pair = (min(name1, name2), max(name1, name2))
-                assert counts[row, column] == method.seeds[0].pair_inliers.get(pair, 0)
-
-
-def test_models_are_drawn_in_one_frame(page: Page) -> None:
-    sift, default = page.data["views"]
-    assert [len(view["cameras"]) for view in (sift, default)] == [4, 5]
-    of_default = {camera["name"]: camera["corners"] for camera in default["cameras"]}
-    centers = []
-    for camera in sift["cameras"]:
-        np.testing.assert_allclose(camera["corners"], of_default[camera["name"]], atol=2e-3)
-        centers.append(camera["corners"][:3])
-    assert np.ptp(centers, axis=0).max() > 0.3
-    data = base64.b64decode(default["points"])
-    assert len(data) == 9 * default["count"]
-    places = np.array(struct.unpack(f"<{3 * default['count']}H", data[: 6 * default["count"]]))
-    assert places.reshape(-1, 3).std(axis=0).min() > 500  # points all around, as synthesized
-
-
-def test_matches_lie_where_the_features_are(comparison: Comparison, folder: Path) -> None:
-    pair = (NAMES[0], NAMES[1])
-    chosen = [item for item in choose_pairs(comparison, ["default"]) if item.names == pair]
-    assert [(item.before.name, item.after.name) for item in chosen] == [("sift", "default")]
-    pictures = {name: Picture("", 80, 60) for name in NAMES}
-    ((before, after),) = [item.plots for item in plot_pairs(chosen, pictures, folder)]
-    assert (before.num_inliers, before.plain, before.warped) == (0, "", "")
-    assert after.num_inliers == comparison.methods[2].seeds[0].pair_inliers[pair]
-    with open_copy(folder / "methods/default/seed-0/database.db") as database:
-        ids = {image.name: image.image_id for image in database.read_all_images()}
-        indices = database.read_two_view_geometry(ids[pair[0]], ids[pair[1]]).inlier_matches
-        points = [database.read_keypoints(ids[name])[:, :2] for name in pair]
-    expected_plain, expected_warped = set(), set()
-    scale = PLOT_HEIGHT / IMAGE_SIZE[1]
-    for index1, index2 in indices:
-        (x1, y1), (x2, y2) = scale * points[0][index1], scale * points[1][index2]
-        line = f"{x1:.1f} {y1:.1f}L{x2 + scale * IMAGE_SIZE[0] + 8:.1f} {y2:.1f}"
-        (expected_warped if index1 % 2 or index2 % 2 else expected_plain).add(line)
-    assert set(after.plain.split("M")[1:]) == expected_plain
-    assert set(after.warped.split("M")[1:]) == expected_warped
-    assert after.num_from_warps == len(expected_warped) > 0 < len(expected_plain)
-
-
-def test_warps_of_the_method_that_rectifies_are_shown(page: Page) -> None:
-    alts = [value for tag, name, value in page.attributes if (tag, name) == ("img", "alt")]
-    assert sum(alt.startswith("Warp of tilt") for alt in alts) >= 3
-    assert sum(alt.endswith("with its regions in colour") for alt in alts) == 3
-
-
-def test_layout_keeps_thumbnails_apart_and_inside() -> None:
-    names = [f"{number}.jpg" for number in range(12)]
-    pairs = {(names[i], names[i + 1]): 100 for i in range(8)}  # the last three are alone
-    layout = lay_out(names, [pairs])
-    half = layout.node_size / 2
-    assert layout.centers.min() >= half - 1e-6
-    assert (layout.centers <= np.array(GRAPH_SIZE) - half + 1e-6).all()
-    for i in range(12):
-        for j in range(i):
-            assert np.abs(layout.centers[i] - layout.centers[j]).max() > 0.9 * layout.node_size
-
-
-def test_what_is_missing_is_said_in_its_place(tmp_path: Path) -> None:
-    (tmp_path / "photographs").mkdir()
-    write_image(tmp_path / "photographs" / "a.png", texture((64, 48), 0))
-    (tmp_path / "photographs" / "b.png").write_bytes(b"no image")
-    seed = SeedResult(0, (), "", 0, 0.0, 0.0, 0.0, {}, None, {})
-    nothing = Comparison(
-        ("a.png", "b.png"), str(tmp_path / "photographs"),
-        (MethodResult("sift", seeds=(seed,)),), (0,), 1, {}, {},
-    )  # fmt: skip
-    page = Page(write_page(nothing, tmp_path).read_text(encoding="utf-8"))
-    for sentence in (
-        "cannot be shown", "There is no model.", "No pair of photographs is verified",
-        "There is one method, so nothing to compare it with.", "None was given",
-        "No method that finished rectifies photographs.",
-    ):  # fmt: skip
-        assert sentence in page.text
-    failed = replace(nothing, methods=(MethodResult("sift", failed="it <broke>"),))
-    page = Page(write_page(failed, tmp_path).read_text(encoding="utf-8"))
-    assert "sift failed: it <broke>" in page.text
-    assert "No method finished" in page.text
-
-
-def test_lost_models_and_databases_are_said_in_their_place(
-    comparison: Comparison, tmp_path: Path
-) -> None:
-    page = Page(write_page(comparison, tmp_path).read_text(encoding="utf-8"))
-    assert "The model cannot be shown" in page.text
-    assert "The inliers cannot be drawn" in page.text
-    assert page.number("registered", "sift") == 4
-
-
-def test_page_of_200_photographs_is_below_15_mb(large_page_path: Path) -> None:
-    page = Page(large_page_path.read_text(encoding="utf-8"))
-    assert 2_000_000 < large_page_path.stat().st_size < 15_000_000
-    assert sum((tag, name) == ("img", "src") for tag, name, _ in page.attributes) == 200
-    assert page.data["views"][4]["count"] > 5000
+def test_parts_make_a_page_of_one_run(tmp_path: Path) -> None:
+    names, pair = ("a <b>.png", "c.png"), ("a <b>.png", "c.png")
+    picture = Picture.jpeg(texture((40, 30), 0))
+    layout = view_graph.lay_out(names, [{pair: 70}])
+    matrix = view_graph.matrix(names, {pair: 70})
+    scene = read_scene({"run": None})
+    nodes = [view_graph.Node(i, name, "always", False, "ok") for i, name in enumerate(names, 1)]
+    view = WarpView(picture, "#ff0000", 2.0, 30.0)
+    (tmp_path / "run.html").write_text(TEMPLATE)
+    path = write_page(
+        tmp_path / "report.html",
+        tmp_path / "run.html",
+        {
+            "image_index": {name: index for index, name in enumerate(names)},
+            "thumbnails": dict.fromkeys(names, picture),
+            "pair_pictures": dict.fromkeys(names, picture),
+            "layout": layout,
+            "edges": view_graph.edge_paths(names, layout, {pair: 70}),
+            "matrix": matrix,
+            "nodes": nodes,
+            "side_by_side": SideBySide(pair, (400.0, 400.0)),
+            "plot": MatchPlot(70, 1, "M1 2L3 4", "M5 6L7 8"),
+            "warped": WarpedPhotograph(pair[0], 1, "asift", 1, picture, (view,), True),
+            "views": scene.views,
+            "script_data": {"names": names, "matrices": [matrix.counts], **scene.script_data()},
+        },
+    )
+    html = path.read_text(encoding="utf-8")
+    assert "<title>A run</title>" in html
+    assert html.count("M1 2L3 4") == html.count("M5 6L7 8") == 2  # with a dark line below
+    assert "a &lt;b&gt;.png" in html
+    assert "<b>" not in html
+    assert "There is no model." in html
+    assert "70 inliers of run between photographs 1 and 2" in html

@@ -15,8 +15,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.errors import StoreError
 from colmap_affrect.pipeline import RunOptions, run
-from colmap_affrect.store import FeatureStore
-from colmap_affrect.workspace import Workspace
+from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.workspace import Workspace
 
 
 @pytest.mark.parametrize("content", [b"", b"no image at all"])
@@ -67,21 +67,6 @@ def test_blank_image_has_no_features_and_the_run_goes_on(
     assert (report["num_pairs"], report["num_verified_pairs"]) == (6, 3)
     assert FeatureStore(tmp_path / "out" / "features.h5").num_keypoints()["blank.png"] == 0
     assert any("blank.png: no features" in line for line in stderr)
-
-
-def test_image_of_another_place_has_no_verified_pair(
-    trio: Path, tmp_path: Path, call: Call
-) -> None:
-    write_image(trio / "elsewhere.png", photograph((0.0, 0.0, 0.0), 0.0)[::-1, ::-1].T[:240, :240])
-    code, stdout, _ = call(
-        "run", "--image-path", trio, "--output-path", tmp_path / "out", "--json",
-        "--recipe", "unrectified-rootsift",
-        "--match-list-path", pair_list(tmp_path, "a.png", "b c.png"),
-    )  # fmt: skip
-    report = json.loads(stdout)
-    assert report["num_pairs"] == 1
-    assert report["unregistered"]["elsewhere.png"] == "no verified pair"
-    assert code in (0, 3)
 
 
 def test_one_image_ends_without_a_model(tmp_path: Path, call: Call) -> None:

@@ -1,7 +1,6 @@
 """Writes that fail: one clear line, nothing lost that was done, and the same results later.
 
 A limit on the size of files stands for a full disk: what goes beyond it fails in the same calls.
-An output folder that cannot be made is in test_stages, failing writes one by one in test_files.
 """
 
 from __future__ import annotations
@@ -15,15 +14,16 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from command import FAST, Call, Ended
 from results import Undisturbed, results, run_arguments
 
-from colmap_affrect.files import FileTransaction
-from colmap_affrect.store import FeatureStore, MatchStore
-from colmap_affrect.workspace import Workspace
+from colmap_affrect.project.atomic_files import FileTransaction
+from colmap_affrect.project.stores import FeatureStore, MatchStore
+from colmap_affrect.project.workspace import Workspace
 
 pytestmark = pytest.mark.long
 
@@ -47,13 +47,53 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
-def call_limited(num_bytes: int, *arguments: object) -> Ended:
-    """Run a command in a process of its own, which pycolmap may abort."""
-    done = subprocess.run(
-        [sys.executable, "-c", LIMITED_COMMAND, str(num_bytes), *map(str, arguments)],
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-    return Ended(done.returncode, done.stdout, done.stderr.splitlines())
+@dataclass(frozen=True)
+class Disturbed:
+    """A run whose writes are to fail, and one that nothing disturbed."""
+
+    photos: Path
+    workspace: Workspace
+    undisturbed: Undisturbed
+    call: Call
+
+    @property
+    def out(self) -> Path:
+        return self.workspace.path
+
+    @property
+    def arguments(self) -> list[str]:
+        return run_arguments(self.photos, self.out, FAST)
+
+    def run(self) -> Ended:
+        return self.call(*self.arguments)
+
+    def run_limited(self, num_bytes: int, *arguments: object) -> Ended:
+        """Run a command in a process of its own, which pycolmap may abort."""
+        command = [*map(str, arguments)] or self.arguments
+        done = subprocess.run(
+            [sys.executable, "-c", LIMITED_COMMAND, str(num_bytes), *command],
+            capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+        return Ended(done.returncode, done.stdout, done.stderr.splitlines())
+
+    def begin_without(self, *names: str) -> None:
+        """Begin with the undisturbed run as it was before it made some of its files."""
+        shutil.copytree(self.undisturbed.out, self.out)
+        for name in (*names, "report.json", "sparse"):
+            path = self.out / name
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    def assert_finishes(self) -> None:
+        """Run again and have the same results."""
+        assert self.run().code == 0
+        assert results(self.out) == self.undisturbed.results
+
+
+@pytest.fixture
+def disturbed(
+    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
+) -> Disturbed:
+    return Disturbed(small_photos, Workspace(tmp_path / "out"), undisturbed, call)
 
 
 def assert_says_what_to_do(ended: Ended, path: Path) -> None:
@@ -65,21 +105,11 @@ def assert_says_what_to_do(ended: Ended, path: Path) -> None:
     assert "run the same command again" in line
 
 
-def copy_without(source: Path, target: Path, *names: str) -> Path:
-    """Copy a finished run as it was before it made some of its files."""
-    shutil.copytree(source, target)
-    for name in (*names, "report.json", "sparse"):
-        path = target / name
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-    return target
-
-
 @pytest.mark.parametrize("passing", [2, 4])
 def test_hdf5_write_that_fails_loses_nothing_else(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call,
-    monkeypatch: pytest.MonkeyPatch, passing: int,
-) -> None:  # fmt: skip
-    out, calls = tmp_path / "out", []
+    disturbed: Disturbed, monkeypatch: pytest.MonkeyPatch, passing: int
+) -> None:
+    workspace, calls = disturbed.workspace, []
     commit = FileTransaction.commit
 
     def full(changes: FileTransaction) -> None:
@@ -90,168 +120,132 @@ def test_hdf5_write_that_fails_loses_nothing_else(
 
     with monkeypatch.context() as patch:
         patch.setattr(FileTransaction, "commit", full)
-        ended = call(*run_arguments(small_photos, out, FAST))
-    workspace = Workspace(out)
-    failed = workspace.features if passing < 4 else workspace.matches
-    assert_says_what_to_do(ended, failed)
+        ended = disturbed.run()
+    assert_says_what_to_do(ended, workspace.features if passing < 4 else workspace.matches)
     assert "No space left on device" in ended.stderr[0]
     assert len(FeatureStore(workspace.features).names()) == passing
-    assert call(*run_arguments(small_photos, out, FAST)).code == 0
-    assert results(out) == undisturbed.results
+    disturbed.assert_finishes()
 
 
-def test_features_that_do_not_fit_on_the_disk(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
-) -> None:
-    out = tmp_path / "out"
-    with file_size_limit(undisturbed.out.joinpath("features.h5").stat().st_size * 2 // 3):
-        ended = call(*run_arguments(small_photos, out, FAST))
-        assert_says_what_to_do(ended, Workspace(out).features)
-        assert call(*run_arguments(small_photos, out, FAST)).code == 1  # nor does it get worse
-    assert 1 <= len(FeatureStore(Workspace(out).features).names()) < 4
-    assert call(*run_arguments(small_photos, out, FAST)).code == 0
-    assert results(out) == undisturbed.results
+def test_features_that_do_not_fit_on_the_disk(disturbed: Disturbed) -> None:
+    features = disturbed.workspace.features
+    with file_size_limit(disturbed.undisturbed.out.joinpath("features.h5").stat().st_size * 2 // 3):
+        assert_says_what_to_do(disturbed.run(), features)
+        assert disturbed.run().code == 1  # nor does it get worse
+    assert 1 <= len(FeatureStore(features).names()) < 4
+    disturbed.assert_finishes()
 
 
-def test_matches_that_do_not_fit_on_the_disk(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
-) -> None:
-    out = ["--output-path", tmp_path / "out"]
-    workspace = Workspace(tmp_path / "out")
-    for command in (["extract", "--image-path", small_photos, *FAST], ["pairs"]):
-        assert call(*command, *out, "-q").code == 0
+def test_matches_that_do_not_fit_on_the_disk(disturbed: Disturbed) -> None:
+    out = ["--output-path", disturbed.out, "-q"]
+    for command in (["extract", "--image-path", disturbed.photos, *FAST], ["pairs"]):
+        assert disturbed.call(*command, *out).code == 0
     with file_size_limit(10_000):
-        assert_says_what_to_do(call("match", *out, "-q"), workspace.matches)
-    assert MatchStore(workspace.matches).names() == []
-    assert call(*run_arguments(small_photos, workspace.path, FAST)).code == 0
-    assert results(workspace.path) == undisturbed.results
+        assert_says_what_to_do(disturbed.call("match", *out), disturbed.workspace.matches)
+    assert MatchStore(disturbed.workspace.matches).names() == []
+    disturbed.assert_finishes()
 
 
-def test_record_of_options_that_does_not_fit_on_the_disk(
-    small_photos: Path, tmp_path: Path, call: Call
-) -> None:
-    out = tmp_path / "out"
+def test_record_of_options_that_does_not_fit_on_the_disk(disturbed: Disturbed) -> None:
     with file_size_limit(700):
-        ended = call(*run_arguments(small_photos, out, FAST))
-    assert_says_what_to_do(ended, Workspace(out).config)
-    assert not Workspace(out).config.exists()
-    assert not Workspace(out).features.exists()
+        ended = disturbed.run()
+    assert_says_what_to_do(ended, disturbed.workspace.config)
+    assert not disturbed.workspace.config.exists()
+    assert not disturbed.workspace.features.exists()
 
 
-def test_report_that_cannot_be_written(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
-) -> None:
-    out = copy_without(undisturbed.out, tmp_path / "out")
-    (out / "report.json.new").mkdir()
-    assert_says_what_to_do(call(*run_arguments(small_photos, out, FAST)), out / "report.json")
-    (out / "report.json.new").rmdir()
-    assert call(*run_arguments(small_photos, out, FAST)).code == 0
-    assert results(out) == undisturbed.results
+def test_report_that_cannot_be_written(disturbed: Disturbed) -> None:
+    disturbed.begin_without()
+    (disturbed.out / "report.json.new").mkdir()
+    assert_says_what_to_do(disturbed.run(), disturbed.workspace.report)
+    (disturbed.out / "report.json.new").rmdir()
+    disturbed.assert_finishes()
 
 
-def test_new_database_that_does_not_fit_on_the_disk(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
-) -> None:
+def test_new_database_that_does_not_fit_on_the_disk(disturbed: Disturbed) -> None:
     # COLMAP would end the process in the middle of its images.
-    out = copy_without(undisturbed.out, tmp_path / "out", "database.db")
-    ended = call_limited(160_000, *run_arguments(small_photos, out, FAST))
-    assert_says_what_to_do(ended, out / "database.db.new")
-    assert call(*run_arguments(small_photos, out, FAST)).code == 0
-    assert results(out) == undisturbed.results
+    disturbed.begin_without("database.db")
+    assert_says_what_to_do(disturbed.run_limited(160_000), disturbed.out / "database.db.new")
+    disturbed.assert_finishes()
 
 
 @pytest.mark.parametrize("emptied", [("keypoints", "matches"), ("matches",)])
 def test_database_that_grows_too_large_for_the_disk(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call,
-    emptied: tuple[str, ...],
-) -> None:  # fmt: skip
-    out = copy_without(undisturbed.out, tmp_path / "out")
-    with closing(sqlite3.connect(out / "database.db", isolation_level=None)) as database:
+    disturbed: Disturbed, emptied: tuple[str, ...]
+) -> None:
+    disturbed.begin_without()
+    path = disturbed.workspace.database
+    with closing(sqlite3.connect(path, isolation_level=None)) as database:
         for table in ("two_view_geometries", *emptied):
             database.execute(f"DELETE FROM {table}")
         database.execute("VACUUM")
-    limit = (out / "database.db").stat().st_size + 20_000
-    ended = call_limited(limit, *run_arguments(small_photos, out, FAST))
-    assert_says_what_to_do(ended, out / "database.db")
-    assert call(*run_arguments(small_photos, out, FAST)).code == 0
-    assert results(out) == undisturbed.results
+    assert_says_what_to_do(disturbed.run_limited(path.stat().st_size + 20_000), path)
+    disturbed.assert_finishes()
 
 
-def test_geometries_that_do_not_fit_on_the_disk(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
-) -> None:
-    out = ["--output-path", tmp_path / "out"]
-    workspace = Workspace(tmp_path / "out")
-    for command in (["extract", "--image-path", small_photos, *FAST], ["pairs"], ["match"]):
-        assert call(*command, *out, "-q").code == 0
+def test_geometries_that_do_not_fit_on_the_disk(disturbed: Disturbed) -> None:
+    out = ["--output-path", disturbed.out, "-q"]
+    for command in (["extract", "--image-path", disturbed.photos, *FAST], ["pairs"], ["match"]):
+        assert disturbed.call(*command, *out).code == 0
     # COLMAP would end the process in the middle of this.
-    ended = call_limited(workspace.database.stat().st_size + 10_000, "verify", *out, "-q")
-    assert_says_what_to_do(ended, workspace.database)
-    assert call(*run_arguments(small_photos, workspace.path, FAST)).code == 0
-    assert results(workspace.path) == undisturbed.results
+    database = disturbed.workspace.database
+    ended = disturbed.run_limited(database.stat().st_size + 10_000, "verify", *out)
+    assert_says_what_to_do(ended, database)
+    disturbed.assert_finishes()
 
 
-def test_model_that_does_not_fit_on_the_disk_is_not_taken_for_whole(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
-) -> None:
+def test_model_that_does_not_fit_on_the_disk_is_not_taken_for_whole(disturbed: Disturbed) -> None:
     # pycolmap writes what fits and says nothing.
-    out = copy_without(undisturbed.out, tmp_path / "out")
+    disturbed.begin_without()
     with file_size_limit(50_000):
-        ended = call(*run_arguments(small_photos, out, FAST))
-    assert_says_what_to_do(ended, out / "sparse.partial" / "0")
-    assert not Workspace(out).sparse.exists()
-    assert not Workspace(out).report.exists()
-    assert call(*run_arguments(small_photos, out, FAST)).code == 0
-    assert results(out) == undisturbed.results
+        ended = disturbed.run()
+    assert_says_what_to_do(ended, disturbed.out / "sparse.partial" / "0")
+    assert not disturbed.workspace.sparse.exists()
+    assert not disturbed.workspace.report.exists()
+    disturbed.assert_finishes()
 
 
-def test_model_that_was_damaged_later_is_named(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
-) -> None:
-    out = Path(shutil.copytree(undisturbed.out, tmp_path / "out"))
-    damaged = out / "sparse" / "0" / "points3D.bin"
+def test_model_that_was_damaged_later_is_named(disturbed: Disturbed) -> None:
+    shutil.copytree(disturbed.undisturbed.out, disturbed.out)
+    damaged = disturbed.workspace.sparse / "0" / "points3D.bin"
     os.truncate(damaged, damaged.stat().st_size // 2)
-    ended = call(*run_arguments(small_photos, out, FAST))
+    ended = disturbed.run()
     assert (ended.code, ended.stdout, len(ended.stderr)) == (1, "", 1)
     assert ended.stderr[0].startswith(f"error: {damaged}: damaged")
     assert ended.stderr[0].endswith("run map again with --overwrite")
-    assert call("map", "--output-path", out, "--overwrite").code == 0
-    assert results(out) == undisturbed.results
+    assert disturbed.call("map", "--output-path", disturbed.out, "--overwrite").code == 0
+    assert results(disturbed.out) == disturbed.undisturbed.results
 
 
-def test_hdf5_file_that_was_damaged_later_is_named(
-    tmp_path: Path, undisturbed: Undisturbed, call: Call
-) -> None:
-    content = (undisturbed.out / "features.h5").read_bytes()
-    out = copy_without(undisturbed.out, tmp_path / "out", "database.db")
+def test_hdf5_file_that_was_damaged_later_is_named(disturbed: Disturbed) -> None:
+    disturbed.begin_without("database.db")
+    features = disturbed.workspace.features
+    content, num_refused = features.read_bytes(), 0
     for start in range(0, 6000, 200):
         damaged = bytearray(content)
         damaged[start : start + 64] = b"\xa5" * 64
-        (out / "features.h5").write_bytes(damaged)
-        ended = call("pairs", "--output-path", out, "-q")
+        features.write_bytes(damaged)
+        ended = disturbed.call("pairs", "--output-path", disturbed.out, "-q")
         if ended.code:
+            num_refused += 1
             (line,) = ended.stderr
-            assert line.startswith(f"error: {out / 'features.h5'}: ")
+            assert line.startswith(f"error: {features}: ")
             assert "--overwrite" in line or "another --output-path" in line
+    assert num_refused > 2
 
 
-def test_log_that_cannot_be_written_stops_nothing(
-    small_photos: Path, tmp_path: Path, call: Call
-) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "run.log").symlink_to("/dev/full")
-    arguments = ["extract", "--image-path", small_photos, "--output-path", tmp_path / "out"]
-    ended = call(*arguments, "-q", *FAST)
+def test_log_that_cannot_be_written_stops_nothing(disturbed: Disturbed) -> None:
+    disturbed.out.mkdir()
+    disturbed.workspace.log.symlink_to("/dev/full")
+    arguments = ["extract", "--image-path", disturbed.photos, "--output-path", disturbed.out]
+    ended = disturbed.call(*arguments, "-q", *FAST)
     assert (ended.code, ended.stderr) == (0, [])
     assert ended.stdout.startswith("extract: 4 done")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="permissions do not stop root")
-def test_output_folder_that_may_not_be_written_is_refused(
-    small_photos: Path, tmp_path: Path, call: Call
-) -> None:
-    out = tmp_path / "out"
-    out.mkdir(mode=0o555)
-    ended = call(*run_arguments(small_photos, out, FAST))
+def test_output_folder_that_may_not_be_written_is_refused(disturbed: Disturbed) -> None:
+    disturbed.out.mkdir(mode=0o555)
+    ended = disturbed.run()
     assert (ended.code, len(ended.stderr)) == (1, 1)
-    assert str(out) in ended.stderr[0]
+    assert str(disturbed.out) in ended.stderr[0]

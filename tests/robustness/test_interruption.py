@@ -1,7 +1,4 @@
-"""Runs that are killed, ended and interrupted at random moments, and run again.
-
-Options that changed in between: test_stages, test_other_options_than_before_are_named.
-"""
+"""Runs that are killed, ended and interrupted at random moments, and run again."""
 
 from __future__ import annotations
 
@@ -27,8 +24,8 @@ from results import (
 )
 
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.files import journal_of
-from colmap_affrect.workspace import Workspace
+from colmap_affrect.project.atomic_files import journal_of
+from colmap_affrect.project.workspace import Workspace
 
 COURTYARD = Path(__file__).parents[2] / "sample_scenes" / "courtyard" / "images"
 COURTYARD_OPTIONS = ("--camera-mode", "single", "--set", "max_image_size_px=500")

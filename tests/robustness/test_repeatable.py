@@ -9,7 +9,7 @@ import pytest
 from command import CAMERA, start
 from results import results
 
-from colmap_affrect.executor import available_cores
+from colmap_affrect.parallel.executor import available_cores
 
 OPTIONS = [*CAMERA, "--random-seed", 7, "-q"]
 

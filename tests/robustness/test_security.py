@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import os
+import re
 from pathlib import Path
 
 import h5py
@@ -15,72 +15,16 @@ import colmap_affrect
 
 PACKAGE = Path(colmap_affrect.__file__).parent
 
-FORBIDDEN_NAMES = {"eval", "exec", "compile", "__import__"}
-FORBIDDEN_MODULES = {"marshal", "shelve", "dill", "cloudpickle", "joblib", "yaml"}
 
-TASKS = {"cluster.py": {"dumps", "loads"}}
-"""Workers unpickle what the command that leads them sends, and nothing that a file holds."""
-
-
-def dotted(node: ast.expr) -> str:
-    """Name of what is called, such as ``torch.load``."""
-    if isinstance(node, ast.Attribute):
-        return f"{dotted(node.value)}.{node.attr}"
-    return node.id if isinstance(node, ast.Name) else ""
-
-
-def offences(source: str) -> list[str]:
-    """What executes data, or could, in the source of a module."""
-    found = []
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            found += [item.name for item in node.names if item.name in FORBIDDEN_MODULES]
-        if isinstance(node, ast.ImportFrom) and node.module in {*FORBIDDEN_MODULES, "pickle"}:
-            found += [item.name for item in node.names if item.name != "UnpicklingError"]
-        if isinstance(node, ast.Attribute) and dotted(node.value) == "pickle":
-            found += [node.attr] * (node.attr != "UnpicklingError")
-        if not isinstance(node, ast.Call):
-            continue
-        name = dotted(node.func)
-        given = {
-            item.arg: item.value.value if isinstance(item.value, ast.Constant) else "unknown"
-            for item in node.keywords
-        }
-        wrong = (
-            name in FORBIDDEN_NAMES
-            or name in ("os.system", "os.popen", "subprocess.getoutput")
-            or bool(given.get("shell", False))
-            or bool(given.get("trust_remote_code", False))
-            or bool(given.get("allow_pickle", False))
-            or (name.endswith("torch.load") and given.get("weights_only") is not True)
-            or (name.endswith("np.load") and given.get("allow_pickle") is not False)
-        )
-        found += [name] * wrong
-    return found
-
-
-@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: path.stem)
-def test_module_executes_no_data(path: Path) -> None:
-    assert set(offences(path.read_text(encoding="utf-8"))) == TASKS.get(path.name, set())
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        "eval(text)",
-        "pickle.loads(data)",
-        "import marshal",
-        "from pickle import loads",
-        "torch.load(path)",
-        "torch.load(path, weights_only=False)",
-        "np.load(path)",
-        "np.load(path, allow_pickle=True)",
-        "np.lib.format.read_array(stream, allow_pickle=flag)",
-        "subprocess.run(command, shell=True)",
-    ],
-)
-def test_offences_are_found(source: str) -> None:
-    assert len(offences(source)) == 1
+def test_no_source_can_load_code_with_data() -> None:
+    # Ruff's rules of flake8-bandit forbid eval, pickle and shells; what they do not know is here.
+    for path in sorted(PACKAGE.rglob("*.py")):
+        source = path.read_text(encoding="utf-8")
+        loads = re.findall(r"(?:torch|np)\.load\(.*|format.read_array\(.*", source)
+        assert all(re.search("allow_pickle=False|weights_only=True", line) for line in loads), path
+        assert not re.search(r"trust_remote_code=True|import (joblib|cloudpickle)", source), path
+        # Workers unpickle what the command that leads them sends, and nothing that a file holds.
+        assert path.name == "cluster.py" or not re.search("noqa.*S(102|30[127]|60[245])", source)
 
 
 def state(folder: Path, *, without: Path) -> dict[str, tuple[bytes, int]]:

@@ -1,0 +1,131 @@
+"""The commands, with help texts."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from colmap_affrect import __version__
+from colmap_affrect.cli import arguments as args
+from colmap_affrect.cli import commands
+
+if TYPE_CHECKING:
+    # The type of what takes arguments has no public name.
+    Container = argparse._ActionsContainer
+
+EPILOG = """\
+examples:
+  colmap-affrect run --image-path photos --output-path out
+  colmap-affrect run --image-path photos --output-path out --camera-mode single
+  colmap-affrect run --image-path photos --output-path out --recipe unrectified-rootsift
+  colmap-affrect extract --image-path photos --output-path out
+  colmap-affrect pairs   --output-path out --pairs retrieval,sequence --num-neighbors 30
+  colmap-affrect match   --output-path out
+  colmap-affrect verify  --output-path out
+  colmap-affrect map     --output-path out
+  colmap-affrect run --image-path photos --output-path out --recipe on-demand
+  colmap-affrect run --image-path photos --output-path out --recipe depth-planes-recommended \\
+      --depth-path depth
+  colmap-affrect compare --image-path photos --output-path out
+  colmap-affrect compare --image-path photos --output-path out --methods sift,default --seeds 0
+  colmap-affrect evaluate evd --dataset-path EVD --output-path out \\
+      --recipes unrectified-rootsift,default,on-demand
+  colmap-affrect inspect photos/a.jpg --output-path out
+  colmap-affrect weights fetch
+  colmap-affrect doctor out
+  colmap-affrect doctor database.db --image-path photos
+  colmap-affrect import-h5 --image-path photos --features-path features.h5 \\
+      --matches-path matches.h5 --database-path new.db
+  colmap-affrect export-h5 --database-path any.db --features-path features.h5 \\
+      --matches-path matches.h5
+
+Run a command again and it goes on where it stopped. Exit codes: 0 done, 1 failed (one line
+says why; also when images could not be read, see --max-failures), 2 wrong usage, 3 finished
+without a model, 130 interrupted.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    parser = argparse.ArgumentParser(
+        prog="colmap-affrect",
+        description="Rectified wide-baseline features for COLMAP: photographs in, model out.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"colmap-affrect {__version__}")
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, (function, summary, options) in COMMANDS.items():
+        command = subparsers.add_parser(
+            name,
+            help=summary,
+            description=summary,
+            epilog=EPILOG,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        command.set_defaults(function=function, output_path=None)
+        _add(command, options)
+    return parser
+
+
+def _add(container: Container, options: tuple[args.Option | args.OneOf, ...]) -> None:
+    for option in options:
+        if isinstance(option, args.OneOf):
+            group = container.add_mutually_exclusive_group(required=option.required)
+            _add(group, option.options)
+        else:
+            container.add_argument(*option.flags, **option.settings)
+
+
+Command = tuple[Callable[[argparse.Namespace], int], str, tuple[args.Option | args.OneOf, ...]]
+"""What is called with the options, what it does in one line, and the options."""
+
+COMMANDS: dict[str, Command] = {
+    "run": (commands.run, "all stages: photographs in, COLMAP model out",
+        (*args.RESULTS, *args.IMAGES, args.DESCRIPTORS, *args.recipe(), args.MATCHER,
+        *args.RESOURCES, args.SCHEDULER, *args.DEPTH, *args.PAIRS, args.PRESET, *args.MAPPER,
+        args.seed(), args.json())),
+    "extract": (commands.extract, "features into features.h5 and database.db",
+        (*args.RESULTS, *args.IMAGES, args.DESCRIPTORS, *args.recipe(), args.MATCHER,
+        *args.RESOURCES, args.SCHEDULER, *args.DEPTH)),
+    "pairs": (commands.pairs, "which images to match, into pairs.txt",
+        (*args.RESULTS, *args.PAIRS)),
+    "match": (commands.match, "matches into matches.h5 and database.db",
+        (*args.RESULTS, *args.recipe(default=None), args.MATCHER, args.DEVICE, args.SCHEDULER)),
+    "verify": (commands.verify, "two-view geometries into database.db",
+        (*args.RESULTS, args.PRESET, args.seed())),
+    "escalate": (commands.escalate,
+        "match pairs that failed again, with more warps (recipes that escalate, as on-demand)",
+        (*args.RESULTS, args.setting("escalate.min_num_tracks=10"), *args.RESOURCES,
+            args.SCHEDULER)),
+    "map": (commands.map, "COLMAP models into sparse/",
+        (*args.RESULTS, args.PRESET, *args.MAPPER, args.seed(), args.json())),
+    "compare": (commands.compare,
+        "how many photographs, and which, COLMAP's SIFT and recipes register; with pictures",
+        (*args.RESULTS, *args.IMAGES, *args.COMPARISON, *args.RESOURCES, *args.DEPTH,
+        args.PAIR_LIST, args.PRESET, *args.MAPPER,
+        args.json("print comparison.json, no summary"), args.VIEWER)),
+    "evaluate": (commands.evaluate,
+        "score recipes on pairs of images with a known truth, as the paper does on its datasets",
+        (*args.RESULTS, *args.EVALUATION, *args.RESOURCES, *args.DEPTH,
+        args.seed("of the estimators and the statistics", default=0),
+        args.json("print evaluation.json, no tables"))),
+    "inspect": (commands.inspect,
+        "draw what a recipe does to one image: regions, warps, features; the plan as JSON",
+        (args.OUTPUT_PATH, args.VOLUME, args.IMAGE, *args.MASKS, *args.recipe(), *args.RESOURCES,
+        *args.DEPTH)),
+    "import-h5": (commands.import_h5,
+        "features and matches of hloc or deep-image-matching into a new COLMAP database",
+        (args.IMAGE_PATH, *args.H5_FILES, args.IMPORT_TARGET, *args.CAMERAS,
+        *args.IMPORT_FORMAT, args.seed(default=0), args.VOLUME)),
+    "export-h5": (commands.export_h5,
+        "features and matches of an output folder or a database for hloc or deep-image-matching",
+        (args.EXPORT_SOURCE, *args.H5_FILES, *args.EXPORT_FORMAT, args.VOLUME)),
+    "doctor": (commands.doctor,
+        "look for what is wrong with results or the installation, and say what to do about it",
+        (*args.DOCTOR, args.json("print JSON"), args.VOLUME)),
+    "recipes": (commands.recipes, "list the recipes and what they need", (args.SHOWN_RECIPE,)),
+    "weights": (commands.weights, "list the files of weights, or fetch them beforehand",
+        args.WEIGHTS),
+}  # fmt: skip

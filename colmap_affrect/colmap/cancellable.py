@@ -1,0 +1,51 @@
+"""Run pycolmap's long calls so that Ctrl-C stops them cleanly and freed memory is theirs."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import TypeVar
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.parallel.executor import return_freed_memory
+
+Result = TypeVar("Result")
+
+POLL_S = 0.2
+
+
+def run_cancellable(call: Callable[[pycolmap.CancellationToken], Result]) -> Result:
+    """Run ``call`` in a thread; on Ctrl-C cancel it, wait until it has ended, and re-raise.
+
+    First, memory that this process has freed goes back to the system.
+
+    Args:
+        call: takes the token that pycolmap's call must be given.
+    """
+    return_freed_memory()
+    token = pycolmap.CancellationToken()
+    outcome: list[Result] = []
+    failure: list[BaseException] = []
+    # Not Thread.join: interrupted in Python 3.11, it takes the running thread for ended, and
+    # the interpreter then ends under pycolmap's feet (bpo-45274).
+    ended = threading.Event()
+
+    def work() -> None:
+        try:
+            outcome.append(call(token))
+        except BaseException as error:  # noqa: BLE001  (raised again by the waiting thread)
+            failure.append(error)
+        finally:
+            ended.set()
+
+    threading.Thread(target=work).start()
+    try:
+        while not ended.wait(POLL_S):
+            pass
+    except KeyboardInterrupt:
+        token.cancel()
+        ended.wait()
+        raise
+    if failure:
+        raise failure[0]
+    return outcome[0]

@@ -1,0 +1,246 @@
+"""Camera poses of a model against ground truth, or against another model."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.errors import ComparisonError
+
+Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""cam_from_world: rotation matrix and translation."""
+Poses = dict[str, Pose]
+"""Poses by image name."""
+PairErrors = Mapping[tuple[str, str], tuple[float, float]]
+"""By the sorted names of two images: the errors of their relative pose in degrees, of the rotation
+and of the direction of the translation."""
+
+AUC_THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0)
+MAX_CORRECT_ERROR_DEG = 5.0
+"""An image is registered correctly if its relative poses to at least half of the other registered
+images are off by at most this, in rotation and in translation direction."""
+MIN_IMAGES_TO_ALIGN = 3
+MAX_ALIGNMENT_ERROR = 0.05
+"""Centres farther off do not decide the alignment; in units of the extent of the true centres."""
+
+
+@dataclass(frozen=True)
+class PoseScores:
+    """A model against ground truth.
+
+    Attributes:
+        correct_names: images registered correctly (``MAX_CORRECT_ERROR_DEG``).
+        pair_errors_deg: of every pair of registered images that have ground truth.
+        num_pairs: pairs of all given images that have ground truth; those that are not in
+            ``pair_errors_deg`` count as failures.
+        auc: area under the curve of pairs whose larger error is below a threshold, up to
+            1, 3, 5 and 10 degrees, by threshold; 0 to 1.
+        median_position_error: of camera centres after similarity alignment, in units of the
+            ground truth; None with fewer than three images, or all on one line.
+    """
+
+    correct_names: tuple[str, ...]
+    pair_errors_deg: PairErrors
+    num_pairs: int
+    auc: Mapping[float, float]
+    median_position_error: float | None
+
+    @property
+    def median_rotation_error_deg(self) -> float | None:
+        """Of the pairs of registered images; None without pairs."""
+        return median(r for r, _ in self.pair_errors_deg.values()) if self.pair_errors_deg else None
+
+    @property
+    def median_direction_error_deg(self) -> float | None:
+        """Of the translations of the pairs of registered images; None without pairs."""
+        return median(d for _, d in self.pair_errors_deg.values()) if self.pair_errors_deg else None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            "correct_names": list(self.correct_names),
+            "num_pairs": self.num_pairs,
+            "auc": {f"{limit:g}": value for limit, value in self.auc.items()},
+            "median_rotation_error_deg": self.median_rotation_error_deg,
+            "median_direction_error_deg": self.median_direction_error_deg,
+            "median_position_error": self.median_position_error,
+            "pair_errors_deg": [[*pair, *errors] for pair, errors in self.pair_errors_deg.items()],
+        }
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build from :meth:`to_mapping`."""
+        return cls(
+            tuple(values["correct_names"]),
+            {(a, b): (rot, direction) for a, b, rot, direction in values["pair_errors_deg"]},
+            values["num_pairs"],
+            {float(limit): value for limit, value in values["auc"].items()},
+            values["median_position_error"],
+        )
+
+
+def read_poses(model_path: Path) -> Poses:
+    """Read the poses of the registered images of a COLMAP model, text or binary.
+
+    Raises:
+        ComparisonError: when it is not a model or holds no poses.
+    """
+    try:
+        model = pycolmap.Reconstruction(model_path)
+    except (RuntimeError, ValueError) as error:
+        raise ComparisonError(
+            f"{model_path}: not a COLMAP model; give the folder that holds cameras, images and "
+            f"points3D as .bin or .txt ({' '.join(str(error).split())})"
+        ) from error
+    poses = model_poses(model)
+    if not poses:
+        raise ComparisonError(f"{model_path}: the model has no images with poses")
+    return poses
+
+
+def model_poses(model: pycolmap.Reconstruction) -> Poses:
+    """Return the poses of the registered images of a model."""
+    images = [model.image(image_id) for image_id in model.reg_image_ids()]
+    matrices = {image.name: image.cam_from_world().matrix() for image in images}
+    return {name: (matrix[:, :3], matrix[:, 3]) for name, matrix in matrices.items()}
+
+
+def relative_pose(pose1: Pose, pose2: Pose) -> Pose:
+    """Compute cam2_from_cam1 from two cam_from_world poses."""
+    rotation = pose2[0] @ pose1[0].T
+    return rotation, pose2[1] - rotation @ pose1[1]
+
+
+def pose_errors(estimated: Pose, truth: Pose) -> tuple[float, float]:
+    """Compare two relative poses, whatever the lengths of their translations.
+
+    Returns:
+        The rotation angle and the angle between the translation directions, in degrees.
+    """
+    rotation, translation = estimated
+    true_rotation, true_translation = truth
+    difference = rotation @ true_rotation.T
+    skew = difference - difference.T
+    sine = np.linalg.norm([skew[2, 1], skew[0, 2], skew[1, 0]])
+    rotation_error = np.degrees(np.arctan2(sine, np.trace(difference) - 1.0))
+    cross = np.linalg.norm(np.cross(translation, true_translation))
+    direction_error = np.degrees(np.arctan2(cross, translation @ true_translation))
+    return float(rotation_error), float(direction_error)
+
+
+def pair_errors(estimated: Poses, truth: Poses) -> PairErrors:
+    """Compute the errors of the relative poses of all pairs of images that both have."""
+    names = sorted(estimated.keys() & truth.keys())
+    return {
+        (name1, name2): pose_errors(
+            relative_pose(estimated[name1], estimated[name2]),
+            relative_pose(truth[name1], truth[name2]),
+        )
+        for name1, name2 in itertools.combinations(names, 2)
+    }
+
+
+def correct_images(errors: PairErrors) -> tuple[str, ...]:
+    """Return the images whose relative poses to at least half of the others are right.
+
+    A pair is right if both of its errors are at most ``MAX_CORRECT_ERROR_DEG``.
+
+    Args:
+        errors: of all pairs of the images, see :func:`pair_errors`.
+    """
+    num_right = {name: 0 for pair in errors for name in pair}
+    for pair, both in errors.items():
+        if max(both) <= MAX_CORRECT_ERROR_DEG:
+            for name in pair:
+                num_right[name] += 1
+    num_others = len(num_right) - 1
+    return tuple(sorted(name for name, count in num_right.items() if 2 * count >= num_others))
+
+
+def area_under_curve(errors_deg: Iterable[float], num_pairs: int, threshold_deg: float) -> float:
+    """Integrate the share of pairs with at most an error over errors from 0 to a threshold.
+
+    Args:
+        errors_deg: one per pair that was estimated.
+        num_pairs: all pairs; those that were not estimated are never below a threshold.
+        threshold_deg: where to stop.
+
+    Returns:
+        The exact area under the steps, divided by the threshold: from 0 to 1.
+
+    >>> area_under_curve([0.0, 2.5, 90.0], 4, 5.0)
+    0.375
+    """
+    if not num_pairs:
+        return 0.0
+    return math.fsum(max(0.0, 1.0 - error / threshold_deg) for error in errors_deg) / num_pairs
+
+
+def position_errors(estimated: Poses, truth: Poses) -> dict[str, float]:
+    """Compute the distances of camera centres after the best similarity has aligned them.
+
+    Centres that are far off do not pull at the alignment.
+
+    Returns:
+        Distances by name in units of the ground truth; empty with fewer than three images, or
+        when the centres are on one line, which leaves the similarity open.
+    """
+    names = sorted(estimated.keys() & truth.keys())
+    if len(names) < MIN_IMAGES_TO_ALIGN:
+        return {}
+    centres, true_centres = (
+        np.array([-poses[name][0].T @ poses[name][1] for name in names])
+        for poses in (estimated, truth)
+    )
+    extent = float(np.linalg.norm(np.ptp(true_centres, axis=0)))
+    robust: Any = pycolmap.estimate_sim3d_robust(  # its stub says Sim3d, it is a dictionary
+        centres,
+        true_centres,
+        pycolmap.RANSACOptions(max_error=MAX_ALIGNMENT_ERROR * extent, random_seed=0),
+    )
+    aligned = robust["tgt_from_src"] if robust else pycolmap.estimate_sim3d(centres, true_centres)
+    if aligned is None:
+        return {}
+    moved = centres @ aligned.matrix()[:, :3].T + aligned.matrix()[:, 3]
+    return dict(zip(names, np.linalg.norm(moved - true_centres, axis=1).tolist(), strict=True))
+
+
+def pose_scores(estimated: Poses, truth: Poses, image_names: Sequence[str]) -> PoseScores:
+    """Measure a model against ground truth.
+
+    Args:
+        estimated: poses of the registered images.
+        truth: poses of the ground truth.
+        image_names: all images that were given; others do not count.
+    """
+    given = {name: pose for name, pose in truth.items() if name in set(image_names)}
+    errors = pair_errors(estimated, given)
+    largest = [max(both) for both in errors.values()]
+    num_pairs = math.comb(len(given), 2)
+    distances = list(position_errors(estimated, given).values())
+    return PoseScores(
+        correct_names=correct_images(errors),
+        pair_errors_deg=errors,
+        num_pairs=num_pairs,
+        auc={limit: area_under_curve(largest, num_pairs, limit) for limit in AUC_THRESHOLDS_DEG},
+        median_position_error=float(np.median(distances)) if distances else None,
+    )
+
+
+def disagreeing_images(poses: Poses, other: Poses) -> tuple[str, ...]:
+    """Return the images that two models have both, in poses that contradict each other.
+
+    An image agrees if its relative poses to at least half of the other common images do.
+    """
+    errors = pair_errors(poses, other)
+    agreeing = set(correct_images(errors))
+    return tuple(sorted({name for pair in errors for name in pair} - agreeing))

@@ -1,0 +1,138 @@
+"""A comparison of methods as one page, ``report.html``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from colmap_affrect.colmap.poses import AUC_THRESHOLDS_DEG, MAX_CORRECT_ERROR_DEG
+from colmap_affrect.comparison.contact_sheet import FILTERS, cards_of
+from colmap_affrect.comparison.differing_pairs import choose_pairs, pair_rows, plot_pairs
+from colmap_affrect.comparison.method_table import columns_of, summary_rows
+from colmap_affrect.comparison.results import Comparison
+from colmap_affrect.comparison.verdict import verdict
+from colmap_affrect.errors import AffrectError
+from colmap_affrect.options import flat
+from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report import page, view_graph
+from colmap_affrect.report.pictures import photograph_pictures
+from colmap_affrect.report.scene import read_scene
+from colmap_affrect.report.warp_views import rectifies, warped_photographs
+from colmap_affrect.stages.context import Resources
+
+TEMPLATE = Path(__file__).parent / "templates" / "comparison.html"
+FILE_NAME = "report.html"
+
+THUMBNAIL_PX = 160
+MATCH_PICTURE_PX = 560
+MAX_NUM_WARPED_PHOTOGRAPHS = 3
+MAX_NUM_TABLE_PAIRS = 200
+
+
+def write_page(
+    comparison: Comparison,
+    output_path: Path,
+    progress: Progress = SILENT,
+    resources: Resources | None = None,
+) -> Path:
+    """Write ``report.html`` into the folder of a comparison.
+
+    It is one file that loads nothing. Whatever is missing, such as a photograph that cannot be
+    read or a model that is not there, is said in its place.
+
+    Args:
+        comparison: the results; their paths are relative to ``output_path``.
+        output_path: folder of the comparison.
+        progress: where to show it.
+        resources: weights and device of the methods that have networks, to draw their warps.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        WorkspaceError: when it cannot be written.
+    """
+    columns = columns_of(comparison)
+    folder = Path(comparison.image_path)
+    rectifying = [
+        column.name
+        for column in columns
+        if column.method.folder and rectifies(Workspace(output_path / column.method.folder))
+    ]
+    thumbnails = photograph_pictures(folder, comparison.image_names, THUMBNAIL_PX, progress)
+    chosen = choose_pairs(comparison.finished, rectifying)
+    of_pairs = list(dict.fromkeys(name for item in chosen for name in item.names))
+    pair_pictures = photograph_pictures(folder, sorted(of_pairs), MATCH_PICTURE_PX)
+    rows = pair_rows(comparison.finished)
+    content = {
+        "comparison": comparison,
+        "verdict": verdict(comparison),
+        "columns": columns,
+        "column_of": {column.name: column for column in columns},
+        "failed": [method for method in comparison.methods if method.failed],
+        "rows": summary_rows(columns, comparison),
+        "filters": FILTERS,
+        "cards": cards_of(columns, comparison),
+        "thumbnails": thumbnails,
+        "image_index": {name: index for index, name in enumerate(comparison.image_names)},
+        "pair_rows": rows[:MAX_NUM_TABLE_PAIRS],
+        "num_verified_pairs": len(rows),
+        "pair_pictures": pair_pictures,
+        "pair_plots": plot_pairs(chosen, pair_pictures, output_path),
+        "rectifying": rectifying,
+        "max_correct_error_deg": MAX_CORRECT_ERROR_DEG,
+        "auc_thresholds_deg": AUC_THRESHOLDS_DEG,
+        "settings": flat(comparison.settings),
+        "method_options": {column.name: flat(column.method.options) for column in columns},
+        **_warps(comparison, rectifying, of_pairs, output_path, resources),
+        **_graphs_and_models(comparison, output_path),
+    }
+    return page.write_page(output_path / FILE_NAME, TEMPLATE, content)
+
+
+def _graphs_and_models(comparison: Comparison, output_path: Path) -> dict[str, Any]:
+    """Return the content of the sections that the script of the page works on."""
+    names = comparison.image_names
+    graphs = [method.pair_inliers for method in comparison.finished]
+    layout = view_graph.lay_out(names, graphs)
+    matrices = [view_graph.matrix(names, graph) for graph in graphs]
+    scene = read_scene(comparison.model_paths(output_path))
+    counts = [matrix.counts for matrix in matrices]
+    return {
+        "layout": layout,
+        "edges": [view_graph.edge_paths(names, layout, graph) for graph in graphs],
+        "matrices": matrices,
+        "views": scene.views,
+        "script_data": {"names": names, "matrices": counts, **scene.script_data()},
+    }
+
+
+def _warps(
+    comparison: Comparison,
+    rectifying: Sequence[str],
+    of_pairs: Sequence[str],
+    output_path: Path,
+    resources: Resources | None,
+) -> dict[str, Any]:
+    """Return the method whose warps are shown, those of a few photographs, or why there are none.
+
+    It is the method with most registered images of those that rectify; its photographs are
+    those of the pairs that are drawn.
+    """
+    content: dict[str, Any] = {"warped_method": "", "warped": [], "warped_error": ""}
+    methods = [method for method in comparison.finished if method.name in rectifying]
+    if not methods:
+        return content
+    best = max(methods, key=lambda method: method.registered.mean)
+    content["warped_method"] = best.name
+    names = dict.fromkeys([*of_pairs, *comparison.image_names])
+    readable = [name for name in names if name in best.num_keypoints]
+    try:
+        workspace = Workspace(output_path / best.folder)
+        shown = readable[:MAX_NUM_WARPED_PHOTOGRAPHS]
+        content["warped"] = warped_photographs(workspace, shown, resources)
+    except AffrectError as error:
+        content["warped_error"] = str(error)
+    return content

@@ -1,0 +1,267 @@
+"""Data that flows between the layers: frozen, checked, numpy only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.conventions import is_inside
+from colmap_affrect.geometry.affine import determinants
+
+GrayImage = NDArray[np.uint8]
+"""(H, W) gray values, 0.299 R + 0.587 G + 0.114 B."""
+
+ColorImage = NDArray[np.uint8]
+"""(H, W, 3) red, green, blue."""
+
+Mask = NDArray[np.bool_]
+View = tuple[GrayImage | ColorImage, NDArray[np.uint8] | None]
+"""An image or a warp to find features in, and where (mask not 0; everywhere if it is None)."""
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """An image as rectifiers and depth sources see it.
+
+    Attributes:
+        gray: (H, W) uint8 at the size of processing, at most ``max_image_size_px``.
+        name: relative POSIX path below the image folder, the key of depth maps.
+        path: the file; None for an image that was never one.
+        camera_matrix: (3, 3) pinhole intrinsics in pixel-centre px of ``gray``.
+        mask: (H, W) bool, where features may be; None means everywhere.
+        color: (H, W, 3), for feature extractors that ask for it.
+    """
+
+    gray: GrayImage
+    name: str
+    path: Path | None
+    camera_matrix: NDArray[np.float64]
+    mask: Mask | None = None
+    color: ColorImage | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in px."""
+        return self.gray.shape[1], self.gray.shape[0]
+
+
+@dataclass(frozen=True)
+class ShapeSamples:
+    """Affine shapes at points of an image.
+
+    Attributes:
+        points: (N, 2) pixel-centre px.
+        metrics: (N, 3) unit metrics (S11, S22, S12) of the *rectifying* maps.
+    """
+
+    points: NDArray[np.float64]
+    metrics: NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class ShapeGrid:
+    """Affine shapes on a regular grid over an image; what every dense shape source returns.
+
+    Attributes:
+        metrics: (R, C, 3) unit metrics (S11, S22, S12) of the *rectifying* maps.
+        textured: (R, C) bool, False where the image has no structure to read a shape from.
+        origin_px: centre of cell (0, 0) in x and in y, pixel-centre px.
+        step_px: distance of neighbouring cells in px.
+    """
+
+    metrics: NDArray[np.floating]
+    textured: Mask
+    origin_px: float
+    step_px: int
+
+    def __post_init__(self) -> None:
+        _require(
+            self.metrics.ndim == 3 and self.metrics.shape == (*self.textured.shape, 3),
+            f"{self.metrics.shape=} but expected (R, C, 3) with {self.textured.shape=}",
+        )
+
+    def samples(self) -> ShapeSamples:
+        """Return the shapes of all textured cells with their centres."""
+        rows, columns = np.nonzero(self.textured)
+        points = self.origin_px + self.step_px * np.stack([columns, rows], axis=1)
+        return ShapeSamples(points.astype(np.float64), self.metrics[rows, columns])
+
+
+@dataclass(frozen=True)
+class LocalFeatures:
+    """Local features of one image as full local affine frames.
+
+    Attributes:
+        lafs: (N, 2, 3) float64 frames in image px; x = A u + c maps the unit circle to the
+            measurement ellipse (conventions, item 6); det A > 0.
+        responses: (N,) float32 detector responses, > 0.
+        descriptors: (N, D) float32 of unit length; D = 0 before they are described.
+        rectification_ids: (N,) int32, the warp each feature comes from; 0 is the image itself.
+    """
+
+    lafs: NDArray[np.float64]
+    responses: NDArray[np.float32]
+    descriptors: NDArray[np.float32]
+    rectification_ids: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+
+    def __post_init__(self) -> None:
+        count = len(self.lafs)
+        if count and not len(self.rectification_ids):
+            object.__setattr__(self, "rectification_ids", np.zeros(count, np.int32))
+        shapes = (self.lafs.shape, self.responses.shape, self.rectification_ids.shape)
+        _require(
+            shapes == ((count, 2, 3), (count,), (count,)) and len(self.descriptors) == count,
+            f"shapes of frames, responses, ids {shapes} and {self.descriptors.shape=} do not fit",
+        )
+        _require(
+            bool(np.isfinite(self.lafs).all() and (determinants(self.lafs[:, :, :2]) > 0).all()),
+            "frames must be finite and of positive determinant",
+        )
+
+    def __len__(self) -> int:
+        return len(self.lafs)
+
+    @property
+    def keypoints(self) -> NDArray[np.float64]:
+        """(N, 2) centres of the frames, pixel-centre px."""
+        return self.lafs[:, :, 2]
+
+    @property
+    def scales(self) -> NDArray[np.float64]:
+        """(N,) geometric mean radius sqrt(det A) of the measurement ellipses in px."""
+        return np.asarray(np.sqrt(determinants(self.lafs[:, :, :2])))
+
+    def select(self, index: NDArray[np.generic]) -> LocalFeatures:
+        """Keep the features of an index or mask array, in its order."""
+        return LocalFeatures(
+            self.lafs[index],
+            self.responses[index],
+            self.descriptors[index],
+            self.rectification_ids[index],
+        )
+
+    @classmethod
+    def empty(cls, descriptor_size: int = 0) -> LocalFeatures:
+        """Return the result for an image without features."""
+        return cls(
+            np.zeros((0, 2, 3)),
+            np.zeros(0, np.float32),
+            np.zeros((0, descriptor_size), np.float32),
+        )
+
+    def with_frames(self, lafs: NDArray[np.float64]) -> LocalFeatures:
+        """Replace the frames."""
+        return replace(self, lafs=lafs)
+
+    def with_rectification_id(self, rectification_id: int) -> LocalFeatures:
+        """Say which rectification all features come from."""
+        return replace(self, rectification_ids=np.full(len(self), rectification_id, np.int32))
+
+    def inside(self, size: tuple[int, int]) -> Mask:
+        """Tell which centres lie in an image of (width, height)."""
+        return is_inside(self.keypoints, size)
+
+
+def union(parts: list[LocalFeatures]) -> LocalFeatures:
+    """Concatenate features in the order given; at least one part."""
+    return LocalFeatures(
+        np.concatenate([part.lafs for part in parts]),
+        np.concatenate([part.responses for part in parts]),
+        np.concatenate([part.descriptors for part in parts]),
+        np.concatenate([part.rectification_ids for part in parts]),
+    )
+
+
+@dataclass(frozen=True)
+class Rectification:
+    """One rectifying warp and the part of the image it is meant for.
+
+    Attributes:
+        rectified_from_image: (3, 3) float64 map of pixel-centre coordinates; a homography
+            has a positive third coordinate all over the region.
+        canvas_size: (width, height) of the warp in px.
+        region: (h, w) bool mask of the part of the image; None means all of it.
+        tilt, tilt_angle_rad: class of the map in the space of tilts; of a homography, that of
+            its Jacobian at the middle of the region.
+        region_origin: (x, y) image pixel of the mask's first pixel.
+        segment_id: the segment of the image it belongs to, from 0; several warps may share one.
+    """
+
+    rectified_from_image: NDArray[np.float64]
+    canvas_size: tuple[int, int]
+    region: Mask | None
+    tilt: float
+    tilt_angle_rad: float
+    region_origin: tuple[int, int] = (0, 0)
+    segment_id: int = 0
+
+    def in_region(self, points: NDArray[np.floating]) -> Mask:
+        """Tell which (N, 2) points, rounded to pixels of the image, belong to the region."""
+        if self.region is None:
+            return np.ones(len(points), dtype=bool)
+        return in_mask(self.region, points, self.region_origin)
+
+    @property
+    def image_from_rectified(self) -> NDArray[np.float64]:
+        """(3, 3) inverse map."""
+        return np.asarray(np.linalg.inv(self.rectified_from_image), dtype=np.float64)
+
+    @property
+    def canvas_area_px(self) -> int:
+        """Number of pixels of the warp."""
+        return self.canvas_size[0] * self.canvas_size[1]
+
+    @property
+    def is_affine(self) -> bool:
+        """Whether the last row of the map is (0, 0, 1)."""
+        return bool(np.array_equal(self.rectified_from_image[2], [0.0, 0.0, 1.0]))
+
+
+def in_mask(mask: Mask, points: NDArray[np.floating], origin: tuple[int, int] = (0, 0)) -> Mask:
+    """Tell which (N, 2) points, rounded to pixels, an (h, w) mask holds that begins at origin."""
+    height, width = mask.shape
+    columns, rows = (np.rint(points).astype(int) - origin).T
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    columns, rows = np.where(inside, columns, 0), np.where(inside, rows, 0)
+    return np.asarray(inside & mask[rows, columns])
+
+
+@dataclass(frozen=True)
+class RectificationPlan:
+    """What to warp: data only, made by a rectifier, executed by ``rectifiers.execute``.
+
+    The image itself is always looked at and not listed. Warp k of ``items`` has the
+    rectification id k + 1.
+
+    Attributes:
+        image_size: (width, height) in px.
+        items: the warps; may be empty.
+        original_region: (H, W) bool, where features of the image itself are kept; None
+            means everywhere.
+        replaces_original: a feature of the image itself gives way to one of a warp at the same
+            place and scale. For disjoint regions, each with the map that suits it best; where
+            several warps show the same place none of them is better than the image for sure.
+    """
+
+    image_size: tuple[int, int]
+    items: tuple[Rectification, ...] = ()
+    original_region: Mask | None = None
+    replaces_original: bool = False
+
+    @property
+    def num_regions(self) -> int:
+        """Number of different segments of the image that are warped; a whole image is one."""
+        return len({item.segment_id for item in self.items})
+
+    @property
+    def rectified_area_px(self) -> int:
+        """Pixels of all warps together."""
+        return sum(item.canvas_area_px for item in self.items)

@@ -1,0 +1,87 @@
+"""What is wrong with an output folder, a COLMAP database or the installation, and what helps.
+
+Nothing is changed: databases are examined in a copy. No run can begin in a folder meanwhile.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+from colmap_affrect.doctor.database import examine_database
+from colmap_affrect.doctor.findings import Diagnosis, Finding, Findings
+from colmap_affrect.doctor.folder import examine_folder
+from colmap_affrect.features.weights import describe_weights
+from colmap_affrect.pipeline import installed_versions
+from colmap_affrect.progress import SILENT, Progress
+
+__all__ = ["Diagnosis", "Finding", "diagnose"]
+
+USUAL_WEIGHTS = ("affnet", "orinet", "hardnet")
+"""What learned features need by default."""
+
+
+def diagnose(
+    path: Path | None = None,
+    *,
+    image_path: Path | None = None,
+    weights_path: Path | None = None,
+    progress: Progress = SILENT,
+) -> Diagnosis:
+    """Examine the installation and, if a path is given, an output folder or a COLMAP database.
+
+    Args:
+        path: output folder of colmap-affrect, or any COLMAP database.
+        image_path: folder of the photographs, whose sizes are compared with the cameras.
+        weights_path: folder in which weights of networks are looked for first.
+        progress: where the reading of photographs is shown.
+
+    Returns:
+        The findings; also for files that are damaged or something else.
+    """
+    findings = Findings(progress)
+    if image_path is not None and not image_path.is_dir():
+        findings.add("no-photographs", image_path)
+        image_path = None
+    if path is not None and path.is_dir():
+        examine_folder(findings, path, image_path)
+    elif path is not None:
+        examine_database(findings, path, image_path)
+    _examine_installation(findings, weights_path)
+    return findings.diagnosis()
+
+
+def _examine_installation(findings: Findings, weights_path: Path | None) -> None:
+    """Examine versions, import order, device, weights and the COLMAP program."""
+    versions = ", ".join(f"{name} {number}" for name, number in installed_versions().items())
+    findings.checked.append(f"installation: {versions}")
+    loaded = list(sys.modules)
+    if loaded.index("pycolmap") < loaded.index("colmap_affrect"):
+        findings.add("import-order", "installation")
+    if weights_path is not None and not weights_path.is_dir():
+        findings.add("no-weights-folder", f"--weights {weights_path}")
+    try:
+        _examine_networks(findings, weights_path)
+    except (ImportError, OSError) as error:
+        findings.add("no-torch", "installation", error=error)
+    if shutil.which("colmap") is None:
+        findings.add("no-colmap", "installation")
+
+
+def _examine_networks(findings: Findings, weights_path: Path | None) -> None:
+    from colmap_affrect.features.networks import resolve_device
+
+    device = resolve_device("auto")
+    findings.checked.append(f"networks: run on {device}")
+    if device.type == "cpu":
+        findings.add("no-gpu", "networks")
+    rows = describe_weights(weights_path)
+    found = ", ".join(str(row.path) for row in rows if row.path)
+    findings.checked.append(f"weights: {found or 'none found'}")
+    for row in rows:
+        if row.verified is False:
+            findings.add("other-weights", str(row.path))
+    missing = [row.published.file_name for row in rows if row.key in USUAL_WEIGHTS and not row.path]
+    if missing:
+        findings.add("no-weights", "weights", missing=", ".join(missing))

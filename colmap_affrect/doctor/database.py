@@ -1,0 +1,92 @@
+"""Examines a COLMAP database, in a copy."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from colmap_affrect.colmap.checks import (
+    CHECKS,
+    Tables,
+    check_database,
+    check_image_files,
+    is_unsafe,
+)
+from colmap_affrect.colmap.database_copy import copy_database, newest_schema_version, schema_version
+from colmap_affrect.doctor.findings import Findings, without_path
+from colmap_affrect.errors import DatabaseError, ImageError
+from colmap_affrect.images.reading import read_gray
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.progress import Progress
+
+
+def examine_database(findings: Findings, path: Path, image_path: Path | None) -> None:
+    """Examine a COLMAP database, and its photographs if their folder is given."""
+    with examined_copy(findings, path, image_path, {}):
+        pass
+
+
+@contextmanager
+def examined_copy(
+    findings: Findings, path: Path, image_path: Path | None, own_advice: Mapping[str, str]
+) -> Iterator[tuple[Path, Tables] | None]:
+    """Examine a copy of a database and yield it with its tables, None if it cannot be used.
+
+    Args:
+        findings: to which those of the database are added.
+        path: of the database.
+        image_path: folder of the photographs, if their sizes are compared too.
+        own_advice: what to do about a problem by its kind, where it is not what ``TEXTS`` says.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        copy = Path(temporary) / "database.db"
+        try:
+            version, newest = schema_version(path), newest_schema_version()
+            copy_database(path, copy)
+        except DatabaseError as error:
+            message = without_path(path, error).replace(str(copy), "a temporary file")
+            findings.add("no-database", path, error=message)
+            yield None
+            return
+        if version < newest:
+            kept = path.with_suffix(".old.db")
+            findings.add("old-schema", path, version=version, newest=newest, path=path, copy=kept)
+        try:
+            tables, problems = check_database(copy)
+        except DatabaseError as error:
+            findings.add("database-damaged", path, error=without_path(copy, error))
+            yield None
+            return
+        findings.checked.append(f"{path}: {tables.summary()}")
+        if image_path is not None:
+            sizes = _file_sizes(image_path, tables.names.values(), findings.progress)
+            problems |= check_image_files(tables, image_path, sizes)
+            findings.checked.append(f"{image_path}: sizes of {len(sizes)} photographs")
+        for kind in sorted(problems, key=list(CHECKS).index):
+            advice = own_advice.get(kind, "")
+            findings.add(kind, path, problems[kind], advice=advice, path=path, folder=path.parent)
+        yield copy, tables
+
+
+def _file_sizes(
+    image_path: Path, names: Iterable[str], progress: Progress
+) -> dict[str, tuple[int, int] | None]:
+    """Read photographs for their (width, height), None for those that cannot be read."""
+
+    def size_of(name: str) -> tuple[int, int] | None:
+        try:
+            height, width = read_gray(image_path / name).shape
+        except ImageError:
+            return None
+        return width, height
+
+    present = [n for n in names if not is_unsafe(n) and (image_path / n).is_file()]
+    sizes = {}
+    with progress.stage("read", len(present), "images") as advance:
+        found = map_ordered(size_of, present, available_cores())
+        for name, size in zip(present, found, strict=True):
+            sizes[name] = size
+            advance(1)
+    return sizes

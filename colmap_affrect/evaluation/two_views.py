@@ -1,0 +1,186 @@
+"""Geometry of two views: models from matches by OpenCV's random sampling, and distances to them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap.poses import Pose
+
+Points = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+PAPER_MAX_NUM_ITERATIONS = 100_000
+"""What the paper says."""
+
+MIN_HOMOGRAPHY_MATCHES = 4
+MIN_FUNDAMENTAL_MATCHES = 8
+MIN_POSE_MATCHES = 6
+"""Five points leave several essential matrices, none of which another match supports."""
+
+
+@dataclass(frozen=True)
+class Ransac:
+    """How to look for a model.
+
+    OpenCV draws the same samples every time, so the seed decides the order of the matches.
+
+    Attributes:
+        method: ``cv2.RANSAC``, ``cv2.USAC_MAGSAC`` or another of OpenCV's.
+        threshold: of an inlier (MAGSAC: largest noise) in px; of relative poses in units of the
+            focal length.
+        confidence: at which to end before all iterations.
+        max_num_iterations: at most.
+        random_seed: decides the order of the matches.
+    """
+
+    method: int
+    threshold: float
+    confidence: float
+    max_num_iterations: int
+    random_seed: int = 0
+
+    def reseeded(self, count: int) -> list[Self]:
+        """Return as many of the same with seeds that follow each other."""
+        return [replace(self, random_seed=self.random_seed + number) for number in range(count)]
+
+    def homography(
+        self, points1: NDArray[np.floating], points2: NDArray[np.floating]
+    ) -> tuple[Matrix | None, int]:
+        """Estimate image2_from_image1 from (M, 2) matches; also return the number of inliers."""
+        return self._matrix(cv2.findHomography, MIN_HOMOGRAPHY_MATCHES, points1, points2)
+
+    def fundamental_matrix(
+        self, points1: NDArray[np.floating], points2: NDArray[np.floating]
+    ) -> tuple[Matrix | None, int]:
+        """Estimate F with x2' F x1 = 0 from (M, 2) matches; also return the number of inliers."""
+        return self._matrix(cv2.findFundamentalMat, MIN_FUNDAMENTAL_MATCHES, points1, points2)
+
+    def _matrix(
+        self,
+        find: Callable[..., Any],
+        min_num_matches: int,
+        points1: NDArray[np.floating],
+        points2: NDArray[np.floating],
+    ) -> tuple[Matrix | None, int]:
+        if len(points1) < min_num_matches:
+            return None, 0
+        order = np.random.default_rng(self.random_seed).permutation(len(points1))
+        matrix, inliers = find(
+            np.asarray(points1, dtype=np.float64)[order],
+            np.asarray(points2, dtype=np.float64)[order],
+            self.method,
+            self.threshold,
+            confidence=self.confidence,
+            maxIters=self.max_num_iterations,
+        )
+        if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+            return None, 0
+        return np.asarray(matrix, dtype=np.float64), int(np.count_nonzero(inliers))
+
+    def relative_pose(self, rays1: Points, rays2: Points) -> tuple[Pose | None, NDArray[np.bool_]]:
+        """Estimate camera2_from_camera1 from five-point samples.
+
+        Args:
+            rays1: (N, 2) x/z, y/z in front of camera 1; matches with NaN are never inliers.
+            rays2: (N, 2) of camera 2.
+
+        Returns:
+            The pose, its translation of length 1, None if there is none; and the (N,) inliers.
+        """
+        inliers = np.zeros(len(rays1), dtype=bool)
+        usable = np.flatnonzero(np.isfinite(rays1).all(axis=1) & np.isfinite(rays2).all(axis=1))
+        if len(usable) < MIN_POSE_MATCHES:
+            return None, inliers
+        order = np.random.default_rng(self.random_seed).permutation(usable)
+        first, second = np.ascontiguousarray(rays1[order]), np.ascontiguousarray(rays2[order])
+        essential, mask = cv2.findEssentialMat(
+            first,
+            second,
+            np.eye(3),
+            method=self.method,
+            prob=self.confidence,
+            threshold=self.threshold,
+            maxIters=self.max_num_iterations,
+        )
+        if essential is None or essential.shape != (3, 3):
+            return None, inliers
+        inliers[order] = mask.ravel() != 0
+        if inliers.sum() < MIN_POSE_MATCHES:
+            return None, inliers
+        _, rotation, translation, _ = cv2.recoverPose(
+            essential, first[inliers[order]], second[inliers[order]], np.eye(3)
+        )
+        pose = np.asarray(rotation, np.float64), np.asarray(translation, np.float64).ravel()
+        return pose, inliers
+
+
+@dataclass(frozen=True)
+class RansacSettings:
+    """What every protocol that estimates geometry can be told.
+
+    Attributes:
+        threshold_px: of an inlier of plain RANSAC (the paper: 0.5).
+        confidence: at which estimators may end.
+        max_num_iterations: of estimators; 1000 gave the paper's numbers of relative poses, for
+            the function of OpenCV that its code called takes no number.
+    """
+
+    threshold_px: float = 0.5
+    confidence: float = 0.9999
+    max_num_iterations: int = PAPER_MAX_NUM_ITERATIONS
+
+    def ransac(self, method: int, threshold: float, random_seed: int) -> Ransac:
+        """Return how to look for a model."""
+        return Ransac(method, threshold, self.confidence, self.max_num_iterations, random_seed)
+
+
+def symmetric_epipolar_distances(
+    matrix: Matrix | None, points1: Points, points2: Points
+) -> NDArray[np.float64]:
+    """Return the (N,) distances of matches from a fundamental matrix, in px.
+
+    The distance is sqrt(d1^2 + d2^2), of the points from their epipolar lines in images 1 and 2,
+    as WxBS has it. Without a matrix, and where a line is not defined, it is infinite.
+    """
+    if matrix is None:
+        return np.full(len(points1), np.inf)
+    residuals, slopes1, slopes2 = _epipolar_terms(matrix, points1, points2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distances = np.abs(residuals) * np.sqrt(1.0 / slopes1 + 1.0 / slopes2)
+    return np.asarray(np.nan_to_num(distances, nan=np.inf))
+
+
+def sampson_distances(pose: Pose, rays1: Points, rays2: Points) -> NDArray[np.float64]:
+    """Return the (N,) first-order distances of matches from a relative pose.
+
+    Args:
+        pose: camera2_from_camera1.
+        rays1: (N, 2) x/z, y/z in front of camera 1.
+        rays2: (N, 2) of camera 2.
+
+    Returns:
+        Distances in units of the focal length; infinite where they are not defined.
+    """
+    rotation, (x, y, z) = pose
+    essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
+    residuals, slopes1, slopes2 = _epipolar_terms(essential, rays1, rays2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distances = np.abs(residuals) / np.sqrt(slopes2 + slopes1)
+    return np.asarray(np.nan_to_num(distances, nan=np.inf))
+
+
+def _epipolar_terms(
+    matrix: Matrix, points1: Points, points2: Points
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return x2' M x1 of (N, 2) points, and the squared slopes of their lines in images 1 and 2."""
+    ones = np.ones((len(points1), 1))
+    first, second = np.hstack([points1, ones]), np.hstack([points2, ones])
+    lines2, lines1 = first @ matrix.T, second @ matrix
+    slopes1, slopes2 = (np.square(lines[:, :2]).sum(axis=1) for lines in (lines1, lines2))
+    return (second * lines2).sum(axis=1), slopes1, slopes2

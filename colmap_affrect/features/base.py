@@ -1,0 +1,115 @@
+"""What a feature extractor and a source of affine shapes are.
+
+Those of another package become known by an entry point of the group ``colmap_affrect.features`` or
+``colmap_affrect.shapes``. Several threads may call the same object at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, ClassVar, Protocol
+
+from colmap_affrect.data import GrayImage, LocalFeatures, ShapeGrid, ShapeSamples, View
+from colmap_affrect.options import PartOptions, Registry, within
+
+PATCH_SIZE_PX = 32
+"""Side of the patches that all networks take."""
+
+
+@dataclass(frozen=True)
+class NetworkContext:
+    """What networks run with.
+
+    Attributes:
+        weights: files by key, found beforehand (:mod:`colmap_affrect.features.weights`).
+        device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``.
+    """
+
+    weights: Mapping[str, Path] = field(default_factory=dict)
+    device: str = "cpu"
+
+
+class NetworkOptions(PartOptions):
+    """Base of the options of parts that may run on torch."""
+
+    uses_network: ClassVar[bool] = True
+    """Whether it runs on torch, one image at a time."""
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Keys of the files of weights that the part reads."""
+        return ()
+
+
+class FeatureOptions(NetworkOptions):
+    """Base of the options of all feature extractors."""
+
+    in_color: ClassVar[bool] = False
+    """Whether views are (H, W, 3) instead of (H, W)."""
+    max_num_features: Annotated[int, within(1, 1_000_000)] = 8192
+    """Most features of the image itself, by response."""
+    max_num_rectified_features: Annotated[int, within(1, 1_000_000)] = 6144
+    """Most features of all warps together, by response."""
+
+
+class FeatureExtractor(Protocol):
+    """Detection and description; called with its ``Options`` and a :class:`NetworkContext`.
+
+    Attributes:
+        descriptor_size: D, also of an image without features.
+    """
+
+    descriptor_size: int
+
+    def detect(self, view: View) -> LocalFeatures:
+        """Return features of one view, frames in its px; descriptors may be (N, 0) still."""
+
+    def describe(
+        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
+    ) -> list[LocalFeatures]:
+        """Describe features that :meth:`detect` found, a list element for each image.
+
+        The result is the same for images that are given together or one by one.
+        """
+
+
+EXTRACTORS: Registry[FeatureExtractor] = Registry(
+    kind="feature extractor",
+    group="colmap_affrect.features",
+    built_in={
+        "rootsift": "colmap_affrect.features.sift:RootSift",
+        "affnet-hardnet": "colmap_affrect.features.affnet_hardnet:AffNetHardNet",
+    },
+    default="rootsift",
+)
+
+
+class ShapeOptions(NetworkOptions):
+    """Base of the options of all shape sources."""
+
+
+class ShapeSource(Protocol):
+    """Affine shapes of an image.
+
+    Called with its ``Options``, a :class:`NetworkContext` and the :class:`FeatureOptions` of the
+    recipe, whose keypoints may be those that shapes are read at.
+    """
+
+    def grid(self, image: GrayImage) -> ShapeGrid:
+        """Return one shape per 4 x 4 block of a (H, W) uint8 image."""
+
+    def samples(self, image: GrayImage) -> ShapeSamples:
+        """Return shapes at points of a (H, W) uint8 image."""
+
+
+SHAPES: Registry[ShapeSource] = Registry(
+    kind="shape source",
+    group="colmap_affrect.shapes",
+    built_in={
+        "second-moment": "colmap_affrect.features.shapes.second_moment:SecondMoment",
+        "affnet": "colmap_affrect.features.shapes.affnet:AffNet",
+    },
+    default="second-moment",
+)

@@ -1,0 +1,1 @@
+"""Affine shapes of an image."""

@@ -1,0 +1,305 @@
+"""Shape source ``affnet``: affine shapes from a network, on all blocks or on patches of keypoints.
+
+AffNet (Mishkin, Radenovic, Matas 2018) reads the shape of a feature off a 32 x 32 patch. Without
+the final pooling it is fully convolutional and gives a shape every 4 px: the paper's
+DenseAffNet (Sec. 3).
+
+The three outputs o of the network make the frame L = [[1 + o0, 0], [o1, 1 + o2]], image from
+patch, up to scale; shapes are the unit metrics of L^-1.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from functools import partial
+from math import ceil
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS, grid_origin, resized_from_original
+from colmap_affrect.data import GrayImage, Mask, ShapeGrid, ShapeSamples
+from colmap_affrect.features.base import PATCH_SIZE_PX, FeatureOptions, NetworkContext, ShapeOptions
+from colmap_affrect.features.sift import DogOptions, detect_dog
+from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.geometry.shapes import (
+    STEP_PX,
+    log_metrics,
+    metrics_from_log,
+    rectifying_metrics,
+)
+from colmap_affrect.images.reading import shrink_to
+from colmap_affrect.options import within
+
+if TYPE_CHECKING:
+    import torch
+    from kornia.feature import LAFAffNetShapeEstimator
+    from torch import nn
+
+LEAD_PX = (PATCH_SIZE_PX - STEP_PX) // 2
+"""Cell (0, 0) of the network has the patch of the rows and columns 0...31. With 14 px more in
+front, that patch has the block of rows and columns 0...3 in its middle."""
+
+PAPER_CROP_PX = (-LEAD_PX) % STEP_PX
+"""Without padding, 2 px fewer in front put the patches of all cells round whole blocks."""
+
+PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX
+"""Blocks before the first one that then has a patch."""
+
+CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9
+"""Cell i depends on the rows 4 i - 11...4 i + 39: on those of the cells i - 3...i + 9."""
+
+STRIP_CELLS = 64
+"""Rows of cells that are computed at once, to bound the memory."""
+
+WINDOW_PX = 33
+"""Surroundings whose mean and deviation normalise a pixel."""
+
+DEVIATION_FLOOR = 0.01 * 255
+"""Added to the deviation of the surroundings, gray values: blank ones stay blank."""
+
+MAX_NORMALISED = 6.0
+"""Largest normalised value (as in the AffNet authors' own fully convolutional network)."""
+
+PATCH_SIGMAS = 12.0
+"""Half width of the patch of a keypoint in units of its sigma (kornia-moons, the paper)."""
+
+BATCH_SIZE = 256
+"""Patches that go through the network at once."""
+
+
+class AffNetOptions(ShapeOptions):
+    """Shape source ``affnet``."""
+
+    name: Literal["affnet"] = "affnet"
+    scales: Annotated[
+        tuple[Annotated[float, within(0.05, 1.0)], ...], Field(strict=False, min_length=1)
+    ] = (1.0, 0.5, 0.25)
+    """Sizes of the image at which dense shapes are estimated; their log-Euclidean mean counts."""
+    paper: bool = False
+    """Normalise by mean and deviation of the whole image and use the full size only, as the
+    authors did; otherwise by those of the surrounding 33 x 33 px."""
+    min_deviation: Annotated[float, within(0.0, 255.0)] = 3.0
+    """Standard deviation of the surroundings, in gray values, under which a block counts as flat;
+    not with ``paper``."""
+    max_num_keypoints: Annotated[int, within(1, 1_000_000)] = 4000
+    """Sparse shapes are those of the strongest keypoints."""
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Keys of the files of weights that the network reads."""
+        return ("affnet",)
+
+
+class AffNet:
+    """Shapes of all 4 x 4 blocks of an image, or of its keypoints.
+
+    Sparse shapes are those of DoG keypoints; where the recipe's features are found by DoG, with
+    their thresholds.
+    """
+
+    Options = AffNetOptions
+
+    def __init__(
+        self,
+        options: AffNetOptions,
+        network: NetworkContext,
+        features: FeatureOptions | None = None,
+    ) -> None:
+        """Load the network.
+
+        Args:
+            options: scales and normalisation of dense shapes, number of sparse ones.
+            network: file of weights, and the device.
+            features: of the recipe.
+        """
+        from colmap_affrect.features.networks import load_affnet, resolve_device
+
+        self.options = options
+        dog = features if isinstance(features, DogOptions) else DogOptions()
+        self.detect = partial(detect_dog, options=dog)
+        self.device = resolve_device(network.device)
+        affnet = load_affnet(network.weights["affnet"], network.device)
+        self.layers = fully_convolutional(affnet).to(self.device)
+
+    def grid(self, image: GrayImage) -> ShapeGrid:
+        """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
+
+        By default pixels are normalised by mean and deviation of the 33 x 33 px around them,
+        the border is reflected, and the shapes of several sizes of the image are combined by
+        their log-Euclidean mean. Blocks whose surroundings deviate by less than
+        ``min_deviation`` are not textured and get the identity.
+
+        With ``paper``, the image is normalised as a whole, the network sees the full size
+        without padding (the shorter side must have 32 px), and blocks near the border get the
+        shape of the nearest one that has a patch inside. All blocks are textured.
+        """
+        if self.options.paper:
+            logs = self._paper_logs(image)
+            textured = np.ones(logs.shape[:2], dtype=bool)
+        else:
+            logs, textured = self._mean_logs(image), _textured(image, self.options.min_deviation)
+            logs[~textured] = 0.0
+        return ShapeGrid(metrics_from_log(logs), textured, grid_origin(STEP_PX), STEP_PX)
+
+    def samples(self, image: GrayImage) -> ShapeSamples:
+        """Estimate the affine shapes of the strongest keypoints of a (H, W) uint8 image.
+
+        Each shape is read off the 32 x 32 patch of half width 12 sigma. Keypoints whose shape
+        is not finite or turns the patch over are left out.
+        """
+        keypoints = self.detect(image)
+        order = np.argsort(-keypoints.responses, kind="stable")
+        keypoints = keypoints.select(order[: self.options.max_num_keypoints])
+        shapes = _frames(self._patch_outputs(image, keypoints.lafs))
+        valid = np.isfinite(shapes).all(axis=(1, 2)) & (determinants(shapes) > 0)
+        return ShapeSamples(keypoints.keypoints[valid], rectifying_metrics(shapes[valid]))
+
+    def _mean_logs(self, image: GrayImage) -> NDArray[np.float32]:
+        """Return (R, C, 2) logarithms of metrics, the mean over all sizes of the image."""
+        size = image.shape[::-1]
+        resized = [shrink_to(image, round(max(size) * scale)) for scale in self.options.scales]
+        largest = max(min(level.shape) for level in resized)
+        levels = [level for level in resized if min(level.shape) >= min(PATCH_SIZE_PX, largest)]
+        mean = np.zeros((ceil(size[1] / STEP_PX), ceil(size[0] / STEP_PX), 2), dtype=np.float32)
+        for level in levels:
+            padded = _with_reflected_border(_locally_normalised(level))
+            logs = self._dense_logs(padded)
+            level_from_image = resized_from_original((size[0], size[1]), level.shape[::-1])
+            mean += _read_grid(logs, level_from_image, mean.shape[:2]) / len(levels)
+        return mean
+
+    def _paper_logs(self, image: GrayImage) -> NDArray[np.float32]:
+        """Return (R, C, 2) logarithms of metrics as in the paper, border cells replicated."""
+        values = image.astype(np.float32)
+        normalised = (values - values.mean()) / (values.std() + 1e-6)
+        logs = self._dense_logs(normalised[PAPER_CROP_PX:, PAPER_CROP_PX:])
+        below, right = (
+            ceil(length / STEP_PX) - PAPER_LEAD_CELLS - count
+            for length, count in zip(image.shape, logs.shape[:2], strict=True)
+        )
+        widths = ((PAPER_LEAD_CELLS, below), (PAPER_LEAD_CELLS, right), (0, 0))
+        return np.pad(logs, widths, mode="edge")
+
+    def _dense_logs(self, normalised: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return (R, C, 2) logarithms of the metrics that the network sees in a float image.
+
+        Computed in strips of ``STRIP_CELLS`` rows of cells, with as many rows around as
+        these depend on.
+        """
+        import torch
+
+        image = torch.from_numpy(normalised)[None, None]
+        num_rows = ceil(len(normalised) / STEP_PX) - PATCH_SIZE_PX // STEP_PX + 1
+        strips = []
+        for first in range(0, num_rows, STRIP_CELLS):
+            last = min(first + STRIP_CELLS, num_rows)
+            begin = max(first - CELLS_SEEN_BEFORE, 0)
+            strip = image[:, :, STEP_PX * begin : STEP_PX * (last + CELLS_SEEN_AFTER)]
+            with torch.inference_mode():
+                outputs = self.layers(strip.to(self.device))[0, :, first - begin : last - begin]
+            metrics = rectifying_metrics(_frames(outputs.permute(1, 2, 0)))
+            strips.append(log_metrics(metrics))
+        return np.concatenate(strips)
+
+    def _patch_outputs(self, image: GrayImage, lafs: NDArray[np.float64]) -> torch.Tensor:
+        """Return the (N, 3) outputs of the network on the patches of (N, 2, 3) frames."""
+        import torch
+
+        from colmap_affrect.features.networks import standardized
+        from colmap_affrect.features.patches import PatchSampler
+
+        wide = lafs.copy()
+        wide[:, :, :2] *= PATCH_SIGMAS / MEASUREMENT_SIGMAS
+        patches = PatchSampler(image.astype(np.float32), self.device).sample(wide)
+        outputs = torch.empty((len(patches), 3))
+        with torch.inference_mode():
+            for begin in range(0, len(patches), BATCH_SIZE):
+                batch = standardized(patches[begin : begin + BATCH_SIZE])
+                outputs[begin : begin + BATCH_SIZE] = self.layers(batch)[:, :, 0, 0]
+        return outputs
+
+
+def fully_convolutional(network: LAFAffNetShapeEstimator) -> nn.Sequential:
+    """Return the layers of AffNet without the final pooling, for inference.
+
+    Batch normalisation is folded into the convolutions. An image of H x W px gives
+    (ceil(H / 4) - 7) x (ceil(W / 4) - 7) cells; cell (i, j) has the patch whose first pixel is
+    (4 j, 4 i).
+    """
+    import torch
+    from torch import nn
+    from torch.nn.utils import convert_conv2d_weight_memory_format
+
+    from colmap_affrect.features.networks import folded
+
+    kept = (nn.Conv2d, nn.BatchNorm2d, nn.ReLU, nn.Tanh)
+    layers = [layer for layer in deepcopy(network.features) if isinstance(layer, kept)]
+    sequence = folded(nn.Sequential(*layers)).eval()
+    return convert_conv2d_weight_memory_format(sequence, torch.channels_last)
+
+
+def _frames(outputs: torch.Tensor) -> NDArray[np.float64]:
+    """Return (..., 2, 2) frames L = [[1 + o0, 0], [o1, 1 + o2]] of (..., 3) outputs."""
+    values = outputs.cpu().numpy().astype(np.float64)
+    frames = np.zeros((*values.shape[:-1], 2, 2))
+    frames[..., 0, 0] = 1.0 + values[..., 0]
+    frames[..., 1, 0] = values[..., 1]
+    frames[..., 1, 1] = 1.0 + values[..., 2]
+    return frames
+
+
+def _mean_and_deviation(image: GrayImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (H, W) mean and standard deviation of the window round each pixel."""
+    window, border = (WINDOW_PX, WINDOW_PX), cv2.BORDER_REFLECT_101
+    mean = np.asarray(cv2.boxFilter(image, cv2.CV_64F, window, borderType=border), np.float64)
+    mean_square = cv2.sqrBoxFilter(image, cv2.CV_64F, window, borderType=border)
+    return mean, np.sqrt(np.maximum(mean_square - mean**2, 0.0))
+
+
+def _locally_normalised(image: GrayImage) -> NDArray[np.float32]:
+    mean, deviation = _mean_and_deviation(image)
+    normalised = (image - mean) / (deviation + DEVIATION_FLOOR)
+    return np.clip(normalised, -MAX_NORMALISED, MAX_NORMALISED).astype(np.float32)
+
+
+def _with_reflected_border(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Add a border so that the cells of the network are the 4 x 4 blocks of the image."""
+    bottom, right = (LEAD_PX + -length % STEP_PX for length in values.shape)
+    return np.asarray(
+        cv2.copyMakeBorder(values, LEAD_PX, bottom, LEAD_PX, right, cv2.BORDER_REFLECT_101)
+    )
+
+
+def _textured(image: GrayImage, min_deviation: float) -> Mask:
+    """Tell in which blocks gray values deviate by more than ``min_deviation`` round the middle."""
+    deviation = _with_reflected_border(_mean_and_deviation(image)[1])
+    middle = LEAD_PX + STEP_PX // 2
+    return np.asarray(deviation[middle:-LEAD_PX:STEP_PX, middle:-LEAD_PX:STEP_PX] > min_deviation)
+
+
+def _read_grid(
+    values: NDArray[np.float32], level_from_image: NDArray[np.float64], cells: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Interpolate a grid of a resized image bilinearly at the cells of the image's own grid.
+
+    Args:
+        values: (r, c, D) at the blocks of the resized image.
+        level_from_image: (3, 3) map of pixel-centre coordinates.
+        cells: (R, C) of the image's grid.
+
+    Returns:
+        (R, C, D); beyond the outermost centres their values count.
+    """
+    weights = []
+    for axis, (count, length) in enumerate(zip(cells, values.shape[:2], strict=True)):
+        scale, shift = level_from_image[1 - axis, [1 - axis, 2]]
+        centers = grid_origin(STEP_PX) + STEP_PX * np.arange(count)
+        indices = (scale * centers + shift - grid_origin(STEP_PX)) / STEP_PX
+        distances = np.clip(indices, 0, length - 1)[:, None] - np.arange(length)
+        weights.append(np.maximum(1.0 - np.abs(distances), 0.0).astype(np.float32))
+    by_row, by_column = weights
+    return np.stack([by_row @ channel @ by_column.T for channel in np.moveaxis(values, -1, 0)], -1)

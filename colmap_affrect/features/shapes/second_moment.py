@@ -1,0 +1,90 @@
+"""Shape source ``second-moment``: affine shapes from the structure tensor; no network, no weights.
+
+With a shape L ~ mu^(-1/2) the rectifying map is L^-1 ~ mu^(1/2), so the unit metric of the
+rectifying map is mu / sqrt(det mu) itself (Lindeberg & Garding 1997; Baumberg 2000).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from colmap_affrect.conventions import grid_origin
+from colmap_affrect.data import GrayImage, ShapeGrid, ShapeSamples
+from colmap_affrect.features.base import FeatureOptions, NetworkContext, ShapeOptions
+from colmap_affrect.geometry.shapes import STEP_PX, log_metrics, metrics_from_log
+from colmap_affrect.options import within
+
+
+class SecondMomentOptions(ShapeOptions):
+    """Shape source ``second-moment``."""
+
+    name: Literal["second-moment"] = "second-moment"
+    uses_network: ClassVar[bool] = False
+    derivative_sigma_px: Annotated[float, within(0.3, 20.0)] = 1.5
+    """Gaussian smoothing before the gradients."""
+    integration_sigmas_px: Annotated[
+        tuple[Annotated[float, within(1.0, 1000.0)], ...], Field(strict=False, min_length=1)
+    ] = (8.0, 16.0, 32.0)
+    """Windows over which the structure tensor is averaged; shapes are their log-Euclidean mean."""
+    min_gradient: Annotated[float, within(0.0, 255.0)] = 1.0
+    """Root mean square gradient, gray values per px, under which a block counts as flat."""
+
+
+class SecondMoment:
+    """Shapes of all 4 x 4 blocks from the gradients around them."""
+
+    Options = SecondMomentOptions
+
+    def __init__(
+        self,
+        options: SecondMomentOptions,
+        network: NetworkContext | None = None,
+        features: FeatureOptions | None = None,
+    ) -> None:
+        """Keep the options; there is no network, and there are no keypoints."""
+        del network, features
+        self.options = options
+
+    def grid(self, image: GrayImage) -> ShapeGrid:
+        """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
+
+        The tensor is averaged over blocks, then over each integration scale; the scales are
+        combined by the log-Euclidean mean of the unit metrics. Blocks whose gradients stay
+        under ``min_gradient`` are not textured and get the identity.
+        """
+        tensor = _block_tensor(image, self.options.derivative_sigma_px)
+        sigmas_px = self.options.integration_sigmas_px
+        mean_log = np.zeros((*tensor.shape[:2], 2), dtype=np.float32)
+        for sigma_px in sigmas_px:
+            mean_log += log_metrics(_smooth(tensor, sigma_px)) / len(sigmas_px)
+        local = _smooth(tensor, min(sigmas_px))
+        textured = local[..., 0] + local[..., 1] > self.options.min_gradient**2
+        mean_log[~textured] = 0.0
+        return ShapeGrid(metrics_from_log(mean_log), textured, grid_origin(STEP_PX), STEP_PX)
+
+    def samples(self, image: GrayImage) -> ShapeSamples:
+        """Return the shapes of the textured blocks of a (H, W) uint8 image."""
+        return self.grid(image).samples()
+
+
+def _smooth(tensor: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    return np.asarray(cv2.GaussianBlur(tensor, (0, 0), sigma_px / STEP_PX), dtype=np.float32)
+
+
+def _block_tensor(image: GrayImage, derivative_sigma_px: float) -> NDArray[np.float32]:
+    """Return (R, C, 3) block means of (Ix^2, Iy^2, Ix Iy); gradients in gray values per px."""
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), derivative_sigma_px)
+    right = cv2.copyMakeBorder(smooth, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)
+    gradient_x = (right[1:-1, 2:] - right[1:-1, :-2]) / 2
+    gradient_y = (right[2:, 1:-1] - right[:-2, 1:-1]) / 2
+    products = np.dstack([gradient_x**2, gradient_y**2, gradient_x * gradient_y])
+    height, width = image.shape
+    bottom, side = -height % STEP_PX, -width % STEP_PX
+    padded = np.pad(products, ((0, bottom), (0, side), (0, 0)), mode="edge")
+    grid = ((width + side) // STEP_PX, (height + bottom) // STEP_PX)
+    return np.asarray(cv2.resize(padded, grid, interpolation=cv2.INTER_AREA), dtype=np.float32)

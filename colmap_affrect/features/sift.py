@@ -1,0 +1,156 @@
+"""Features ``rootsift``: OpenCV's DoG and SIFT, described as RootSIFT; no weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.data import GrayImage, LocalFeatures, View
+from colmap_affrect.features.base import FeatureOptions, NetworkContext
+from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.options import within
+
+
+class DogOptions(FeatureOptions):
+    """OpenCV's difference-of-Gaussians detector."""
+
+    name: str = "dog"
+    contrast_threshold: Annotated[float, within(0.0, 1.0)] = 0.013
+    """OpenCV's contrast threshold; lower finds fainter features (OpenCV and the paper: 0.04)."""
+    edge_threshold: Annotated[float, within(1.0, 1e6)] = 10.0
+    num_octave_layers: Annotated[int, within(1, 10)] = 3
+    sigma_px: Annotated[float, within(0.5, 10.0)] = 1.6
+
+
+class SiftOptions(DogOptions):
+    """Features ``rootsift``."""
+
+    name: Literal["rootsift"] = "rootsift"
+    uses_network: ClassVar[bool] = False
+    max_num_features: Annotated[int, within(1, 1_000_000)] = 13_000
+    """Most features of the image itself, by response times scale: large ones are found again more
+    often. Those of several orientations count as several, so this is about as many as COLMAP keeps
+    of a large photograph, which counts 8192 before."""
+
+
+class RootSift:
+    """DoG keypoints with RootSIFT descriptors (Arandjelovic & Zisserman 2012)."""
+
+    Options = SiftOptions
+    descriptor_size = 128
+
+    def __init__(self, options: SiftOptions, network: NetworkContext | None = None) -> None:
+        """Keep the options; there is no network."""
+        del network
+        self.options = options
+
+    def detect(self, view: View) -> LocalFeatures:
+        """Detect and describe in one pass over the scale space.
+
+        A location with several dominant orientations yields one feature for each: their
+        descriptors differ, and the matcher's second neighbour never lies at the same location,
+        so none of them is lost. Of too many the strongest are kept, by response times sigma.
+
+        Returns:
+            Described features by falling response; none for images under 8 px.
+        """
+        image, mask = view
+        if not is_searchable(image, mask):
+            return LocalFeatures.empty(self.descriptor_size)
+        keypoints, descriptors = make_sift(self.options).detectAndCompute(image, mask)
+        if not keypoints:
+            return LocalFeatures.empty(self.descriptor_size)
+        order, rows, responses = by_falling_response(keypoints)
+        strongest = np.argsort(-responses * rows[:, 2], kind="stable")
+        best = np.sort(strongest[: self.options.max_num_features])
+        rows = rows[best]
+        lafs = lafs_from_keypoints(rows[:, :2], MEASUREMENT_SIGMAS * rows[:, 2], rows[:, 3])
+        described = root_normalized(descriptors[order[best]].astype(np.float32))
+        return LocalFeatures(lafs, responses[best], described)
+
+    def describe(
+        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
+    ) -> list[LocalFeatures]:
+        """Return the features as they are: :meth:`detect` has described them."""
+        del images
+        return list(detected)
+
+
+def root_normalized(descriptors: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Divide non-negative rows by their sum and take square roots: rows of unit length."""
+    sums = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)
+    return np.asarray(np.sqrt(descriptors / sums), dtype=np.float32)
+
+
+MIN_IMAGE_SIZE_PX = 8
+"""OpenCV's scale space needs this much of the shorter side."""
+
+
+def make_sift(options: DogOptions) -> cv2.SIFT:
+    """Build OpenCV's detector and descriptor.
+
+    ``enable_precise_upscale`` removes OpenCV's bias of +0.25 px in x and y.
+    """
+    return cv2.SIFT.create(
+        nfeatures=0,
+        nOctaveLayers=options.num_octave_layers,
+        contrastThreshold=options.contrast_threshold,
+        edgeThreshold=options.edge_threshold,
+        sigma=options.sigma_px,
+        enable_precise_upscale=True,
+    )
+
+
+def is_searchable(image: GrayImage, mask: NDArray[np.uint8] | None) -> bool:
+    """Tell whether an image is large enough for OpenCV, not flat, and its mask not empty."""
+    large = min(image.shape) >= MIN_IMAGE_SIZE_PX
+    return large and bool(image.min() < image.max()) and (mask is None or bool(mask.any()))
+
+
+def by_falling_response(
+    keypoints: Sequence[cv2.KeyPoint],
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
+    """Sort keypoints by falling response; those of equal response keep their order.
+
+    Returns:
+        (N,) index of the sorted keypoints in the given ones; their (N, 4) x, y in pixel-centre
+        px, sigma in px and angle in radians (from x towards y); their (N,) responses.
+    """
+    responses = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
+    order = np.argsort(-responses, kind="stable")
+    rows = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=np.float64)
+    rows = rows.reshape(-1, 4)[order] * (1.0, 1.0, 1.0 / 2.0, np.pi / 180.0)
+    return order, rows, responses[order]
+
+
+def detect_dog(
+    image: GrayImage, options: DogOptions, mask: NDArray[np.uint8] | None = None
+) -> LocalFeatures:
+    """Detect DoG keypoints for descriptors that assign orientations themselves.
+
+    OpenCV returns a location once for each of its dominant orientations, 15 to 18 % of them more
+    than once. With another orientation put in their place these would be equal features, which
+    no ratio test tells apart; so there is one keypoint per centre and scale.
+
+    Args:
+        image: (H, W) uint8.
+        options: detector thresholds and the cap on the number of features.
+        mask: (H, W) uint8, keypoints are kept only where it is not 0.
+
+    Returns:
+        Features by falling response, frames upright circles of 6 sigma, descriptors (N, 0); none
+        for images under 8 px.
+    """
+    if not is_searchable(image, mask):
+        return LocalFeatures.empty()
+    _, rows, responses = by_falling_response(make_sift(options).detect(image, mask))
+    _, first = np.unique(rows[:, :3], axis=0, return_index=True)
+    kept = np.sort(first)[: options.max_num_features]
+    rows = rows[kept]
+    lafs = lafs_from_keypoints(rows[:, :2], MEASUREMENT_SIGMAS * rows[:, 2], np.zeros(len(rows)))
+    return LocalFeatures(lafs, responses[kept], np.zeros((len(rows), 0), np.float32))

@@ -1,0 +1,1 @@
+"""Photographs: which there are, reading, masks, warping, depth maps."""

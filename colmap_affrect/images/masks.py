@@ -1,0 +1,54 @@
+"""Masks: where features may be, and connected parts of an image."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.data import Mask
+from colmap_affrect.images.reading import decode
+
+
+def read_mask(path: Path) -> Mask:
+    """Read a mask: black pixels are False, all others True (COLMAP's convention).
+
+    Raises:
+        ImageError: when the file is missing, empty, or not an image.
+    """
+    return np.asarray(decode(path) != 0)
+
+
+def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:
+    """Resize an (H, W) mask to (width, height) px, each pixel from the nearest one."""
+    values = mask.astype(np.uint8)
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0)
+
+
+def mask_values(mask: Mask) -> NDArray[np.uint8]:
+    """Return an (H, W) mask as uint8, 255 inside and 0 outside."""
+    return mask.astype(np.uint8) * 255
+
+
+def connected_regions(mask: Mask, min_area_px: float) -> list[tuple[Mask, tuple[int, int]]]:
+    """Find the 4-connected regions of an (H, W) mask that have enough pixels.
+
+    Returns:
+        For each its (h, w) mask, cropped to it, and the (x, y) of the mask's first pixel.
+    """
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    regions = []
+    for label, (left, top, width, height, area) in enumerate(stats.tolist()):
+        if label > 0 and area >= min_area_px:
+            crop = labels[top : top + height, left : left + width] == label
+            regions.append((crop, (left, top)))
+    return regions
+
+
+def connected_groups(mask: Mask, gap: int) -> list[Mask]:
+    """Split an (H, W) mask into groups of pixels that are at most ``gap`` - 1 px apart."""
+    joined = cv2.dilate(mask.astype(np.uint8), np.ones((gap, gap), np.uint8))
+    num_groups, groups = cv2.connectedComponents(joined, connectivity=8)
+    return [mask & (groups == group) for group in range(1, num_groups)]

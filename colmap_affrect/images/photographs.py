@@ -1,0 +1,246 @@
+"""The photographs of a run: which there are, how they share cameras, and their masks."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Literal, Self
+
+import numpy as np
+
+from colmap_affrect.data import Mask
+from colmap_affrect.errors import ImageError, OptionError, StoreError
+from colmap_affrect.images.masks import read_mask
+from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES, read_gray
+from colmap_affrect.options import Options, within
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.project.stores import pair_key
+
+
+class CameraOptions(Options):
+    """How images share cameras (COLMAP's camera modes, models and parameters)."""
+
+    mode: Literal["auto", "single", "per-folder", "per-image"] = "auto"
+    model: str = "SIMPLE_RADIAL"
+    params: str = ""
+    default_focal_length_factor: Annotated[float, within(0.01, 100.0)] = 1.2
+    """Focal length in units of the longer side where EXIF has none."""
+    existing_camera_id: Annotated[int, within(-1, 2**31)] = -1
+    """Camera of the database that all new images get; -1 makes cameras for them."""
+
+
+class MaskOptions(Options):
+    """Where features may be, as COLMAP has it: nowhere that a mask is black."""
+
+    path: str = ""
+    """Folder with a mask for every image: a/b.jpg has a/b.jpg.png or a/b.png; empty for none."""
+    camera_path: str = ""
+    """One mask for all images; empty for none."""
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """Where the photographs of a run and their masks are.
+
+    Attributes:
+        folder: of the photographs.
+        masks: where features may be.
+    """
+
+    folder: Path
+    masks: MaskOptions = field(default_factory=MaskOptions)
+
+    def check(self) -> None:
+        """Refuse masks that are not there at all.
+
+        Raises:
+            OptionError: naming the option.
+        """
+        if self.masks.path and not Path(self.masks.path).is_dir():
+            raise OptionError(f"--mask-path {self.masks.path}: no such folder")
+        if self.masks.camera_path and not Path(self.masks.camera_path).is_file():
+            raise OptionError(f"--camera-mask-path {self.masks.camera_path}: no such file")
+
+    def mask(self, name: str) -> Mask | None:
+        """Return the (H, W) mask of an image, None where there are no masks.
+
+        Raises:
+            ImageError: when a mask is missing or cannot be read.
+        """
+        masks = []
+        if self.masks.path:
+            masks.append(read_mask(self._mask_path(name)))
+        if self.masks.camera_path:
+            masks.append(read_mask(Path(self.masks.camera_path)))
+        if len({mask.shape for mask in masks}) > 1:
+            raise ImageError(f"{self.folder / name}: its mask and the camera mask differ in size")
+        return np.logical_and.reduce(masks) if masks else None
+
+    def _mask_path(self, name: str) -> Path:
+        paths = self._mask_paths(name)
+        for path in paths:
+            if path.is_file():
+                return path
+        raise ImageError(
+            f"{self.folder / name}: has no mask {paths[0]}; make one (black is left out), or "
+            "leave out --mask-path"
+        )
+
+    def _mask_paths(self, name: str) -> list[Path]:
+        """Return where the mask of an image may be, the first that is there counts."""
+        folder = Path(self.masks.path)
+        return [folder / f"{name}.png", (folder / name).with_suffix(".png")]
+
+    def files(self, name: str) -> list[Path]:
+        """Return the files that the extraction of an image reads, as far as they are there."""
+        paths = [self.folder / name]
+        if self.masks.path:
+            paths += self._mask_paths(name)
+        if self.masks.camera_path:
+            paths.append(Path(self.masks.camera_path))
+        return [path for path in paths if path.is_file()]
+
+    def moved(self, move: Callable[[Path], Path]) -> Self:
+        """Return the same photographs with all files in other places."""
+        folders = (self.masks.path, self.masks.camera_path)
+        path, camera_path = (str(move(Path(folder))) if folder else "" for folder in folders)
+        return replace(
+            self, folder=move(self.folder), masks=MaskOptions(path=path, camera_path=camera_path)
+        )
+
+
+def list_images(image_path: Path, image_list_path: Path | None = None) -> list[str]:
+    """Return the sorted names, relative to ``image_path``, of all images or of those listed.
+
+    Folders are searched through; hidden ones and files of other formats are passed over (see
+    :func:`left_out`).
+
+    Raises:
+        ImageError: when there are none, or a listed one is missing.
+    """
+    if not image_path.is_dir():
+        raise ImageError(f"{image_path}: no such folder; give the folder of the photographs")
+    if image_list_path is not None:
+        return _listed_images(image_path, image_list_path)
+    names = [name for name in _visible_files(image_path) if _suffix(name) in IMAGE_SUFFIXES]
+    if not names:
+        others = "".join(f"; {kind}: {what}" for kind, what in left_out(image_path).items())
+        raise ImageError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}")
+    for name in names:
+        _check_name(name, image_path)
+    return names
+
+
+def left_out(image_path: Path) -> dict[str, str]:
+    """Tell by ``*.suffix`` which photographs in a folder are passed over for their format."""
+    found: dict[str, list[str]] = {}
+    for name in _visible_files(image_path):
+        if _suffix(name) in OTHER_IMAGE_SUFFIXES:
+            found.setdefault(f"*{_suffix(name)}", []).append(name)
+    return {
+        kind: f"{len(names)} left out, such as {names[0]}: COLMAP or OpenCV cannot read this "
+        "format; convert to PNG or JPEG"
+        for kind, names in found.items()
+    }
+
+
+def _visible_files(folder: Path) -> list[str]:
+    """Return the sorted names, relative to a folder, of all files that are not hidden."""
+    paths = (path.relative_to(folder) for path in folder.rglob("*"))
+    return sorted(
+        path.as_posix()
+        for path in paths
+        if not any(part.startswith(".") for part in path.parts) and not (folder / path).is_dir()
+    )
+
+
+def _suffix(name: str) -> str:
+    return PurePosixPath(name).suffix.lower()
+
+
+def _check_name(name: str, where: Path) -> None:
+    """Refuse a name that a list of images, one a line, cannot hold."""
+    if name != name.encode("utf-8", "replace").decode("utf-8"):
+        raise ImageError(f"{where}: the name {name!r} is not UTF-8; rename it")
+    if any(unicodedata.category(character) in ("Cc", "Zl", "Zp") for character in name):
+        raise ImageError(
+            f"{where}: the name {name!r} has a line break, tab or other control character, which "
+            "lists of images cannot hold; rename it"
+        )
+
+
+def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
+    try:
+        lines = image_list_path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ImageError(f"{image_list_path}: cannot be read ({error})") from error
+    listed = [
+        line if _is_below(image_path, line) else line.strip()  # a name may begin with a space or #
+        for line in lines
+        if _is_below(image_path, line) or (line.strip() and not line.startswith("#"))
+    ]
+    if not listed:
+        raise ImageError(f"{image_list_path}: is empty")
+    return checked_names(image_path, listed, str(image_list_path))
+
+
+def checked_names(image_path: Path, names: Sequence[str], where: str) -> list[str]:
+    """Return the sorted names of images below a folder, each once.
+
+    Raises:
+        ImageError: for a name that is not there, or that leads out of the folder.
+    """
+    found = sorted({PurePosixPath(name).as_posix() for name in names})
+    missing = [name for name in found if not _is_below(image_path, name)]
+    for name in found:
+        _check_name(name, image_path)
+    if missing:
+        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
+        raise ImageError(f"{where}: lists {missing[0]}{more}, which is not in {image_path}")
+    return found
+
+
+def _is_below(image_path: Path, name: str) -> bool:
+    inside = ".." not in PurePosixPath(name).parts and not name.startswith("/")
+    try:
+        return inside and (image_path / name).is_file()
+    except OSError:  # for one, of a name that is too long
+        return False
+
+
+def refuse_colliding_keys(names: Sequence[str]) -> None:
+    """Refuse two names that are the same in hloc's pair keys, which turn '/' into '-'."""
+    seen: dict[str, str] = {}
+    for name in names:
+        other = seen.setdefault(pair_key(name, ""), name)
+        if other != name:
+            raise StoreError(
+                f"{other} and {name} have the same key in hloc's match files, where '/' becomes "
+                "'-'; rename one of them"
+            )
+
+
+def refuse_mixed_sizes(
+    image_path: Path, names: Sequence[str], mode: str, known: Mapping[str, tuple[int, int]]
+) -> None:
+    """Refuse images of several sizes with one camera, of which COLMAP would leave some out."""
+
+    def size_of(name: str) -> tuple[int, int] | None:
+        try:
+            return known.get(name) or read_gray(image_path / name).shape[::-1]
+        except ImageError:
+            return None
+
+    first: dict[PurePosixPath, tuple[str, tuple[int, int]]] = {}
+    for name, size in zip(names, map_ordered(size_of, names, available_cores()), strict=True):
+        if size is None:
+            continue
+        folder = PurePosixPath(name).parent if mode == "per-folder" else PurePosixPath()
+        other, expected = first.setdefault(folder, (name, size))
+        if size != expected:
+            raise OptionError(
+                f"--camera-mode {mode}: {other} is {expected[0]} x {expected[1]} px, {name} is "
+                f"{size[0]} x {size[1]} px; images that share a camera must have one size"
+            )

@@ -1,0 +1,418 @@
+"""Features and matches in other programs' HDF5 files, into and out of COLMAP databases.
+
+The layouts that are read and written are in :mod:`.hdf5_layouts`. Names must be those of images
+in the folder, and every value is checked before it reaches COLMAP.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import (
+    DESCRIPTOR_NORM,
+    check_cameras,
+    colmap_keypoints,
+    import_images,
+    open_database,
+    write_matches,
+)
+from colmap_affrect.colmap.database_copy import open_copy
+from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
+from colmap_affrect.errors import DatabaseError, ImageError, OptionError, StoreError
+from colmap_affrect.images.photographs import (
+    CameraOptions,
+    list_images,
+)
+from colmap_affrect.interop.hdf5_layouts import (
+    LAYOUTS,
+    Datasets,
+    ForeignFiles,
+    Source,
+    check_names,
+    created,
+    feature_key,
+    listed,
+    match_datasets,
+    one_match_per_keypoint,
+    open_files,
+)
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.stores import PairMatches
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.pairs import listed_pairs
+
+PIXEL_ORIGINS = ("center", "corner")
+
+
+@dataclass(frozen=True)
+class InterchangeReport:
+    """What was imported or exported.
+
+    Attributes:
+        action: ``imported`` or ``exported``.
+        layout: of the files, ``hloc`` or ``dim``.
+        num_images: images in the database or the file, those without features included.
+        num_verified: pairs with a two-view geometry; None where no verification was asked for.
+        notes: what was left out, chosen or lost, one line each.
+    """
+
+    action: str
+    layout: str
+    num_images: int
+    num_keypoints: int
+    num_pairs: int
+    num_matches: int
+    num_verified: int | None
+    notes: tuple[str, ...]
+
+    def summary(self) -> str:
+        """Return a line of numbers, and one for each note."""
+        verified = "" if self.num_verified is None else f", {self.num_verified} verified"
+        counts = (
+            f"{self.action} ({self.layout}): {self.num_images} images, "
+            f"{self.num_keypoints} keypoints, {self.num_pairs} pairs{verified}, "
+            f"{self.num_matches} matches"
+        )
+        return "\n".join([counts, *(f"note: {note}" for note in self.notes)])
+
+
+def import_h5(
+    image_path: Path,
+    features_path: Path,
+    matches_path: Path,
+    database_path: Path,
+    *,
+    cameras: CameraOptions | None = None,
+    layout: str = "auto",
+    pixel_origin: str = "center",
+    skip_verification: bool = False,
+    random_seed: int = 0,
+    progress: Progress = SILENT,
+) -> InterchangeReport:
+    """Make a new COLMAP database from the features and matches of another program.
+
+    Keypoints get 6 columns where the file has ``lafs``, 4 where it has ``scales`` and ``oris``,
+    else 2. All images of the folder are imported, with or without features. The database appears
+    when it is complete; nothing else is written.
+
+    Args:
+        image_path: folder of the photographs, searched with its sub-folders.
+        features_path: HDF5 file of keypoints.
+        matches_path: HDF5 file of matches.
+        database_path: where the database is made.
+        cameras: which images share a camera, and known intrinsics.
+        layout: ``hloc``, ``dim``, or ``auto``: as the matches are stored.
+        pixel_origin: where (0, 0) is, the ``center`` of the first pixel (both programs) or its
+            ``corner``, which is COLMAP's.
+        skip_verification: leave the database without two-view geometries.
+        random_seed: of the verification, by :func:`colmap_affrect.colmap.verification.verify`.
+        progress: where to show progress.
+
+    Raises:
+        StoreError: when a file cannot be read, or contradicts the photographs or the other file.
+        DatabaseError: when the database exists already.
+    """
+    _check_choice("layout", layout, ("auto", *LAYOUTS))
+    _check_choice("pixel_origin", pixel_origin, PIXEL_ORIGINS)
+    _refuse_existing(database_path, DatabaseError)
+    cameras = cameras or CameraOptions()
+    verification = VerificationOptions(random_seed=random_seed)
+    check_cameras(cameras)
+    names = list_images(image_path)
+    with (
+        open_files(features_path, matches_path, layout, names, image_path) as files,
+        # Verification may take hours, and half a database must not be left behind.
+        tempfile.TemporaryDirectory(prefix=".import-h5-", dir=database_path.parent) as folder,
+    ):
+        new = Path(folder) / "new.db"
+        rejected = import_images(new, image_path, names, cameras)
+        lost = sorted(files.keys.keys() & set(rejected))
+        if lost:
+            raise ImageError(
+                f"{image_path}: COLMAP does not take (damaged, or of another size than camera "
+                f"mode {cameras.mode} allows): {listed(lost)}"
+            )
+        counts, num_matches = _fill_database(new, files, pixel_origin, progress)
+        num_verified = None
+        if not skip_verification:
+            with progress.stage("verify", len(files.pairs), "pairs") as advance:
+                verify(new, verification)
+                advance(len(files.pairs))
+            num_verified = len(verified_pairs(new, verification.min_num_inliers))
+        new.replace(database_path)
+    notes = list(files.notes)
+    imported = set(names) - set(rejected)
+    if without := sorted(imported - counts.keys()):
+        notes.append(f"images without features are there without keypoints: {listed(without)}")
+    if rejected:
+        notes.append(f"images that COLMAP does not take are left out: {listed(rejected)}")
+    return InterchangeReport(
+        "imported", files.layout, len(imported), sum(counts.values()), len(files.pairs),
+        num_matches, num_verified, tuple(notes),
+    )  # fmt: skip
+
+
+def _fill_database(
+    path: Path, files: ForeignFiles, pixel_origin: str, progress: Progress
+) -> tuple[dict[str, int], int]:
+    """Write keypoints and matches; return the keypoints of each image, and how many matches."""
+    counts, num_matches = {}, 0
+    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
+        images = {image.name: image for image in database.read_all_images()}
+        with progress.stage("keypoints", len(files.keys), "images") as advance:
+            for name, key in files.keys.items():
+                camera = database.read_camera(images[name].camera_id)
+                files.check_size(name, (camera.width, camera.height))
+                keypoints = _read_keypoints(files.features, key, pixel_origin)
+                database.write_keypoints(images[name].image_id, keypoints)
+                counts[name] = len(keypoints)
+                advance(1)
+        with progress.stage("matches", len(files.pairs), "pairs") as advance:
+            for pair in files.pairs:
+                indices = files.read_indices(pair, counts[pair[0]])
+                _check_range(files.matches.path, pair, indices, counts)
+                id1, id2 = (images[name].image_id for name in pair)
+                write_matches(database, id1, id2, indices)
+                num_matches += len(indices)
+                advance(1)
+    return counts, num_matches
+
+
+def export_h5(
+    features_path: Path,
+    matches_path: Path,
+    *,
+    output_path: Path | None = None,
+    database_path: Path | None = None,
+    layout: str = "hloc",
+    half: bool = False,
+    progress: Progress = SILENT,
+) -> InterchangeReport:
+    """Write features and raw matches of an output folder or a database for another program.
+
+    Features keep their indices. ``scales`` and ``oris`` are those of hloc: sigma in px, and
+    degrees from x towards y. Descriptors are of unit length. Scores, which a database does not
+    have, are 1 then.
+
+    Args:
+        features_path: new HDF5 file of features.
+        matches_path: new HDF5 file of matches.
+        output_path: an output folder of ours in which matching is done; or
+        database_path: any COLMAP database, which is copied first and stays as it is.
+        layout: ``hloc`` or ``dim``.
+        half: write all real numbers as float16, coordinates too.
+        progress: where to show progress.
+
+    Raises:
+        StoreError: when a file exists, cannot be written, or its layout cannot hold the content.
+        DatabaseError: when the database cannot be used.
+    """
+    _check_choice("layout", layout, LAYOUTS)
+    if features_path.resolve() == matches_path.resolve():
+        raise StoreError(f"{features_path}: features and matches need a file each")
+    for path in (features_path, matches_path):
+        _refuse_existing(path, StoreError)
+    counts: dict[str, int] = {}
+    num_matches, num_lost = 0, 0
+    with _content(output_path, database_path) as content:
+        check_names(content.names, layout)
+        with created(features_path) as features, created(matches_path) as matches:
+            with progress.stage("features", len(content.names), "images") as advance:
+                for name in content.names:
+                    size, data = content.features(name)
+                    if half:
+                        data = {key: values.astype(np.float16) for key, values in data.items()}
+                    data["image_size"] = np.asarray(size if layout == "hloc" else size[::-1])
+                    features.write(feature_key(name, layout), data)
+                    counts[name] = len(data["keypoints"])
+                    advance(1)
+            with progress.stage("matches", content.num_pairs, "pairs") as advance:
+                for pair in content.matches():
+                    _check_range(content.where, pair.names, pair.indices, counts)
+                    written = one_match_per_keypoint(pair) if layout == "hloc" else pair
+                    matches.write(*match_datasets(written, layout))
+                    num_matches += len(written.indices)
+                    num_lost += len(pair.indices) - len(written.indices)
+                    advance(1)
+    notes = list(content.notes)
+    if num_lost:
+        notes.append(f"{num_lost} matches are left out: hloc's files hold one of each keypoint")
+    if half:
+        notes.append("coordinates are rounded: float16 has steps of 1 px from 1024 px on")
+    return InterchangeReport(
+        "exported", layout, len(counts), sum(counts.values()), content.num_pairs, num_matches,
+        None, tuple(notes),
+    )  # fmt: skip
+
+
+def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    if value not in choices:
+        raise OptionError(f"{name} {value!r}: not one of {', '.join(choices)}")
+
+
+def _refuse_existing(path: Path, error: type[StoreError | DatabaseError]) -> None:
+    if path.exists():
+        raise error(f"{path}: exists already and is not overwritten; give another name")
+    if not path.parent.is_dir():
+        raise error(f"{path.parent}: no such folder; make it first")
+
+
+def _check_range(
+    where: object, pair: Pair, indices: NDArray[np.integer], counts: Mapping[str, int]
+) -> None:
+    for name, column in zip(pair, indices.T, strict=True):
+        wrong = column[(column < 0) | (column >= counts.get(name, 0))]
+        if len(wrong):
+            raise StoreError(
+                f"{where}: the matches of {pair[0]} and {pair[1]} point at keypoint {wrong[0]} of "
+                f"{name}, which has {counts.get(name, 0)}; match them again"
+            )
+
+
+def _read_keypoints(source: Source, key: str, pixel_origin: str) -> NDArray[np.float32]:
+    """Return the (N, 2), (N, 4) or (N, 6) keypoints of an image as COLMAP stores them."""
+    path = f"{key}/keypoints" if f"{key}/keypoints" in source.shapes else key
+    lafs, scales, oris = (f"{key}/{name}" for name in ("lafs", "scales", "oris"))
+    with np.errstate(over="ignore"):  # what float32 cannot hold is refused at the end
+        points = source.read(path, (None, 2)).astype(np.float32)
+        centers = colmap_from_pixel(points) if pixel_origin == "center" else points
+        count = len(points)
+        keypoints = np.asarray(centers)
+        if lafs in source.shapes:
+            frames = source.read(lafs, (count, 2, 3)).astype(np.float64)
+            keypoints = np.column_stack([centers, colmap_keypoints(frames)[:, 2:]])
+        elif {scales, oris} <= source.shapes.keys():
+            sigmas = source.read(scales, (count,)).astype(np.float32)
+            if (sigmas < 0).any():
+                raise StoreError(f"{source.path}: {scales} holds negative values")
+            angles = np.deg2rad(source.read(oris, (count,)).astype(np.float32))
+            keypoints = np.column_stack([centers, sigmas, angles])
+    if not np.isfinite(keypoints).all():
+        raise StoreError(f"{source.path}: {path} or its shapes hold values that are too large")
+    return keypoints
+
+
+class _WorkspaceContent:
+    """Features and matches of an output folder, to be exported.
+
+    Attributes:
+        where: they are, for messages.
+        names: of the images with features.
+        num_pairs: number of pairs that :meth:`matches` yields.
+        notes: what is left out.
+    """
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.where = str(workspace.path)
+        context = Context(workspace)
+        self._features, self._matches = context.features, context.matches
+        self._sizes = self._features.image_sizes()
+        self._pairs = listed_pairs(context)
+        self.names, self.num_pairs = sorted(self._sizes), len(self._pairs)
+        self.notes: list[str] = []
+
+    def features(self, name: str) -> tuple[tuple[int, int], Datasets]:
+        """Return the (width, height) of an image and its datasets as in hloc's layout."""
+        found = self._features.read(name)
+        data: Datasets = {
+            "keypoints": found.keypoints.astype(np.float32),
+            "descriptors": found.descriptors.T,
+            "scores": found.responses,
+        }
+        return self._sizes[name], data | _frame_datasets(found.lafs)
+
+    def matches(self) -> Iterator[PairMatches]:
+        """Yield the raw matches of all pairs."""
+        return self._matches.read(self._pairs) if self._pairs else iter(())
+
+
+class _DatabaseContent:
+    """Features and matches of a COLMAP database; its members are those of an output folder's."""
+
+    def __init__(self, database: pycolmap.Database, where: str) -> None:
+        self.where = where
+        self._database = database
+        self._images = {image.name: image for image in database.read_all_images()}
+        found = {n for n, i in self._images.items() if database.exists_keypoints(i.image_id)}
+        pair_ids, _ = database.read_num_matches()
+        self._pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
+        self.names, self.num_pairs = sorted(found), len(self._pairs)
+        without = sorted(set(self._images) - found)
+        self.notes = [f"images without keypoints are left out: {listed(without)}"] * bool(without)
+
+    def features(self, name: str) -> tuple[tuple[int, int], Datasets]:
+        image = self._images[name]
+        camera = self._database.read_camera(image.camera_id)
+        keypoints = np.asarray(self._database.read_keypoints(image.image_id), np.float32)
+        points = np.asarray(pixel_from_colmap(keypoints[:, :2]))
+        data: Datasets = {"keypoints": points, "scores": np.ones(len(points), np.float32)}
+        columns = keypoints.shape[1]
+        if columns == 6:
+            shapes = keypoints[:, 2:].reshape(-1, 2, 2) * np.float32(MEASUREMENT_SIGMAS)
+            data |= _frame_datasets(np.concatenate([shapes, points[:, :, None]], axis=2))
+        elif columns == 4:
+            data |= {"scales": keypoints[:, 2], "oris": np.rad2deg(keypoints[:, 3])}
+        elif len(keypoints) and columns != 2:
+            raise DatabaseError(f"{self.where}: {name} has keypoints of {columns} columns")
+        if self._database.exists_descriptors(image.image_id):
+            data["descriptors"] = self._descriptors(name, len(points)).T
+        return (camera.width, camera.height), data
+
+    def _descriptors(self, name: str, count: int) -> NDArray[np.float32]:
+        found = self._database.read_descriptors(self._images[name].image_id)
+        if len(found.data) != count:
+            raise DatabaseError(
+                f"{self.where}: {name} has {count} keypoints and {len(found.data)} descriptors"
+            )
+        try:
+            values = np.asarray(found.to_float().data, np.float32)
+        except ValueError as error:
+            raise DatabaseError(f"{self.where}: {name} has descriptors of no known type") from error
+        sift = found.type == pycolmap.FeatureExtractorType.SIFT
+        return values / np.float32(DESCRIPTOR_NORM if sift else 1)
+
+    def matches(self) -> Iterator[PairMatches]:
+        names = {image.image_id: name for name, image in self._images.items()}
+        for id1, id2 in self._pairs:
+            if not {id1, id2} <= names.keys():
+                raise DatabaseError(f"{self.where}: has matches of images that are not in it")
+            indices = np.asarray(self._database.read_matches(id1, id2), np.int64)
+            count = self._database.num_keypoints_for_image(id1)
+            scores = np.ones(len(indices), np.float32)
+            yield PairMatches((names[id1], names[id2]), indices, scores, count)
+
+
+@contextmanager
+def _content(
+    output_path: Path | None, database_path: Path | None
+) -> Iterator[_WorkspaceContent | _DatabaseContent]:
+    if output_path is not None and database_path is None:
+        workspace = Workspace(output_path)
+        workspace.require("match")
+        with workspace.locked():
+            yield _WorkspaceContent(workspace)
+    elif database_path is not None and output_path is None:
+        with open_copy(database_path) as database:
+            yield _DatabaseContent(database, str(database_path))
+    else:
+        raise OptionError("give either an output folder or a database")
+
+
+def _frame_datasets(lafs: NDArray[np.floating]) -> Datasets:
+    """Return (N, 2, 3) frames, and their scales in sigmas and orientations in degrees."""
+    shapes = lafs[:, :, :2].astype(np.float64)
+    scales = np.sqrt(np.abs(np.linalg.det(shapes))) / MEASUREMENT_SIGMAS
+    angles = np.rad2deg(np.arctan2(shapes[:, 1, 0], shapes[:, 0, 0]))
+    datasets = {"lafs": lafs, "scales": scales, "oris": angles}
+    return {name: values.astype(np.float32) for name, values in datasets.items()}

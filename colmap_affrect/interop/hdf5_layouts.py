@@ -1,0 +1,383 @@
+"""HDF5 files of other programs: safe access, and which image or pair each of their keys means.
+
+Three layouts are read, two are written; in all of them (0, 0) is the centre of the first pixel.
+
+``hloc``
+    Features: a group per image name, nested at '/', with ``keypoints`` (N, 2), ``descriptors``
+    (D, N), ``scores`` (N,), ``image_size`` (width, height), and perhaps ``scales`` (N,) in sigmas,
+    ``oris`` (N,) in degrees from x towards y, ``lafs`` (N, 2, 3). Matches: a group per pair with
+    ``matches0`` (N0,), -1 where unmatched, and ``matching_scores0`` (N0,); in its key each '/'
+    of a name is '-', and '/' stands between the names ('_' in old files).
+``dim`` (deep-image-matching)
+    The same features by file name without folders, ``image_size`` as (height, width); matches
+    [name 1][name 2] (M, 2). Also read without groups, as in the notebooks of the Image Matching
+    Challenge: keypoints [name] (N, 2) and matches.
+
+These files are not trusted: links and data in other files are refused, and arrays are checked.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap.checks import is_unsafe
+from colmap_affrect.errors import StoreError
+from colmap_affrect.images.photographs import refuse_colliding_keys
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.project.atomic_files import require_space
+from colmap_affrect.project.stores import PairMatches, hloc_matches, pair_key
+
+Datasets = dict[str, NDArray[Any]]
+
+LAYOUTS = ("hloc", "dim")
+
+MAX_VALUES = 1 << 28
+"""An array of more values is taken for damage, and not read."""
+
+MAX_NAMES_IN_MESSAGE = 10
+
+SPARE_BYTES = 8 << 20
+"""What HDF5 may need beside the data themselves: its index, and what it has not written yet."""
+
+KEYPOINTS, HLOC_MATCHES = "/keypoints", "/matches0"
+
+UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, SystemError)
+"""What h5py raises for a damaged file."""
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return names for a message, the first of them if there are many."""
+    names = list(names)
+    more = len(names) - MAX_NAMES_IN_MESSAGE
+    shown = ", ".join(names[:MAX_NAMES_IN_MESSAGE])
+    return f"{shown}, and {more} more" if more > 0 else shown
+
+
+@dataclass(frozen=True)
+class Source:
+    """An open HDF5 file of another program, and the shapes of its datasets by their paths."""
+
+    path: Path
+    file: Any
+    shapes: dict[str, tuple[int, ...]]
+
+    def read(self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu") -> NDArray[Any]:
+        """Read a dataset of finite numbers once its shape has been checked.
+
+        Args:
+            key: path of the dataset.
+            shape: expected shape; None stands for any size.
+            kinds: numpy's kinds of types that are accepted.
+        """
+        found = self.shapes[key]
+        same = [size in (expected, None) for size, expected in zip(shape, found, strict=False)]
+        if len(found) != len(shape) or not all(same):
+            wanted = str(shape).replace("None", "N")
+            raise StoreError(f"{self.path}: {key} has shape {found}, expected {wanted}")
+        if np.prod([float(size) for size in found]) > MAX_VALUES:
+            raise StoreError(f"{self.path}: {key} of shape {found} is too large to be true")
+        with _reading(self.path):
+            kind = self.file[key].dtype.kind
+            values = np.asarray(self.file[key][()]) if kind in kinds else None
+        if values is None:
+            what = "numbers" if "f" in kinds else "integers"
+            raise StoreError(f"{self.path}: {key} does not hold {what}")
+        if not np.isfinite(values).all():
+            raise StoreError(f"{self.path}: {key} holds values that are not finite")
+        return values
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Source]:
+    """Open a file for reading; links and data that lead out of it are refused."""
+    if not path.is_file():
+        raise StoreError(f"{path}: no such file")
+    try:
+        file = h5py.File(path, "r")
+    except BlockingIOError as error:
+        raise StoreError(
+            f"{path}: another program is writing it; wait until it has ended"
+        ) from error
+    except OSError as error:
+        if "already open for write" in str(error):
+            raise StoreError(
+                f"{path}: is being written, or its writer was killed; in the second case "
+                f"'h5clear --status {path.name}' mends it"
+            ) from error
+        raise StoreError(f"{path}: not an HDF5 file, or damaged ({_first_line(error)})") from error
+    with file:
+        yield Source(path, file, _shapes(path, file))
+
+
+def _shapes(path: Path, file: h5py.File) -> dict[str, tuple[int, ...]]:
+    shapes: dict[str, tuple[int, ...]] = {}
+    outside: list[str] = []
+
+    def visit(key: str, link: object) -> None:
+        item = file[key] if isinstance(link, h5py.HardLink) else None
+        if item is None or (isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)):
+            outside.append(key)
+        elif isinstance(item, h5py.Dataset):
+            shapes[key] = item.shape or ()
+
+    with _reading(path):
+        file.visititems_links(visit)
+    if outside:
+        raise StoreError(
+            f"{path}: soft and external links and data in other files are not followed: "
+            f"{listed(outside)}"
+        )
+    return shapes
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except UNREADABLE as error:
+        raise StoreError(f"{path}: damaged ({_first_line(error)})") from error
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+@dataclass(frozen=True)
+class Target:
+    """An HDF5 file that is being written."""
+
+    path: Path
+    file: Any
+
+    def write(self, key: str, datasets: Datasets) -> None:
+        """Add datasets to a group, if the disk has room: else HDF5 may end the process."""
+        require_space(self.path, sum(values.nbytes for values in datasets.values()) + SPARE_BYTES)
+        with _writing(self.path):
+            group = self.file.require_group(key)
+            for name, values in datasets.items():
+                group.create_dataset(name, data=values)
+
+
+@contextmanager
+def created(path: Path) -> Iterator[Target]:
+    """Make a file, under another name until it is complete."""
+    new = path.with_name(path.name + ".partial")
+    require_space(path, SPARE_BYTES)
+    try:
+        with _writing(path):
+            file = h5py.File(new, "w")
+        try:
+            yield Target(path, file)
+        finally:
+            with _writing(path):
+                file.close()
+        new.replace(path)
+    finally:
+        new.unlink(missing_ok=True)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        raise StoreError(
+            f"{path}: cannot be written ({_first_line(error)}); free space or give another name"
+        ) from error
+
+
+@dataclass(frozen=True)
+class ForeignFiles:
+    """Features and matches of another program, by the names of photographs.
+
+    Attributes:
+        layout: of both files, ``hloc`` or ``dim``.
+        keys: of the features of each image that has some.
+        pairs: key of the matches of each pair.
+        notes: which pairs were passed over.
+    """
+
+    features: Source
+    matches: Source
+    layout: str
+    keys: dict[str, str]
+    pairs: dict[Pair, str]
+    notes: list[str]
+
+    def check_size(self, name: str, expected: tuple[int, int]) -> None:
+        """Refuse features of an image of another (width, height) than the photograph has."""
+        key = f"{self.keys[name]}/image_size"
+        if key not in self.features.shapes:
+            return
+        stored = tuple(self.features.read(key, (2,)).tolist())
+        size = stored if self.layout == "hloc" else stored[::-1]
+        if size != expected:
+            turned = " (turned by its EXIF orientation?)" if size == expected[::-1] else ""
+            raise StoreError(
+                f"{self.features.path}: {name} was {size[0]:g} x {size[1]:g} px for the features"
+                f"{turned}, and the photograph is {expected[0]} x {expected[1]} px; use the same "
+                "photographs"
+            )
+
+    def read_indices(self, pair: Pair, num_keypoints1: int) -> NDArray[np.int64]:
+        """Read the (M, 2) matches of a pair, the range of which is not checked here."""
+        key = self.pairs[pair]
+        if self.layout == "dim":
+            return self.matches.read(key, (None, 2), "iu").astype(np.int64)
+        column = self.matches.read(key + HLOC_MATCHES, (num_keypoints1,), "iu").astype(np.int64)
+        rows = np.flatnonzero(column != -1)
+        return np.stack([rows, column[rows]], axis=1)
+
+
+@contextmanager
+def open_files(
+    features_path: Path, matches_path: Path, layout: str, names: Sequence[str], image_path: Path
+) -> Iterator[ForeignFiles]:
+    """Open files of features and matches of named photographs; see ``import_h5``."""
+    with _opened(features_path) as features, _opened(matches_path) as matches:
+        if layout == "auto":  # a file without any matches is taken for hloc's
+            columns = [k for k, s in matches.shapes.items() if len(s) == 1]
+            is_hloc = any(key.endswith(HLOC_MATCHES) for key in columns) or not matches.shapes
+            layout = "hloc" if is_hloc else "dim"
+        keys = _name_features(features, names, layout, image_path)
+        pairs, notes = _name_pairs(matches, keys, layout)
+        yield ForeignFiles(features, matches, layout, keys, pairs, notes)
+
+
+def _name_features(
+    source: Source, names: Sequence[str], layout: str, image_path: Path
+) -> dict[str, str]:
+    """Return the group with keypoints of each image, or the dataset of them at the top."""
+    keys = [key.removesuffix(KEYPOINTS) for key in source.shapes if key.endswith(KEYPOINTS)]
+    keys += [key for key in source.shapes if "/" not in key]
+    if not keys:
+        raise StoreError(f"{source.path}: holds no keypoints; is it a file of local features?")
+    known = {name: [name] for name in names}
+    if layout == "dim":
+        known |= _by_file_name(names)
+    unknown = sorted(set(keys) - known.keys())
+    if unknown:
+        raise StoreError(
+            f"{source.path}: has features of images that are not in {image_path}: {listed(unknown)}"
+        )
+    key_of: dict[str, str] = {}
+    for key in sorted(keys):
+        name, *others = known[key]
+        if others:
+            raise StoreError(f"{source.path}: {key} may be any of {listed(known[key])}")
+        if name in key_of:
+            raise StoreError(f"{source.path}: has features of {name} twice")
+        key_of[name] = key
+    if layout == "hloc":
+        refuse_colliding_keys(list(key_of))
+    return key_of
+
+
+def _name_pairs(
+    source: Source, feature_keys: Mapping[str, str], layout: str
+) -> tuple[dict[Pair, str], list[str]]:
+    """Return the key of each pair of images, and notes on pairs that were passed over."""
+    if layout == "hloc":
+        keys = [
+            key.removesuffix(HLOC_MATCHES) for key in source.shapes if key.endswith(HLOC_MATCHES)
+        ]
+        parts = {name.replace("/", "-"): name for name in feature_keys}
+    else:
+        keys, parts = list(source.shapes), {key: name for name, key in feature_keys.items()}
+    if source.shapes and not keys:
+        raise StoreError(f"{source.path}: holds no 'matches0'; is it of another layout?")
+    pairs: dict[Pair, str] = {}
+    unknown, selves, again = [], [], []
+    for key in sorted(keys, key=lambda key: ("/" not in key, key)):
+        found = _split_key(key, parts)
+        if len(found) > 1:
+            raise StoreError(f"{source.path}: {key} may be any of {listed(map(' + '.join, found))}")
+        if not found:
+            unknown.append(key)
+        elif found[0][0] == found[0][1]:
+            selves.append(key)
+        elif found[0] in pairs or found[0][::-1] in pairs:
+            again.append(key)
+        else:
+            pairs[found[0]] = key
+    if unknown:
+        raise StoreError(
+            f"{source.path}: has matches of images that have no features: {listed(unknown)}"
+        )
+    notes = []
+    if again:
+        notes.append(f"pairs that are there twice, the second is left out: {listed(again)}")
+    if selves:
+        notes.append(f"images matched with themselves are left out: {listed(selves)}")
+    return pairs, notes
+
+
+def _split_key(key: str, names: Mapping[str, str]) -> list[Pair]:
+    """Return every way to read a key as two names."""
+    separator = "/" if "/" in key else "_"
+    parts = key.split(separator)
+    halves = (
+        (separator.join(parts[:count]), separator.join(parts[count:]))
+        for count in range(1, len(parts))
+    )
+    return [(names[a], names[b]) for a, b in halves if a in names and b in names]
+
+
+def check_names(names: Sequence[str], layout: str) -> None:
+    """Refuse image names that the keys of a layout cannot hold or tell apart."""
+    unsafe = [
+        name
+        for name in names
+        if is_unsafe(name) or PurePosixPath(name).as_posix() != name or "\0" in name
+    ]
+    if unsafe:
+        raise StoreError(f"names that are no plain relative paths: {listed(unsafe)}")
+    if layout == "dim":
+        groups = _by_file_name(names).values()
+        same = [name for group in groups if len(group) > 1 for name in group]
+        if same:
+            raise StoreError(
+                f"deep-image-matching knows images by file name only, which these share: "
+                f"{listed(same)}; use --layout hloc"
+            )
+        return
+    refuse_colliding_keys(names)
+    folders = {str(parent) for name in names for parent in PurePosixPath(name).parents}
+    both = sorted(folders & set(names))
+    if both:
+        raise StoreError(f"{both[0]}: is an image and the folder of another; rename it")
+
+
+def _by_file_name(names: Iterable[str]) -> dict[str, list[str]]:
+    groups = defaultdict(list)
+    for name in names:
+        groups[PurePosixPath(name).name].append(name)
+    return dict(groups)
+
+
+def feature_key(name: str, layout: str) -> str:
+    """Return the group of the features of an image."""
+    return name if layout == "hloc" else PurePosixPath(name).name
+
+
+def match_datasets(pair: PairMatches, layout: str) -> tuple[str, Datasets]:
+    """Return the group of a pair and its datasets."""
+    if layout == "hloc":
+        return pair_key(*pair.names), hloc_matches(pair)
+    first, second = (feature_key(name, layout) for name in pair.names)
+    return first, {second: pair.indices}
+
+
+def one_match_per_keypoint(pair: PairMatches) -> PairMatches:
+    """Keep the first match of each keypoint of the first image: hloc's files have room for one."""
+    _, kept = np.unique(pair.indices[:, 0], return_index=True)
+    return replace(pair, indices=pair.indices[kept], scores=pair.scores[kept])

@@ -1,0 +1,1 @@
+"""Mappers: from verified pairs to models."""

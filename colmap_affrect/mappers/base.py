@@ -1,0 +1,114 @@
+"""What a mapper is: it makes models from verified pairs.
+
+A mapper of another package becomes known by an entry point of the group
+``colmap_affrect.mappers``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, Self
+
+from pydantic import Field
+
+from colmap_affrect.options import (
+    CUSTOM,
+    MAX_SEED,
+    PRESETS,
+    PartOptions,
+    Registry,
+    preset_values,
+    within,
+)
+
+if TYPE_CHECKING:
+    from colmap_affrect.colmap import pycolmap
+
+
+class MapperOptions(PartOptions):
+    """Base of the options of all mappers, by default the sparse preset (names as in pycolmap)."""
+
+    ignore_two_view_tracks: bool = False
+    """COLMAP's True leaves sparse sets without a model: there most tracks have two views."""
+    min_model_size: Annotated[int, within(2, 1_000_000)] = 2
+    keep_given_intrinsics: bool = True
+    """Leave camera parameters that the user gave as they are; refining them on a few images of a
+    sparse set moves them far away."""
+    max_num_attempts: Annotated[int, within(1, 100)] = 1
+    """While images are missing, map again with another seed and keep the largest model; one of 100
+    images or more is kept at once."""
+    random_seed: Annotated[int, within(-1, MAX_SEED)] = 0
+    mapper_options: dict[str, Any] = Field(default_factory=dict)
+    """Other options of pycolmap's pipeline, by dotted key (``mapper.init_max_error``); they win
+    over those above."""
+
+    COLMAP: ClassVar[Mapping[str, Any]] = {}
+    """The preset ``colmap``: COLMAP's own defaults."""
+
+    @classmethod
+    def preset(cls, preset: str, **values: Any) -> Self:
+        """Return the options of a preset, ``sparse`` or ``colmap``, and others given."""
+        return cls(**{**preset_values(preset, cls.COLMAP), **values})
+
+    @property
+    def preset_name(self) -> str:
+        """Name of the preset that these options are, ``mapper_options`` apart, else ``custom``."""
+        free = {"random_seed": self.random_seed, "mapper_options": self.mapper_options}
+        return next((name for name in PRESETS if self == self.preset(name, **free)), CUSTOM)
+
+
+@dataclass(frozen=True)
+class MappingTask:
+    """What to map.
+
+    Attributes:
+        database_path: COLMAP database with two-view geometries.
+        image_path: folder of the photographs, for the colours of the points.
+        intrinsics_given: the user gave the camera parameters.
+    """
+
+    database_path: Path
+    image_path: Path
+    intrinsics_given: bool = False
+
+
+class Mapper(Protocol):
+    """Makes models; called with its ``Options``.
+
+    Attributes:
+        options: checked, with pycolmap's full keys in ``mapper_options``.
+    """
+
+    options: Any
+
+    def map(
+        self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
+    ) -> list[pycolmap.Reconstruction]:
+        """Map once.
+
+        Args:
+            task: what to map.
+            output_path: an empty folder that models may be written to.
+            random_seed: of this attempt.
+            show: is told how many images have been registered so far.
+
+        Raises:
+            MappingError: when COLMAP ends with an error.
+            KeyboardInterrupt: after mapping has been stopped.
+        """
+
+    def differences(self, *, intrinsics_given: bool) -> dict[str, Any]:
+        """Return where mapping differs from COLMAP's defaults, by pycolmap's dotted keys."""
+
+
+MAPPERS: Registry[Mapper] = Registry(
+    kind="mapper",
+    group="colmap_affrect.mappers",
+    built_in={
+        "incremental": "colmap_affrect.mappers.incremental:IncrementalMapper",
+        "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
+    },
+    default="incremental",
+)

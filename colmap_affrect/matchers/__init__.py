@@ -1,0 +1,1 @@
+"""Matchers: which features of two images show the same."""

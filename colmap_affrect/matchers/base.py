@@ -1,0 +1,83 @@
+"""What a matcher is: it finds which features of two images may show the same.
+
+A matcher of another package becomes known by an entry point of the group
+``colmap_affrect.matchers``. Several threads may call the same object at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.features.base import NetworkContext, NetworkOptions
+from colmap_affrect.options import Registry
+
+
+class MatcherOptions(NetworkOptions):
+    """Base of the options of all matchers."""
+
+
+@dataclass(frozen=True)
+class MatcherContext(NetworkContext):
+    """What a matcher works with.
+
+    Attributes:
+        device: as given, also ``auto``.
+        num_similarities: about how many pairs of features there will be to compare in all.
+    """
+
+    device: str = "auto"
+    num_similarities: float = 0
+
+
+@dataclass(frozen=True)
+class ImageFeatures:
+    """What a matcher is given of an image.
+
+    Attributes:
+        features: frames, scores (``responses``), descriptors and the warps they come from.
+        image_size: (width, height) of the stored image in px.
+        extractor: name of the feature extractor.
+    """
+
+    features: LocalFeatures
+    image_size: tuple[int, int]
+    extractor: str
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matches of two images before geometric verification.
+
+    Attributes:
+        indices: (M, 2) int64 features of image 1 and 2, strictly rising in column 0.
+        scores: (M,) float32 in [0, 1], larger is better.
+    """
+
+    indices: NDArray[np.int64]
+    scores: NDArray[np.float32]
+
+
+class Matcher(Protocol):
+    """Matches pairs of images; called with its ``Options`` and a :class:`MatcherContext`."""
+
+    def prepare(self, image: ImageFeatures) -> Any:
+        """Return what :meth:`match` needs of an image, made once for all of its pairs.
+
+        It has an attribute ``nbytes``, the memory that it takes.
+        """
+
+    def match(self, first: Any, second: Any) -> Matches:
+        """Match two prepared images. Either may have no features."""
+
+
+MATCHERS: Registry[Matcher] = Registry(
+    kind="matcher",
+    group="colmap_affrect.matchers",
+    built_in={"nearest": "colmap_affrect.matchers.nearest:NearestNeighbors"},
+    default="nearest",
+)

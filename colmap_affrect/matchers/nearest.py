@@ -1,0 +1,296 @@
+"""Mutual nearest neighbours with a geometrically consistent ratio test (FGINN).
+
+The second neighbour of the ratio test is the nearest descriptor that lies at least
+``min_contrast_distance_px`` away from the first one (Mishkin, Matas, Perdoch, MODS, 2015):
+features of several warps at one location do not reject each other. Every distance is computed,
+in chunks of bounded memory; long lists coarsely at first, and exactly where that can decide
+(:mod:`colmap_affrect.matchers.nearest_8bit`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Annotated, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.geometry.neighbors import NeighborLists, neighbors_within
+from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, MatcherOptions, Matches
+from colmap_affrect.matchers.nearest_8bit import (
+    CoarseDescriptors,
+    MakeCoarse,
+    ShortList,
+    coarse_descriptors,
+)
+from colmap_affrect.options import within
+from colmap_affrect.parallel.executor import unless_gpu_is_full
+
+CHUNK_ELEMENTS = 1 << 22
+"""Similarities held at once, which bounds memory."""
+
+CHUNK_ROWS = 1 << 12
+"""Pairs of descriptors held at once, which bounds memory."""
+
+logger = logging.getLogger(__name__)
+
+_WARNING = threading.Lock()
+"""Held by the thread that warns: ``cache`` alone lets two threads through."""
+
+Found = TypeVar("Found")
+
+NO_LIMIT = 2.0
+"""No ratio is larger than 1."""
+
+ROUNDING = np.float32(1e-6)
+"""Similarities closer to 1 than this are equal: two copies of a descriptor have ratio 1."""
+
+
+class NearestOptions(MatcherOptions):
+    """Mutual nearest neighbours."""
+
+    name: Literal["nearest"] = "nearest"
+    max_ratio: Annotated[float, within(0.1, 1.0)] = 0.85
+    """Largest ratio of first to second descriptor distance."""
+    ratio_both_ways: bool = True
+    """Test the ratio in both directions; False: from image 1 to 2 only, as in the paper."""
+    min_contrast_distance_px: Annotated[float, within(0.1, 1000.0)] = 10.0
+    """The second neighbour must be this far from the first (FGINN; MODS: 10-30 px)."""
+    duplicate_radius_px: Annotated[float, within(0.01, 1000.0)] = 2.0
+    """Of matches closer than this at both ends the best one stays."""
+
+
+class NearestNeighbors:
+    """Every descriptor of one image is compared with every one of the other.
+
+    Where the memory of a GPU is full the CPU matches, with the same result.
+    """
+
+    Options = NearestOptions
+
+    def __init__(self, options: NearestOptions, context: MatcherContext) -> None:
+        """Choose how similarities are computed."""
+        self.options = options
+        self._make_coarse = coarse_descriptors(context.num_similarities, context.device)
+
+    def prepare(self, image: ImageFeatures) -> MatchableImage:
+        """Make the features of an image ready for matching."""
+        descriptors, keypoints = image.features.descriptors, image.features.keypoints
+        return _unless_gpu_is_full(
+            partial(matchable, descriptors, keypoints, self.options, self._make_coarse),
+            partial(matchable, descriptors, keypoints, self.options),
+        )
+
+    def match(self, first: MatchableImage, second: MatchableImage) -> Matches:
+        """Match two images; the score is 1 minus the ratio of distances."""
+        exact = [replace(image, coarse=None) for image in (first, second)]
+        found = _unless_gpu_is_full(
+            partial(match_features, first, second, self.options),
+            partial(match_features, exact[0], exact[1], self.options),
+        )
+        return Matches(found.indices, 1.0 - found.ratios)
+
+
+def _unless_gpu_is_full(with_gpu: Callable[[], Found], without: Callable[[], Found]) -> Found:
+    def say_once_and_go_on() -> Found:
+        with _WARNING:
+            _warn_that_gpu_is_full()
+        return without()
+
+    return unless_gpu_is_full(with_gpu, say_once_and_go_on)
+
+
+@cache
+def _warn_that_gpu_is_full() -> None:
+    logger.warning("the memory of the GPU is full; the CPU matches the rest")
+
+
+@dataclass(frozen=True)
+class MatchableImage:
+    """What matching needs of one image, prepared once for all of its pairs.
+
+    Attributes:
+        descriptors: (N, D) float32 rows of unit length.
+        keypoints: (N, 2) pixel-centre px.
+        rivals: for each feature those too close to serve as its second neighbour.
+        coarse: the descriptors in few bits; None where that does not pay.
+    """
+
+    descriptors: NDArray[np.float32]
+    keypoints: NDArray[np.floating]
+    rivals: NeighborLists
+    coarse: CoarseDescriptors | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all arrays, on whatever device."""
+        kept = (self.descriptors, self.keypoints, self.rivals.starts, self.rivals.indices)
+        return sum(array.nbytes for array in kept) + (self.coarse.nbytes if self.coarse else 0)
+
+
+@dataclass(frozen=True)
+class PutativeMatches:
+    """Matches before geometric verification.
+
+    Attributes:
+        indices: (M, 2) int64 feature indices in image 1 and 2, by row of image 1.
+        ratios: (M,) float32 larger of the two distance ratios, smaller is better.
+    """
+
+    indices: NDArray[np.int64]
+    ratios: NDArray[np.float32]
+
+
+def matchable(
+    descriptors: NDArray[np.floating],
+    keypoints: NDArray[np.floating],
+    options: NearestOptions,
+    make_coarse: MakeCoarse | None = None,
+) -> MatchableImage:
+    """Prepare the features of one image for matching.
+
+    Args:
+        descriptors: (N, D) rows of unit length.
+        keypoints: (N, 2) pixel-centre px.
+        options: of matching.
+        make_coarse: the same for all images that are matched with each other.
+    """
+    descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
+    return MatchableImage(
+        descriptors,
+        keypoints,
+        neighbors_within(keypoints, options.min_contrast_distance_px),
+        make_coarse(descriptors) if make_coarse else None,
+    )
+
+
+def match_features(
+    image1: MatchableImage, image2: MatchableImage, options: NearestOptions
+) -> PutativeMatches:
+    """Match two images; see the module docstring. Either may have no features."""
+    if not len(image1.descriptors) or not len(image2.descriptors):
+        return PutativeMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
+    everything = np.arange(len(image1.descriptors))
+    forward, ratios = _nearest(image1, everything, image2, options.max_ratio)
+    rows = np.flatnonzero(ratios < options.max_ratio)
+    targets, back = np.unique(forward[rows], return_inverse=True)
+    back_limit = options.max_ratio if options.ratio_both_ways else NO_LIMIT
+    backward, back_ratios = _nearest(image2, targets, image1, back_limit)
+    mutual = backward[back] == rows
+    worst = ratios[rows]
+    if options.ratio_both_ways:
+        worst = np.maximum(worst, back_ratios[back])
+    keep = mutual & (worst < options.max_ratio)
+    matches = PutativeMatches(np.stack([rows, targets[back]], axis=1)[keep], worst[keep])
+    return _without_duplicates(matches, image1, image2, options.duplicate_radius_px)
+
+
+def _nearest(
+    image1: MatchableImage, rows: NDArray[np.int64], image2: MatchableImage, max_ratio: float
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the nearest feature of each of some features, and the ratio to the nearest non-rival.
+
+    They may be -1 and infinite where the ratio is ``max_ratio`` or larger.
+    """
+    if image1.coarse is None or image2.coarse is None:
+        return _nearest_of_all(image1.descriptors[rows], image2)
+    short = image1.coarse.short_list(rows, image2.coarse, image2.rivals, max_ratio)
+    found, found_ratios, doubtful = _nearest_of_listed(image1.descriptors, image2, short)
+    again = short.rows[doubtful]
+    found[doubtful], found_ratios[doubtful] = _nearest_of_all(image1.descriptors[again], image2)
+    nearest = np.full(len(rows), -1)
+    ratios = np.full(len(rows), np.inf, np.float32)
+    places = np.searchsorted(rows, short.rows)
+    nearest[places], ratios[places] = found, found_ratios
+    return nearest, ratios
+
+
+def _nearest_of_listed(
+    queries: NDArray[np.float32], image: MatchableImage, short: ShortList
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.bool_]]:
+    """Return nearest and ratio among the features listed for each row, and where they are doubtful.
+
+    That is where the list says so, and where the second neighbour by coarse similarities is a rival
+    of the nearest by exact ones: what takes its place may not be listed.
+    """
+    similarity = np.empty(len(short.entry_rows), np.float32)
+    for begin in range(0, len(similarity), CHUNK_ROWS):
+        part = slice(begin, begin + CHUNK_ROWS)
+        query = queries[short.rows[short.entry_rows[part]]]
+        candidates = image.descriptors[short.entry_columns[part]]
+        similarity[part] = np.einsum("ij,ij->i", query, candidates)
+    starts = np.searchsorted(short.entry_rows, np.arange(len(short.rows)))
+    if not len(starts):
+        return np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros(0, bool)
+    first = np.maximum.reduceat(similarity, starts)
+    highest = np.flatnonzero(similarity == first[short.entry_rows])
+    _, lowest_column = np.unique(short.entry_rows[highest], return_index=True)
+    nearest = short.entry_columns[highest[lowest_column]]
+    rows, rivals = image.rivals.of(nearest)
+    without_rivals = similarity.copy()
+    without_rivals[_places(short, rows, rivals, len(image.descriptors))] = -1.0
+    second = np.maximum.reduceat(without_rivals, starts)
+    doubtful = short.doubtful.copy()
+    doubtful[rows[rivals == short.runners_up[rows]]] = True
+    return nearest, _ratios(first, second), doubtful
+
+
+def _places(
+    short: ShortList, rows: NDArray[np.int64], columns: NDArray[np.int64], count: int
+) -> NDArray[np.int64]:
+    """Return the entries of a short list that are among some rows and columns of ``count``."""
+    listed = short.entry_rows * count + short.entry_columns
+    wanted = rows * count + columns
+    places = np.searchsorted(listed, wanted)
+    places[places == len(listed)] = 0
+    return np.asarray(places[listed[places] == wanted])
+
+
+def _nearest_of_all(
+    queries: NDArray[np.float32], image: MatchableImage
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the nearest feature of each query and the ratio to the nearest non-rival."""
+    count = len(image.descriptors)
+    nearest = np.empty(len(queries), np.int64)
+    ratios = np.empty(len(queries), np.float32)
+    step = max(1, CHUNK_ELEMENTS // count)
+    buffer = np.empty((min(step, len(queries)), count), np.float32)
+    for begin in range(0, len(queries), step):
+        chunk = queries[begin : begin + step]
+        similarity = np.matmul(chunk, image.descriptors.T, out=buffer[: len(chunk)])
+        best = similarity.argmax(axis=1)
+        first = similarity[np.arange(len(chunk)), best]
+        similarity[image.rivals.of(best)] = -1.0
+        nearest[begin : begin + step] = best
+        ratios[begin : begin + step] = _ratios(first, similarity.max(axis=1))
+    return nearest, ratios
+
+
+def _ratios(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the ratios of distances of unit vectors with these similarities."""
+    distances = (np.maximum(1.0 - similarity, ROUNDING) for similarity in (first, second))
+    return np.asarray(np.sqrt(np.divide(*distances)))
+
+
+def _without_duplicates(
+    matches: PutativeMatches, image1: MatchableImage, image2: MatchableImage, radius_px: float
+) -> PutativeMatches:
+    """Drop matches that have a better one within ``radius_px`` at both ends."""
+    order = np.argsort(matches.ratios, kind="stable")
+    points1 = image1.keypoints[matches.indices[order, 0]]
+    points2 = image2.keypoints[matches.indices[order, 1]]
+    close = neighbors_within(points1, radius_px)
+    rows, others = close.of(np.arange(len(order)))
+    near = ((points2[rows] - points2[others]) ** 2).sum(axis=1) <= radius_px**2
+    keep = np.ones(len(order), dtype=bool)
+    for row, other in zip(
+        rows[near & (others < rows)], others[near & (others < rows)], strict=True
+    ):
+        if keep[other]:
+            keep[row] = False
+    kept = np.sort(order[keep])
+    return PutativeMatches(matches.indices[kept], matches.ratios[kept])

@@ -1,1 +1,0 @@
-"""Which images to match, and matching."""

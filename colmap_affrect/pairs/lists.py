@@ -1,0 +1,186 @@
+"""Lists of pairs: all, by sequence, the most similar; their order, and their files."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import re
+from collections import defaultdict, deque
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.errors import PairListError
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.project.atomic_files import replace_text
+
+MAX_NAMES_IN_MESSAGE = 5
+CANDIDATES_PER_NEIGHBOR = 5
+"""An image may have that many times as many neighbours as images have on average."""
+
+
+def exhaustive_pairs(names: Sequence[str]) -> list[Pair]:
+    """Return every unordered pair of the names, sorted."""
+    return list(itertools.combinations(sorted(names), 2))
+
+
+def sequence_pairs(names: Sequence[str], num_neighbors: int) -> list[Pair]:
+    """Return the pairs of each name and the ``num_neighbors`` after it, sorted.
+
+    Numbers in names count by value: frame 9 comes before frame 10.
+    """
+    ordered = sorted(names, key=_by_numbers)
+    return sorted(
+        (min(first, second), max(first, second))
+        for index, first in enumerate(ordered)
+        for second in ordered[index + 1 : index + 1 + num_neighbors]
+    )
+
+
+def _by_numbers(name: str) -> tuple[list[str | int], str]:
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
+
+
+def most_similar_pairs(
+    names: Sequence[str], similarities: Iterable[NDArray[np.number]], num_neighbors: int
+) -> list[Pair]:
+    """Choose pairs so that images have ``num_neighbors`` neighbours on average.
+
+    Each image is paired with half as many that are most similar to it. The rest goes to the pairs
+    that are the most similar of all: of some places there are many photographs, of others few.
+
+    Args:
+        names: of N different images.
+        similarities: for each image its (N,) similarities with all, larger is more similar.
+        num_neighbors: 1 or more.
+
+    Returns:
+        ``num_neighbors * N / 2`` pairs, sorted; more if the nearest of each image are more.
+    """
+    half, count = -(-num_neighbors // 2), len(names)
+    candidates = [
+        _candidates(index, row.astype(np.float32), CANDIDATES_PER_NEIGHBOR * num_neighbors)
+        for index, row in enumerate(similarities)
+    ]
+    if not candidates:
+        return []
+    indices1, indices2, similarity, rank = (
+        np.concatenate(column) for column in zip(*candidates, strict=True)
+    )
+    best_first = np.lexsort((-similarity, rank >= half))
+    _, first = np.unique((indices1 * count + indices2)[best_first], return_index=True)
+    ranked = best_first[np.sort(first)]
+    num_pairs = max(count * num_neighbors // 2, np.count_nonzero(rank[ranked] < half))
+    chosen = ranked[:num_pairs]
+    return sorted(
+        (min(names[i], names[j]), max(names[i], names[j]))
+        for i, j in zip(indices1[chosen], indices2[chosen], strict=True)
+    )
+
+
+def _candidates(
+    index: int, row: NDArray[np.float32], max_num: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:
+    """Return the smaller and larger indices, similarities and ranks of an image's best pairs."""
+    order = np.argsort(-row, kind="stable")
+    others = order[order != index][:max_num]
+    return (
+        np.minimum(others, index),
+        np.maximum(others, index),
+        row[others],
+        np.arange(len(others)),
+    )
+
+
+def ordered_for_reuse(pairs: Sequence[Pair], num_images: int) -> list[Pair]:
+    """Order pairs so that those of the same images come close together.
+
+    Images are numbered by walking breadth first through the graph of pairs. Then come, block by
+    block, the pairs of ``num_images`` with as many others: memory must hold twice as many.
+    """
+    numbers = _breadth_first(pairs)
+    keyed = []
+    for pair in pairs:
+        low, high = sorted((numbers[pair[0]], numbers[pair[1]]))
+        keyed.append((low // num_images, high // num_images, low, high, pair))
+    return [pair for *_, pair in sorted(keyed)]
+
+
+def _breadth_first(pairs: Sequence[Pair]) -> dict[str, int]:
+    """Number the images of pairs; those that share pairs get near numbers."""
+    others = defaultdict(list)
+    for first, second in sorted(pairs):
+        others[first].append(second)
+        others[second].append(first)
+    numbers: dict[str, int] = {}
+    for start in sorted(others):
+        reached = deque([start])
+        while reached:
+            name = reached.popleft()
+            if name not in numbers:
+                numbers[name] = len(numbers)
+                reached.extend(other for other in others[name] if other not in numbers)
+    return numbers
+
+
+def read_pairs(path: Path, names: Sequence[str]) -> list[Pair]:
+    """Read a pair list as COLMAP and hloc write it: two names per line.
+
+    Names may be separated by spaces, a tab or a comma, and may contain spaces. Empty
+    lines and lines that begin with # are skipped; pairs given twice, in either order,
+    count once; pairs of an image with itself are dropped.
+
+    Raises:
+        PairListError: when the file is unreadable or a name is not among ``names``.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PairListError(f"{path}: cannot be read ({error})") from error
+    known = set(names)
+    pairs: dict[Pair, None] = {}
+    problems = []
+    for number, line in enumerate(lines, start=1):
+        pair = _split(line, known) or _split(line.strip(), known)
+        if pair is None and (not line.strip() or line.lstrip().startswith("#")):
+            continue
+        if pair is None:
+            problems.append((number, line))
+        elif pair[0] != pair[1]:
+            pairs[min(pair), max(pair)] = None
+    if problems:
+        more = len(problems) - MAX_NAMES_IN_MESSAGE
+        shown = (
+            f"line {number}: {line.strip()!r}{_suggestion(line, names)}"
+            for number, line in problems[:MAX_NAMES_IN_MESSAGE]
+        )
+        listed = "; ".join(shown) + (f"; and {more} more" * (more > 0))
+        raise PairListError(f"{path}: names that are not among the images: {listed}")
+    if not pairs:
+        raise PairListError(f"{path}: holds no pair of two different images")
+    return sorted(pairs)
+
+
+def write_pairs(path: Path, pairs: Sequence[Pair]) -> None:
+    """Write 'name1 name2' lines; with a tab where a name contains white space."""
+    blank = any(re.search(r"\s", name) for pair in pairs for name in pair)
+    separator = "\t" if blank else " "
+    replace_text(path, "".join(f"{a}{separator}{b}\n" for a, b in pairs))
+
+
+def _split(line: str, known: set[str]) -> Pair | None:
+    for separator in (r"\t", r"\s*[\t,]\s*|\s+", " "):
+        for match in re.finditer(separator, line):
+            first, second = line[: match.start()], line[match.end() :]
+            if first in known and second in known:
+                return first, second
+    return None
+
+
+def _suggestion(line: str, names: Sequence[str]) -> str:
+    unknown = [word for word in line.replace(",", " ").split() if word not in set(names)]
+    close = [match for word in unknown for match in difflib.get_close_matches(word, names, n=1)]
+    return f" (did you mean {', '.join(close)}?)" if close else ""

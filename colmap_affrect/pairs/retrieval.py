@@ -1,0 +1,152 @@
+"""Which images show the same, by one vector per image (VLAD).
+
+The vocabulary is built from descriptors of the images themselves. An image is described by the sums
+of the differences between its descriptors and their nearest words (Jegou et al., Aggregating local
+descriptors into a compact image representation, 2010), each sum of unit length and damped by square
+roots, so that neither repeated structures nor single words decide (Arandjelovic and Zisserman, All
+about VLAD, 2013). What all images have in common is subtracted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import most_similar_pairs
+from colmap_affrect.progress import Progress
+
+NUM_WORDS = 256
+NUM_SAMPLED_IMAGES = 512
+"""The vocabulary of larger sets is built from that many of their images."""
+NUM_SAMPLES = 1 << 15
+"""Descriptors that the vocabulary is built from."""
+NUM_ITERATIONS = 10
+VECTORS_AT_ONCE = 512
+"""Image vectors that are compared with as many others at a time, which bounds memory."""
+
+
+def build_vocabulary(
+    samples: NDArray[np.float32], random: np.random.Generator
+) -> NDArray[np.float32]:
+    """Find words by k-means.
+
+    Args:
+        samples: (M, D) descriptors of many images.
+        random: chooses where k-means begins.
+
+    Returns:
+        (K, D) words, ``NUM_WORDS`` or as many as there are samples.
+    """
+    words = random.permutation(samples)[:NUM_WORDS]
+    if len(samples) <= len(words):
+        return words
+    labels = nearest_words(samples, words).astype(np.int32)
+    ends = (cv2.TERM_CRITERIA_MAX_ITER, NUM_ITERATIONS, 0.0)
+    found = cv2.kmeans(samples, len(words), labels, ends, 1, cv2.KMEANS_USE_INITIAL_LABELS)
+    return np.asarray(found[2], dtype=np.float32)
+
+
+def nearest_words(
+    descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]
+) -> NDArray[np.int64]:
+    """Return the (N,) nearest of (K, D) words to (N, D) descriptors."""
+    half_squares = 0.5 * np.einsum("kd,kd->k", vocabulary, vocabulary)
+    return np.asarray((descriptors @ vocabulary.T - half_squares).argmax(axis=1))
+
+
+def image_vector(
+    descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]
+) -> NDArray[np.float16]:
+    """Describe an image by one vector of unit length; zeros without descriptors.
+
+    Args:
+        descriptors: (N, D) of the image.
+        vocabulary: (K, D) words.
+
+    Returns:
+        (K * D,) vector.
+    """
+    words = nearest_words(descriptors, vocabulary)
+    sums = _unit_rows(_sums(descriptors - vocabulary[words], words, len(vocabulary)))
+    damped = np.sign(sums) * np.sqrt(np.abs(sums))
+    return np.asarray(_unit_rows(damped.reshape(1, -1))[0], dtype=np.float16)
+
+
+def _sums(
+    rows: NDArray[np.float32], words: NDArray[np.int64], num_words: int
+) -> NDArray[np.float32]:
+    """Add up the (N, D) rows of each word; (K, D), zeros where there are none."""
+    order = np.argsort(words, kind="stable")
+    present, begins = np.unique(words[order], return_index=True)
+    sums = np.zeros((num_words, rows.shape[1]), np.float32)
+    if len(rows):
+        sums[present] = np.add.reduceat(rows[order], begins, axis=0)
+    return sums
+
+
+def similarities(vectors: NDArray[np.float16]) -> Iterator[NDArray[np.float32]]:
+    """Yield for each of (N, V) image vectors its (N,) similarities with all of them.
+
+    They are the cosines after the mean of all vectors has been subtracted.
+    """
+    mean = vectors.mean(axis=0, dtype=np.float32)
+    begins = range(0, len(vectors), VECTORS_AT_ONCE)
+
+    def centered(begin: int) -> NDArray[np.float32]:
+        return _unit_rows(vectors[begin : begin + VECTORS_AT_ONCE] - mean)
+
+    for begin in begins:
+        queries = centered(begin)
+        yield from np.concatenate([queries @ centered(other).T for other in begins], axis=1)
+
+
+def _unit_rows(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Divide (N, V) rows by their lengths; rows of zeros stay."""
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.asarray(rows / np.maximum(lengths, np.finfo(np.float32).tiny))
+
+
+def retrieved_pairs(
+    names: Sequence[str],
+    read: Callable[[str], LocalFeatures],
+    num_neighbors: int,
+    progress: Progress,
+) -> list[Pair]:
+    """Return the pairs of images whose descriptors are alike as a whole.
+
+    None if all features are those of warps.
+
+    Args:
+        names: of images that have features.
+        read: returns the features of an image; those of warps are not looked at.
+        num_neighbors: on average.
+        progress: where to show progress.
+    """
+    random = np.random.default_rng(0)
+    sampled = random.permutation(len(names))[:NUM_SAMPLED_IMAGES]
+    num_each = -(-NUM_SAMPLES // max(1, len(sampled)))
+    samples = []
+    with progress.stage("retrieval", len(sampled) + len(names), "images") as advance:
+        for index in sampled:
+            descriptors = _original_descriptors(read(names[index]))
+            samples.append(random.permutation(descriptors)[:num_each])
+            advance(1)
+        vocabulary = build_vocabulary(np.concatenate(samples), random)
+        if not len(vocabulary):
+            return []
+        vectors = np.empty((len(names), vocabulary.size), np.float16)
+        for vector, name in zip(vectors, names, strict=True):
+            vector[:] = image_vector(_original_descriptors(read(name)), vocabulary)
+            advance(1)
+    return most_similar_pairs(names, similarities(vectors), num_neighbors)
+
+
+def _original_descriptors(features: LocalFeatures) -> NDArray[np.float32]:
+    """Return the (N, D) descriptors of the image itself; with those of warps recall is lower."""
+    descriptors = features.descriptors[features.rectification_ids == 0]
+    return np.asarray(descriptors, dtype=np.float32)

@@ -1,0 +1,315 @@
+"""Work on an existing dask.distributed cluster (the only user of distributed).
+
+The workers compute and send results back; only this process writes. Tasks of a lost worker are
+done again by others. A worker has as many tasks at a time as it has threads, each on one core. Its
+results are the same as here, because it must have the same versions of the packages that compute.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import pickle
+import platform
+import re
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from colmap_affrect.errors import ClusterError
+from colmap_affrect.parallel.executor import Result, Task, use_one_blas_thread
+from colmap_affrect.parallel.opencv_threads import use_one_opencv_thread
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+logger = logging.getLogger(__name__)
+
+CONNECT_TIMEOUT_S = 10.0
+POLL_S = 2.0
+"""How often the scheduler is asked for the number of workers."""
+
+TASKS_PER_THREAD = 2
+"""One that is being worked on and one that waits, so that no worker has to."""
+
+FINGERPRINT_BYTES = 1 << 16
+
+PACKAGES = (
+    "colmap-affrect", "distributed", "numpy", "opencv-python-headless", "torch", "kornia",
+)  # fmt: skip
+"""Packages whose versions must be the same everywhere."""
+
+
+@dataclass(frozen=True)
+class WorkerEnvironment:
+    """What results depend on besides the task.
+
+    Attributes:
+        host: name of the machine.
+        versions: (package, version) of ``PACKAGES``.
+        files: (path, fingerprint) of files and folders, '' for a missing one.
+    """
+
+    host: str
+    versions: tuple[tuple[str, str], ...]
+    files: tuple[tuple[str, str], ...]
+
+    @classmethod
+    def of(cls, paths: Sequence[str]) -> Self:
+        """Describe the machine this is called on."""
+        return cls(
+            platform.node(),
+            tuple((name, _version(name)) for name in PACKAGES),
+            tuple((path, _fingerprint(Path(path))) for path in paths),
+        )
+
+    def require_same(self, worker: WorkerEnvironment) -> None:
+        """Refuse a worker that would give other results.
+
+        Raises:
+            ClusterError: naming its machine and the first difference.
+        """
+        for (name, here), (_, there) in zip(self.versions, worker.versions, strict=True):
+            if here != there:
+                raise ClusterError(
+                    f"worker on {worker.host}: has {name} {there}, and the machine that leads the "
+                    f"work {here}; results could differ, install the same versions on both"
+                )
+        for (path, here), (_, there) in zip(self.files, worker.files, strict=True):
+            if here != there:
+                raise ClusterError(
+                    f"worker on {worker.host}: does not see {path}, as the workers before did; "
+                    "mount it there, or end that worker, and run the same command again"
+                )
+
+
+def _version(package: str) -> str:
+    """Return a version without its build, which differs on a worker with a GPU."""
+    try:
+        return metadata.version(package).partition("+")[0]
+    except metadata.PackageNotFoundError:
+        return "missing"
+
+
+def _fingerprint(path: Path) -> str:
+    try:
+        if path.is_dir():
+            return "folder"
+        with path.open("rb") as file:
+            start = hashlib.sha256(file.read(FINGERPRINT_BYTES)).hexdigest()
+            return f"{file.seek(0, 2)} {start}"
+    except OSError:
+        return ""
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What comes with every task of a map: a pickled function and the environment it expects."""
+
+    function: bytes
+    environment: WorkerEnvironment
+
+
+_loading = threading.Lock()
+
+
+@lru_cache(maxsize=1)
+def _function(job: _Job) -> Callable[[Any], Any]:
+    """Unpickle a function once per process; the next one replaces it and frees its memory."""
+    paths = [path for path, _ in job.environment.files]
+    job.environment.require_same(WorkerEnvironment.of(paths))
+    use_one_blas_thread()
+    use_one_opencv_thread()
+    function: Callable[[Any], Any] = pickle.loads(job.function)  # noqa: S301 - from the driver
+    return function
+
+
+def _work(job: _Job, task: bytes) -> Any:
+    """Do one task on a worker."""
+    with _loading:
+        function = _function(job)
+    return function(pickle.loads(task))  # noqa: S301 - from the driver
+
+
+def _forget() -> None:
+    """Free the memory of the last function."""
+    _function.cache_clear()
+
+
+@contextmanager
+def connected(address: str) -> Iterator[Cluster]:
+    """Use the cluster of a scheduler, such as ``tcp://10.0.0.1:8786``, and leave it running.
+
+    Raises:
+        ClusterError: when distributed is not installed, the scheduler does not answer, there are
+            no workers, or they differ from this machine.
+    """
+    try:
+        from dask import config
+        from distributed import Client, Security
+    except ModuleNotFoundError as error:
+        raise ClusterError(
+            f"--scheduler: {error.name} is not installed; pip install 'colmap-affrect[cluster]'"
+        ) from error
+    if not re.fullmatch(r"(tcp|tls)://.+:\d+", address):
+        raise ClusterError(f"--scheduler {address}: not an address such as tcp://10.0.0.1:8786")
+    security = Security()  # as dask's configuration has it
+    if address.startswith("tls") and not security.get_connection_args("client")["ssl_context"]:
+        raise ClusterError(
+            f"--scheduler {address}: needs certificates, distributed.comm.tls in the "
+            "configuration of dask"
+        )
+    # Tasks may contain large images: dask need not warn of that.
+    images_are_large = {"distributed.admin.large-graph-warning-threshold": "1 TB"}
+    with _silent("distributed"), config.set(images_are_large):
+        try:
+            client = Client(
+                address, timeout=CONNECT_TIMEOUT_S, security=security, set_as_default=False
+            )
+        except OSError as error:
+            raise ClusterError(
+                f"--scheduler {address}: no scheduler answers ({error}); give the address that "
+                "'dask scheduler' prints"
+            ) from error
+        with client:
+            cluster = Cluster(client, address)
+            cluster.require_workers()
+            try:
+                yield cluster
+            finally:
+                with suppress(OSError, RuntimeError, CancelledError):
+                    client.run(_forget, on_error="ignore")
+
+
+@contextmanager
+def _silent(package: str) -> Iterator[None]:
+    """Keep a package from logging to the terminal: errors that matter are raised."""
+    handlers = logging.getLogger(package).handlers
+    levels = [handler.level for handler in handlers]
+    for handler in handlers:
+        handler.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for handler, level in zip(handlers, levels, strict=True):
+            handler.setLevel(level)
+
+
+class Cluster:
+    """An :class:`~colmap_affrect.parallel.executor.Executor` on the workers of a cluster."""
+
+    def __init__(self, client: Client, address: str) -> None:
+        """Take a client that is connected to the scheduler of this address."""
+        self._client, self._address = client, address
+        self._num_threads, self._asked_at = 0, -POLL_S
+
+    def require_workers(self) -> None:
+        """Refuse a cluster that cannot do the work.
+
+        Raises:
+            ClusterError: when there are no workers, or they would give other results.
+        """
+        with suppress(TimeoutError):
+            self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
+        workers = self._ask([])
+        if not workers:
+            raise ClusterError(
+                f"{self._address}: the cluster has no workers; start some, with 'dask worker "
+                f"{self._address}' on each machine"
+            )
+        here = WorkerEnvironment.of([])
+        for worker in workers:
+            here.require_same(worker)
+
+    def sees(self, paths: Sequence[Path]) -> bool:
+        """See :class:`~colmap_affrect.parallel.executor.Executor`."""
+        names = [str(path) for path in paths]
+        here = WorkerEnvironment.of(names)
+        return all(worker.files == here.files for worker in self._ask(names))
+
+    def _ask(self, paths: Sequence[str]) -> list[WorkerEnvironment]:
+        try:
+            self._client.run_on_scheduler(WorkerEnvironment.of, [])  # which unpickles tasks
+            found: dict[str, WorkerEnvironment] = self._client.run(WorkerEnvironment.of, paths)
+        except (ModuleNotFoundError, AttributeError) as error:
+            raise self._not_installed(error) from error
+        return list(found.values())
+
+    def _not_installed(self, error: Exception) -> ClusterError:
+        return ClusterError(
+            f"{self._address}: scheduler or workers do not have this version of colmap-affrect "
+            f"({error}); install it on all machines of the cluster"
+        )
+
+    def map(
+        self,
+        function: Callable[[Task], Result],
+        tasks: Iterable[Task],
+        files: Sequence[Path] = (),
+    ) -> Iterator[Result]:
+        """See :class:`~colmap_affrect.parallel.executor.Executor`.
+
+        Raises:
+            ClusterError: when the scheduler is lost, several workers are lost with one task, or a
+                worker that joins later differs.
+        """
+        job = _Job(pickle.dumps(function), WorkerEnvironment.of([str(path) for path in files]))
+        name = f"{type(function).__name__}-{uuid.uuid4().hex}"
+        pending: deque[tuple[Future, Task]] = deque()
+        try:
+            for number, task in enumerate(tasks):
+                future = self._client.submit(
+                    _work, job, pickle.dumps(task), key=f"{name}-{number}", pure=False
+                )
+                pending.append((future, task))
+                while len(pending) >= self._max_num_pending():
+                    yield self._result(*pending.popleft())
+            while pending:
+                yield self._result(*pending.popleft())
+        finally:
+            if pending:
+                with suppress(OSError, RuntimeError, CancelledError):
+                    self._client.cancel([future for future, _ in pending])
+
+    def _max_num_pending(self) -> int:
+        if time.monotonic() > self._asked_at + POLL_S:
+            self._num_threads = sum(self._client.nthreads().values())
+            self._asked_at = time.monotonic()
+        return TASKS_PER_THREAD * max(1, self._num_threads)
+
+    def _result(self, future: Future, task: object) -> Any:
+        from distributed import KilledWorker
+
+        try:
+            self._wait(future)
+            return future.result()
+        except KilledWorker as error:
+            raise ClusterError(
+                f"{task}: {error.allowed_failures + 1} workers were lost while working on it, for "
+                "want of memory perhaps; run the same command again"
+            ) from error
+        except CancelledError as error:
+            raise ClusterError(
+                f"{self._address}: the scheduler was lost; start it and run the same command again"
+            ) from error
+        except ModuleNotFoundError as error:
+            raise self._not_installed(error) from error
+
+    def _wait(self, future: Future) -> None:
+        """Wait until a task has ended, and for new workers if all are lost."""
+        is_warned = False
+        while not future.done():
+            with suppress(TimeoutError):
+                future.result(timeout=POLL_S)
+            if not is_warned and not self._client.nthreads():
+                logger.warning("%s: no workers are left; waiting for some", self._address)
+                is_warned = True

@@ -1,0 +1,1 @@
+"""The output folder: record of options, stores, files that change as a whole, report."""

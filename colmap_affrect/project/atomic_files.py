@@ -1,0 +1,245 @@
+"""Files that change as a whole or not at all, also when the program is killed or the disk full."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import shutil
+import signal
+import struct
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from math import ceil
+from pathlib import Path
+from typing import BinaryIO
+
+from colmap_affrect.errors import WorkspaceError
+
+PAGE_BYTES = 4096
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file as :func:`replace_bytes`."""
+    replace_bytes(path, text.encode("utf-8"))
+
+
+def replace_bytes(path: Path, content: bytes) -> None:
+    """Write a file, or replace an existing one.
+
+    Raises:
+        WorkspaceError: when it cannot be written; an existing file stays as it is.
+    """
+    new = path.with_name(path.name + ".new")
+    try:
+        new.write_bytes(content)
+        new.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            new.unlink(missing_ok=True)
+        raise cannot_write(path, error) from error
+
+
+def require_space(path: Path, num_bytes: int) -> None:
+    """Make sure that there is room for a file of so many bytes beside ``path``.
+
+    For files that are written by libraries which do not survive a full disk.
+
+    Raises:
+        WorkspaceError: when there is no room.
+    """
+    scratch = path.with_name(path.name + ".new")
+    try:
+        with scratch.open("wb") as file:
+            _allocate(file, num_bytes)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def _allocate(file: BinaryIO, num_bytes: int) -> None:
+    """Allocate blocks of the disk for a file, or at least see whether there are enough."""
+    try:
+        os.posix_fallocate(file.fileno(), 0, num_bytes)
+    except (AttributeError, OSError) as error:
+        if getattr(error, "errno", None) not in (None, errno.EINVAL, errno.EOPNOTSUPP):
+            raise
+        if shutil.disk_usage(Path(file.name).parent).free < num_bytes:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+
+
+def cannot_write(path: Path, error: Exception) -> WorkspaceError:
+    """Return the error that says which file could not be written and what to do."""
+    reason = getattr(error, "strerror", None) or error
+    return WorkspaceError(
+        f"{path}: cannot be written ({reason}); free space on the disk, or permit writing, and "
+        "run the same command again: what was done before is kept"
+    )
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Postpone Ctrl-C until the block has ended.
+
+    A ``KeyboardInterrupt`` inside a callback of a C library would leave it in disorder.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or handler is None:
+        yield
+        return
+    interrupts = []
+    signal.signal(signal.SIGINT, lambda *arguments: interrupts.append(arguments))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if interrupts:
+            signal.raise_signal(signal.SIGINT)
+
+
+class FileTransaction(io.RawIOBase):
+    """A binary file for h5py, whose changes stay in memory until :meth:`commit` makes them all.
+
+    What lies behind the old end is appended first, where nobody looks. The changed pages of the
+    old part go into a journal beside the file; once that is complete, the changes count, and
+    :func:`apply_journal` puts them in place, now or when the file is next opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a file that exists."""
+        super().__init__()
+        apply_journal(path)
+        self._path = path
+        self._stored = path.open("rb")
+        self._stored_size = self._readable_size = self._size = path.stat().st_size
+        self._position = 0
+        self._pages: dict[int, bytearray] = {}
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """See :class:`io.RawIOBase`."""
+        starts = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}
+        self._position = starts[whence] + offset
+        return self._position
+
+    def readinto(self, buffer: bytearray | memoryview) -> int:  # type: ignore[override]
+        """Read, as :class:`io.RawIOBase`; bytes that were never written are 0."""
+        view = memoryview(buffer).cast("B")
+        count = max(0, min(len(view), self._size - self._position))
+        view[:count] = bytes(count)
+        self._read_stored(self._position, view[:count])
+        for number, within, there in self._spans(count):
+            if number in self._pages:
+                view[there] = self._pages[number][within]
+        self._position += count
+        return count
+
+    def write(self, data: bytes | memoryview) -> int:  # type: ignore[override]
+        """Write, as :class:`io.RawIOBase`, into memory."""
+        view = memoryview(data).cast("B")
+        for number, within, there in self._spans(len(view)):
+            self._page(number)[within] = view[there]
+        self._position += len(view)
+        if len(view):  # writing nothing behind the end does not move the end
+            self._size = max(self._size, self._position)
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Change the size, as :class:`io.RawIOBase`."""
+        self._size = self._position if size is None else size
+        self._readable_size = min(self._readable_size, self._size)
+        for number in [number for number in self._pages if number * PAGE_BYTES >= self._size]:
+            del self._pages[number]
+        if (last := self._size // PAGE_BYTES) in self._pages:
+            rest = self._size % PAGE_BYTES
+            self._pages[last][rest:] = bytes(PAGE_BYTES - rest)
+        return self._size
+
+    def close(self) -> None:
+        """Forget what was not committed."""
+        self._stored.close()
+        super().close()
+
+    def commit(self) -> None:
+        """Make all changes.
+
+        Raises:
+            OSError: when they cannot be written; the file stays as it was.
+        """
+        journal = journal_of(self._path)
+        new = journal.with_name(journal.name + ".new")
+        for number in range(
+            self._readable_size // PAGE_BYTES, ceil(min(self._stored_size, self._size) / PAGE_BYTES)
+        ):
+            self._page(number)  # cut off and now 0
+        pages = sorted(self._pages.items())
+        inside = [(number, page) for number, page in pages if self._is_stored(number)]
+        try:
+            with self._path.open("r+b") as file:
+                file.seek(self._stored_size)
+                file.write(bytes(max(0, min(self._size, self._page_end) - self._stored_size)))
+                following = -1
+                for number, page in pages[len(inside) :]:
+                    if number != following:
+                        file.seek(number * PAGE_BYTES)
+                    file.write(page)
+                    following = number + 1
+            with new.open("wb") as file:
+                file.write(struct.pack("<Q", self._size))
+                for number, page in inside:
+                    file.write(struct.pack("<Q", number) + page)
+            new.replace(journal)
+        except OSError:
+            new.unlink(missing_ok=True)
+            os.truncate(self._path, self._stored_size)
+            raise
+        apply_journal(self._path)
+
+    @property
+    def _page_end(self) -> int:
+        """End of the page that the end of the stored file is in."""
+        return ceil(self._stored_size / PAGE_BYTES) * PAGE_BYTES
+
+    def _is_stored(self, number: int) -> bool:
+        return number * PAGE_BYTES < self._stored_size
+
+    def _page(self, number: int) -> bytearray:
+        """Return a page that may be changed."""
+        if number not in self._pages:
+            self._pages[number] = bytearray(PAGE_BYTES)
+            self._read_stored(number * PAGE_BYTES, memoryview(self._pages[number]))
+        return self._pages[number]
+
+    def _read_stored(self, position: int, view: memoryview) -> None:
+        if position < self._readable_size:
+            self._stored.seek(position)
+            self._stored.readinto(view[: self._readable_size - position])
+
+    def _spans(self, count: int) -> Iterator[tuple[int, slice, slice]]:
+        """Split what follows the position: number of a page, part of it, part of the whole."""
+        done = 0
+        while done < count:
+            number, start = divmod(self._position + done, PAGE_BYTES)
+            length = min(PAGE_BYTES - start, count - done)
+            yield number, slice(start, start + length), slice(done, done + length)
+            done += length
+
+
+def journal_of(path: Path) -> Path:
+    """Return the file that holds the changes of a file that are not in place yet."""
+    return path.with_name(path.name + ".journal")
+
+
+def apply_journal(path: Path) -> None:
+    """Put the changes of an interrupted :meth:`FileTransaction.commit` in place, if any."""
+    journal = journal_of(path)
+    if not journal.exists():
+        return
+    with journal.open("rb") as changes, path.open("r+b") as file:
+        (size,) = struct.unpack("<Q", changes.read(8))
+        while header := changes.read(8):
+            file.seek(struct.unpack("<Q", header)[0] * PAGE_BYTES)
+            file.write(changes.read(PAGE_BYTES))
+        file.truncate(size)
+    journal.unlink()

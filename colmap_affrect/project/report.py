@@ -1,0 +1,198 @@
+"""What stages and runs report: frozen, printable, JSON out."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
+
+
+def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table with a header; a column for every key, in the order of first use.
+
+    >>> print(csv_text([{"a": 1}, {"a": 2, "b": "x"}]), end="")
+    a,b
+    1,
+    2,x
+    """
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """One stage of a run.
+
+    Attributes:
+        name: extract, pairs, match, verify, escalate or map.
+        wall_s: seconds.
+        num_done: images, pairs or models made now.
+        num_kept: those found done already.
+        failures: image name to reason.
+        warnings: image name to what went less well than asked for.
+    """
+
+    name: str
+    wall_s: float
+    num_done: int
+    num_kept: int = 0
+    failures: dict[str, str] = dataclasses.field(default_factory=dict)
+    warnings: dict[str, str] = dataclasses.field(default_factory=dict)
+
+    def summary(self) -> str:
+        """Return one line."""
+        kept = f", {self.num_kept} already there" if self.num_kept else ""
+        failed = f", {len(self.failures)} failed" if self.failures else ""
+        warned = f", {len(self.warnings)} with a warning" if self.warnings else ""
+        return f"{self.name}: {self.num_done} done{kept}{failed}{warned} in {self.wall_s:.1f} s"
+
+
+@dataclass(frozen=True)
+class ModelSummary:
+    """One COLMAP model; the error is the mean over observations in px."""
+
+    registered_names: tuple[str, ...]
+    num_points3D: int
+    mean_track_length: float
+    mean_reprojection_error_px: float
+
+
+@dataclass(frozen=True)
+class ReconstructionReport:
+    """A whole run; numbers of points and tracks are those of the largest model.
+
+    Attributes:
+        status: ``ok`` (all images in one model), ``partial``, or ``no_model``.
+        unregistered: image name to reason: unreadable, no features, no verified pair, not
+            registered, or in another model.
+        models: all models, largest first, as written to sparse/0, sparse/1, ...
+        presets: of verification and of mapping: ``sparse``, ``colmap`` or ``custom``.
+        verification: options of two-view geometry.
+        mapping: the mapper and its options.
+        differs_from_colmap: for verification and mapping, what pycolmap was given that is not
+            COLMAP's default, by pycolmap's dotted keys.
+        pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
+            and ``none``; empty for other recipes.
+    """
+
+    images_total: int
+    unregistered: dict[str, str]
+    models: tuple[ModelSummary, ...]
+    num_verified_pairs: int
+    num_pairs: int
+    stages: tuple[StageReport, ...]
+    recipe: str
+    versions: dict[str, str]
+    presets: tuple[str, str]
+    verification: dict[str, Any]
+    mapping: dict[str, Any]
+    differs_from_colmap: dict[str, dict[str, Any]]
+    pair_levels: dict[str, int] = dataclasses.field(default_factory=dict)
+
+    @property
+    def status(self) -> str:
+        """See the class docstring."""
+        if not self.models:
+            return "no_model"
+        return "partial" if self.unregistered else "ok"
+
+    @property
+    def preset(self) -> str:
+        """``sparse``, ``colmap`` or ``custom``; both names where verification's is another one."""
+        verification, mapping = self.presets
+        if verification == mapping:
+            return mapping
+        return f"{verification} for verification, {mapping} for mapping"
+
+    @property
+    def registered_names(self) -> tuple[str, ...]:
+        """Names of the images in the largest model."""
+        return self.models[0].registered_names if self.models else ()
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """Images that could not be read, with the reason."""
+        return {name: why for stage in self.stages for name, why in stage.failures.items()}
+
+    @property
+    def warnings(self) -> dict[str, str]:
+        """Images that were worked on in another way than asked for, with the reason."""
+        return {name: why for stage in self.stages for name, why in stage.warnings.items()}
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the content of ``report.json``."""
+        mapping, verification = dict(self.mapping), dict(self.verification)
+        mapper, mapper_options = mapping.pop("name"), mapping.pop("mapper_options")
+        random_seed = mapping.pop("random_seed")
+        verification.pop("random_seed")
+        largest = self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
+        return {
+            "status": self.status,
+            "images_total": self.images_total,
+            "images_registered": len(largest.registered_names),
+            "registered_names": list(largest.registered_names),
+            "unregistered": self.unregistered,
+            "num_models": len(self.models),
+            "points3D": largest.num_points3D,
+            "mean_track_length": largest.mean_track_length,
+            "mean_reprojection_error_px": largest.mean_reprojection_error_px,
+            "models": [list(model.registered_names) for model in self.models],
+            "num_pairs": self.num_pairs,
+            "num_verified_pairs": self.num_verified_pairs,
+            "pair_levels": self.pair_levels,
+            "stages": [dataclasses.asdict(stage) for stage in self.stages],
+            "recipe": self.recipe,
+            "preset": self.preset,
+            "mapper": mapper,
+            "mapper_options": mapper_options,
+            "verification": verification,
+            "mapping": mapping,
+            "differs_from_colmap": self.differs_from_colmap,
+            "random_seed": random_seed,
+            "versions": self.versions,
+        }
+
+    def to_json(self) -> str:
+        """Return ``report.json`` as text."""
+        return json.dumps(self.to_mapping(), indent=2, ensure_ascii=False) + "\n"
+
+    def summary(self) -> str:
+        """Return one screen of text."""
+        registered = len(self.registered_names)
+        lines = [f"registered  {registered} of {self.images_total} images"]
+        lines += [f"            not {name}: {why}" for name, why in self.unregistered.items()]
+        lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
+        if self.pair_levels:
+            counts = ", ".join(f"{count} by {name}" for name, count in self.pair_levels.items())
+            lines += [f"decided     {counts}"]
+        if self.models:
+            model = self.models[0]
+            lines += [
+                f"points      {model.num_points3D}",
+                f"track       {model.mean_track_length:.2f} images on average",
+                f"error       {model.mean_reprojection_error_px:.2f} px on average",
+            ]
+        if len(self.models) > 1:
+            sizes = ", ".join(str(len(model.registered_names)) for model in self.models)
+            lines += [f"models      {len(self.models)}, of {sizes} images"]
+        given = [f"{key}={value}" for key, value in self.mapping["mapper_options"].items()]
+        chosen = ", ".join([self.preset, f"{self.mapping['name']} mapper", *given])
+        lines += [f"preset      {chosen}"]
+        lines += [
+            f"warning     {name}: {why}"
+            for stage in self.stages
+            for name, why in stage.warnings.items()
+        ]
+        seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
+        lines += [f"seconds     {seconds}"]
+        return "\n".join(lines)

@@ -1,0 +1,366 @@
+"""Features and matches of a run in HDF5, in hloc's layout.
+
+``features.h5``: a group per image name with ``keypoints`` (N, 2) float32, ``descriptors``
+(D, N) float16, ``scores`` (N,), ``image_size`` (width, height) and, of our own, ``lafs``
+(N, 2, 3) float32, ``rectification_ids`` (N,), and ``level_ends``: the features of level k of
+escalation follow those of level k - 1 and end at ``level_ends[k]``. ``matches.h5``: a group
+per pair with ``matches0`` (N0,), -1 where unmatched, ``matching_scores0`` (N0,) and the
+attributes ``level``, whose features were matched together with those of level 0, and
+``tried_level``, the highest that was tried. Coordinates have their origin at the centre of the
+first pixel. Files are opened for one image or one batch of pairs and closed again; what is
+written in between appears as a whole (:mod:`colmap_affrect.project.atomic_files`). A group without
+the attribute ``complete``, of another program, does not count.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.data import LocalFeatures, union
+from colmap_affrect.errors import StaleStoreError, StoreError
+from colmap_affrect.project.atomic_files import (
+    FileTransaction,
+    apply_journal,
+    cannot_write,
+    journal_of,
+    replace_bytes,
+    uninterrupted,
+)
+
+FORMAT_VERSION = 2
+MAX_INT16 = 32767
+
+
+@dataclass(frozen=True)
+class PairMatches:
+    """Raw matches of one pair.
+
+    Attributes:
+        names: the two image names, in the order of the columns.
+        indices: (M, 2) int64, strictly rising in column 0.
+        scores: (M,) float32 in [0, 1], larger is better.
+        num_keypoints1: number of features of the first image.
+        level: of escalation, whose features were looked at together with those of level 0.
+    """
+
+    names: tuple[str, str]
+    indices: NDArray[np.int64]
+    scores: NDArray[np.float32]
+    num_keypoints1: int
+    level: int = 0
+
+
+class _Store:
+    """A HDF5 file of complete groups that were all made with the same options."""
+
+    kind = ""
+
+    def __init__(self, path: Path, options_digest: str = "") -> None:
+        """Name the file, and the options that its content must have been made with (any if '')."""
+        self.path = path
+        self.options_digest = options_digest
+
+    @contextmanager
+    def _open(self, mode: str) -> Iterator[h5py.File]:
+        """Open to read ("r"), or to write ("a") all that the block changes or nothing.
+
+        HDF5 itself is only let at memory when writing: a full disk ends its process, and a kill
+        between two of its writes leaves a file that cannot be read.
+        """
+        if mode == "r":
+            with self._opened(None) as file:
+                yield file
+            return
+        with uninterrupted():
+            if not self.path.exists():
+                self._create()
+            with FileTransaction(self.path) as changes:
+                with self._opened(changes) as file:
+                    yield file
+                try:
+                    changes.commit()
+                except OSError as error:
+                    raise cannot_write(self.path, error) from error
+
+    @contextmanager
+    def _opened(self, changes: FileTransaction | None) -> Iterator[h5py.File]:
+        try:
+            if changes is None:
+                apply_journal(self.path)
+            with h5py.File(changes or self.path, "r+" if changes else "r") as file:
+                self._check_format(file)
+                yield file
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
+            raise StoreError(
+                f"{self.path}: cannot be opened as HDF5 ({error}); if it is damaged or another "
+                "program has it open, close that program or run again with --overwrite"
+            ) from error
+
+    def _create(self) -> None:
+        """Make the file without groups."""
+        content = io.BytesIO()
+        with h5py.File(content, "w") as file:
+            file.attrs["format"] = f"colmap_affrect/{self.kind}"
+            file.attrs["format_version"] = FORMAT_VERSION
+            file.attrs["pixel_origin"] = "center"
+            file.attrs["options_digest"] = self.options_digest
+        journal_of(self.path).unlink(missing_ok=True)
+        replace_bytes(self.path, content.getvalue())
+
+    def _check_format(self, file: h5py.File) -> None:
+        known = file.attrs.get("format")
+        version = file.attrs.get("format_version")
+        if known != f"colmap_affrect/{self.kind}" or version != FORMAT_VERSION:
+            found = f"{known} {version}" if known else "a file of another program"
+            raise StoreError(
+                f"{self.path}: expected {self.kind} of format version {FORMAT_VERSION}, found "
+                f"{found}; use another --output-path"
+            )
+        if self.options_digest and file.attrs.get("options_digest") != self.options_digest:
+            raise StaleStoreError(
+                f"{self.path}: was made with other options than config.toml beside it records; "
+                "run again with --overwrite"
+            )
+
+    def complete(self, keys: Iterable[str]) -> set[str]:
+        """Return those of the keys whose group is there and complete."""
+        if not self.path.exists():
+            return set()
+        with self._open("r") as file:
+            return {key for key in keys if key in file and file[key].attrs.get("complete", False)}
+
+    def names(self) -> list[str]:
+        """Return the sorted names of all complete groups."""
+        if not self.path.exists():
+            return []
+        with self._open("r") as file:
+            return sorted(_complete_groups(file))
+
+    @staticmethod
+    def _write(file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:
+        if key in file:
+            del file[key]
+        group = file.create_group(key)
+        for name, values in datasets.items():
+            group.create_dataset(name, data=values)
+        group.attrs.update(attributes)
+        group.attrs["complete"] = True
+
+
+def _complete_groups(group: h5py.Group, path: str = "") -> Iterator[str]:
+    """Yield the paths of all complete groups.
+
+    Their datasets are not opened, which takes long, and links are not followed.
+    """
+    is_complete = group.attrs.get("complete", False)
+    if is_complete:
+        yield path
+    for key in group.keys() - (DATASETS if is_complete else set()):
+        is_link = not isinstance(group.get(key, getlink=True), h5py.HardLink)
+        inner = None if is_link else group[key]
+        if isinstance(inner, h5py.Group):
+            yield from _complete_groups(inner, f"{path}/{key}" if path else key)
+
+
+DATASETS = {
+    "descriptors", "image_size", "keypoints", "lafs", "level_ends", "matches0",
+    "matching_scores0", "rectification_ids", "scores",
+}  # fmt: skip
+"""What complete groups hold; groups too, where a file has become a folder."""
+
+
+class FeatureStore(_Store):
+    """Local features by image name."""
+
+    kind = "features"
+
+    def write(self, name: str, features: LocalFeatures, image_size: tuple[int, int]) -> None:
+        """Write the features of one image, in the place of incomplete ones."""
+        with self._open("a") as file:
+            self._write_features(file, name, features, image_size, [len(features)])
+
+    def extend(self, name: str, features: LocalFeatures) -> None:
+        """Add the features of the next level; what is there keeps its indices."""
+        with self._open("a") as file:
+            group = self._group(file, name)
+            size = tuple(group["image_size"][()].tolist())
+            ends = group["level_ends"][()].tolist()
+            there = self._features(group, ends[-1])
+            first_id = int(there.rectification_ids.max(initial=0))
+            added = replace(features, rectification_ids=features.rectification_ids + first_id)
+            both = union([there, added])
+            self._write_features(file, name, both, size, [*ends, len(both)])
+
+    def _write_features(
+        self,
+        file: h5py.File,
+        name: str,
+        features: LocalFeatures,
+        image_size: tuple[int, int],
+        level_ends: list[int],
+    ) -> None:
+        self._write(
+            file,
+            name,
+            {
+                "keypoints": features.keypoints.astype(np.float32),
+                "descriptors": features.descriptors.T.astype(np.float16),
+                "scores": features.responses,
+                "image_size": np.asarray(image_size),
+                "lafs": features.lafs.astype(np.float32),
+                "rectification_ids": features.rectification_ids,
+                "level_ends": np.asarray(level_ends),
+            },
+        )
+
+    def read(self, name: str) -> LocalFeatures:
+        """Read all features of one image.
+
+        Raises:
+            StoreError: if they are missing or incomplete.
+        """
+        with self._open("r") as file:
+            group = self._group(file, name)
+            return self._features(group, group["level_ends"][()].tolist()[-1])
+
+    def level_indices(self, name: str, level: int) -> NDArray[np.int64]:
+        """Return the indices of the features of the image itself and of one level."""
+        ends = self.level_ends(name)
+        added = np.arange(ends[level - 1], ends[level]) if level else np.arange(0)
+        return np.concatenate([np.arange(ends[0]), added])
+
+    def _group(self, file: h5py.File, name: str) -> h5py.Group:
+        if name not in file or not file[name].attrs.get("complete", False):
+            raise StoreError(f"{self.path}: no features of {name}; run extract first")
+        return file[name]
+
+    @staticmethod
+    def _features(group: h5py.Group, end: int) -> LocalFeatures:
+        return LocalFeatures(
+            group["lafs"][:end].astype(np.float64),
+            group["scores"][:end],
+            np.ascontiguousarray(group["descriptors"][:, :end].T, dtype=np.float32),
+            group["rectification_ids"][:end],
+        )
+
+    def level_ends(self, name: str) -> list[int]:
+        """Return, for each level that an image has, the number of features up to it."""
+        with self._open("r") as file:
+            ends: list[int] = self._group(file, name)["level_ends"][()].tolist()
+            return ends
+
+    def num_keypoints(self) -> dict[str, int]:
+        """Return the number of features of each image."""
+        names = self.names()
+        if not names:
+            return {}
+        with self._open("r") as file:
+            return {name: len(file[name]["keypoints"]) for name in names}
+
+    def image_size(self, name: str) -> tuple[int, int]:
+        """Return the (width, height) of one image in px."""
+        with self._open("r") as file:
+            width, height = self._group(file, name)["image_size"][()].tolist()
+            return width, height
+
+    def image_sizes(self) -> dict[str, tuple[int, int]]:
+        """Return the (width, height) of each image in px."""
+        names = self.names()
+        if not names:
+            return {}
+        with self._open("r") as file:
+            return {name: tuple(file[name]["image_size"][()].tolist()) for name in names}
+
+    def read_frames(self, name: str) -> NDArray[np.float32]:
+        """Read the (N, 2, 3) frames of one image."""
+        with self._open("r") as file:
+            return np.asarray(file[name]["lafs"][()])
+
+    def read_rectification_ids(self, name: str) -> NDArray[np.int32]:
+        """Read the (N,) warps that the features of one image come from."""
+        with self._open("r") as file:
+            return np.asarray(self._group(file, name)["rectification_ids"][()])
+
+
+def pair_key(name1: str, name2: str) -> str:
+    """Return hloc's group name of a pair: '/' becomes '-', the two joined by '/'."""
+    return f"{name1.replace('/', '-')}/{name2.replace('/', '-')}"
+
+
+def hloc_matches(pair: PairMatches) -> dict[str, NDArray[np.generic]]:
+    """Return the datasets that hloc has for a pair; in 32 bits where 16 do not suffice."""
+    matches0 = np.full(pair.num_keypoints1, -1, np.int64)
+    scores0 = np.zeros(pair.num_keypoints1, np.float16)
+    matches0[pair.indices[:, 0]] = pair.indices[:, 1]
+    scores0[pair.indices[:, 0]] = pair.scores
+    wide = matches0.max(initial=0) > MAX_INT16
+    return {
+        "matches0": matches0.astype(np.int32 if wide else np.int16),
+        "matching_scores0": scores0,
+    }
+
+
+class MatchStore(_Store):
+    """Raw matches by pair of image names."""
+
+    kind = "matches"
+
+    def write(self, pairs: Iterable[PairMatches]) -> None:
+        """Write a batch of pairs."""
+        with self._open("a") as file:
+            for pair in pairs:
+                self._write(
+                    file,
+                    pair_key(*pair.names),
+                    hloc_matches(pair),
+                    level=pair.level,
+                    tried_level=pair.level,
+                )
+
+    def mark_tried(self, pairs: Iterable[tuple[str, str]], level: int) -> None:
+        """Record that a level was tried for pairs, which keep the matches they have."""
+        with self._open("a") as file:
+            for pair in pairs:
+                file[pair_key(*pair)].attrs["tried_level"] = level
+
+    def levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
+        """Return the level of escalation that the matches of each pair are from."""
+        return self._attribute("level", pairs)
+
+    def tried_levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
+        """Return the highest level of escalation that was tried for each pair."""
+        return self._attribute("tried_level", pairs)
+
+    def _attribute(self, name: str, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
+        with self._open("r") as file:
+            return {pair: int(file[pair_key(*pair)].attrs[name]) for pair in pairs}
+
+    def read(self, pairs: Sequence[tuple[str, str]]) -> Iterator[PairMatches]:
+        """Yield the matches of each pair.
+
+        Raises:
+            StoreError: at a pair without matches.
+        """
+        with self._open("r") as file:
+            for name1, name2 in pairs:
+                key = pair_key(name1, name2)
+                if key not in file or not file[key].attrs.get("complete", False):
+                    raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
+                matches0 = file[key]["matches0"][()].astype(np.int64)
+                rows = np.flatnonzero(matches0 >= 0)
+                yield PairMatches(
+                    (name1, name2),
+                    np.stack([rows, matches0[rows]], axis=1),
+                    file[key]["matching_scores0"][()][rows].astype(np.float32),
+                    len(matches0),
+                    int(file[key].attrs["level"]),
+                )

@@ -1,0 +1,274 @@
+"""The output folder: its files, its lock, and the record of the options that made them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import shutil
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import tomli_w
+from filelock import FileLock, Timeout
+
+from colmap_affrect.errors import StaleStoreError, WorkspaceError
+from colmap_affrect.options import flat
+from colmap_affrect.project.atomic_files import replace_text
+
+logger = logging.getLogger(__name__)
+
+LOCAL = ("image_path", "image_list_path", "from_database", "cameras")
+"""Options that :meth:`Workspace.options_digest` leaves out: where files are, and cameras."""
+STAGES = ("extract", "pairs", "match", "verify", "escalate", "map")
+FORMAT_VERSION = 3
+"""Of ``config.toml``: counts up when a stage records other options than before."""
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Paths below an output folder.
+
+    ``config.toml`` records, by stage, the options of a run, and under ``begun`` the stages that
+    have been run with them. A stage that is run again with the same options goes on where it
+    stopped; with other options it refuses, and ``overwrite`` removes its results and those of the
+    stages after it. A stage that has not begun takes the options on record unless it is given
+    others.
+
+    Attributes:
+        path: the folder.
+        users_database: database of the user that results go to instead of one in the folder;
+            never removed.
+    """
+
+    path: Path
+    users_database: Path | None = None
+
+    @classmethod
+    def beside(cls, database_path: Path) -> Self:
+        """Return the workspace of a user's database: ``x.affrect`` beside ``x.db``."""
+        return cls(database_path.with_suffix(".affrect"), database_path)
+
+    @property
+    def features(self) -> Path:
+        """Features by image (HDF5)."""
+        return self.path / "features.h5"
+
+    @property
+    def pairs(self) -> Path:
+        """List of the pairs to match (text)."""
+        return self.path / "pairs.txt"
+
+    @property
+    def matches(self) -> Path:
+        """Raw matches by pair (HDF5)."""
+        return self.path / "matches.h5"
+
+    @property
+    def database(self) -> Path:
+        """COLMAP database."""
+        return self.users_database or self.path / "database.db"
+
+    @property
+    def sparse(self) -> Path:
+        """Folder of the COLMAP models 0, 1, ..."""
+        return self.path / "sparse"
+
+    @property
+    def report(self) -> Path:
+        """Report of the last run (JSON)."""
+        return self.path / "report.json"
+
+    @property
+    def depth(self) -> Path:
+        """Folder of the depth maps that a network made."""
+        return self.path / "depth"
+
+    @property
+    def config(self) -> Path:
+        """Record of the options (TOML)."""
+        return self.path / "config.toml"
+
+    @property
+    def log(self) -> Path:
+        """Log of all runs."""
+        return self.path / "run.log"
+
+    @contextmanager
+    def locked(self) -> Iterator[Workspace]:
+        """Create the folder and keep other runs out of it.
+
+        Raises:
+            WorkspaceError: when it cannot be written or another run uses it.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            lock = FileLock(self.path / ".lock")
+            lock.acquire(timeout=0)
+        except Timeout as error:
+            raise WorkspaceError(
+                f"{self.path}: another colmap-affrect is working in this folder; wait for it "
+                "or use another --output-path"
+            ) from error
+        except OSError as error:
+            raise WorkspaceError(
+                f"{self.path}: cannot be used as output folder ({error.strerror or error})"
+            ) from error
+        try:
+            yield self
+        finally:
+            lock.release()
+
+    def recorded(self) -> dict[str, Any]:
+        """Return the options on record by stage; empty where there are none.
+
+        Raises:
+            WorkspaceError: when the record is damaged or of another version of this package.
+        """
+        if not self.config.exists():
+            return {}
+        try:
+            record = tomllib.loads(self.config.read_text(encoding="utf-8"))
+        except (ValueError, RecursionError) as error:
+            raise WorkspaceError(f"{self.config}: damaged ({error}); remove it") from error
+        if record.pop("format_version", None) != FORMAT_VERSION:
+            raise WorkspaceError(
+                f"{self.path}: was made by another version of colmap-affrect, which cannot be "
+                "gone on with; use another --output-path or remove it"
+            )
+        return record
+
+    def recipe(self) -> str:
+        """Return the name of the recipe that the features were made with."""
+        self.require("extract")
+        return str(self.recorded()["recipe"])
+
+    def planned(self, stage: str) -> dict[str, Any] | None:
+        """Return the options on record for a stage, begun or not; None if there are none."""
+        return self.recorded().get(stage)
+
+    def record_options(
+        self,
+        stage: str,
+        options: Mapping[str, Any],
+        *,
+        plan: Mapping[str, Mapping[str, Any]] | None = None,
+        recipe: str = "",
+        overwrite: bool = False,
+    ) -> None:
+        """Put the options of a stage on record before it begins.
+
+        Args:
+            stage: one of ``STAGES``.
+            options: what the results depend on; nested mappings of plain values.
+            plan: options of later stages; those of stages that have begun stay as they are.
+            recipe: name of the recipe, for the record only; by default that on record.
+            overwrite: discard the results of this stage and the later ones first. With the first
+                stage their options are forgotten, too.
+
+        Raises:
+            StaleStoreError: when other options made the results that are there.
+        """
+        record = self.recorded()
+        self._refuse_foreign_results(record)
+        begun = record.get("begun", [])
+        if overwrite:
+            self._discard(stage)
+            begun = [name for name in begun if STAGES.index(name) < STAGES.index(stage)]
+            record = record if begun else {}
+        if stage in begun:
+            difference = first_difference(record[stage], options)
+            if difference:
+                raise StaleStoreError(
+                    f"{self.path}: the {stage} stage was run there with {difference}; "
+                    f"{self._remedy}"
+                )
+        begun = [name for name in STAGES if name in begun or name == stage]
+        later = {name: dict(values) for name, values in (plan or {}).items() if name not in begun}
+        record = {**record, **later, stage: dict(options), "begun": begun}
+        if recipe:
+            record["recipe"] = recipe
+        ordered = {key: record[key] for key in ("recipe", "begun", *STAGES) if key in record}
+        text = tomli_w.dumps({"format_version": FORMAT_VERSION, **ordered})
+        replace_text(self.config, text)
+
+    @property
+    def _remedy(self) -> str:
+        if self.users_database:
+            return "use a new database (from_database= takes over its images and cameras)"
+        return "use --overwrite to redo it and the stages after it, or another --output-path"
+
+    def options_digest(self, *stages: str) -> str:
+        """Return a sha256 of the recorded options of stages, without those in ``LOCAL``.
+
+        The digest stays the same when photographs are moved or get other cameras.
+        """
+        record = self.recorded()
+        options = {
+            stage: {key: value for key, value in record.get(stage, {}).items() if key not in LOCAL}
+            for stage in stages
+        }
+        return hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()
+
+    def require(self, stage: str) -> dict[str, Any]:
+        """Return the recorded options of an earlier stage.
+
+        Raises:
+            WorkspaceError: when it has not been run.
+        """
+        record = self.recorded()
+        if stage not in record.get("begun", []):
+            raise WorkspaceError(
+                f"{self.path}: the {stage} stage has not been run there; run "
+                f"'colmap-affrect {stage}' with this --output-path first"
+            )
+        options: dict[str, Any] = record[stage]
+        return options
+
+    def _refuse_foreign_results(self, record: Mapping[str, Any]) -> None:
+        if "extract" in record.get("begun", []):
+            return
+        database = [] if self.users_database else [self.database]
+        for path in (*database, self.sparse, self.features, self.matches):
+            if path.exists():
+                raise StaleStoreError(
+                    f"{path}: exists and was not made here; it is left as it is, use "
+                    "another --output-path"
+                )
+
+    def _discard(self, stage: str) -> None:
+        """Remove what a stage and those after it made."""
+        first = STAGES.index(stage)
+        outdated = [self.sparse, self.report]
+        if first <= STAGES.index("verify"):
+            outdated.append(self.database)
+        if first <= STAGES.index("match"):
+            outdated.append(self.matches)
+        if first <= STAGES.index("pairs"):
+            outdated.append(self.pairs)
+        if first == 0:
+            outdated.append(self.features)
+        for path in outdated:
+            logger.info("overwrite: removing %s", path)
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+
+
+def _is_name(key: str) -> bool:
+    return key.rpartition(".")[2] == "name"
+
+
+def first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Say where options on record differ from those given now; empty if they do not."""
+    old, new = flat(known), flat(now)
+    # The name of a part first: with another one most other options differ too.
+    for key in sorted(old.keys() | new.keys(), key=lambda key: (not _is_name(key), key)):
+        if old.get(key) != new.get(key):
+            return f"{key}={old.get(key)!r}, and it is {new.get(key)!r} now"
+    return ""

@@ -1,0 +1,106 @@
+"""What a rectifier is: it decides which warps of a photograph to look at.
+
+A rectifier of another package becomes known by an entry point of the group
+``colmap_affrect.rectifiers``. Several threads may call the same object at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Protocol
+
+from pydantic import BeforeValidator, SerializeAsAny
+
+from colmap_affrect.data import Photograph, RectificationPlan
+from colmap_affrect.errors import OptionError
+from colmap_affrect.features.base import SHAPES, ShapeOptions, ShapeSource
+from colmap_affrect.features.shapes.second_moment import SecondMomentOptions
+from colmap_affrect.images.depth import DepthSource
+from colmap_affrect.options import PartOptions, Registry, within
+
+
+class Rectifier(Protocol):
+    """Plans warps; called with its ``Options`` and :class:`RectifierInputs`."""
+
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        """Plan the warps of one photograph."""
+
+
+@dataclass(frozen=True)
+class RectifierInputs:
+    """What a rectifier may read beside the photograph.
+
+    Attributes:
+        shapes: the source that its options name; None if they name none.
+        depth: None when the recipe needs no depth.
+    """
+
+    shapes: ShapeSource | None = None
+    depth: DepthSource | None = None
+
+    def required_shapes(self) -> ShapeSource:
+        """Return the shape source.
+
+        Raises:
+            OptionError: when there is none.
+        """
+        if self.shapes is None:
+            raise OptionError("the rectifier needs affine shapes: name a shape_source")
+        return self.shapes
+
+    def required_depth(self) -> DepthSource:
+        """Return the depth source.
+
+        Raises:
+            OptionError: when there is none.
+        """
+        if self.depth is None:
+            raise OptionError("the rectifier needs depth maps: give a folder or a depth network")
+        return self.depth
+
+
+class RectifierOptions(PartOptions):
+    """Base of the options of all rectifiers."""
+
+    uses_depth: ClassVar[bool] = False
+    """Whether it reads a depth map of every photograph."""
+
+
+class AffineWarpOptions(RectifierOptions):
+    """How large affine warps are rendered."""
+
+    area_preserving: bool = True
+    """Warp by diag(sqrt t, 1 / sqrt t), which keeps the area; False: by diag(1, 1 / t), which
+    never magnifies (the paper)."""
+
+
+class CoverOptions(AffineWarpOptions):
+    """Greedy cover of the affine shapes of a photograph in the space of tilts."""
+
+    shape_source: Annotated[SerializeAsAny[ShapeOptions], BeforeValidator(SHAPES.options)] = (
+        SecondMomentOptions()
+    )
+    """Where affine shapes come from: its name, or a section with ``name`` and options."""
+    tilt_radius: Annotated[float, within(1.05, 10.0)] = 1.7
+    """Radius r of a covering ball as a tilt ratio. Paper: 1.7."""
+    max_tilt: Annotated[float, within(1.0, 20.0)] = 5.8
+    """Shapes of a larger tilt neither vote nor count. Paper: 5.8."""
+    covered_frac: Annotated[float, within(0.0, 1.0)] = 0.95
+    """Share of the shapes that the balls must hold. Paper: 0.95."""
+    max_num_rectifications: Annotated[int, within(0, 192)] = 8
+    """Upper bound on the covering maps."""
+
+
+RECTIFIERS: Registry[Rectifier] = Registry(
+    kind="rectifier",
+    group="colmap_affrect.rectifiers",
+    built_in={
+        "identity": "colmap_affrect.rectifiers.whole_image:Identity",
+        "asift": "colmap_affrect.rectifiers.whole_image:Asift",
+        "affnet-shapes": "colmap_affrect.rectifiers.whole_image:AffNetShapes",
+        "depth-planes": "colmap_affrect.rectifiers.depth_planes:DepthPlanes",
+        "depth-affnet": "colmap_affrect.rectifiers.depth_affnet:DepthAffNet",
+        "dense-shapes": "colmap_affrect.rectifiers.dense:DenseShapes",
+    },
+    default="dense-shapes",
+)

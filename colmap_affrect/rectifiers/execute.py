@@ -1,0 +1,161 @@
+"""Execute a rectification plan: warp, detect, carry back, choose, describe, unite."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS, is_inside
+from colmap_affrect.data import (
+    ColorImage,
+    GrayImage,
+    LocalFeatures,
+    Mask,
+    Rectification,
+    RectificationPlan,
+    View,
+    in_mask,
+    union,
+)
+from colmap_affrect.features.base import FeatureExtractor
+from colmap_affrect.geometry.affine import ellipse_extents, transform_frames
+from colmap_affrect.geometry.neighbors import neighbors_within
+from colmap_affrect.images.masks import mask_values
+from colmap_affrect.images.warping import warp, warp_mask
+
+DUPLICATE_RADIUS_SIGMAS = 0.5
+MAX_DUPLICATE_RADIUS_PX = 4.0
+SAME_SCALE_RATIO = 2 ** (1 / 3)
+"""One layer of a scale space with three layers per octave."""
+
+
+def extract_rectified(
+    image: GrayImage | ColorImage,
+    plan: RectificationPlan,
+    extractor: FeatureExtractor,
+    max_num_rectified: int,
+    *,
+    with_original: bool = True,
+    mask: Mask | None = None,
+) -> LocalFeatures:
+    """Return the features of the image and of all planned warps, frames in image px.
+
+    Of the features in warps the ``max_num_rectified`` strongest are kept. Only what stays is
+    described, and all of it in one call.
+
+    Args:
+        image: (H, W) uint8, or (H, W, 3) for extractors that ask for colour.
+        plan: warps of this image.
+        extractor: detector and descriptor.
+        max_num_rectified: bound on the features of all warps together.
+        with_original: False leaves out the features of the image itself.
+        mask: (H, W) bool, where features may be; None means everywhere.
+    """
+    rectifications: list[Rectification | None] = [None] if with_original else []
+    rectifications += plan.items
+    if not rectifications:
+        return LocalFeatures.empty(extractor.descriptor_size)
+    views = _views(image, rectifications, mask)
+    detected = [extractor.detect(view) for view in views]
+    carried = [_carried(*pair) for pair in zip(detected, rectifications, strict=True)]
+    keep = [_usable(*pair, plan) for pair in zip(carried, rectifications, strict=True)]
+    warped = slice(1 if with_original else 0, None)
+    _keep_strongest(keep[warped], carried[warped], max_num_rectified)
+    if with_original and plan.replaces_original and plan.items:
+        kept = [part.select(mask) for part, mask in zip(carried, keep, strict=True)]
+        keep[0] &= ~found_again(carried[0], union(kept[1:]))
+    chosen = [features.select(kept) for features, kept in zip(detected, keep, strict=True)]
+    described = extractor.describe([view[0] for view in views], chosen)
+    first_id = 0 if with_original else 1
+    return union(
+        [
+            _carried(features, rectification).with_rectification_id(first_id + number)
+            for number, (features, rectification) in enumerate(
+                zip(described, rectifications, strict=True)
+            )
+        ]
+    )
+
+
+def _views(
+    image: GrayImage | ColorImage, rectifications: list[Rectification | None], mask: Mask | None
+) -> list[View]:
+    """Return a warp for each rectification; for None the image itself."""
+    whole = image, None if mask is None else mask_values(mask)
+    source = image.astype(np.float32)
+    return [whole if item is None else _warped(source, item, mask) for item in rectifications]
+
+
+def _warped(source: NDArray[np.float32], rectification: Rectification, mask: Mask | None) -> View:
+    size = (source.shape[1], source.shape[0])
+    inside = warp_mask(rectification, size)
+    if mask is not None:
+        unmasked = replace(rectification, region=mask, region_origin=(0, 0))
+        inside = np.minimum(inside, warp_mask(unmasked, size))
+    return warp(source, rectification), inside
+
+
+def _carried(features: LocalFeatures, rectification: Rectification | None) -> LocalFeatures:
+    """Carry features of a view back into the image."""
+    if rectification is None:
+        return features
+    return features.with_frames(transform_frames(rectification.image_from_rectified, features.lafs))
+
+
+def _usable(
+    features: LocalFeatures, rectification: Rectification | None, plan: RectificationPlan
+) -> Mask:
+    """Tell which features, frames in image px, belong to their part of the image.
+
+    Those of a warp must have their measurement region inside the image: what lies outside
+    is invented by the warp.
+    """
+    if rectification is None:
+        if plan.original_region is None:
+            return np.ones(len(features), dtype=bool)
+        return in_mask(plan.original_region, features.keypoints)
+    extents = ellipse_extents(features.lafs[:, :, :2])
+    inside = is_inside(features.keypoints, plan.image_size, extents)
+    return np.asarray(inside & rectification.in_region(features.keypoints))
+
+
+def _keep_strongest(keep: list[Mask], features: list[LocalFeatures], limit: int) -> None:
+    """Clear in ``keep`` all but the ``limit`` strongest of the features of several views."""
+    if not keep:
+        return
+    kept = np.concatenate(keep)
+    responses = np.concatenate([part.responses for part in features])
+    candidates = np.flatnonzero(kept)
+    order = np.argsort(-responses[candidates], kind="stable")
+    kept[candidates[order[limit:]]] = False
+    ends = np.cumsum([len(part) for part in features])
+    for part, mask in zip(np.split(kept, ends[:-1]), keep, strict=True):
+        mask[:] = part
+
+
+def found_again(original: LocalFeatures, rectified: LocalFeatures) -> Mask:
+    """Tell which features of the image itself a warp shows at the same place and scale.
+
+    Same means centres within half a sigma and scales within ``SAME_SCALE_RATIO`` in the
+    image, whatever the orientation. The region of a warp holds just those pixels whose shape
+    is nearer to its class than to the identity, so of the two the residual tilt of the
+    rectified feature is the smaller one, and the one to keep.
+    """
+    scales1, scales2 = original.scales, rectified.scales
+    radius = DUPLICATE_RADIUS_SIGMAS / MEASUREMENT_SIGMAS * scales1
+    again = np.zeros(len(original), dtype=bool)
+    if not len(original) or not len(rectified):
+        return again
+    points = np.concatenate([original.keypoints, rectified.keypoints])
+    # Larger frames than this have no counterpart worth the search for it.
+    search_px = min(float(radius.max()), MAX_DUPLICATE_RADIUS_PX)
+    neighbors = neighbors_within(points, search_px)
+    rows, others = neighbors.of(np.arange(len(original)))
+    between = others >= len(original)
+    rows, others = rows[between], others[between] - len(original)
+    distances = np.linalg.norm(original.keypoints[rows] - rectified.keypoints[others], axis=1)
+    same_scale = np.abs(np.log(scales1[rows] / scales2[others])) < np.log(SAME_SCALE_RATIO)
+    again[rows[(distances < radius[rows]) & same_scale]] = True
+    return again

@@ -1,0 +1,111 @@
+"""Rectifiers whose warps show the whole photograph: none, a fixed cover, a cover of its shapes."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.data import Photograph, Rectification, RectificationPlan
+from colmap_affrect.geometry.canvas import fit_canvas, image_corners, rectifying_affine
+from colmap_affrect.geometry.tilts import asift_covering, cover_shapes, near_optimal_covering
+from colmap_affrect.rectifiers.base import (
+    AffineWarpOptions,
+    CoverOptions,
+    RectifierInputs,
+    RectifierOptions,
+)
+
+COVERINGS = {"near-optimal": near_optimal_covering, "asift": asift_covering}
+
+
+class IdentityOptions(RectifierOptions):
+    """No warps."""
+
+    name: Literal["identity"] = "identity"
+
+
+class Identity:
+    """The photograph as it is."""
+
+    Options = IdentityOptions
+
+    def __init__(self, options: IdentityOptions, sources: RectifierInputs) -> None:
+        """See :mod:`colmap_affrect.rectifiers.base`."""
+        del options, sources
+
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        """Plan no warps."""
+        return RectificationPlan(photograph.size)
+
+
+class AsiftOptions(AffineWarpOptions):
+    """The same warps of the whole image for every photograph."""
+
+    name: Literal["asift"] = "asift"
+    covering: Literal["near-optimal", "asift"] = "near-optimal"
+    """``near-optimal``: 24 maps that with the identity cover all tilts to 5.8 (Rodriguez et al.
+    2018); ``asift``: the 60 of ASIFT with tilts to 8 (Morel & Yu 2009, the paper)."""
+
+
+class Asift:
+    """The same maps for every photograph (Morel & Yu 2009)."""
+
+    Options = AsiftOptions
+
+    def __init__(self, options: AsiftOptions, sources: RectifierInputs) -> None:
+        """See :mod:`colmap_affrect.rectifiers.base`."""
+        del sources
+        self.options = options
+
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        """Warp the whole photograph by every map of the covering."""
+        centers = COVERINGS[self.options.covering]()
+        return plan_whole_image(photograph.size, centers, self.options)
+
+
+class AffNetShapesOptions(CoverOptions):
+    """The whole photograph is warped by every covering map of its shapes."""
+
+    name: Literal["affnet-shapes"] = "affnet-shapes"
+
+
+class AffNetShapes:
+    """A greedy cover of the photograph's own affine shapes (Rodriguez et al. 2018; Sec. 2.4)."""
+
+    Options = AffNetShapesOptions
+
+    def __init__(self, options: AffNetShapesOptions, sources: RectifierInputs) -> None:
+        """See :mod:`colmap_affrect.rectifiers.base`."""
+        self.options = options
+        self.shapes = sources.required_shapes()
+
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        """Warp the whole photograph by every covering map of its shapes."""
+        centers = covering_centers(self.shapes.samples(photograph.gray).metrics, self.options)
+        return plan_whole_image(photograph.size, centers, self.options)
+
+
+def covering_centers(metrics: NDArray[np.floating], options: CoverOptions) -> NDArray[np.float64]:
+    """Return the (K, 2) rows (tilt, angle_rad) that cover (N, 3) metrics, each with one vote."""
+    return cover_shapes(
+        metrics,
+        np.ones(len(metrics)),
+        radius=options.tilt_radius,
+        max_tilt=options.max_tilt,
+        covered_frac=options.covered_frac,
+        max_num_centers=options.max_num_rectifications,
+    ).centers
+
+
+def plan_whole_image(
+    image_size: tuple[int, int], centers: NDArray[np.floating], options: AffineWarpOptions
+) -> RectificationPlan:
+    """Warp an image of (width, height) as a whole by (K, 2) classes (tilt, angle_rad)."""
+    items = []
+    for tilt, angle in centers.tolist():
+        linear = rectifying_affine(tilt, angle, area_preserving=options.area_preserving)
+        matrix, canvas_size = fit_canvas(linear, image_corners(image_size), margin_px=0.0)
+        items.append(Rectification(matrix, canvas_size, None, tilt, angle))
+    return RectificationPlan(image_size, tuple(items))

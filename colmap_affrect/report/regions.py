@@ -1,0 +1,87 @@
+"""The regions of a plan: where they lie, how large they are, and their colours in pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.colors import LinearSegmentedColormap, to_rgb
+from numpy.typing import NDArray
+
+from colmap_affrect.data import Mask, Rectification, RectificationPlan
+from colmap_affrect.geometry.affine import project, transform_frames
+
+Color = tuple[float, float, float]
+Size = tuple[int, int]
+
+PALETTE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442", "#882255")
+"""Okabe and Ito's colours for all kinds of colour vision, and one of Paul Tol's."""
+ANGLE_COLORS = LinearSegmentedColormap.from_list(
+    "tilt angle", [PALETTE[index] for index in (0, 5, 2, 6, 1, 4, 3, 0)]
+)
+"""For more maps than the palette has colours: a circle, since the tilt angle has period pi."""
+
+TURN = np.linspace(0.0, 2.0 * np.pi, 25)
+UNIT_CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)])
+
+
+def warp_colors(plan: RectificationPlan) -> list[Color]:
+    """Choose a colour for each warp of a plan.
+
+    Warps of one segment have the same, and so have warps of one class that show the whole
+    image. Where that is more than the palette has, the tilt angle decides.
+    """
+    keys = [
+        (item.tilt, item.tilt_angle_rad) if item.region is None else item.segment_id
+        for item in plan.items
+    ]
+    groups = list(dict.fromkeys(keys))
+    if len(groups) > len(PALETTE):
+        return [to_rgb(ANGLE_COLORS(item.tilt_angle_rad / np.pi)) for item in plan.items]
+    return [to_rgb(PALETTE[groups.index(key)]) for key in keys]
+
+
+def region_pixels(item: Rectification) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows and the columns in the image of the pixels of a region; none without one."""
+    if item.region is None:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    rows, columns = np.nonzero(item.region)
+    return rows + item.region_origin[1], columns + item.region_origin[0]
+
+
+def region_area_px(item: Rectification, image_size: Size) -> int:
+    """Count the pixels of a region in an image of (width, height)."""
+    if item.region is None:
+        return image_size[0] * image_size[1]
+    return int(np.count_nonzero(item.region))
+
+
+def bounding_box(item: Rectification, image_size: Size) -> tuple[int, int, int, int]:
+    """Return left, top, width and height of a region in an image of (width, height), in px."""
+    if item.region is None:
+        return (0, 0, *image_size)
+    columns = np.flatnonzero(item.region.any(axis=0))
+    rows = np.flatnonzero(item.region.any(axis=1))
+    left, top = item.region_origin[0] + int(columns[0]), item.region_origin[1] + int(rows[0])
+    return left, top, int(columns[-1] - columns[0]) + 1, int(rows[-1] - rows[0]) + 1
+
+
+def region_middle(region: Mask, origin: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the (2,) pixel of an (h, w) region that is nearest to its centre of mass, image px."""
+    rows, columns = np.nonzero(region)
+    points = np.stack([columns, rows], axis=1).astype(np.float64)
+    nearest = np.argmin(((points - points.mean(axis=0)) ** 2).sum(axis=1))
+    return np.asarray(points[nearest] + origin)
+
+
+def circle_origin(
+    item: Rectification, middle: NDArray[np.float64], radius_px: float
+) -> NDArray[np.float64]:
+    """Return the (2, N) ellipse around a point, in image px, that a warp turns into a circle.
+
+    Its area is that of a circle of ``radius_px``.
+    """
+    ((x, y),) = project(item.rectified_from_image, middle[None])
+    (frame,) = transform_frames(
+        item.image_from_rectified, np.array([[[1.0, 0.0, x], [0.0, 1.0, y]]])
+    )
+    shape = frame[:, :2] * radius_px / np.sqrt(np.linalg.det(frame[:, :2]))
+    return np.asarray(shape @ UNIT_CIRCLE + middle[:, None])

@@ -1,0 +1,66 @@
+"""What all stages of a run have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from colmap_affrect.parallel.executor import Executor
+from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.stores import FeatureStore, MatchStore
+from colmap_affrect.project.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What is needed from outside and does not change results.
+
+    Attributes:
+        weights_path: folder with the weights of networks; None searches the usual places.
+        device: ``auto``, ``cpu``, ``cuda``, ``cuda:1``, ``mps``; of networks and of matching.
+        depth_cache_path: folder that keeps the depth maps of a network; None keeps none.
+    """
+
+    weights_path: Path | None = None
+    device: str = "auto"
+    depth_cache_path: Path | None = None
+
+    def require_device(self) -> None:
+        """Refuse a device that is not there; torch is loaded only when one is named.
+
+        Raises:
+            DeviceError: naming those there are.
+        """
+        if self.device not in ("auto", "cpu"):
+            from colmap_affrect.features.networks import resolve_device
+
+            resolve_device(self.device)
+
+
+@dataclass(frozen=True)
+class Context:
+    """Where a run works and with what; none of it changes a result.
+
+    Attributes:
+        workspace: the output folder.
+        resources: weights and device.
+        executor: where images and pairs are worked on, a cluster for one; by default in threads
+            of this process.
+        progress: where to show progress.
+    """
+
+    workspace: Workspace
+    resources: Resources = field(default_factory=Resources)
+    executor: Executor | None = None
+    progress: Progress = SILENT
+
+    @property
+    def features(self) -> FeatureStore:
+        """The features; a file that was made with other options than those on record is refused."""
+        return FeatureStore(self.workspace.features, self.workspace.options_digest("extract"))
+
+    @property
+    def matches(self) -> MatchStore:
+        """The raw matches; refused like features."""
+        digest = self.workspace.options_digest("extract", "match")
+        return MatchStore(self.workspace.matches, digest)

@@ -1,0 +1,383 @@
+"""Extract: photographs into ``features.h5``, cameras, images and keypoints into the database."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap.database_copy import copy_without_features, open_copy
+from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
+from colmap_affrect.features.weights import file_sha256
+from colmap_affrect.images.photographs import (
+    CameraOptions,
+    MaskOptions,
+    Photographs,
+    checked_names,
+    left_out,
+    list_images,
+    refuse_colliding_keys,
+    refuse_mixed_sizes,
+)
+from colmap_affrect.options import Options
+from colmap_affrect.parallel.executor import Threads
+from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import ExtractionOptions, Recipe
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.one_image import (
+    ExtractedImage,
+    ImageExtractor,
+    ImageTask,
+    num_images_at_once,
+    prepare,
+)
+
+logger = logging.getLogger(__name__)
+
+
+class Inputs(Options):
+    """Which photographs a run is about, and what is known of them."""
+
+    image_path: str
+    """Folder of the photographs."""
+    image_list_path: str = ""
+    """List of the photographs to use; all below the folder if empty."""
+    from_database: str = ""
+    """COLMAP database whose images, cameras, rigs, frames and pose priors are taken over; it stays
+    as it is."""
+    cameras: CameraOptions = CameraOptions()
+    """How images share cameras."""
+    masks: MaskOptions = MaskOptions()
+    """Where features may be; everywhere by default."""
+
+    @classmethod
+    def of(
+        cls,
+        image_path: Path,
+        *,
+        image_list_path: Path | None = None,
+        from_database: Path | None = None,
+        cameras: CameraOptions | None = None,
+        masks: MaskOptions | None = None,
+    ) -> Inputs:
+        """Build from paths, which are made absolute."""
+        return cls(
+            image_path=str(image_path.resolve()),
+            image_list_path=str(image_list_path.resolve()) if image_list_path else "",
+            from_database=str(from_database.resolve()) if from_database else "",
+            cameras=cameras or CameraOptions(),
+            masks=masks or MaskOptions(),
+        )
+
+    @classmethod
+    def recorded(cls, workspace: Workspace) -> Inputs:
+        """Return what the extract stage of a workspace was given."""
+        record = workspace.require("extract")
+        values = {key: value for key, value in record.items() if key in cls.model_fields}
+        return cls.from_mapping(values, str(workspace.config))
+
+    @property
+    def photographs(self) -> Photographs:
+        """The folder and the masks."""
+        return Photographs(Path(self.image_path), self.masks)
+
+    def names(self) -> list[str]:
+        """Return the images of the folder, of the list, or of the database.
+
+        With list and database they are those of the list.
+        """
+        folder, listed = Path(self.image_path), Path(self.image_list_path)
+        if not self.from_database:
+            return list_images(folder, listed if self.image_list_path else None)
+        with open_copy(Path(self.from_database)) as database:
+            known = [image.name for image in database.read_all_images()]
+        if not self.image_list_path:
+            return checked_names(folder, known, self.from_database)
+        names = list_images(folder, listed)
+        unknown = sorted(set(names) - set(known))
+        if unknown:
+            raise ImageError(f"{listed}: lists {unknown[0]}, which {self.from_database} has not")
+        return names
+
+    def check(self) -> None:
+        """Refuse cameras and masks that cannot be used.
+
+        Raises:
+            OptionError: naming the option.
+        """
+        self.photographs.check()
+        colmap_database.check_cameras(self.cameras)
+        if self.from_database and self.cameras != CameraOptions():
+            raise OptionError(
+                f"the cameras of {self.from_database} are used; leave out camera mode, model and "
+                "parameters"
+            )
+
+    def check_names(self, names: Sequence[str], workspace: Workspace | None = None) -> None:
+        """Refuse photographs that cannot be used together.
+
+        Args:
+            names: of the photographs.
+            workspace: where some have features, and their sizes are known.
+
+        Raises:
+            StoreError: when two have the same key in hloc's files.
+            OptionError: when photographs that share a camera differ in size.
+        """
+        refuse_colliding_keys(names)
+        if self.cameras.mode in ("single", "per-folder"):
+            known = FeatureStore(workspace.features).image_sizes() if workspace else {}
+            refuse_mixed_sizes(Path(self.image_path), names, self.cameras.mode, known)
+
+
+def recorded_extraction(workspace: Workspace) -> ExtractionOptions:
+    """Return the options that the features of a workspace were made with."""
+    record = workspace.require("extract")
+    names = ExtractionOptions.model_fields
+    options = {key: value for key, value in record.items() if key in names}
+    return ExtractionOptions.from_mapping(options, str(workspace.config))
+
+
+def extract(
+    context: Context,
+    inputs: Inputs,
+    recipe: Recipe,
+    *,
+    image_names: Sequence[str] = (),
+    later: Mapping[str, Options] | None = None,
+    overwrite: bool = False,
+) -> StageReport:
+    """Extract features of all images and put cameras, images and keypoints into the database.
+
+    An image that cannot be read is reported and passed over. One that cannot be rectified, for
+    want of a depth map, is extracted as it is, with a warning. The options of later stages are
+    put on record too.
+
+    Args:
+        context: where the results go.
+        inputs: the photographs.
+        recipe: what to extract.
+        image_names: the images to look at now, in the place of a list on record.
+        later: options of later stages by name, beside those of the recipe.
+        overwrite: discard the results of this and later stages first.
+    """
+    start = time.perf_counter()
+    workspace, folder = context.workspace, Path(inputs.image_path)
+    inputs.check()
+    names = inputs.names()
+    if image_names:
+        names = checked_names(folder, image_names, "image_names")
+    inputs.check_names(names, None if overwrite else workspace)
+    extractor = prepared_recipe(context, recipe.extraction, names)
+    _record(workspace, inputs, recipe, extractor, later or {}, overwrite=overwrite)
+    _start_database(workspace)
+    done = context.features.complete(names)
+    missing = [name for name in names if name not in done]
+    _refuse_foreign_features(workspace, missing)
+    is_whole_folder = not (inputs.image_list_path or image_names or inputs.from_database)
+    warnings = left_out(folder) if is_whole_folder else {}
+    for kind, what in warnings.items():
+        logger.warning("%s: %s", kind, what)
+    failures = _extract_missing(context, inputs, extractor, missing, warnings)
+    if len(failures) == len(names):
+        raise ImageError(
+            f"{folder}: none of the {len(names)} images can be used; the first: "
+            f"{failures[names[0]]}"
+        )
+    failures |= write_images_and_keypoints(context)
+    return StageReport(
+        "extract",
+        time.perf_counter() - start,
+        len(set(missing) - set(failures)),
+        len(done - set(failures)),
+        failures,
+        warnings,
+    )
+
+
+def _record(
+    workspace: Workspace,
+    inputs: Inputs,
+    recipe: Recipe,
+    extractor: ImageExtractor,
+    later: Mapping[str, Options],
+    *,
+    overwrite: bool,
+) -> None:
+    """Put the options of this stage and those known of later ones on record."""
+    weights = {path.name: file_sha256(path) for path in extractor.weights.values()}
+    planned: dict[str, Options] = {"match": recipe.matching}
+    if recipe.extraction.escalation:
+        planned["escalate"] = recipe.escalate
+    if recipe.mapping:
+        planned["map"] = recipe.mapper_options("sparse")
+    planned |= later
+    workspace.record_options(
+        "extract",
+        {**inputs.to_mapping(), **recipe.extraction.to_mapping(), "weights": weights},
+        plan={stage: chosen.to_mapping() for stage, chosen in planned.items()},
+        recipe=recipe.name,
+        overwrite=overwrite,
+    )
+
+
+def _extract_missing(
+    context: Context,
+    inputs: Inputs,
+    extractor: ImageExtractor,
+    names: Sequence[str],
+    warnings: dict[str, str],
+) -> dict[str, str]:
+    """Extract images one by one; return why some cannot be used, and add to the warnings."""
+    store = context.features
+    failures: dict[str, str] = {}
+    with context.progress.stage("extract", len(names), "images") as advance:
+        images = [(name, 0) for name in names]
+        with closing(extract_images(context, inputs, extractor, images)) as found_images:
+            for name, found in zip(names, found_images, strict=True):
+                if isinstance(found, ImageError):
+                    logger.warning("%s", found)
+                    failures[name] = str(found)
+                else:
+                    if not len(found.features):
+                        logger.warning("%s: no features (blank or too small?)", name)
+                    if found.warning:
+                        warnings[name] = found.warning
+                    store.write(name, found.features, found.image_size)
+                advance(1)
+    return failures
+
+
+def prepared_recipe(
+    context: Context, options: ExtractionOptions, names: Sequence[str]
+) -> ImageExtractor:
+    """Prepare a recipe for the images of a workspace, which keeps the depth maps of networks."""
+    resources = replace(context.resources, depth_cache_path=context.workspace.depth)
+    return prepare(options, resources, names, context.progress)
+
+
+def extract_images(
+    context: Context,
+    inputs: Inputs,
+    extractor: ImageExtractor,
+    images: Sequence[tuple[str, int]],
+) -> Generator[ExtractedImage | ImageError, None, None]:
+    """Yield the features of images, or why one cannot be used, in order.
+
+    Args:
+        context: says where to work; by default in as many threads as cores and memory allow.
+        inputs: where the images are.
+        extractor: prepared.
+        images: names and levels of escalation.
+
+    Raises:
+        ClusterError: when the workers do not see the depth maps.
+    """
+    if not images:
+        return
+    executor = context.executor or Threads(num_images_at_once(extractor))
+    depth_folder = extractor.options.depth.folder
+    if depth_folder and not executor.sees([depth_folder]):
+        raise ClusterError(
+            f"{depth_folder}: the workers of the cluster do not see this folder of depth maps; put "
+            "it on storage that all of them share"
+        )
+    files = inputs.photographs.files(images[0][0])
+    is_shared = executor.sees(files)
+    tasks: Iterable[ImageTask] = image_tasks(context.workspace, inputs, extractor.options, images)
+    if not is_shared:
+        tasks = (task.with_files() for task in tasks)
+    outcomes = executor.map(extractor, tasks, files if is_shared else ())
+    for (name, level), found in zip(images, outcomes, strict=True):
+        if isinstance(found, ExtractedImage):
+            logger.debug("%s: %d features (level %d)", name, len(found.features), level)
+            if found.warning:
+                logger.warning("%s: %s", name, found.warning)
+        yield found
+
+
+def image_tasks(
+    workspace: Workspace,
+    inputs: Inputs,
+    options: ExtractionOptions,
+    images: Iterable[tuple[str, int]],
+) -> Iterator[ImageTask]:
+    """Yield what is to be done for images; cameras are read where rectification depends on them."""
+    known = {}
+    if workspace.database.exists():
+        known = colmap_database.read_cameras(workspace.database)
+    for name, level in images:
+        camera = known.get(name)
+        intrinsics = None
+        if options.uses_depth:
+            path = Path(inputs.image_path) / name
+            intrinsics = (
+                camera.matrix
+                if camera
+                else colmap_database.read_camera_matrix(path, inputs.cameras)
+            )
+        size = camera.size if camera else None
+        yield ImageTask(inputs.photographs, name, level, intrinsics, size)
+
+
+def _start_database(workspace: Workspace) -> None:
+    """Make the database from the one that the extract stage was given, unless it is there."""
+    original = workspace.require("extract")["from_database"]
+    if original and not workspace.database.exists():
+        copy_without_features(Path(original), workspace.database)
+
+
+def _refuse_foreign_features(workspace: Workspace, names: Sequence[str]) -> None:
+    """Refuse to replace features of another program in a user's database."""
+    if not (workspace.users_database and workspace.database.exists()):
+        return
+    ids = colmap_database.image_ids(workspace.database)
+    with colmap_database.open_database(workspace.database) as database:
+        foreign = [n for n in names if n in ids and database.exists_keypoints(ids[n])]
+    if foreign:
+        raise DatabaseError(
+            f"{workspace.database}: has other features of {foreign[0]}; they are not replaced, "
+            "start a new database from it (from_database, --from-database)"
+        )
+
+
+def write_images_and_keypoints(context: Context) -> dict[str, str]:
+    """Bring the database up to date; return the images that COLMAP does not take, with reasons."""
+    workspace, store = context.workspace, context.features
+    _start_database(workspace)
+    inputs = Inputs.recorded(workspace)
+    counts = store.num_keypoints()
+    rejected = colmap_database.import_images(
+        workspace.database, Path(inputs.image_path), list(counts), inputs.cameras
+    )
+    ids = colmap_database.image_ids(workspace.database)
+    with colmap_database.open_database(workspace.database) as database:
+        for name, count in counts.items():
+            if name in ids and not colmap_database.has_keypoints(database, ids[name], count):
+                colmap_database.write_keypoints(
+                    database, ids[name], store.read_frames(name), store.level_ends(name)
+                )
+    reason = f"COLMAP does not take it (camera mode {inputs.cameras.mode})"
+    return dict.fromkeys(rejected, reason)
+
+
+def write_descriptors(context: Context) -> None:
+    """Write the descriptors of all images into the database as COLMAP's matchers take them."""
+    features, path = context.features, context.workspace.database
+    ids = colmap_database.image_ids(path)
+    counts = {name: count for name, count in features.num_keypoints().items() if name in ids}
+    with colmap_database.open_database(path) as database:
+        written = {name: database.num_descriptors_for_image(ids[name]) for name in counts}
+        if any(written[name] not in (0, count) for name, count in counts.items()):
+            database.clear_descriptors()  # from before an escalation; COLMAP cannot replace them
+            written = dict.fromkeys(counts, 0)
+        for name, count in counts.items():
+            if count and not written[name]:
+                descriptors = features.read(name).descriptors
+                colmap_database.write_descriptors(database, ids[name], descriptors)

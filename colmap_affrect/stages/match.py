@@ -1,0 +1,100 @@
+"""Match: raw matches of the listed pairs, into ``matches.h5`` and the database."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+
+from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stores import PairMatches, pair_key
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.extract import recorded_extraction, write_images_and_keypoints
+from colmap_affrect.stages.one_pair import iterate_matches
+from colmap_affrect.stages.pairs import listed_pairs
+
+PAIRS_PER_WRITE = 64
+
+
+def recorded_matching(workspace: Workspace) -> MatcherOptions:
+    """Return the options on record of matching, done or still to be done."""
+    options: MatcherOptions = MATCHERS.options(workspace.planned("match") or {})
+    return options
+
+
+def match(
+    context: Context, options: MatcherOptions | None = None, *, overwrite: bool = False
+) -> StageReport:
+    """Match the listed pairs and put the raw matches into the database.
+
+    Args:
+        context: with features and a list of pairs.
+        options: of the matcher; by default those on record.
+        overwrite: discard the results of this and later stages first.
+    """
+    start = time.perf_counter()
+    context.resources.require_device()
+    pairs = listed_pairs(context)
+    options = options or recorded_matching(context.workspace)
+    context.workspace.record_options("match", options.to_mapping(), overwrite=overwrite)
+    done = context.matches.complete(pair_key(*pair) for pair in pairs)
+    missing = [pair for pair in pairs if pair_key(*pair) not in done]
+    with context.progress.stage("match", len(missing), "pairs") as advance:
+        match_pairs(context, missing, options, advance)
+    write_matches(context, pairs)
+    return StageReport("match", time.perf_counter() - start, len(missing), len(done))
+
+
+def match_pairs(
+    context: Context,
+    pairs: Sequence[Pair],
+    options: MatcherOptions,
+    advance: Callable[[int], None],
+) -> None:
+    """Match pairs by the features that every image has, and store them batch by batch."""
+    matches = context.matches
+    batch: list[PairMatches] = []
+    try:
+        with closing(
+            iterate_matches(
+                pairs,
+                context.features,
+                options,
+                0,
+                context.resources,
+                context.executor,
+                recorded_extraction(context.workspace).features.name,
+            )
+        ) as found_pairs:
+            for found in found_pairs:
+                batch.append(found)
+                advance(1)
+                if len(batch) == PAIRS_PER_WRITE:
+                    matches.write(batch)
+                    batch = []
+    finally:
+        if batch:
+            matches.write(batch)
+
+
+def write_matches(context: Context, pairs: Sequence[Pair]) -> None:
+    """Put the raw matches that the database lacks into it, after images and keypoints."""
+    write_images_and_keypoints(context)
+    path = context.workspace.database
+    ids = colmap_database.image_ids(path)
+    with colmap_database.open_database(path) as database:
+        lacking = [
+            pair
+            for pair in pairs
+            if pair[0] in ids
+            and pair[1] in ids
+            and not database.exists_matches(ids[pair[0]], ids[pair[1]])
+        ]
+        if not lacking:
+            return
+        for (first, second), found in zip(lacking, context.matches.read(lacking), strict=True):
+            colmap_database.write_matches(database, ids[first], ids[second], found.indices)

@@ -1,0 +1,389 @@
+"""What is done for one photograph, in a thread of this process or on a worker of a cluster.
+
+Workers read photographs from shared storage. Where they do not see them, or see other files in
+their place, photographs and masks travel with the tasks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.conventions import camera_matrix, resized_from_original
+from colmap_affrect.data import (
+    GrayImage,
+    LocalFeatures,
+    Mask,
+    Photograph,
+    RectificationPlan,
+    in_mask,
+)
+from colmap_affrect.errors import DepthError, ImageError, OptionError, WeightsError
+from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
+from colmap_affrect.features.weights import file_sha256, resolve
+from colmap_affrect.geometry.affine import transform_frames
+from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
+from colmap_affrect.images.masks import shrink_mask
+from colmap_affrect.images.photographs import Photographs
+from colmap_affrect.images.reading import read_color, read_gray, shrink_to
+from colmap_affrect.parallel.executor import (
+    available_cores,
+    available_memory_bytes,
+    unless_gpu_is_full,
+)
+from colmap_affrect.parallel.opencv_threads import SHARED_OPENCV_THREADS
+from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.recipes import ExtractionOptions
+from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, Rectifier, RectifierInputs
+from colmap_affrect.rectifiers.execute import extract_rectified
+from colmap_affrect.stages.context import Resources
+
+MIN_RECTIFIABLE_PX = 32
+"""Images with a shorter side are not rectified: no block would see its surroundings."""
+
+MEMORY_IS_FULL = "extracted on the CPU, the memory of the GPU is full"
+
+BYTES_PER_PIXEL = 256
+"""Memory of the extraction of one image, roughly."""
+
+
+@dataclass(frozen=True)
+class ExtractedImage:
+    """Features of one image file.
+
+    Attributes:
+        features: frames in px of the stored image.
+        image_size: (width, height) of the stored image in px.
+        warning: why it was not rectified though it was to be, or not on the GPU; empty if all
+            went well.
+    """
+
+    features: LocalFeatures
+    image_size: tuple[int, int]
+    warning: str = ""
+
+
+@dataclass(frozen=True)
+class ImageTask:
+    """One photograph to extract.
+
+    Attributes:
+        photographs: where it and its masks are.
+        name: of the photograph.
+        level: of escalation: 0 for the features that every image gets; above that, only those
+            that the rectifier of this level adds.
+        intrinsics: (3, 3) camera matrix in pixel-centre px of the stored image; by default
+            COLMAP's guess of a focal length of 1.2 times the longer side.
+        camera_size: (width, height) of its camera, if it has one already.
+        sent: content of its files by absolute path; None where they are read.
+    """
+
+    photographs: Photographs
+    name: str
+    level: int = 0
+    intrinsics: NDArray[np.float64] | None = None
+    camera_size: tuple[int, int] | None = None
+    sent: Mapping[Path, bytes] | None = None
+
+    def __str__(self) -> str:
+        return self.name
+
+    def with_files(self) -> ImageTask:
+        """Return the task with its files; extraction will report those that cannot be read."""
+        sent = {}
+        for path in self.photographs.files(self.name):
+            with suppress(OSError):
+                sent[path] = path.read_bytes()
+        return replace(self, sent=sent)
+
+    @contextmanager
+    def unpacked(self) -> Iterator[Photographs]:
+        """Yield where the files are; those that were sent are written to a temporary folder."""
+        if self.sent is None:
+            yield self.photographs
+            return
+        with TemporaryDirectory() as root:
+            for path, content in self.sent.items():
+                here = moved(path, Path(root))
+                here.parent.mkdir(parents=True, exist_ok=True)
+                here.write_bytes(content)
+            try:
+                yield self.photographs.moved(lambda path: moved(path, Path(root)))
+            except ImageError as error:
+                raise ImageError(str(error).replace(root, "")) from error
+
+
+@dataclass(eq=False)
+class ImageExtractor:
+    """A recipe ready to work: built once by :func:`prepare`, called for every photograph.
+
+    It may work on several images at once, in threads. In another process (pickled) it is prepared
+    there anew, with the weights and the device found there.
+
+    Attributes:
+        options: of the recipe.
+        extractor: detector and descriptor.
+        rectifiers: one per level, that of every image first, then those of escalation.
+        weights: files of the networks by key.
+        resources: that it was prepared with.
+        network_lock: held while networks run, which take one image at a time.
+    """
+
+    options: ExtractionOptions
+    extractor: FeatureExtractor
+    rectifiers: tuple[Rectifier, ...]
+    weights: Mapping[str, Path] = field(default_factory=dict)
+    resources: Resources = field(default_factory=Resources)
+    network_lock: AbstractContextManager[Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.network_lock = Lock() if self.options.uses_networks else nullcontext()
+
+    def __reduce__(self) -> tuple[Callable[..., ImageExtractor], tuple[Any, ...]]:
+        digests = {key: file_sha256(path) for key, path in self.weights.items()}
+        return _prepared_elsewhere, (self.options, self.resources, digests)
+
+    def __call__(self, task: ImageTask) -> ExtractedImage | ImageError:
+        """Extract the features of a photograph, or return why it cannot be used."""
+        try:
+            with task.unpacked() as photographs:
+                found = self.extract_file(
+                    photographs.folder / task.name,
+                    task.name,
+                    task.intrinsics,
+                    task.level,
+                    photographs.mask(task.name),
+                )
+        except ImageError as error:
+            return error
+        if task.camera_size and task.camera_size != found.image_size:
+            (width, height), expected = found.image_size, task.camera_size
+            return ImageError(
+                f"{task.photographs.folder / task.name}: is {width} x {height} px, and its camera "
+                f"in the database {expected[0]} x {expected[1]} px; give the images that the "
+                "database is of"
+            )
+        return found
+
+    def extract_file(
+        self,
+        path: Path,
+        name: str = "",
+        intrinsics: NDArray[np.float64] | None = None,
+        level: int = 0,
+        mask: Mask | None = None,
+    ) -> ExtractedImage:
+        """Read an image and extract its features.
+
+        Args:
+            path: the image file.
+            name: key of its depth map; the file's name by default.
+            intrinsics: see :class:`ImageTask`.
+            level: see :class:`ImageTask`.
+            mask: (H, W) bool of the stored image, where features may be; None means everywhere.
+
+        Raises:
+            ImageError: when the file cannot be read, or its mask has another size.
+        """
+        photograph, original_size = self.photograph(path, name, intrinsics, mask)
+        with self.network_lock, SHARED_OPENCV_THREADS:
+            found = unless_gpu_is_full(
+                lambda: self.extract(photograph, level),
+                lambda: self._extract_on_cpu(photograph, level),
+            )
+        features = found.features
+        if photograph.size != original_size:
+            original_from_resized = np.linalg.inv(
+                resized_from_original(original_size, photograph.size)
+            )
+            features = features.with_frames(transform_frames(original_from_resized, features.lafs))
+        keep = features.inside(original_size)
+        if mask is not None:
+            keep &= in_mask(mask, features.keypoints)
+        return ExtractedImage(features.select(keep), original_size, found.warning)
+
+    def extract(self, photograph: Photograph, level: int = 0) -> ExtractedImage:
+        """Plan and execute; frames are in px of the photograph at the size of processing."""
+        plan, warning = self.plan_or_warn(photograph, level)
+        features = self.execute(photograph, plan, with_original=level == 0)
+        return ExtractedImage(features, photograph.size, warning)
+
+    def _extract_on_cpu(self, photograph: Photograph, level: int) -> ExtractedImage:
+        found = self._on_cpu.extract(photograph, level)
+        return replace(found, warning="; ".join(filter(None, (MEMORY_IS_FULL, found.warning))))
+
+    @cached_property
+    def _on_cpu(self) -> ImageExtractor:
+        return prepare(self.options, replace(self.resources, device="cpu"))
+
+    def photograph(
+        self,
+        path: Path,
+        name: str = "",
+        intrinsics: NDArray[np.float64] | None = None,
+        mask: Mask | None = None,
+    ) -> tuple[Photograph, tuple[int, int]]:
+        """Read an image at the size of processing; also return its stored (width, height)."""
+        image = read_gray(path)
+        if mask is not None and mask.shape != image.shape:
+            raise ImageError(
+                f"{path}: is {image.shape[1]} x {image.shape[0]} px and its mask "
+                f"{mask.shape[1]} x {mask.shape[0]} px; they must have one size"
+            )
+        original_size = (image.shape[1], image.shape[0])
+        limit = self.options.max_image_size_px
+        gray = shrink_to(image, limit)
+        color = read_color(path, limit) if self.options.features.in_color else None
+        size = (gray.shape[1], gray.shape[0])
+        original_camera = camera_matrix(original_size) if intrinsics is None else intrinsics
+        camera = resized_from_original(original_size, size) @ original_camera
+        if mask is not None:
+            mask = shrink_mask(mask, size)
+        return Photograph(gray, name or path.name, path, camera, mask, color), original_size
+
+    def plan(self, photograph: Photograph, level: int = 0) -> RectificationPlan:
+        """Decide which warps of a photograph to look at.
+
+        Raises:
+            DepthError: when the rectifier needs a depth map and it cannot be used.
+        """
+        if min(photograph.size) < MIN_RECTIFIABLE_PX:
+            return RectificationPlan(photograph.size)
+        return self.rectifiers[level].plan(photograph)
+
+    def plan_or_warn(self, photograph: Photograph, level: int = 0) -> tuple[RectificationPlan, str]:
+        """Plan; without a usable depth map plan no warps and say why, else say nothing."""
+        try:
+            return self.plan(photograph, level), ""
+        except DepthError as error:
+            return RectificationPlan(photograph.size), f"not rectified: {error}"
+
+    def execute(
+        self, photograph: Photograph, plan: RectificationPlan, *, with_original: bool = True
+    ) -> LocalFeatures:
+        """Extract the features of a plan, frames in px of the photograph."""
+        return extract_rectified(
+            photograph.gray if photograph.color is None else photograph.color,
+            plan,
+            self.extractor,
+            self.options.features.max_num_rectified_features,
+            with_original=with_original,
+            mask=photograph.mask,
+        )
+
+
+def moved(path: Path, root: Path) -> Path:
+    """Return where a file would be if ``root`` were the root of the file system.
+
+    >>> moved(Path("/photos/a.jpg"), Path("/sent")).as_posix()
+    '/sent/photos/a.jpg'
+    """
+    absolute = path.absolute()
+    return root / absolute.relative_to(absolute.anchor)
+
+
+def num_images_at_once(extractor: ImageExtractor) -> int:
+    """Return how many images are worked on at once in this process.
+
+    They take at most half of the memory there is. With networks two: one is read while the
+    networks run on the other.
+    """
+    if extractor.options.uses_networks:
+        return 2
+    num_bytes = BYTES_PER_PIXEL * extractor.options.max_image_size_px**2
+    return min(available_cores(), max(1, available_memory_bytes() // 2 // num_bytes))
+
+
+def extract_image(image: GrayImage, options: ExtractionOptions | None = None) -> LocalFeatures:
+    """Extract the features of one (H, W) uint8 image, frames in its px.
+
+    For many images build the extractor once with :func:`prepare`.
+    """
+    extractor = prepare(options or ExtractionOptions())
+    size = (image.shape[1], image.shape[0])
+    photograph = Photograph(image, "", None, camera_matrix(size))
+    return extractor.execute(photograph, extractor.plan(photograph))
+
+
+def prepare(
+    options: ExtractionOptions,
+    resources: Resources | None = None,
+    image_names: Sequence[str] | None = None,
+    progress: Progress = SILENT,
+) -> ImageExtractor:
+    """Find everything a recipe needs, before any image is touched, and build its parts.
+
+    Args:
+        options: of the recipe.
+        resources: weights, device, cache.
+        image_names: the images to come, to see whether there are depth maps for them.
+        progress: where to show downloads.
+
+    Raises:
+        WeightsError: when a file of weights is neither found nor downloaded.
+        DeviceError: when the device is not there.
+        OptionError: when depth maps are needed and no source is given.
+        DepthError: when the folder of depth maps has none of the images.
+    """
+    resources = resources or Resources()
+    weights = resolve(options.weights, resources.weights_path, progress=progress)
+    network = NetworkContext(weights, _device(options, resources))
+    extractor = EXTRACTORS.make(options.features, network)
+    depth = None
+    if options.uses_depth:
+        if not options.depth.is_given:
+            needing = next(item.name for item in options.rectifiers if item.uses_depth)
+            raise OptionError(
+                f"rectifier {needing} needs depth maps: give --depth-path FOLDER, or "
+                "--depth-model NAME for a monocular depth network"
+            )
+        depth_context = DepthContext(resources.depth_cache_path, network.device)
+        depth = DEPTH_SOURCES.make(options.depth, depth_context)
+        if image_names is not None:
+            depth.require_some(image_names)
+    covers = (item for item in options.rectifiers if isinstance(item, CoverOptions))
+    sources = {cover.shape_source for cover in covers}
+    shapes = {source: SHAPES.make(source, network, options.features) for source in sources}
+    rectifiers = tuple(
+        RECTIFIERS.make(
+            item,
+            RectifierInputs(
+                shapes[item.shape_source] if isinstance(item, CoverOptions) else None,
+                depth if item.uses_depth else None,
+            ),
+        )
+        for item in options.rectifiers
+    )
+    return ImageExtractor(options, extractor, rectifiers, weights, resources)
+
+
+def _prepared_elsewhere(
+    options: ExtractionOptions, resources: Resources, digests: Mapping[str, str]
+) -> ImageExtractor:
+    """Prepare a recipe in another process; depth maps of networks are not kept from there."""
+    extractor = prepare(options, replace(resources, depth_cache_path=None))
+    for key, path in extractor.weights.items():
+        if file_sha256(path) != digests[key]:
+            raise WeightsError(
+                f"{path}: is another file than {key} on the machine that leads the work; give "
+                "both the same"
+            )
+    return extractor
+
+
+def _device(options: ExtractionOptions, resources: Resources) -> str:
+    """Return the device that is there; torch is asked only when it is needed."""
+    if resources.device in ("auto", "cpu") and not options.uses_networks:
+        return "cpu"
+    from colmap_affrect.features.networks import resolve_device
+
+    return str(resolve_device(resources.device))

@@ -1,0 +1,245 @@
+"""What is done for one pair, in a thread of this process or on a worker of a cluster.
+
+Workers read features from shared storage. Where they do not see the file, those of its two images
+travel with each pair.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.features.weights import resolve
+from colmap_affrect.matchers.base import (
+    MATCHERS,
+    ImageFeatures,
+    MatcherContext,
+    MatcherOptions,
+    Matches,
+)
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import ordered_for_reuse
+from colmap_affrect.parallel.executor import Executor, Threads, available_cores
+from colmap_affrect.project.stores import FeatureStore, PairMatches
+from colmap_affrect.stages.context import Resources
+
+CACHE_BYTES = 1 << 29
+"""Memory that prepared images may take in a process."""
+
+BYTES_PER_FEATURE = 870
+"""Of a feature ready for matching, with descriptors of 128 and coarse ones."""
+
+
+def iterate_matches(
+    pairs: Sequence[Pair],
+    features: FeatureStore,
+    options: MatcherOptions,
+    level: int = 0,
+    resources: Resources | None = None,
+    executor: Executor | None = None,
+    extractor: str = "",
+) -> Generator[PairMatches, None, None]:
+    """Match pairs by the features of the images themselves and those of one level.
+
+    Pairs come in an order in which an image, once read, stays in memory for most of its pairs.
+
+    Args:
+        pairs: names of images.
+        features: of the images; workers that do not see the file get those of each pair.
+        options: of the matcher.
+        level: of escalation.
+        resources: weights and device.
+        executor: where to match; by default in a thread for each core.
+        extractor: name of the feature extractor.
+    """
+    if not pairs:
+        return
+    executor = executor or Threads(available_cores())
+    store = FeatureStore(features.path.absolute(), features.options_digest)
+    counts = store.num_keypoints()
+    num_similarities = sum(counts[first] * counts[second] for first, second in pairs)
+    num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
+    images = CachedMatcher(
+        store,
+        options,
+        level=level,
+        num_similarities=num_similarities,
+        resources=resources or Resources(),
+        extractor=extractor,
+    )
+    files = [store.path]
+    is_shared = executor.sees(files)
+    tasks = (
+        PairTask(pair, None if is_shared else (images.read(pair[0]), images.read(pair[1])))
+        for pair in ordered_for_reuse(pairs, max(1, num_kept // 2))
+    )
+    yield from executor.map(images, tasks, files if is_shared else ())
+
+
+@dataclass(frozen=True)
+class StoredFeatures:
+    """The features of an image that are matched.
+
+    Attributes:
+        image: the features.
+        indices: (N,) int64 that they have in the store.
+    """
+
+    image: ImageFeatures
+    indices: NDArray[np.int64]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Send what the store holds, in its precision."""
+        image, features = self.image, self.image.features
+        arrays = (
+            features.lafs.astype(np.float32),
+            features.responses,
+            features.descriptors.astype(np.float16),
+            features.rectification_ids,
+        )
+        return _received, (arrays, image.image_size, image.extractor, self.indices)
+
+
+def _received(
+    arrays: tuple[NDArray[Any], ...],
+    image_size: tuple[int, int],
+    extractor: str,
+    indices: NDArray[np.int64],
+) -> StoredFeatures:
+    lafs, responses, descriptors, ids = arrays
+    features = LocalFeatures(
+        lafs.astype(np.float64), responses, descriptors.astype(np.float32), ids
+    )
+    return StoredFeatures(ImageFeatures(features, image_size, extractor), indices)
+
+
+@dataclass(frozen=True)
+class PairTask:
+    """One pair to match; the features of its images where the worker does not see their file."""
+
+    names: Pair
+    sent: tuple[StoredFeatures, StoredFeatures] | None = None
+
+    def __str__(self) -> str:
+        return " and ".join(self.names)
+
+
+@dataclass(frozen=True)
+class PreparedImage:
+    """An image ready for matching.
+
+    Attributes:
+        content: what the matcher made of it.
+        keypoints: (N, 2) pixel-centre px.
+        indices: (N,) int64 that its features have in the store.
+    """
+
+    content: Any
+    keypoints: NDArray[np.floating]
+    indices: NDArray[np.int64]
+
+
+class CachedMatcher:
+    """Matches pairs, and keeps the images that it has prepared, as many as ``CACHE_BYTES`` hold.
+
+    Those not used for longest are dropped first. A copy in another process starts with none.
+    """
+
+    def __init__(
+        self,
+        store: FeatureStore,
+        options: MatcherOptions,
+        *,
+        level: int = 0,
+        max_num_features: int | None = None,
+        num_similarities: float = 0,
+        resources: Resources | None = None,
+        extractor: str = "",
+    ) -> None:
+        """Name the features and build the matcher.
+
+        Args:
+            store: where they are.
+            options: of the matcher.
+            level: of escalation; its features come together with those of level 0.
+            max_num_features: of the features of an image, those of the largest responses; None
+                takes all.
+            num_similarities: about how many pairs of features there will be to compare.
+            resources: weights and device.
+            extractor: name of the feature extractor.
+        """
+        resources = resources or Resources()
+        self._store, self._options, self._level = store, options, level
+        self._max_num_features, self._num_similarities = max_num_features, num_similarities
+        self._resources, self._extractor = resources, extractor
+        weights = resolve(options.weights, resources.weights_path)
+        context = MatcherContext(weights, resources.device, num_similarities)
+        self._matcher = MATCHERS.make(options, context)
+        self._images: OrderedDict[str, PreparedImage] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        given = {
+            "level": self._level,
+            "max_num_features": self._max_num_features,
+            "num_similarities": self._num_similarities,
+            "resources": self._resources,
+            "extractor": self._extractor,
+        }
+        return _rebuilt, (self._store, self._options, given)
+
+    def __call__(self, task: PairTask) -> PairMatches:
+        """Match by the features that came with the task, or by those in the store."""
+        if task.sent:
+            images = [self._prepare(stored) for stored in task.sent]
+        else:
+            images = [self.prepared(name) for name in task.names]
+        first, second = images
+        found = self.match(first, second)
+        rows, columns = found.indices.T
+        indices = np.stack([first.indices[rows], second.indices[columns]], axis=1)
+        count = int(first.indices.max(initial=-1)) + 1
+        return PairMatches(task.names, indices, found.scores, count, self._level)
+
+    def match(self, first: PreparedImage, second: PreparedImage) -> Matches:
+        """Match two images; indices are those among the features that were prepared."""
+        return self._matcher.match(first.content, second.content)
+
+    def read(self, name: str) -> StoredFeatures:
+        """Read the features of an image."""
+        indices = self._store.level_indices(name, self._level)
+        features = self._store.read(name).select(indices)
+        if self._max_num_features is not None:
+            order = np.argsort(-features.responses, kind="stable")
+            strongest = np.sort(order[: self._max_num_features])
+            indices, features = indices[strongest], features.select(strongest)
+        size = self._store.image_size(name)
+        return StoredFeatures(ImageFeatures(features, size, self._extractor), indices)
+
+    def _prepare(self, stored: StoredFeatures) -> PreparedImage:
+        content = self._matcher.prepare(stored.image)
+        return PreparedImage(content, stored.image.features.keypoints, stored.indices)
+
+    def prepared(self, name: str) -> PreparedImage:
+        """Return an image ready for matching."""
+        with self._lock:
+            if name not in self._images:
+                self._images[name] = self._prepare(self.read(name))
+            self._images.move_to_end(name)
+            while self._nbytes() > CACHE_BYTES and len(self._images) > 1:
+                self._images.popitem(last=False)
+            return self._images[name]
+
+    def _nbytes(self) -> int:
+        return sum(image.content.nbytes for image in self._images.values())
+
+
+def _rebuilt(store: FeatureStore, options: MatcherOptions, given: dict[str, Any]) -> CachedMatcher:
+    return CachedMatcher(store, options, **given)

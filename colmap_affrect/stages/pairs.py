@@ -1,0 +1,129 @@
+"""Pairs: which photographs are matched, into ``pairs.txt``."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from colmap_affrect.errors import StaleStoreError
+from colmap_affrect.matchers.base import Matches
+from colmap_affrect.matchers.nearest import NearestOptions
+from colmap_affrect.pairs.base import Pair, PairOptions
+from colmap_affrect.pairs.by_place import pairs_by_place
+from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, write_pairs
+from colmap_affrect.pairs.low_resolution import NUM_STRONGEST, low_resolution_pairs
+from colmap_affrect.pairs.retrieval import retrieved_pairs
+from colmap_affrect.project.report import StageReport
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.extract import Inputs, write_images_and_keypoints
+from colmap_affrect.stages.one_pair import CachedMatcher
+
+logger = logging.getLogger(__name__)
+
+MANY_IMAGES = 300
+MANY_PAIRS = (
+    "all pairs of %d images are %d; --pairs retrieval matches the promising ones only "
+    "(see --num-neighbors)"
+)
+
+
+def choose_pairs(
+    context: Context, options: PairOptions | None = None, *, overwrite: bool = False
+) -> StageReport:
+    """Write the list of the pairs to match: by default every pair of images.
+
+    When images are added, pairs that were chosen by other options than these stay.
+
+    Args:
+        context: with features.
+        options: how pairs are chosen; by default those on record.
+        overwrite: discard the pairs that are there, and what was made of them, first.
+
+    Raises:
+        PairListError: when the list cannot be used.
+        DatabaseError: when there are no positions to choose by.
+        StaleStoreError: when earlier pairs are missing in the list, or other options made them.
+    """
+    start = time.perf_counter()
+    workspace = context.workspace
+    options = options or PairOptions.from_mapping(
+        workspace.planned("pairs") or {}, str(workspace.config)
+    )
+    pairs = _given_pairs(context, options)
+    workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
+    there = _pairs_there(context)
+    if set(options.methods) == {"exhaustive"}:
+        _refuse_lost_pairs(workspace.pairs, there - pairs)
+    else:
+        pairs |= there | _similar_pairs(context, options, there)
+    write_pairs(workspace.pairs, sorted(pairs))
+    return StageReport("pairs", time.perf_counter() - start, len(pairs))
+
+
+def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
+    """Return the pairs that are listed or chosen by names and positions."""
+    context.workspace.require("extract")
+    names = context.features.names()
+    if "gps" in options.methods:
+        write_images_and_keypoints(context)
+    pairs = pairs_by_place(names, context.workspace.database, options)
+    if options.match_list_path:
+        # Images that could not be read may be in the list; only their pairs are dropped.
+        known = set(names)
+        all_names = Inputs.recorded(context.workspace).names()
+        listed = read_pairs(Path(options.match_list_path), all_names)
+        return pairs | {pair for pair in listed if known.issuperset(pair)}
+    if "exhaustive" in options.methods:
+        pairs |= set(exhaustive_pairs(names))
+        if len(names) > MANY_IMAGES:
+            logger.warning(MANY_PAIRS, len(names), len(pairs))
+    return pairs
+
+
+def _similar_pairs(context: Context, options: PairOptions, there: Collection[Pair]) -> set[Pair]:
+    """Return the pairs chosen by features; none when all images have pairs already."""
+    features, progress = context.features, context.progress
+    names = [name for name, count in features.num_keypoints().items() if count]
+    if len(names) < 2 or {name for pair in there for name in pair}.issuperset(names):
+        return set()
+    pairs: list[Pair] = []
+    if "retrieval" in options.methods:
+        pairs += retrieved_pairs(names, features.read, options.num_neighbors, progress)
+    if "low-resolution" in options.methods:
+        strongest = CachedMatcher(features, NearestOptions(), max_num_features=NUM_STRONGEST)
+
+        def match(pair: Pair) -> Matches:
+            return strongest.match(strongest.prepared(pair[0]), strongest.prepared(pair[1]))
+
+        pairs += low_resolution_pairs(names, match, options.num_neighbors, progress)
+    return set(pairs)
+
+
+def add_pairs(context: Context, pairs: Sequence[Pair]) -> None:
+    """Add pairs to those that are matched already, as pycolmap's matchers do."""
+    context.workspace.record_options("pairs", PairOptions().to_mapping())
+    write_pairs(context.workspace.pairs, sorted(_pairs_there(context).union(pairs)))
+
+
+def _pairs_there(context: Context) -> set[Pair]:
+    """Return the pairs that were chosen before."""
+    path = context.workspace.pairs
+    return set(listed_pairs(context)) if path.exists() and path.stat().st_size else set()
+
+
+def _refuse_lost_pairs(path: Path, lost: Collection[Pair]) -> None:
+    """Refuse to drop pairs that are matched already: they would stay in the database."""
+    if lost:
+        raise StaleStoreError(
+            f"{path}: has pairs that are not to be matched any more, such as "
+            f"{' and '.join(min(lost))}; use --overwrite to redo the pairs stage and those after it"
+        )
+
+
+def listed_pairs(context: Context) -> list[Pair]:
+    """Return the pairs of the list whose images have features."""
+    context.workspace.require("pairs")
+    names = context.features.names()
+    return read_pairs(context.workspace.pairs, names) if len(names) > 1 else []

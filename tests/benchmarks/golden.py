@@ -1,0 +1,240 @@
+"""Digests of whole runs: did a change of the code change any result?
+
+Runs the command line and the functions with pycolmap's names on the sample scene and, where it is,
+on photographs of ``../shared``, and writes one digest for each kind of result: features, raw
+matches, list of pairs, verified pairs, poses and points. Digests are those of one machine with one
+set of packages: run this before and after a change, and hold the two files against each other:
+
+    python tests/benchmarks/golden.py before.json
+    python tests/benchmarks/golden.py after.json --against before.json
+
+It reads results with h5py, sqlite3 and pycolmap only, so that it also runs on other versions of
+the package (``PYTHONPATH``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pycolmap
+
+ROOT = Path(__file__).parents[2]
+COURTYARD = ROOT / "sample_scenes" / "courtyard"
+SHARED = ROOT.parent / "shared"
+FOUNTAIN = SHARED / "scenes" / "strecha_fountain_p11" / "images"
+KERMIT = SHARED / "scenes" / "kermit" / "images"
+AFFNET = ["--recipe", "affnet-shapes", "--set", "features.descriptor=hardtfeat"]
+FEWER = [
+    "--set", "rectifier.max_num_rectifications=6", "--set", "features.max_num_features=3000",
+    "--set", "features.max_num_rectified_features=6000",
+]  # fmt: skip
+
+DROP_IN = """
+import sys
+import colmap_affrect, pycolmap
+database, images, pairs, sparse = sys.argv[1:]
+colmap_affrect.extract_features(database, images, camera_mode="SINGLE",
+    image_names=["court_1.jpg", "court_2.jpg", "court_3.jpg", "court_4.jpg"])
+colmap_affrect.match_image_pairs(database, pairing_options={"match_list_path": pairs})
+colmap_affrect.match_exhaustive(database)
+options = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=0, num_threads=1)
+pycolmap.incremental_mapping(database, images, sparse, options=options)
+"""
+
+
+def digest(*parts: Any) -> str:
+    """Hash texts and arrays, with shapes and dtypes."""
+    found = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            found.update(f"{part.shape}{part.dtype}".encode())
+            found.update(np.ascontiguousarray(part).tobytes())
+        else:
+            found.update(str(part).encode())
+        found.update(b"\0")
+    return found.hexdigest()[:16]
+
+
+def h5_digest(path: Path) -> str:
+    """Digest all datasets of a file, and the attributes that are results."""
+    parts: list[Any] = []
+
+    def add(name: str, item: Any) -> None:
+        parts.append(name)
+        if isinstance(item, h5py.Dataset):
+            parts.append(item[()])
+        kept = ("level", "tried_level", "complete", "uncertainty")
+        parts.append(sorted((key, str(item.attrs[key])) for key in item.attrs if key in kept))
+
+    with h5py.File(path, "r") as file:
+        file.visititems(add)
+    return digest(*parts)
+
+
+def database_digests(path: Path) -> dict[str, str]:
+    """Digest keypoints, cameras, raw matches and verified pairs."""
+    queries = {
+        "cameras": "SELECT camera_id, model, width, height, params FROM cameras ORDER BY 1",
+        "keypoints": "SELECT image_id, rows, cols, data FROM keypoints ORDER BY 1",
+        "descriptors": "SELECT image_id, rows, cols, data FROM descriptors ORDER BY 1",
+        "raw": "SELECT pair_id, rows, cols, data FROM matches ORDER BY 1",
+        "verified": "SELECT pair_id, rows, cols, data, config FROM two_view_geometries ORDER BY 1",
+    }
+    with closing(sqlite3.connect(path)) as connection:
+        return {key: digest(*connection.execute(query)) for key, query in queries.items()}
+
+
+def models_digest(sparse: Path) -> str:
+    """Digest poses, cameras and points of all models."""
+    parts: list[Any] = []
+    for folder in sorted(path for path in sparse.iterdir() if path.name.isdigit()):
+        model = pycolmap.Reconstruction(folder)
+        for image_id in sorted(model.reg_image_ids()):
+            image = model.images[image_id]
+            parts += [image.name, np.asarray(image.cam_from_world().matrix())]
+            parts.append(np.asarray(image.camera.params))
+        points = sorted(tuple(point.xyz.tolist()) for point in model.points3D.values())
+        parts.append(np.asarray(points))
+    return digest(*parts)
+
+
+def folder_digests(path: Path) -> dict[str, str]:
+    """Digest an output folder."""
+    return {
+        "features": h5_digest(path / "features.h5"),
+        "matches": h5_digest(path / "matches.h5"),
+        "pairs": digest((path / "pairs.txt").read_text(encoding="utf-8")),
+        **database_digests(path / "database.db"),
+        "models": models_digest(path / "sparse"),
+    }
+
+
+def command(*arguments: object) -> None:
+    """Run the command line."""
+    environment = {**os.environ, "COLMAP_AFFRECT_WEIGHTS": str(SHARED / "weights")}
+    line = [sys.executable, "-m", "colmap_affrect", *map(str, arguments)]
+    done = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(line)}: exit code {done.returncode}\n{done.stderr[-2000:]}")
+
+
+def run_digests(work: Path, images: Path, names: list[str], options: list[str]) -> dict[str, str]:
+    """Run on some images of a folder and digest the results."""
+    work.mkdir(parents=True)
+    listed = work / "names.txt"
+    listed.write_text("\n".join(names), encoding="utf-8")
+    given = ["--image-path", images, "--image-list-path", listed, "--output-path", work / "out"]
+    command("run", "--quiet", *given, *options)
+    return folder_digests(work / "out")
+
+
+def drop_in_digests(work: Path) -> dict[str, str]:
+    """Run the functions with pycolmap's names on four photographs of the courtyard."""
+    work.mkdir(parents=True)
+    pairs = work / "pairs.txt"
+    pairs.write_text("court_1.jpg court_2.jpg\n", encoding="utf-8")
+    paths = [work / "x.db", COURTYARD / "images", pairs, work / "sparse"]
+    (work / "sparse").mkdir()
+    subprocess.run([sys.executable, "-c", DROP_IN, *map(str, paths)], check=True)
+    return {**database_digests(work / "x.db"), "models": models_digest(work / "sparse")}
+
+
+def interop_digests(work: Path, run: Path) -> dict[str, str]:
+    """Export an output folder in both layouts, and import one of them again."""
+    work.mkdir(parents=True)
+    found = {}
+    for layout in ("hloc", "dim"):
+        paths = [work / f"{kind}-{layout}.h5" for kind in ("features", "matches")]
+        files = ["--features-path", paths[0], "--matches-path", paths[1]]
+        command("export-h5", "--quiet", "--output-path", run, *files, "--layout", layout)
+        for path in paths:
+            found[path.stem] = h5_digest(path)
+    files = ["--features-path", work / "features-hloc.h5"]
+    files += ["--matches-path", work / "matches-hloc.h5"]
+    database = work / "imported.db"
+    images = COURTYARD / "images"
+    command("import-h5", "--quiet", "--image-path", images, *files, "--database-path", database)
+    return found | database_digests(database)
+
+
+def scenarios(work: Path) -> dict[str, dict[str, str]]:
+    """Run everything and return the digests by name."""
+    court = sorted(path.name for path in (COURTYARD / "images").iterdir())
+    depth = ["--depth-path", str(COURTYARD / "depth")]
+    jobs: dict[str, tuple[Path, list[str], list[str]]] = {
+        "courtyard default": (COURTYARD / "images", court, []),
+        "courtyard on-demand": (COURTYARD / "images", court, ["--recipe", "on-demand"]),
+        "courtyard depth-affnet-recommended": (
+            COURTYARD / "images", court[:5], ["--recipe", "depth-affnet-recommended", *depth],
+        ),
+        "courtyard depth-planes, global mapper, descriptors": (
+            COURTYARD / "images", court,
+            ["--recipe", "depth-planes-recommended", *depth, "--mapper", "global",
+             "--database-descriptors", "--preset", "colmap"],
+        ),
+        "courtyard retrieval, low resolution": (
+            COURTYARD / "images", court,
+            ["--pairs", "retrieval,low-resolution,sequence", "--num-neighbors", "2"],
+        ),
+    }  # fmt: skip
+    if SHARED.is_dir():
+        fountain = ["0000.jpg", "0005.jpg", "0010.jpg"]
+        kermit = sorted(path.name for path in KERMIT.iterdir())
+        jobs |= {
+            "courtyard affnet-shapes": (COURTYARD / "images", court[:3], AFFNET),
+            "fountain default": (FOUNTAIN, fountain, []),
+            "fountain on-demand": (FOUNTAIN, fountain, ["--recipe", "on-demand"]),
+            "fountain affnet-shapes": (FOUNTAIN, fountain, [*AFFNET, *FEWER]),
+            "kermit default": (KERMIT, kermit, []),
+            "kermit on-demand": (KERMIT, kermit, ["--recipe", "on-demand"]),
+            "kermit affnet-shapes": (KERMIT, kermit[:5], [*AFFNET, *FEWER]),
+        }
+    found = {}
+    for number, (name, (images, names, options)) in enumerate(jobs.items()):
+        start = time.perf_counter()
+        found[name] = run_digests(work / str(number), images, names, options)
+        sys.stderr.write(f"{name}: {time.perf_counter() - start:.1f} s\n")
+    found["drop-in functions"] = drop_in_digests(work / "drop-in")
+    found["export and import"] = interop_digests(work / "interop", work / "0" / "out")
+    return found
+
+
+def main() -> int:
+    """Write the digests, and tell which of them differ from others."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("output", type=Path, help="file to write")
+    parser.add_argument("--against", type=Path, help="file of another version to compare with")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as work:
+        found = scenarios(Path(work))
+    options.output.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    if not options.against:
+        return 0
+    expected = json.loads(options.against.read_text(encoding="utf-8"))
+    different = [
+        f"{name}: {kind}"
+        for name, digests in expected.items()
+        for kind, value in digests.items()
+        if found.get(name, {}).get(kind) != value
+    ]
+    print("\n".join(f"differs: {line}" for line in different) or f"{len(expected)} runs: the same")
+    return bool(different)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

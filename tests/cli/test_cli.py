@@ -1,0 +1,391 @@
+"""The real command line in processes of its own: what it prints where, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import shutil
+import signal
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import pytest
+from small_scene import INTRINSICS, write_photographs
+
+from colmap_affrect import __version__
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import load_recipe, recipe_names
+
+COMMANDS = [
+    "run", "extract", "pairs", "match", "verify", "escalate", "map",
+    "compare", "evaluate", "inspect", "recipes", "weights", "doctor",
+]  # fmt: skip
+TIMEOUT_S = 60
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos")
+    write_photographs(folder, 3)
+    return folder
+
+
+def run_command(
+    *arguments: object, python: tuple[str, ...] = (), environment: dict[str, str] | None = None
+) -> subprocess.CompletedProcess:
+    command = [sys.executable, *python, "-m", "colmap_affrect", *map(str, arguments)]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+        env={**os.environ, **(environment or {})},
+    )  # fmt: skip
+
+
+def run_arguments(photos: Path, out: Path) -> list[str]:
+    return [
+        "--image-path", str(photos), "--output-path", str(out),
+        "--camera-mode", "single", "--camera-model", "PINHOLE", "--camera-params", INTRINSICS,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
+def test_help_has_options_and_examples(command: list[str]) -> None:
+    done = run_command(*command, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "colmap-affrect run --image-path photos --output-path out" in done.stdout
+    assert "Exit codes: 0 done" in done.stdout
+    if not command:
+        assert all(f"    {name} " in done.stdout for name in COMMANDS)
+    elif command[0] not in ("recipes", "weights", "doctor"):
+        assert all(flag in done.stdout for flag in ("--output-path", "--quiet"))
+        assert ("--overwrite" in done.stdout) == (command != ["inspect"])
+
+
+def test_help_loads_no_heavy_package() -> None:
+    script = (
+        "import sys; from colmap_affrect.cli import main\n"
+        "try: main(['run', '--help'])\n"
+        "except SystemExit as end: assert end.code == 0\n"
+        "heavy = {'torch', 'kornia', 'pycolmap', 'cv2', 'h5py', 'matplotlib', 'scipy'}\n"
+        "print('loaded', sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", script],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[-1] == "loaded []"
+
+
+def test_version_is_that_of_the_package() -> None:
+    done = run_command("--version")
+    assert (done.returncode, done.stdout) == (0, f"colmap-affrect {__version__}\n")
+
+
+def test_recipes_are_listed_with_what_they_need() -> None:
+    done = run_command("recipes")
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    assert [line.split()[0] for line in lines[::2]] == recipe_names()
+    needs = {name.split()[0]: line.strip() for name, line in zip(*[iter(lines)] * 2, strict=True)}
+    assert needs["default"] == needs["on-demand"] == "needs nothing"
+    assert needs["dense-affnet"] == "needs affnet, hardnet, orinet"
+    assert needs["depth-planes-recommended"] == "needs depth"
+
+
+def test_one_recipe_is_printed_with_all_options_and_can_be_used_as_a_file(tmp_path: Path) -> None:
+    done = run_command("recipes", "on-demand")
+    assert (done.returncode, done.stderr) == (0, "")
+    path = tmp_path / "copy.toml"
+    path.write_text(done.stdout)
+    copy, original = load_recipe(str(path)), load_recipe("on-demand")
+    assert (copy.extraction, copy.matching) == (original.extraction, original.matching)
+
+
+def test_weights_are_listed_with_where_they_are(tmp_path: Path) -> None:
+    (tmp_path / "AffNet.pth").write_bytes(b"not the published file")
+    done = run_command("weights", "--weights", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"{tmp_path / 'AffNet.pth'}, NOT the published file" in done.stdout
+    assert "65c8bb2cf71e913818522d09dcc4262bcbcef5d756baa86a41f28526c2d61160" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["rum"],
+        ["run"],
+        ["run", "--image-path", "x"],
+        ["map", "--output-path", "{out}", "--camera-mode", "single"],
+        ["run", "--image-path", "x", "--output-path", "{out}", "--camera-mode", "double"],
+        ["run", "--image-path", "x", "--output-path", "{out}", "--random-seed", "one"],
+        ["match", "--output-path", "{out}", "-q", "-v"],
+    ],
+)
+def test_wrong_usage_ends_with_2_and_does_nothing(tmp_path: Path, arguments: list[str]) -> None:
+    out = tmp_path / "out"
+    done = run_command(*[argument.format(out=out) for argument in arguments])
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "usage: colmap-affrect" in done.stderr
+    assert "error:" in done.stderr.splitlines()[-1]
+    assert not out.exists()
+
+
+def test_json_goes_to_stdout_alone_and_progress_to_stderr(photos: Path, tmp_path: Path) -> None:
+    done = run_command("run", *run_arguments(photos, tmp_path / "out"), "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["images_registered"] == 3
+    assert report == json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
+    lines = done.stderr.splitlines()
+    assert "extract: 3/3 images" in lines
+    assert "match: 3/3 pairs" in lines
+    # What COLMAP prints is in the log.
+    assert all(line.split(":")[0] in ("extract", "match", "verify", "map") for line in lines)
+    log = (tmp_path / "out" / "run.log").read_text(encoding="utf-8")
+    assert "colmap-affrect" in log
+    assert ".cc:" in log
+
+
+def test_quiet_prints_the_result_only_and_verbose_every_image(photos: Path, tmp_path: Path) -> None:
+    arguments = run_arguments(photos, tmp_path / "out")
+    done = run_command("run", *arguments, "-q", python=("-W", "error"))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("registered  3 of 3 images\n")
+    done = run_command("extract", *arguments, "--overwrite", "--verbose")
+    assert done.returncode == 0
+    assert done.stdout.startswith("extract: 3 done in ")
+    assert "DEBUG: a.png: " in done.stderr
+
+
+def test_long_options_are_accepted_with_underscores(photos: Path, tmp_path: Path) -> None:
+    underscored = [
+        argument.replace("-", "_").replace("__", "--", 1) if argument.startswith("--") else argument
+        for argument in run_arguments(photos, tmp_path / "out")
+    ]
+    assert "--image_path" in underscored
+    done = run_command("extract", *underscored, "--max_failures", 0, "--quiet")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_failure_prints_one_line_and_leaves_the_traceback_in_the_log(tmp_path: Path) -> None:
+    done = run_command("run", "--image-path", tmp_path / "none", "--output-path", tmp_path / "out")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.splitlines() == [
+        f"error: {tmp_path / 'none'}: no such folder; give the folder of the photographs"
+    ]
+    log = (tmp_path / "out" / "run.log").read_text()
+    assert "Traceback" in log
+    assert "ImageError" in log
+
+
+def _restore_interrupt() -> None:
+    """Test runners in the background ignore SIGINT, and their children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("line", ["extract: 1/3 images", "match: 1/3 pairs", "verify: 3/3 pairs"])
+def test_interrupt_ends_with_130_and_a_later_run_completes(
+    photos: Path, tmp_path: Path, line: str
+) -> None:
+    arguments = ["run", *run_arguments(photos, tmp_path / "out")]
+    with subprocess.Popen(
+        [sys.executable, "-m", "colmap_affrect", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=_restore_interrupt,  # noqa: PLW1509  (nothing here uses threads)
+    ) as process:
+        while (printed := process.stderr.readline().strip()) != line:
+            assert printed, process.wait()
+        os.kill(process.pid, signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=TIMEOUT_S)
+    assert (process.returncode, stdout) == (130, "")
+    lines = stderr.splitlines()
+    assert lines[-1] == "interrupted; run the same command again to go on"
+    stages = ("extract: ", "match: ", "verify: ", "map: ")
+    assert all(text.startswith(stages) for text in lines[:-1])
+    assert not Workspace(tmp_path / "out").report.exists()
+    done = run_command(*arguments, "-q")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("registered  3 of 3 images")
+
+
+ENDLESS = {
+    "incremental": [
+        "ba_global_max_refinements=1000000000", "ba_global_max_refinement_change=0",
+    ],
+    "global": ["max_num_irls_iterations=1000000000", "irls_step_convergence_threshold=-1"],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def verified(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run with COLMAP's preset and its global mapper."""
+    out = tmp_path_factory.mktemp("verified") / "out"
+    done = run_command(
+        "run", *run_arguments(photos, out), "--recipe", "unrectified-rootsift", "-q",
+        "--preset", "colmap", "--mapper", "global",
+        "--mapper-options", "track_min_num_views_per_track=2", "multiple_models=false",
+        "--mapper-options", "mapper.bundle_adjustment.min_track_length=2",
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    return out
+
+
+def test_preset_mapper_and_its_options_are_in_the_report_and_on_record(verified: Path) -> None:
+    given = {
+        "mapper.track_min_num_views_per_track": 2,
+        "multiple_models": False,
+        "mapper.bundle_adjustment.min_track_length": 2,
+    }
+    report = json.loads((verified / "report.json").read_text(encoding="utf-8"))
+    assert report["images_registered"] == 3
+    assert (report["preset"], report["mapper"]) == ("colmap", "global")
+    assert report["mapper_options"] == given
+    assert report["verification"]["min_num_inliers"] == 15
+    assert report["mapping"]["min_model_size"] == 3
+    differs = report["differs_from_colmap"]
+    assert differs["verification"] == {"ransac.random_seed": 0}
+    assert {key: differs["mapping"].get(key) for key in given} == given
+    assert "mapper.retriangulation.ignore_two_view_tracks" not in differs["mapping"]
+    record = Workspace(verified).recorded()["map"]
+    assert record["name"] == "global"
+    assert record["mapper_options"]["mapper.bundle_adjustment.min_track_length"] == 2
+    done = run_command(
+        "map", "--output-path", verified, "-q", "--preset", "colmap", "--mapper", "global"
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "min_track_length=2, and it is None now" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["--preset", "dense"], 2, "invalid choice: 'dense'"),
+        (["--mapper-options"], 2, "expected at least one argument"),
+        (["--mapper-options", "min_model_size"], 1, "min_model_size: expected KEY=VALUE"),
+        (["--mapper-options", "__import__('os')=1"], 1, "pycolmap has no such option"),
+    ],
+)
+def test_wrong_mapping_options_are_said_before_any_image_is_read(
+    tmp_path: Path, arguments: list[str], code: int, message: str
+) -> None:
+    out = tmp_path / "out"
+    done = run_command("run", "--image-path", tmp_path, "--output-path", out, *arguments)
+    assert (done.returncode, done.stdout) == (code, "")
+    assert message in done.stderr.splitlines()[-1]
+    assert not (out / "config.toml").exists()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+def test_interrupted_mapping_ends_with_130_and_leaves_no_half_written_models(
+    verified: Path, tmp_path: Path, mapper: str
+) -> None:
+    out = Path(shutil.copytree(verified, tmp_path / "out"))
+    arguments = ["map", "--output-path", str(out), "--mapper", mapper, "--overwrite"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "colmap_affrect", *arguments, "--mapper-options", *ENDLESS[mapper]],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=_restore_interrupt,  # noqa: PLW1509  (nothing here uses threads)
+    ) as process:
+        if mapper == "incremental":
+            assert process.stderr.readline() == "map: 2/3 images\n"
+        while not (out / "sparse.partial" / "raw").exists():
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=TIMEOUT_S)
+    assert (process.returncode, stdout) == (130, "")
+    assert stderr == "interrupted; run the same command again to go on\n"
+    assert not list(out.glob("sparse*"))
+    assert not (out / "report.json").exists()
+    done = run_command(*arguments, "-q")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("registered  3 of 3 images\n")
+    preset = "colmap for verification, sparse for mapping"
+    assert f"preset      {preset}, {mapper} mapper\n" in done.stdout
+
+
+def test_terminal_gets_bars(photos: Path, tmp_path: Path) -> None:
+    controller, terminal = pty.openpty()
+    termios.tcsetwinsize(terminal, (24, 80))
+    arguments = run_arguments(photos, tmp_path / "out")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "colmap_affrect", "extract", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=terminal,
+        text=True,
+    )
+    with process:
+        os.close(terminal)
+        shown = b""
+        try:
+            while data := os.read(controller, 4096):
+                shown += data
+        except OSError:  # Linux tells the end of a terminal so.
+            pass
+        finally:
+            os.close(controller)
+    assert process.returncode == 0
+    assert b"extract: 100%" in shown
+    assert b"3/3" in shown
+
+
+FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images" / "view_5_tilt70.jpg"
+
+
+def test_inspect_draws_a_sheet_and_writes_the_plan(tmp_path: Path) -> None:
+    out = tmp_path / "out č"
+    done = run_command("inspect", FACADE, "--output-path", out, "--set", "max_image_size_px=400")
+    assert (done.returncode, done.stderr) == (0, "")
+    plan = json.loads((out / "view_5_tilt70-plan.json").read_text(encoding="utf-8"))
+    assert plan["levels"][0]["warps"][0]["tilt"] > 1.7
+    sheet = out / "view_5_tilt70-inspection.png"
+    assert sheet.stat().st_size > 50_000
+    assert str(sheet) in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--device", "gpu"], "--device gpu: not one of auto, cpu, cuda"),
+        (["--recipe", "depth-planes-recommended"], "give --depth-path FOLDER, or --depth-model"),
+        (["--recipe", "depth-planes-recommended", "--depth-path", "nowhere"], "nowhere"),
+        (["--recipe", "dense-affnet", "--weights", "nowhere"], "nowhere: not a folder"),
+    ],
+)
+def test_what_is_missing_is_said_before_any_image_is_read(
+    tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    write_photographs(tmp_path / "photos", 2)
+    out = tmp_path / "out"
+    done = run_command("run", "--image-path", tmp_path / "photos", "--output-path", out, *arguments)
+    assert (done.returncode, done.stdout) == (1, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert message in line
+    assert not (out / "features.h5").exists()
+
+
+def test_missing_weights_are_one_error_with_the_way_out(tmp_path: Path) -> None:
+    write_photographs(tmp_path / "photos", 2)
+    empty = tmp_path / "weights"
+    empty.mkdir()
+    done = run_command(
+        "run", "--image-path", tmp_path / "photos", "--output-path", tmp_path / "out",
+        "--recipe", "dense-affnet", "--weights", empty,
+        environment={"TORCH_HOME": str(tmp_path / "torch"), "https_proxy": "http://127.0.0.1:9",
+                     "COLMAP_AFFRECT_WEIGHTS": ""},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (1, "")
+    for said in ("AffNet.pth", str(empty), "COLMAP_AFFRECT_WEIGHTS", "default"):
+        assert said in done.stderr

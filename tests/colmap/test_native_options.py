@@ -1,0 +1,138 @@
+"""pycolmap's own options by name: every value is converted or refused in one line."""
+
+from __future__ import annotations
+
+import json
+from enum import Enum
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.native_options import flat_values, resolve, set_values
+from colmap_affrect.errors import OptionError
+
+FLAG = "--mapper-options"
+
+
+class Backend(Enum):
+    """Stands for an enumeration of pycolmap."""
+
+    CERES = 1
+
+
+def options_of(mapper: str) -> object:
+    if mapper == "global":
+        return pycolmap.GlobalPipelineOptions()
+    return pycolmap.IncrementalPipelineOptions()
+
+
+@pytest.mark.parametrize(
+    ("mapper", "key", "value", "full_key", "resolved"),
+    [
+        ("incremental", "mapper.init_max_error", "3", "mapper.init_max_error", 3.0),
+        ("incremental", "init_max_error", "2.5e0", "mapper.init_max_error", 2.5),
+        ("incremental", "init_max_error", 3, "mapper.init_max_error", 3.0),
+        ("incremental", "num_threads", "-1", "num_threads", -1),
+        ("incremental", "mapper.num_threads", 4, "mapper.num_threads", 4),
+        ("incremental", "ba_refine_principal_point", "True", "ba_refine_principal_point", True),
+        ("incremental", "ba_refine_principal_point", "0", "ba_refine_principal_point", False),
+        ("incremental", "ba_refine_principal_point", True, "ba_refine_principal_point", True),
+        ("incremental", "ba_gpu_index", "0,1", "ba_gpu_index", "0,1"),
+        ("incremental", "ba_local_backend", "ceres", "ba_local_backend", "CERES"),
+        ("incremental", "ba_local_backend", Backend.CERES, "ba_local_backend", "CERES"),
+        ("incremental", "snapshot_path", "a b/č", "snapshot_path", "a b/č"),
+        ("incremental", "snapshot_path", Path("a b"), "snapshot_path", "a b"),
+        (
+            "global",
+            "max_num_l1_iterations",
+            "7",
+            "mapper.rotation_averaging.max_num_l1_iterations",
+            7,
+        ),
+        (
+            "global",
+            "linear_solver_type",
+            "DENSE_SCHUR",
+            "mapper.bundle_adjustment.ceres.solver_options.linear_solver_type",
+            "DENSE_SCHUR",
+        ),
+    ],
+)
+def test_option_is_converted_to_pycolmaps_type_and_taken_by_pycolmap(
+    mapper: str, key: str, value: object, full_key: str, resolved: object
+) -> None:
+    found = resolve(options_of(mapper), {key: value}, FLAG)
+    assert found == {full_key: resolved}
+    assert type(found[full_key]) is type(resolved)
+    assert resolve(options_of(mapper), found, FLAG) == found
+    native = options_of(mapper)
+    set_values(native, found)
+    taken = flat_values(native)[full_key]
+    if isinstance(resolved, str) and not isinstance(taken, str):
+        taken = str(taken) if isinstance(taken, Path) else taken.name
+    assert taken == resolved
+
+
+@pytest.mark.parametrize(
+    ("mapper", "key", "value", "message"),
+    [
+        ("incremental", "mapper.init_max_eror", "3", "did you mean 'mapper.init_max_error'"),
+        ("incremental", "init_max_eror", "3", "did you mean 'mapper.init_max_error'"),
+        ("incremental", "zzzzzz", "3", "zzzzzz: pycolmap has no such option"),
+        ("incremental", "mapper", "3", "mapper: pycolmap has no such option"),
+        ("incremental", "__class__", "3", "pycolmap has no such option"),
+        ("incremental", "", "3", "pycolmap has no such option"),
+        (
+            "global",
+            "gpu_index",
+            "0",
+            "several sections; give mapper.global_positioning.gpu_index or mapper.bundle_adjust",
+        ),
+        ("incremental", "min_model_size", "2.5", "min_model_size=2.5: expected int"),
+        ("incremental", "min_model_size", True, "min_model_size=True: expected int"),
+        ("incremental", "min_model_size", "9" * 11, "outside the range of int"),
+        ("incremental", "init_max_error", "wide", "init_max_error=wide: expected float"),
+        ("incremental", "init_max_error", False, "expected float"),
+        ("incremental", "init_max_error", "nan", "expected float (a finite number)"),
+        ("incremental", "init_max_error", "-inf", "expected float (a finite number)"),
+        ("incremental", "multiple_models", "yes", "expected bool (true or false)"),
+        ("incremental", "multiple_models", 1, "expected bool (true or false)"),
+        ("incremental", "ba_gpu_index", 0, "expected str"),
+        ("incremental", "snapshot_path", 1.5, "expected path"),
+        ("incremental", "ba_local_backend", "GPU", "expected one of CERES, CASPAR"),
+        ("incremental", "ba_local_backend", 1, "expected one of CERES, CASPAR"),
+        ("incremental", "constant_cameras", "1", "of type set"),
+        ("incremental", "image_names", "a.png", "of type list"),
+        ("global", "gravity_dir", "1", "of type ndarray"),
+        ("incremental", "image_path", "x", "it is the one that extract was given"),
+        ("global", "mapper.image_path", "x", "it is the one that extract was given"),
+        ("incremental", "random_seed", "1", "use --random-seed"),
+        ("incremental", "mapper.random_seed", "1", "use --random-seed"),
+        ("global", "mapper.retriangulation.random_seed", "1", "use --random-seed"),
+    ],
+)
+def test_option_that_pycolmap_does_not_take_is_one_clear_line(
+    mapper: str, key: str, value: object, message: str
+) -> None:
+    with pytest.raises(OptionError) as error:
+        resolve(options_of(mapper), {key: value}, FLAG)
+    text = str(error.value)
+    assert text.startswith(f"{FLAG} {key}")
+    assert message in text
+    assert "\n" not in text
+
+
+@given(
+    key=st.sampled_from(sorted(flat_values(pycolmap.IncrementalPipelineOptions())))
+    | st.text(max_size=12),
+    value=st.text(max_size=12) | st.floats() | st.integers() | st.booleans() | st.none(),
+)
+def test_any_option_is_taken_or_refused_with_our_error(key: str, value: object) -> None:
+    try:
+        found = resolve(pycolmap.IncrementalPipelineOptions(), {key: value}, FLAG)
+    except OptionError:
+        return
+    assert json.loads(json.dumps(found)) == found

@@ -1,0 +1,158 @@
+"""Camera poses against ground truth: hand-made poses with known errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.poses import (
+    Poses,
+    area_under_curve,
+    correct_images,
+    disagreeing_images,
+    pair_errors,
+    pose_scores,
+    position_errors,
+    read_poses,
+)
+from colmap_affrect.errors import ComparisonError
+
+
+def rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
+    """Return the rotation matrix about an axis."""
+    unit = np.array(axis) / np.linalg.norm(axis)
+    return cv2.Rodrigues(np.radians(degrees) * unit)[0]
+
+
+@pytest.fixture
+def truth() -> Poses:
+    """Five cameras on an arc, looking at its centre."""
+    return {
+        f"{i}.jpg": (rotation((0, 1, 0), 20 * i), np.array([0.1 * i * i, 0.3 * i, 5.0]))
+        for i in range(5)
+    }
+
+
+def turned(poses: Poses, name: str, degrees: float) -> Poses:
+    """Turn one camera about its own centre."""
+    turn = rotation((1, 2, 3), degrees)
+    return {**poses, name: (turn @ poses[name][0], turn @ poses[name][1])}
+
+
+def moved(poses: Poses, name: str, centre: tuple[float, float, float]) -> Poses:
+    """Move the centre of one camera."""
+    return {**poses, name: (poses[name][0], -poses[name][0] @ np.array(centre))}
+
+
+def num_correct(estimated: Poses, truth: Poses) -> int:
+    return len(correct_images(pair_errors(estimated, truth)))
+
+
+def test_similarity_of_the_world_changes_nothing(truth: Poses) -> None:
+    world, shift, scale = rotation((3, 1, 2), 50), np.array([7.0, -8, 9]), 0.2
+    estimated = {
+        name: (matrix @ world, matrix @ shift + scale * translation)
+        for name, (matrix, translation) in truth.items()
+    }
+    scores = pose_scores(estimated, truth, list(truth))
+    assert scores.correct_names == tuple(truth)
+    assert scores.median_rotation_error_deg == pytest.approx(0, abs=1e-6)
+    assert scores.median_direction_error_deg == pytest.approx(0, abs=1e-6)
+    assert scores.median_position_error == pytest.approx(0, abs=1e-9)
+    assert scores.auc == pytest.approx({1: 1, 3: 1, 5: 1, 10: 1}, abs=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [1.0, 90.0, 179.0])
+def test_injected_rotation_is_measured(truth: Poses, degrees: float) -> None:
+    errors = pair_errors(turned(truth, "4.jpg", degrees), truth)
+    assert errors["0.jpg", "4.jpg"][0] == pytest.approx(degrees)
+    assert errors["0.jpg", "1.jpg"] == pytest.approx((0, 0))
+
+
+def test_injected_direction_is_measured() -> None:
+    truth = {"a": (np.eye(3), np.zeros(3)), "b": (np.eye(3), np.array([1.0, 0, 0]))}
+    estimated = {**truth, "b": (np.eye(3), np.array([0.0, 2.0, 0]))}
+    assert pair_errors(estimated, truth)["a", "b"] == pytest.approx((0, 90))
+    assert num_correct(estimated, truth) == 0
+
+
+def test_one_turned_camera_is_wrong_and_the_others_right(truth: Poses) -> None:
+    assert num_correct(turned(truth, "2.jpg", 6), truth) == 4
+    assert num_correct(turned(truth, "2.jpg", 3), truth) == 5
+
+
+def test_half_of_the_others_decides(truth: Poses) -> None:
+    """Of five cameras two turned ones leave three right: 2 of 4 others are half."""
+    estimated = turned(turned(truth, "0.jpg", 10), "1.jpg", 60)
+    assert num_correct(estimated, truth) == 3
+    del estimated["4.jpg"]
+    assert num_correct(estimated, truth) == 0
+
+
+@pytest.mark.parametrize("num_images", [0, 1])
+def test_no_pairs(truth: Poses, num_images: int) -> None:
+    estimated = dict(list(truth.items())[:num_images])
+    scores = pose_scores(estimated, truth, list(truth))
+    assert (scores.correct_names, scores.num_pairs) == ((), 10)
+    assert scores.median_rotation_error_deg is None
+    assert scores.median_position_error is None
+    assert set(scores.auc.values()) == {0.0}
+
+
+def test_area_under_the_curve_is_that_of_the_steps() -> None:
+    """Of 5 pairs two are at 0 and 2 degrees: 1/5 from 0 to 2, 2/5 from 2 to 4."""
+    assert area_under_curve([2.0, 0.0, 7.0], 5, 4.0) == pytest.approx((0.2 * 2 + 0.4 * 2) / 4)
+    assert area_under_curve([], 0, 4.0) == 0
+
+
+def test_missing_images_count_as_failures(truth: Poses) -> None:
+    """Three of four given images make 3 of 6 pairs; images that were not given do not count."""
+    given = ["0.jpg", "1.jpg", "2.jpg", "3.jpg"]
+    estimated = {name: truth[name] for name in ("0.jpg", "1.jpg", "2.jpg", "4.jpg")}
+    estimated["without truth.jpg"] = truth["0.jpg"]
+    scores = pose_scores(estimated, truth, given)
+    assert scores.num_pairs == 6
+    assert len(scores.pair_errors_deg) == 3
+    assert scores.correct_names == ("0.jpg", "1.jpg", "2.jpg")
+    assert scores.auc[1.0] == pytest.approx(0.5, abs=1e-6)
+
+
+def test_one_camera_far_off_does_not_move_the_others(truth: Poses) -> None:
+    errors = position_errors(moved(truth, "2.jpg", (50, 0, 0)), truth)
+    centre = -truth["2.jpg"][0].T @ truth["2.jpg"][1]
+    expected = np.linalg.norm(np.array([50, 0, 0]) - centre)
+    assert errors.pop("2.jpg") == pytest.approx(expected)
+    assert max(errors.values()) < 1e-9
+
+
+def test_models_disagree_about_the_camera_that_differs(truth: Poses) -> None:
+    other = moved(truth, "2.jpg", (50, 0, 0))
+    del other["4.jpg"]
+    assert disagreeing_images(truth, other) == ("2.jpg",)
+    assert disagreeing_images(truth, {"0.jpg": truth["1.jpg"]}) == ()
+
+
+def test_poses_are_read_from_text_and_binary_models(tmp_path: Path) -> None:
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1)
+    model = pycolmap.synthesize_dataset(options)
+    (tmp_path / "text").mkdir()
+    model.write(tmp_path)
+    model.write_text(tmp_path / "text")
+    for poses in (read_poses(tmp_path), read_poses(tmp_path / "text")):
+        assert len(poses) == model.num_images()
+        for image in model.images.values():
+            expected = image.cam_from_world().matrix()
+            np.testing.assert_allclose(np.column_stack(poses[image.name]), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("content", [None, "nothing of COLMAP\n"])
+def test_folder_without_a_model_is_refused(tmp_path: Path, content: str | None) -> None:
+    if content:
+        for name in ("cameras.txt", "images.txt", "points3D.txt"):
+            (tmp_path / name).write_text(content)
+    with pytest.raises(ComparisonError, match="not a COLMAP model"):
+        read_poses(tmp_path)

@@ -1,0 +1,76 @@
+"""The matcher and the extractor of ARCHITECTURE.md, registered as it says, do their work."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from contracts.matcher_contract import MatcherContract
+from synthetic import texture, write_image
+
+from colmap_affrect.features.base import EXTRACTORS
+from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
+from colmap_affrect.options import Registry
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.match import match, recorded_matching
+from colmap_affrect.stages.pairs import choose_pairs
+
+TEXT = (Path(__file__).parents[2] / "ARCHITECTURE.md").read_text(encoding="utf-8")
+
+
+def register(
+    registry: Registry[object], name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Write the example of a part to a file, and add the line that the text gives for it."""
+    line = re.search(rf'`"{name}":\s+"([\w.]+):(\w+)"`', TEXT)
+    assert line is not None
+    module = line[1].rpartition(".")[2]
+    path = line[1].replace(".", "/")
+    code = re.search(rf"```python\n(# {path}\.py\n.*?)```", TEXT, re.DOTALL)
+    assert code is not None
+    (folder / f"{module}.py").write_text(code[1], encoding="utf-8")
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setitem(registry.built_in, name, f"{module}:{line[2]}")
+    monkeypatch.delitem(sys.modules, module, raising=False)
+
+
+class TestMutual(MatcherContract):
+    @pytest.fixture(autouse=True)
+    def _registered(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        register(MATCHERS, "mutual", tmp_path, monkeypatch)
+
+    def make(self) -> Matcher:
+        return MATCHERS.make(MATCHERS.options("mutual"), MatcherContext())
+
+
+def test_new_extractor_and_matcher_are_chosen_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    register(MATCHERS, "mutual", tmp_path, monkeypatch)
+    register(EXTRACTORS, "orb", tmp_path, monkeypatch)
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    image = texture((240, 180), 1)
+    write_image(photos / "a.png", image)
+    write_image(photos / "b.png", image[:, 11:])
+    settings = ["features.name=orb", "features.max_num_features=500", "matching.name=mutual"]
+    recipe = load_recipe("default", settings)
+    context = Context(Workspace(tmp_path / "out"))
+    with context.workspace.locked():
+        extract(context, Inputs.of(photos), recipe)
+        choose_pairs(context)
+        assert recorded_matching(context.workspace).name == "mutual"
+        assert match(context).num_done == 1
+    features = context.features
+    first, second = (features.read(name).keypoints for name in ("a.png", "b.png"))
+    assert features.read("a.png").descriptors.shape[1] == 256
+    (found,) = context.matches.read([("a.png", "b.png")])
+    shifts = first[found.indices[:, 0]] - second[found.indices[:, 1]]
+    right = abs(shifts - (11.0, 0.0)).max(axis=1) < 1.5
+    assert right.sum() > 30
+    assert right.mean() > 0.8

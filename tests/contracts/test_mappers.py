@@ -1,0 +1,52 @@
+"""Every mapper that is registered keeps the contract."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from small_scene import INTRINSICS, NAMES, write_photographs
+
+import colmap_affrect
+from colmap_affrect.errors import OptionError
+from colmap_affrect.mappers.attempts import map_database
+from colmap_affrect.mappers.base import MAPPERS, MappingTask
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory: pytest.TempPathFactory) -> MappingTask:
+    """Four photographs, verified."""
+    folder = tmp_path_factory.mktemp("mappers")
+    write_photographs(folder / "photos")
+    path = folder / "database.db"
+    cameras = {"camera_model": "PINHOLE", "camera_params": INTRINSICS}
+    colmap_affrect.extract_features(path, folder / "photos", (), "single", cameras)
+    colmap_affrect.match_exhaustive(path)
+    return MappingTask(path, folder / "photos", intrinsics_given=True)
+
+
+@pytest.mark.parametrize("name", MAPPERS.names())
+def test_mapper_registers_tells_of_it_and_keeps_given_cameras(
+    name: str, task: MappingTask, tmp_path: Path
+) -> None:
+    mapper = MAPPERS.make(MAPPERS.options(name))
+    shown: list[int] = []
+    (model, *_) = map_database(mapper, task, tmp_path / "sparse", shown.append)
+    assert model.registered_names == tuple(sorted(NAMES))
+    assert sum(shown) == len(NAMES)
+    assert [path.name for path in tmp_path.iterdir()] == ["sparse"]
+    params = colmap_affrect.colmap.pycolmap.Reconstruction(tmp_path / "sparse" / "0").cameras
+    assert [camera.params.tolist() for camera in params.values()] == [
+        [float(value) for value in INTRINSICS.split(",")]
+    ]
+
+
+@pytest.mark.parametrize("name", MAPPERS.names())
+def test_mapper_says_where_it_differs_and_takes_native_options(name: str) -> None:
+    options = MAPPERS.options({"name": name, "random_seed": 5, "mapper_options": {}})
+    differences = MAPPERS.make(options).differences(intrinsics_given=False)
+    assert differences["random_seed"] == 5
+    colmap = type(options).preset("colmap")
+    assert (colmap.preset_name, options.preset_name) == ("colmap", "sparse")
+    with pytest.raises(OptionError, match="no such option"):
+        MAPPERS.make(options.changed(mapper_options={"nonsense": 1}))

@@ -1,0 +1,397 @@
+"""The doctor finds what was broken, and nothing in a healthy folder."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import sqlite3
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import h5py
+import pytest
+import tomli_w
+from small_scene import INTRINSICS, NAMES, write_photographs
+
+from colmap_affrect.cli import main
+from colmap_affrect.doctor import Diagnosis, Finding, diagnose
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.workspace import Workspace
+
+NUM_IMAGES = 3
+INSTALLATION = ("installation", "networks", "weights")
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Photographs, and the results of a run on them."""
+
+    photos: Path
+    out: Path
+
+    @property
+    def database(self) -> Path:
+        return self.out / "database.db"
+
+    def execute(self, statement: str) -> None:
+        with closing(sqlite3.connect(self.database)) as connection:
+            assert connection.execute(statement).rowcount == 1
+            connection.commit()
+
+    def change_record(self, change: Callable[[dict], object]) -> None:
+        path = self.out / "config.toml"
+        record = tomllib.loads(path.read_text(encoding="utf-8"))
+        change(record)
+        path.write_text(tomli_w.dumps(record), encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Folders:
+    folder = tmp_path_factory.mktemp("finished")
+    folders = Folders(folder / "my photos", folder / "out")
+    write_photographs(folders.photos, NUM_IMAGES)
+    cameras = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
+    run(folders.photos, folders.out, RunOptions(cameras=cameras))
+    return folders
+
+
+@pytest.fixture
+def folders(finished: Folders, tmp_path: Path) -> Folders:
+    """A copy that can be broken."""
+    copy = Folders(tmp_path / "my photos", tmp_path / "out")
+    shutil.copytree(finished.photos, copy.photos)
+    shutil.copytree(finished.out, copy.out)
+    copy.change_record(lambda record: record["extract"].update(image_path=str(copy.photos)))
+    return copy
+
+
+def findings(path: Path | None, image_path: Path | None = None) -> list[Finding]:
+    """Findings that are not about the installation."""
+    diagnosis = diagnose(path, image_path=image_path)
+    return [found for found in diagnosis.findings if found.where not in INSTALLATION]
+
+
+def test_healthy_run_has_no_findings_and_stays_as_it_is(folders: Folders) -> None:
+    def state() -> dict[Path, bytes]:
+        return {path: path.read_bytes() for path in folders.out.rglob("*") if path.is_file()}
+
+    before = state()
+    assert findings(folders.out, folders.photos) == []
+    assert state() == before
+    checked = "\n".join(diagnose(folders.out).checked)
+    for text in (
+        "stages on record: extract, pairs, match, verify, map; recipe default",
+        "features.h5: features of 3 images",
+        "3 images, 1 cameras",
+        "matches of 3 pairs of 3",
+        "sparse: models of 3 images",
+    ):
+        assert text in checked
+
+
+def break_h5(path: Path, change: Callable[[h5py.File], object]) -> None:
+    with h5py.File(path, "r+") as file:
+        change(file)
+
+
+def unmark(file: h5py.File) -> None:
+    del file["a.png"].attrs["complete"]
+
+
+def unmatch(file: h5py.File) -> None:
+    del file["a.png/b c.png"]
+
+
+def lengthen(path: Path) -> None:
+    path.write_bytes(path.read_bytes() + b"x")
+
+
+FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
+    "photograph added": (
+        lambda f: shutil.copy(f.photos / "a.png", f.photos / "z.png"),
+        Finding("warning", "{photos}", "added later, half done, or not readable (1): z.png",
+                "run the same 'extract' or 'run' again"),
+    ),
+    "group incomplete": (
+        lambda f: break_h5(f.out / "features.h5", unmark),
+        Finding("warning", "{photos}", "images without features: added later, half done",
+                "run the same 'extract' or 'run' again"),
+    ),
+    "photographs gone": (
+        lambda f: shutil.rmtree(f.photos),
+        Finding("warning", "{out}", "its photographs are not there", "put them back"),
+    ),
+    "sparse.partial": (
+        lambda f: (f.out / "sparse.partial").mkdir(),
+        Finding("note", "{out}/sparse.partial", "left behind by a run that was killed",
+                "rm -r {out}/sparse.partial"),
+    ),
+    "features removed": (
+        lambda f: (f.out / "features.h5").unlink(),
+        Finding("error", "{out}/features.h5", "is missing", "run the same"),
+    ),
+    "features of other options": (
+        lambda f: f.change_record(lambda r: r["extract"].update(max_image_size_px=1000)),
+        Finding("error", "{out}/features.h5", "was made with other options", "--overwrite"),
+    ),
+    "database removed": (
+        lambda f: f.database.unlink(),
+        Finding("error", "{out}/database.db", "is missing", "to make it anew"),
+    ),
+    "keypoint added": (
+        lambda f: f.execute(
+            "UPDATE keypoints SET rows = rows + 1, data = zeroblob(rows * 24 + 24) "
+            "WHERE image_id = 1"
+        ),
+        Finding("error", "{out}/database.db", "images with other keypoints than in features.h5 (1)",
+                "--overwrite"),
+    ),
+    "pair not matched": (
+        lambda f: break_h5(f.out / "matches.h5", unmatch),
+        Finding("warning", "{out}/matches.h5",
+                "listed pairs that are not matched (1): a.png - b c.png",
+                "run 'colmap-affrect match --output-path {out}'"),
+    ),
+    "matches not in the database": (
+        lambda f: f.execute("DELETE FROM matches WHERE pair_id = 2147483649"),
+        Finding("warning", "{out}/database.db",
+                "pairs whose matches are not in the database (1): a.png - b c.png",
+                "run 'colmap-affrect match --output-path {out}'"),
+    ),
+    "matches of another program": (
+        lambda f: shutil.copy(f.out / "features.h5", f.out / "matches.h5"),
+        Finding("error", "{out}/matches.h5", "expected matches of format version", "--overwrite"),
+    ),
+    "pair list": (
+        lambda f: (f.out / "pairs.txt").write_text("a.png nothing.png\n"),
+        Finding("error", "{out}/pairs.txt", "names that are not among the images",
+                "run 'colmap-affrect pairs --output-path {out}' --overwrite"),
+    ),
+    "map not run": (
+        lambda f: (
+            f.change_record(lambda r: r["begun"].remove("map")), shutil.rmtree(f.out / "sparse")
+        ),
+        Finding("note", "{out}", "not run yet: map",
+                "run 'colmap-affrect map --output-path {out}', or the same 'run' again"),
+    ),
+    "map interrupted": (
+        lambda f: shutil.rmtree(f.out / "sparse"),
+        Finding("warning", "{out}/sparse", "mapping did not finish",
+                "run 'colmap-affrect map --output-path {out}'"),
+    ),
+    "no model": (
+        lambda f: shutil.rmtree(f.out / "sparse" / "0"),
+        Finding("warning", "{out}/sparse", "mapping found no model", "report.json"),
+    ),
+    "model damaged": (
+        lambda f: lengthen(f.out / "sparse" / "0" / "points3D.bin"),
+        Finding("error", "{out}/sparse/0", "points3D.bin: damaged",
+                "run 'colmap-affrect map --output-path {out}' --overwrite"),
+    ),
+    "pairs verified anew": (
+        lambda f: f.execute(
+            "UPDATE two_view_geometries SET rows = rows - 1, data = substr(data, 9) "
+            "WHERE pair_id = 2147483649"
+        ),
+        Finding("warning", "{out}/sparse", "the models were made before", "map"),
+    ),
+    "config.toml damaged": (
+        lambda f: (f.out / "config.toml").write_text("no [toml"),
+        Finding("error", "{out}/config.toml", "cannot be used (damaged", "restore it"),
+    ),
+    "config.toml lacks an entry": (
+        lambda f: f.change_record(lambda r: r["extract"].pop("image_path")),
+        Finding("error", "{out}/config.toml", "image_path is missing", "restore it"),
+    ),
+    "config.toml removed": (
+        lambda f: (f.out / "config.toml").unlink(),
+        Finding("note", "{out}", "is no output folder of colmap-affrect", "--output-path"),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FOLDER_CASES)
+def test_what_is_broken_in_a_folder_is_the_one_finding(folders: Folders, case: str) -> None:
+    damage, expected = FOLDER_CASES[case]
+    damage(folders)
+    found = findings(folders.out)
+    assert len(found) == 1, found
+    (found,) = found
+    places = {"out": folders.out, "photos": folders.photos}
+    assert found.severity == expected.severity
+    assert found.where == expected.where.format(**places)
+    assert expected.what in found.what
+    assert expected.advice.format(**places) in found.advice
+
+
+def test_photograph_that_was_deleted_is_found(folders: Folders) -> None:
+    (folders.photos / NAMES[1]).unlink()
+    (gone,) = findings(folders.out)
+    assert (gone.severity, gone.where) == ("warning", str(folders.photos))
+    assert gone.what.endswith("not listed any more (1): b c.png")
+    kinds = [found.what for found in findings(folders.out, folders.photos)]
+    assert "images whose file is missing (1): b c.png" in kinds
+
+
+def test_features_that_the_database_lacks_are_found(folders: Folders) -> None:
+    store = FeatureStore(folders.out / "features.h5")
+    store.extend("a.png", store.read("b c.png"))
+    shutil.copy(folders.photos / "a.png", folders.photos / "z.png")
+    break_h5(folders.out / "features.h5", lambda file: file.copy("b c.png", "z.png"))
+    missing, behind = findings(folders.out)
+    assert missing.what == "images whose features are not in the database (1): z.png"
+    assert behind.what.endswith("of escalation that the database lacks (1): a.png")
+    assert "colmap-affrect escalate --output-path" in behind.advice
+
+
+def test_advice_for_a_database_of_ours_names_our_commands(folders: Folders) -> None:
+    folders.execute("UPDATE two_view_geometries SET config = 0 WHERE pair_id = 2147483649")
+    (own,) = findings(folders.out)
+    assert own.advice == (
+        f"run 'colmap-affrect verify --output-path {folders.out} --overwrite' and map"
+    )
+    (foreign,) = findings(folders.database)
+    assert own.what == foreign.what
+    assert "colmap geometric_verifier" in foreign.advice
+
+
+def test_photographs_of_another_size_are_errors(folders: Folders) -> None:
+    path = folders.photos / "a.png"
+    cv2.imwrite(str(path), cv2.imread(str(path))[:200])
+    (found,) = findings(folders.database, folders.photos)
+    assert (found.severity, found.where) == ("error", str(folders.database))
+    assert found.what.endswith("than their camera (1): a.png is 320 x 200, its camera 320 x 240")
+    path.write_bytes(b"no image")
+    (found,) = findings(folders.database, folders.photos)
+    assert found.what == "images whose file cannot be read (1): a.png"
+    (found,) = findings(folders.database, folders.photos / "none")
+    assert (found.where, found.what) == (str(folders.photos / "none"), "no such folder")
+
+
+def test_folder_in_use_is_left_alone(folders: Folders) -> None:
+    (folders.out / "features.h5").unlink()
+    with Workspace(folders.out).locked():
+        (found,) = findings(folders.out)
+    assert found.severity == "warning"
+    assert "another colmap-affrect is working in this folder" in found.what
+    assert found.advice == "run doctor again when it is done"
+
+
+@pytest.mark.parametrize(("change", "severity"), [(-1, "note"), (1, "error")])
+def test_schema_of_another_version_is_found_and_not_migrated(
+    folders: Folders, change: int, severity: str
+) -> None:
+    with closing(sqlite3.connect(folders.database)) as connection:
+        version = connection.execute("PRAGMA user_version").fetchone()[0] + change
+        connection.execute(f"PRAGMA user_version = {version}")
+        connection.execute("PRAGMA journal_mode = DELETE")
+    before = folders.database.read_bytes()
+    (found,) = findings(folders.database)
+    assert found.severity == severity
+    assert str(version) in found.what
+    assert ("keep a copy: cp " in found.advice) == (change < 0)
+    assert folders.database.read_bytes() == before
+    assert [path.name for path in folders.out.glob("database.db*")] == ["database.db"]
+
+
+def damaged_files(data: bytes) -> Iterator[bytes]:
+    rng = random.Random(3)
+    yield b""
+    for _ in range(4):
+        yield rng.randbytes(rng.randrange(1, 5000))
+        yield data[: rng.randrange(1, len(data))]
+        changed = bytearray(data)
+        for _ in range(50):
+            changed[rng.randrange(min(len(data), 20_000))] = rng.randrange(256)
+        yield bytes(changed)
+
+
+@pytest.mark.parametrize("name", ["database.db", "features.h5", "matches.h5", "config.toml"])
+def test_damaged_file_gives_findings_and_never_a_traceback(folders: Folders, name: str) -> None:
+    path = folders.out / name
+    for side in folders.out.glob("database.db-*"):
+        side.unlink()
+    num_found = 0
+    for data in damaged_files(path.read_bytes()):
+        path.write_bytes(data)
+        num_found += any(found.severity == "error" for found in findings(folders.out))
+        if name == "database.db":
+            findings(path)
+    assert num_found > 8
+
+
+def test_what_is_no_database_is_one_error(tmp_path: Path, folders: Folders) -> None:
+    (tmp_path / "empty.db").touch()
+    (tmp_path / "text.db").write_text("text")
+    data = folders.database.read_bytes()
+    # SQLite's message about it quotes bytes that are no UTF-8.
+    (tmp_path / "schema.db").write_bytes(
+        data.replace(b"CREATE TABLE frames", b"CREATE TABL\xbe frames")
+    )
+    for name in ("", "none.db", "empty.db", "text.db", "schema.db"):
+        path = tmp_path / name
+        (found,) = findings(path)
+        assert (found.severity, found.where) == ("error", str(path))
+
+
+def test_installation_is_examined_without_a_path(tmp_path: Path) -> None:
+    (tmp_path / "AffNet.pth").write_bytes(b"not the published file")
+    diagnosis = diagnose(weights_path=tmp_path)
+    assert "pycolmap 4." in diagnosis.checked[0]
+    assert diagnosis.checked[1].startswith("networks: run on ")
+    found = {finding.where: finding for finding in diagnosis.findings}
+    assert found[str(tmp_path / "AffNet.pth")].what == "not the published file"
+    assert diagnosis.num_errors == 0
+    (error,) = [f for f in diagnose(weights_path=tmp_path / "none").findings
+                if f.severity == "error"]  # fmt: skip
+    assert (error.where, error.what) == (f"--weights {tmp_path / 'none'}", "not a folder")
+
+
+def test_wrong_import_order_and_missing_torch_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    def what() -> str:
+        return "\n".join(f"{found.severity} {found.what}" for found in diagnose().findings)
+
+    assert "pycolmap was imported before" not in what()
+    sys.modules["colmap_affrect"] = sys.modules.pop("colmap_affrect")
+    assert "warning pycolmap was imported before colmap_affrect" in what()
+    sys.modules["pycolmap"] = sys.modules.pop("pycolmap")
+    assert "pycolmap was imported before" not in what()
+    monkeypatch.setitem(sys.modules, "colmap_affrect.features.networks", None)
+    assert "error torch or kornia cannot be loaded" in what()
+
+
+def test_summary_says_how_many_and_orders_by_severity() -> None:
+    error = Finding("error", "a.db", "is broken", "mend it")
+    warning, note = replace(error, severity="warning"), replace(error, severity="note")
+    assert Diagnosis((), ("a.db: 2 images",)).summary() == (
+        "checked  a.db: 2 images\nno problems found"
+    )
+    assert Diagnosis((note,), ()).summary().endswith("\nno problems found")
+    text = Diagnosis((error, warning, warning, note), ()).summary()
+    assert text.startswith("error    a.db: is broken\n         -> mend it\nwarning  ")
+    assert text.endswith("\n1 error, 2 warnings")
+
+
+def test_command_prints_and_ends_with_1_if_there_are_errors(
+    folders: Folders, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["doctor", str(folders.out)]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.endswith("no problems found\n")
+    assert printed.err == ""
+    (folders.out / "features.h5").unlink()
+    arguments = ["doctor", str(folders.out), "--image_path", str(folders.photos), "--json", "-q"]
+    assert main(arguments) == 1
+    printed = capsys.readouterr()
+    report = json.loads(printed.out)
+    assert (report["num_errors"], report["num_warnings"], printed.err) == (1, 0, "")
+    assert report["findings"][0]["where"] == str(folders.out / "features.h5")
+    assert set(report["findings"][0]) == {"severity", "where", "what", "advice"}

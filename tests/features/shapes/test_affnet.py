@@ -1,0 +1,442 @@
+"""Dense AffNet is the patch network on the window round every block; direction, borders, scales."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from kornia.feature import LAFAffNetShapeEstimator
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.testing import assert_allclose, assert_array_equal
+from strategies import Array
+from synthetic import texture
+from torch import nn
+
+from colmap_affrect.data import GrayImage, LocalFeatures, ShapeGrid
+from colmap_affrect.features.base import NetworkContext
+from colmap_affrect.features.shapes import affnet
+from colmap_affrect.features.shapes.affnet import AffNet, AffNetOptions, fully_convolutional
+from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
+from colmap_affrect.geometry.affine import rotation
+from colmap_affrect.geometry.shapes import log_metrics, metrics_from_log
+from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
+from colmap_affrect.images.reading import shrink_to
+
+SHARED = Path(__file__).resolve().parents[4] / "shared"
+
+SINGLE = 2e-4
+"""Metrics of tilts up to about 20 through a network in single precision, with the folded batch
+normalisation and other orders of summation."""
+
+ODD_SIZE = (117, 83)
+"""(width, height): both leave another remainder when divided by 4."""
+
+TILT_BAND = 0.15
+"""Relative error of the mean tilt of a stretched isotropic texture."""
+
+ANGLE_BAND_DEG = 5.0
+
+
+def no_keypoints(image: GrayImage) -> LocalFeatures:
+    """Detector for tests of dense shapes."""
+    raise AssertionError(f"dense shapes need no keypoints of an image of {image.shape=}")
+
+
+def random_network(seed: int = 0) -> LAFAffNetShapeEstimator:
+    """AffNet with random weights and statistics, and shapes of moderate tilts."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = LAFAffNetShapeEstimator(pretrained=False, preserve_orientation=False)
+        for layer in network.features:
+            if isinstance(layer, nn.BatchNorm2d):
+                layer.running_mean.normal_(0.0, 0.1)
+                layer.running_var.uniform_(0.05, 0.2)
+    return calibrated(network.eval())
+
+
+def calibrated(network: LAFAffNetShapeEstimator) -> LAFAffNetShapeEstimator:
+    """Scale the last convolution so that outputs on texture deviate by about 0.4."""
+    windows = sliding_window_view(texture((160, 160), seed=1), (32, 32))[::16, ::16]
+    patches = torch.from_numpy(standardised(windows.reshape(-1, 1, 32, 32)).astype(np.float32))
+    with torch.inference_mode():
+        deviation = network.features[:-2](patches).std()
+    network.features[-3].weight.data *= 0.4 / deviation
+    return network
+
+
+def centered_network(seed: int = 0) -> LAFAffNetShapeEstimator:
+    """A network that sees nothing beyond its patch: only the last kernel has an extent.
+
+    The others keep their middle, so that zeros round a patch and pixels round a window of an
+    image make no difference.
+    """
+    network = random_network(seed)
+    for layer in network.features:
+        if isinstance(layer, nn.Conv2d) and layer.padding == (1, 1):
+            middle = layer.weight.data[:, :, 1:2, 1:2].clone()
+            layer.weight.data.zero_()
+            layer.weight.data[:, :, 1:2, 1:2] = middle
+    return calibrated(network)
+
+
+def constant_network(outputs: list[float]) -> LAFAffNetShapeEstimator:
+    """A network that has the same three outputs everywhere."""
+    network = random_network()
+    network.features[-3].weight.data.zero_()
+    network.features[-3].bias.data = torch.tensor(outputs).atanh()
+    return network
+
+
+def source(
+    network: LAFAffNetShapeEstimator,
+    detect: Callable[[GrayImage], LocalFeatures] = no_keypoints,
+    **options: object,
+) -> AffNet:
+    """The shape source with these weights, through a file, and another detector."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "AffNet.pth"
+        torch.save(network.state_dict(), path)
+        made = AffNet(AffNetOptions(**options), NetworkContext({"affnet": path}))
+    made.detect = detect
+    return made
+
+
+def metrics_of_outputs(outputs: torch.Tensor) -> Array:
+    """Unit metrics of L^-1 with L = [[1 + o0, 0], [o1, 1 + o2]] for (..., 3) outputs."""
+    o0, o1, o2 = np.moveaxis(outputs.detach().numpy().astype(float), -1, 0)
+    frames = np.stack([np.stack([1 + o0, 0 * o0], -1), np.stack([o1, 1 + o2], -1)], -2)
+    return unit_metrics(np.linalg.inv(frames))
+
+
+def patch_metrics(network: LAFAffNetShapeEstimator, patches: Array) -> Array:
+    """Metrics by kornia's layers of (..., 32, 32) patches as they are."""
+    inputs = torch.from_numpy(patches.reshape(-1, 1, 32, 32).astype(np.float32))
+    with torch.inference_mode():
+        outputs = torch.cat([network.features(batch)[:, :, 0, 0] for batch in inputs.split(512)])
+    return metrics_of_outputs(outputs).reshape(*patches.shape[:-2], 3)
+
+
+def standardised(patches: Array) -> Array:
+    """(..., 32, 32) patches of mean 0 and deviation 1, as AffNet was trained on."""
+    patches = patches.astype(float)
+    mean = patches.mean(axis=(-1, -2), keepdims=True)
+    return (patches - mean) / (patches.std(axis=(-1, -2), ddof=1, keepdims=True) + 1e-6)
+
+
+def locally_normalised(image: GrayImage) -> Array:
+    """Pixels by mean and deviation of the 33 x 33 px around them, border reflected."""
+    windows = sliding_window_view(np.pad(image.astype(float), 16, mode="reflect"), (33, 33))
+    mean, deviation = windows.mean(axis=(2, 3)), windows.std(axis=(2, 3))
+    return np.clip((image - mean) / (deviation + 2.55), -6.0, 6.0)
+
+
+def reflected(values: Array) -> Array:
+    """Add 14 px, and at the end what is missing to whole blocks."""
+    height, width = values.shape
+    return np.pad(values, ((14, 14 + -height % 4), (14, 14 + -width % 4)), mode="reflect")
+
+
+def log_tilts(metrics1: Array, metrics2: Array) -> Array:
+    """Log transition tilts between (..., 3) unit metrics."""
+    (a11, a22, a12), (b11, b22, b12) = np.moveaxis(metrics1, -1, 0), np.moveaxis(metrics2, -1, 0)
+    return np.arccosh(np.maximum((a11 * b22 + a22 * b11 - 2 * a12 * b12) / 2, 1.0))
+
+
+@pytest.fixture(scope="module")
+def image() -> GrayImage:
+    """An image whose brightness and contrast vary, of odd size."""
+    width, height = ODD_SIZE
+    x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
+    values = texture(ODD_SIZE, seed=3).astype(float)
+    return np.rint((values - 128) * (0.3 + 0.6 * x) + 90 + 60 * y).clip(0, 255).astype(np.uint8)
+
+
+def test_fully_convolutional_layers_equal_the_network_on_patches() -> None:
+    network = random_network()
+    patches = torch.randn((5, 1, 32, 32), generator=torch.Generator().manual_seed(1))
+    expected = network.features(patches)
+    assert expected.shape == (5, 3, 1, 1)
+    assert expected.std() > 0.1
+    outputs = fully_convolutional(network)(patches)
+    torch.testing.assert_close(outputs, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_fully_convolutional_layers_leave_the_network_as_it_was() -> None:
+    network = random_network().train()
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    layers = fully_convolutional(network)
+    assert network.training
+    assert not any(layer.training for layer in layers)
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, before[name])
+        assert value.stride() == before[name].stride()
+
+
+@pytest.mark.parametrize("size", [ODD_SIZE, (84, 34), (32, 39), (34, 33)])
+def test_grid_is_the_network_on_the_window_in_the_middle_of_which_a_block_lies(
+    image: GrayImage, size: tuple[int, int]
+) -> None:
+    image = image[: size[1], : size[0]]
+    network = centered_network()
+    grid = source(network, scales=(1.0,), min_deviation=0.0).grid(image)
+    windows = sliding_window_view(reflected(locally_normalised(image)), (32, 32))[::4, ::4]
+    expected = patch_metrics(network, windows)
+    rows, columns = -(-size[1] // 4), -(-size[0] // 4)
+    assert expected.shape == (rows, columns, 3)
+    assert grid.textured.shape == (rows, columns)
+    # Window (0, 0) holds the rows -14...17: its middle is that of the block 0...3.
+    assert (grid.origin_px, grid.step_px) == (1.5, 4)
+    assert np.median(tilts_from_metrics(expected)[0]) > 1.1
+    assert_allclose(grid.metrics, expected, atol=SINGLE, rtol=SINGLE)
+
+
+@pytest.mark.parametrize("size", [ODD_SIZE, (84, 34), (86, 47), (32, 33)])
+def test_paper_grid_has_global_normalisation_and_replicated_borders(
+    image: GrayImage, size: tuple[int, int]
+) -> None:
+    image = image[: size[1], : size[0]]
+    network = centered_network()
+    grid = source(network, paper=True).grid(image)
+    normalised = (image - image.mean()) / image.std()
+    windows = sliding_window_view(normalised, (32, 32))[2::4, 2::4]
+    expected = patch_metrics(network, windows)
+    # Window (0, 0) from pixel 2 has its middle in that of block 4, which begins at pixel 16.
+    rows, columns = expected.shape[:2]
+    inside = grid.metrics[4 : 4 + rows, 4 : 4 + columns]
+    assert_allclose(inside, expected, atol=SINGLE, rtol=SINGLE)
+    assert grid.textured.shape == (-(-size[1] // 4), -(-size[0] // 4))
+    assert grid.textured.all()
+    assert (grid.origin_px, grid.step_px) == (1.5, 4)
+    assert_array_equal(grid.metrics[:4], np.broadcast_to(grid.metrics[4], grid.metrics[:4].shape))
+    last = grid.metrics[:, -4:]
+    assert_array_equal(last[:, 1:], np.broadcast_to(last[:, :1], last[:, 1:].shape))
+
+
+def test_shapes_of_known_outputs_are_those_of_the_formula(image: GrayImage) -> None:
+    o0, o1, o2 = 0.4, -0.3, -0.2
+    a, c, d = 1 + o0, o1, 1 + o2
+    cosh = (a**2 + c**2 + d**2) / (2 * a * d)
+    expected_tilt = cosh + np.sqrt(cosh**2 - 1)
+    expected_angle = np.mod(0.5 * np.arctan2(2 * a * c, c**2 + d**2 - a**2), np.pi)
+    for options in ({"min_deviation": 0.0}, {"paper": True}):
+        tilts, angles = tilts_from_metrics(
+            source(constant_network([o0, o1, o2]), **options).grid(image).metrics
+        )
+        assert_allclose(tilts, expected_tilt, rtol=SINGLE)
+        assert_allclose(angles, expected_angle, rtol=SINGLE)
+
+
+@pytest.mark.parametrize("paper", [False, True])
+@pytest.mark.parametrize("strip_cells", [2, 5])
+def test_strips_equal_the_whole(
+    image: GrayImage, paper: bool, strip_cells: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    affnet_source = source(random_network(), paper=paper, scales=(1.0,), min_deviation=0.0)
+    monkeypatch.setattr(affnet, "STRIP_CELLS", 1000)
+    whole = affnet_source.grid(image)
+    monkeypatch.setattr(affnet, "STRIP_CELLS", strip_cells)
+    assert_allclose(affnet_source.grid(image).metrics, whole.metrics, atol=SINGLE, rtol=SINGLE)
+
+
+def test_grid_of_several_sizes_is_the_log_euclidean_mean(image: GrayImage) -> None:
+    network = random_network()
+    singles = [
+        log_metrics(source(network, scales=(scale,), min_deviation=0.0).grid(image).metrics)
+        for scale in (1.0, 0.5)
+    ]
+    both = source(network, scales=(1.0, 0.5), min_deviation=0.0).grid(image)
+    expected = metrics_from_log(np.mean(singles, axis=0))
+    assert_allclose(both.metrics, expected, atol=SINGLE, rtol=SINGLE)
+    assert log_tilts(metrics_from_log(singles[0]), metrics_from_log(singles[1])).mean() > 0.05
+
+
+def test_shapes_of_a_smaller_size_are_interpolated_between_the_centers_of_its_blocks(
+    image: GrayImage,
+) -> None:
+    network = random_network()
+    full = source(network, scales=(0.5,), min_deviation=0.0).grid(image)
+    small = shrink_to(image, 58)
+    assert small.shape == (41, 58)
+    logs = log_metrics(source(network, scales=(1.0,), min_deviation=0.0).grid(small).metrics)
+    for axis, (length, small_length) in enumerate(zip(image.shape, small.shape, strict=True)):
+        cells, small_cells = np.arange(-(-length // 4)), np.arange(-(-small_length // 4))
+        # Distances from the edge of the image scale: the middle of cell k is at 4 k + 2.
+        at = (4 * cells + 2) * small_length / length
+        logs = np.apply_along_axis(
+            lambda values, at=at, known=4 * small_cells + 2: np.interp(at, known, values),
+            axis,
+            logs,
+        )
+    assert_allclose(full.metrics, metrics_from_log(logs), atol=SINGLE, rtol=SINGLE)
+
+
+def test_sizes_smaller_than_a_patch_are_left_out(image: GrayImage) -> None:
+    network = random_network()
+    expected = source(network, scales=(1.0, 0.5), min_deviation=0.0).grid(image)
+    # A quarter of 117 x 83 px is 29 x 21 px.
+    actual = source(network, scales=(1.0, 0.5, 0.25), min_deviation=0.0).grid(image)
+    assert_array_equal(actual.metrics, expected.metrics)
+    largest = source(network, scales=(0.25,), min_deviation=0.0).grid(image)
+    assert np.isfinite(largest.metrics).all()
+
+
+def test_blank_and_faint_images_are_untextured_identities() -> None:
+    rng = np.random.default_rng(0)
+    for values in (np.full((61, 83), 200), 128 + rng.integers(-2, 3, (64, 97))):
+        grid = source(random_network()).grid(values.astype(np.uint8))
+        assert not grid.textured.any()
+        assert_allclose(grid.metrics, np.broadcast_to([1.0, 1.0, 0.0], grid.metrics.shape))
+
+
+def test_textured_blocks_are_those_whose_surroundings_deviate() -> None:
+    image = np.full((161, 318), 128, np.uint8)
+    image[:, :160] = texture((160, 161), seed=5)
+    grid = source(random_network()).grid(image)
+    # The surroundings of a block reach 16 px from its middle.
+    assert grid.textured[:, :40].all()
+    assert not grid.textured[:, 44:].any()
+    assert np.isfinite(grid.metrics).all()
+
+
+def circles(centers: list[tuple[float, float]], sigmas: list[float]) -> LocalFeatures:
+    """Keypoints in order of falling response."""
+    lafs = np.zeros((len(centers), 2, 3))
+    lafs[:, :, :2] = 6.0 * np.array(sigmas)[:, None, None] * np.eye(2)
+    lafs[:, :, 2] = np.reshape(centers, (-1, 2))
+    responses = np.linspace(1.0, 0.5, len(centers), dtype=np.float32)
+    return LocalFeatures(lafs, responses, np.zeros((len(centers), 0), np.float32))
+
+
+WINDOW_SIGMA = 16.0 / 12.0
+"""Sigma of a keypoint whose patch of half width 12 sigma has the pixels of the image."""
+
+
+def test_samples_are_the_network_on_patches_of_12_sigma(image: GrayImage) -> None:
+    corners = [(3, 11), (40, 50), (71, 8), (85, 51), (0, 0)]
+    keypoints = circles([(x + 15.5, y + 15.5) for x, y in corners], [WINDOW_SIGMA] * 5)
+    network = random_network()
+    samples = source(network, lambda _: keypoints).samples(image)
+    patches = np.stack([image[y : y + 32, x : x + 32] for x, y in corners])
+    expected = patch_metrics(network, standardised(patches))
+    assert tilts_from_metrics(expected)[0].max() > 1.1
+    assert_array_equal(samples.points, keypoints.keypoints)
+    # The patches are sampled at pixels, up to rounding.
+    assert_allclose(samples.metrics, expected, atol=1e-3, rtol=1e-3)
+
+
+def test_samples_are_those_of_the_strongest_keypoints(
+    image: GrayImage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(4)
+    keypoints = circles([tuple(point) for point in rng.uniform(20, 60, (7, 2))], [1.7] * 7)
+    shuffled = keypoints.select(rng.permutation(7))
+    network = random_network()
+    monkeypatch.setattr(affnet, "BATCH_SIZE", 2)
+    every = source(network, lambda _: keypoints).samples(image)
+    few = source(network, lambda _: shuffled, max_num_keypoints=4).samples(image)
+    assert len(every.points) == 7
+    assert_array_equal(few.points, every.points[:4])
+    assert_allclose(few.metrics, every.metrics[:4], atol=SINGLE, rtol=SINGLE)
+
+
+def test_samples_leave_out_singular_shapes(image: GrayImage) -> None:
+    network = random_network()
+    # Only a patch with contrast reaches the last layer with anything but its bias.
+    network.features[-3].bias.data[:] = -30.0
+    for keypoints in (circles([(50.0, 40.0), (30.0, 30.0)], [2.0, 3.0]), circles([], [])):
+        samples = source(network, lambda _, found=keypoints: found).samples(image)
+        assert samples.points.shape == (0, 2)
+        assert samples.metrics.shape == (0, 3)
+
+
+needs_shared = pytest.mark.skipif(
+    not (SHARED / "weights" / "AffNet.pth").is_file(),
+    reason="the weights and photographs of ../shared are not here",
+)
+
+
+@pytest.fixture(scope="module")
+def published() -> LAFAffNetShapeEstimator:
+    """AffNet with its published weights."""
+    network = LAFAffNetShapeEstimator(pretrained=False, preserve_orientation=False)
+    path = SHARED / "weights" / "AffNet.pth"
+    network.load_state_dict(torch.load(path, "cpu", weights_only=True)["state_dict"])
+    return network.eval()
+
+
+def graffiti(number: int) -> GrayImage:
+    path = SHARED / "pairs" / "oxford_graf" / f"graf_{number}.png"
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+
+
+def stretched_texture(tilt: float, axis_deg: float) -> GrayImage:
+    """Isotropic texture shown ``tilt`` times longer along an axis (x towards y)."""
+    turn = rotation(np.deg2rad(axis_deg))
+    image_from_result = turn @ np.diag([1.0 / tilt, 1.0]) @ turn.T
+    matrix = np.zeros((2, 3))
+    matrix[:, :2] = image_from_result
+    matrix[:, 2] = np.array([319.5, 279.5]) - image_from_result @ np.array([249.5, 239.5])
+    return cv2.warpAffine(
+        texture((640, 560), seed=9, finest_sigma_px=2.5),
+        matrix,
+        (500, 480),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REFLECT_101,
+    )
+
+
+@pytest.mark.shared
+@needs_shared
+@pytest.mark.parametrize("options", [{}, {"paper": True}], ids=["default", "paper"])
+@pytest.mark.parametrize("axis_deg", [0.0, 35.0, 90.0, 140.0])
+def test_shapes_of_a_texture_stretched_by_3_undo_the_stretch(
+    published: LAFAffNetShapeEstimator, axis_deg: float, options: dict[str, bool]
+) -> None:
+    grid = source(published, **options).grid(stretched_texture(3.0, axis_deg))
+    inside = log_metrics(grid.metrics[12:-12, 12:-12]).reshape(-1, 2)
+    tilt, angle = tilts_from_metrics(metrics_from_log(inside.mean(axis=0)))
+    # The rectifying map diag(t, 1) R(phi) stretches the direction -phi: across the axis.
+    expected_deg = (90.0 - axis_deg) % 180.0
+    assert_allclose(tilt, 3.0, rtol=TILT_BAND)
+    assert abs((np.rad2deg(angle) - expected_deg + 90.0) % 180.0 - 90.0) < ANGLE_BAND_DEG
+
+
+def residual_tilts(grid1: ShapeGrid, grid2: ShapeGrid, homography: Array) -> Array:
+    """Transition tilts between the shapes of image 1 and those of image 2 brought back to it."""
+    rows, columns = np.indices(grid1.textured.shape)
+    points = np.stack([columns.ravel(), rows.ravel()], 1) * grid1.step_px + grid1.origin_px
+    mapped = points @ homography[:, :2].T + homography[:, 2]
+    target = mapped[:, :2] / mapped[:, 2:]
+    cells = np.rint((target - grid2.origin_px) / grid2.step_px).astype(int)[:, ::-1]
+    seen = ((cells >= 0) & (cells < grid2.textured.shape)).all(axis=1) & grid1.textured.ravel()
+    cells, target, third = cells[seen], target[seen], mapped[seen, 2, None, None]
+    jacobians = (homography[None, :2, :2] - target[:, :, None] * homography[None, 2:, :2]) / third
+    s11, s22, s12 = grid2.metrics[cells[:, 0], cells[:, 1]].T
+    metrics = np.stack([np.stack([s11, s12], -1), np.stack([s12, s22], -1)], -2)
+    # With S = M^T M of the map M that rectifies image 2, M J rectifies image 1.
+    brought = unit_metrics(np.swapaxes(np.linalg.cholesky(metrics), 1, 2) @ jacobians)
+    return np.exp(log_tilts(grid1.metrics.reshape(-1, 3)[seen], brought))
+
+
+@pytest.mark.shared
+@needs_shared
+def test_dense_shapes_agree_with_the_homography_between_two_photographs(
+    published: LAFAffNetShapeEstimator,
+) -> None:
+    images = graffiti(1), graffiti(4)
+    homography = np.loadtxt(SHARED / "pairs" / "oxford_graf" / "H_graf_1_4.txt")
+    shares = {}
+    for name, shapes in {
+        "default": source(published),
+        "paper": source(published, paper=True),
+        "second-moment": SecondMoment(SecondMomentOptions()),
+    }.items():
+        residuals = residual_tilts(shapes.grid(images[0]), shapes.grid(images[1]), homography)
+        shares[name] = np.mean(residuals < 1.7)
+    assert shares["default"] > 0.75
+    assert shares["default"] > shares["paper"] > shares["second-moment"]

@@ -1,0 +1,182 @@
+"""Shapes from the structure tensor follow the image; images without texture have none."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from strategies import Array
+from synthetic import texture
+
+from colmap_affrect.data import GrayImage, ShapeGrid
+from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
+from colmap_affrect.geometry.affine import rotation
+from colmap_affrect.geometry.shapes import STEP_PX
+from colmap_affrect.geometry.tilts import cosh_distances, tilts_from_metrics, unit_metrics
+
+TILT_BAND = 0.25
+"""Relative: isotropic noise in a window of 32 px is isotropic to about a tenth, and the
+smoothing before the gradients blurs a compressed texture more along one axis."""
+
+ANGLE_BAND_DEG = 5.0
+
+
+SOURCE = SecondMoment(SecondMomentOptions())
+
+
+def mean_class(grid: ShapeGrid, border_px: int = 48) -> tuple[float, float]:
+    """Tilt and angle in degrees of the mean shape, away from the border of the image."""
+    cells = border_px // STEP_PX
+    metrics = grid.metrics[cells:-cells, cells:-cells].reshape(-1, 3).mean(axis=0)
+    metrics = metrics / np.sqrt(metrics[0] * metrics[1] - metrics[2] ** 2)
+    tilt, angle = tilts_from_metrics(metrics)
+    return float(tilt), float(np.rad2deg(angle))
+
+
+def resample(image: GrayImage, image_from_result: Array, size: tuple[int, int]) -> GrayImage:
+    """Show an image through a (2, 2) map about the centres of image and result."""
+    height, width = image.shape
+    matrix = np.zeros((2, 3))
+    matrix[:, :2] = image_from_result
+    center = (np.array(size) - 1) / 2
+    matrix[:, 2] = (np.array([width, height]) - 1) / 2 - image_from_result @ center
+    return cv2.warpAffine(
+        image,
+        matrix,
+        size,
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REFLECT_101,
+    )
+
+
+def tilt_distances(metrics1: Array, metrics2: Array) -> Array:
+    """Log transition tilts between corresponding rows of unit metrics."""
+    cosh = [
+        cosh_distances(metric1[None], metric2[None])[0, 0]
+        for metric1, metric2 in zip(metrics1, metrics2, strict=True)
+    ]
+    return np.asarray(np.arccosh(np.maximum(cosh, 1.0)))
+
+
+@pytest.fixture(scope="module")
+def isotropic() -> GrayImage:
+    """A texture without direction, coarse enough to be stretched and turned."""
+    return texture((640, 560), seed=9, finest_sigma_px=2.5)
+
+
+def test_second_moment_shapes_of_isotropic_texture_are_near_the_identity(
+    isotropic: GrayImage,
+) -> None:
+    grid = SOURCE.grid(isotropic)
+    assert grid.textured.all()
+    assert mean_class(grid)[0] < 1.0 + TILT_BAND / 2
+
+
+@pytest.mark.parametrize("axis_deg", [0.0, 35.0, 90.0, 140.0])
+def test_second_moment_shapes_of_a_texture_stretched_by_3_undo_the_stretch(
+    isotropic: GrayImage, axis_deg: float
+) -> None:
+    # The result shows the texture three times longer along axis_deg (x towards y).
+    turn = rotation(np.deg2rad(axis_deg))
+    result_from_image = turn @ np.diag([3.0, 1.0]) @ turn.T
+    stretched = resample(isotropic, np.linalg.inv(result_from_image), (500, 480))
+    tilt, angle_deg = mean_class(SOURCE.grid(stretched))
+    # The rectifying map diag(t, 1) R(phi) stretches the direction -phi: across the axis.
+    expected_deg = (90.0 - axis_deg) % 180.0
+    assert_allclose(tilt, 3.0, rtol=TILT_BAND)
+    assert abs((angle_deg - expected_deg + 90.0) % 180.0 - 90.0) < ANGLE_BAND_DEG
+
+
+def test_second_moment_shapes_of_a_warped_texture_are_the_warped_shapes(
+    isotropic: GrayImage,
+) -> None:
+    image_from_result = rotation(0.5) @ np.diag([0.8, 1.3]) @ rotation(-0.2)
+    size = (420, 360)
+    # Shapes that vary over the image: the left half is stretched before the common warp.
+    first = isotropic.copy()
+    first[:, :320] = resample(isotropic, np.diag([0.4, 1.0]), (640, 560))[:, :320]
+    second = resample(first, image_from_result, size)
+    before, after = SOURCE.grid(first), SOURCE.grid(second)
+
+    rows, columns = np.indices(after.textured.shape)
+    points = np.stack([columns, rows], -1) * after.step_px + after.origin_px
+    center = (np.array(size) - 1) / 2
+    sources = (points - center) @ image_from_result.T + (np.array([640, 560]) - 1) / 2
+    inside = ((sources > 40) & (sources < np.array([600, 520]))).all(axis=-1)
+    away_from_edge = np.abs(sources[..., 0] - 320) > 40
+    compared = inside & away_from_edge
+    cells = np.rint((sources[compared] - before.origin_px) / before.step_px).astype(int)
+    source_metrics = before.metrics[cells[:, 1], cells[:, 0]]
+    # With S = M^T M of the map M that rectifies the source, the result needs M B.
+    s11, s22, s12 = source_metrics.T
+    gram = np.stack([np.stack([s11, s12], -1), np.stack([s12, s22], -1)], -2)
+    roots = np.swapaxes(np.linalg.cholesky(gram), 1, 2)
+    expected = unit_metrics(roots @ image_from_result)
+    actual = after.metrics[compared]
+    assert np.count_nonzero(compared) > 2000
+    assert np.median(tilt_distances(expected, actual)) < np.log(1.0 + TILT_BAND / 2)
+    # What it would be if the warp were forgotten: the test can tell.
+    assert np.median(tilt_distances(source_metrics, actual)) > np.log(1.0 + TILT_BAND)
+
+
+def test_second_moment_shapes_without_texture_are_untextured_identities() -> None:
+    faint = 128 + np.random.default_rng(0).integers(-1, 2, (64, 96))
+    for image in (np.full((61, 83), 200), faint):
+        grid = SOURCE.grid(image.astype(np.uint8))
+        assert not grid.textured.any()
+        assert_allclose(grid.metrics, np.broadcast_to([1.0, 1.0, 0.0], grid.metrics.shape))
+
+
+def test_second_moment_shapes_tell_textured_blocks_from_flat_ones() -> None:
+    image = np.full((160, 320), 128, np.uint8)
+    image[:, :160] = texture((160, 160), seed=5)
+    textured = SOURCE.grid(image).textured
+    assert textured[:, :36].all()
+    assert not textured[:, 56:].any()
+
+
+def test_textured_blocks_lie_round_the_texture() -> None:
+    image = np.full((161, 318), 128, np.uint8)
+    image[40:72, 200:236] = texture((36, 32), seed=5)
+    grid = SOURCE.grid(image)
+    rows, columns = np.nonzero(grid.textured)
+    middle = np.array([columns.mean(), rows.mean()]) * grid.step_px + grid.origin_px
+    assert_allclose(middle, [217.5, 55.5], atol=2.0)
+
+
+@pytest.mark.parametrize(
+    ("size", "cells"),
+    [((1, 1), (1, 1)), ((50, 1), (13, 1)), ((1, 6), (1, 2)), ((33, 18), (9, 5)), ((8, 4), (2, 1))],
+)
+def test_second_moment_shapes_have_one_cell_per_started_block(
+    size: tuple[int, int], cells: tuple[int, int]
+) -> None:
+    rng = np.random.default_rng(2)
+    image = rng.integers(0, 256, size[::-1]).astype(np.uint8)
+    grid = SOURCE.grid(image)
+    assert grid.textured.shape == cells[::-1]
+    assert grid.metrics.shape == (*cells[::-1], 3)
+    assert (grid.origin_px, grid.step_px) == (1.5, 4)
+    s11, s22, s12 = np.moveaxis(grid.metrics, -1, 0)
+    assert_allclose(s11 * s22 - s12**2, 1.0, rtol=1e-6)
+
+
+def test_second_moment_shapes_of_stripes_stay_finite_and_of_unit_area() -> None:
+    stripes = np.tile(np.repeat([30, 220], 6).astype(np.uint8), (120, 10))
+    grid = SOURCE.grid(stripes)
+    s11, s22, s12 = np.moveaxis(grid.metrics, -1, 0)
+    assert np.isfinite(grid.metrics).all()
+    assert_allclose(s11 * s22 - s12**2, 1.0, rtol=1e-6)
+    # Gradients along x only: x is to be stretched, without limit but that of the code.
+    assert (tilts_from_metrics(grid.metrics)[0] > 10.0).all()
+
+
+def test_samples_are_the_textured_blocks_with_their_centers() -> None:
+    image = np.full((161, 318), 128, np.uint8)
+    image[:, :160] = texture((160, 161), seed=5)
+    grid, samples = SOURCE.grid(image), SOURCE.samples(image)
+    assert 0 < np.count_nonzero(grid.textured) < grid.textured.size
+    columns, rows = ((samples.points - grid.origin_px) / grid.step_px).astype(int).T
+    assert_array_equal(np.stack([rows, columns], axis=1), np.argwhere(grid.textured))
+    assert_array_equal(samples.metrics, grid.metrics[rows, columns])

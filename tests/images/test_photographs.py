@@ -1,0 +1,257 @@
+"""Lists of photographs, masks, and what else is known beside their pixels."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import PIL.ExifTags
+import PIL.Image
+import pytest
+from small_scene import IMAGE_SIZE, photograph
+from synthetic import texture, write_image
+
+import colmap_affrect
+from colmap_affrect.cli import main
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.data import Mask
+from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.features.sift import SiftOptions
+from colmap_affrect.images.masks import read_mask, shrink_mask
+from colmap_affrect.images.photographs import MaskOptions, Photographs, list_images
+from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.recipes import ExtractionOptions
+from colmap_affrect.rectifiers.whole_image import AsiftOptions
+from colmap_affrect.stages.one_image import prepare
+
+OPTIONS = ExtractionOptions(
+    rectifier=AsiftOptions(),
+    features=SiftOptions(max_num_features=100_000, max_num_rectified_features=100_000),
+)
+"""Many warps, so that most features come from one, and all features that there are."""
+
+
+def diagonal_mask(size: tuple[int, int] = IMAGE_SIZE) -> Mask:
+    """True above a slanted line that has no symmetry."""
+    columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    return np.asarray(rows < 60 + 0.4 * columns)
+
+
+@pytest.fixture
+def photo_path(tmp_path: Path) -> Path:
+    path = tmp_path / "photos" / "a b.png"
+    path.parent.mkdir()
+    write_image(path, photograph((0.2, 0.0, 0.1), 4.0))
+    return path
+
+
+def write_mask(path: Path, mask: Mask, white: int = 255) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, mask.astype(np.uint8) * np.uint8(white))
+
+
+@pytest.mark.long
+def test_features_of_the_image_and_of_all_warps_keep_to_the_mask(photo_path: Path) -> None:
+    mask = diagonal_mask()
+    extractor = prepare(OPTIONS)
+    everywhere = extractor.extract_file(photo_path).features
+    inside = extractor.extract_file(photo_path, mask=mask).features
+    columns, rows = np.rint(inside.keypoints).astype(int).T
+    assert mask[rows, columns].all()
+    expected = np.count_nonzero(mask[tuple(np.rint(everywhere.keypoints).astype(int).T[::-1])])
+    # Features next to the mask's edge may differ: in warps the edge is a pixel coarse.
+    assert len(inside) == pytest.approx(expected, rel=0.03)
+    assert (inside.rectification_ids > 0).sum() > 0.8 * len(inside)
+
+
+def test_mask_is_applied_before_the_strongest_features_are_chosen(photo_path: Path) -> None:
+    mask = np.zeros(IMAGE_SIZE[::-1], bool)
+    mask[150:, 200:] = True
+    options = ExtractionOptions.from_mapping(
+        {
+            "rectifier": {"name": "asift"},
+            "features": {"max_num_features": 200, "max_num_rectified_features": 300},
+        },
+        "test",
+    )
+    features = prepare(options).extract_file(photo_path, mask=mask).features
+    assert (features.rectification_ids > 0).sum() > 280  # a few are at the mask's very edge
+    assert (features.rectification_ids == 0).sum() > 30
+
+
+def test_mask_of_a_shrunk_image_is_exact_in_its_own_pixels(photo_path: Path) -> None:
+    mask = diagonal_mask()
+    options = ExtractionOptions(rectifier=AsiftOptions(), max_image_size_px=131)
+    features = prepare(options).extract_file(photo_path, mask=mask).features
+    columns, rows = np.rint(features.keypoints).astype(int).T
+    assert len(features) > 100
+    assert mask[rows, columns].all()
+
+
+def test_shrunk_mask_keeps_its_place() -> None:
+    mask = np.zeros((90, 120), bool)
+    mask[30:, 20:60] = True
+    expected = np.zeros((30, 40), bool)
+    expected[10:, 7:20] = True
+    np.testing.assert_array_equal(shrink_mask(mask, (40, 30)), expected)
+
+
+@pytest.mark.parametrize("white", [1, 77, 255])
+def test_only_black_is_left_out(tmp_path: Path, white: int) -> None:
+    write_mask(tmp_path / "m.png", diagonal_mask((40, 90)), white)
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), diagonal_mask((40, 90)))
+
+
+def test_colour_and_16_bit_masks_are_read(tmp_path: Path) -> None:
+    mask = diagonal_mask((50, 80))
+    colour = np.zeros((*mask.shape, 4), np.uint8)
+    colour[..., 1], colour[..., 3] = mask * 200, 255
+    cv2.imwrite(str(tmp_path / "rgba.png"), colour)
+    cv2.imwrite(str(tmp_path / "deep.png"), mask.astype(np.uint16))
+    for name in ("rgba.png", "deep.png"):
+        np.testing.assert_array_equal(read_mask(tmp_path / name), mask)
+
+
+@pytest.mark.parametrize("mask_name", ["wing/a b.jpg.png", "wing/a b.png"])
+def test_masks_are_found_as_colmap_finds_them(tmp_path: Path, mask_name: str) -> None:
+    image = texture((200, 160), 3)
+    for folder in ("images/wing", "masks/wing"):
+        (tmp_path / folder).mkdir(parents=True)
+    write_image(tmp_path / "images/wing/a b.jpg", image)
+    mask = diagonal_mask((200, 160))
+    write_mask(tmp_path / "masks" / mask_name, mask)
+    found = Photographs(tmp_path / "images", MaskOptions(path=str(tmp_path / "masks"))).mask(
+        "wing/a b.jpg"
+    )
+    np.testing.assert_array_equal(found, mask)
+    pycolmap.extract_features(
+        tmp_path / "colmap.db",
+        tmp_path / "images",
+        reader_options=dict(mask_path=tmp_path / "masks"),
+    )
+    with pycolmap.Database.open(tmp_path / "colmap.db") as database:
+        points = database.read_keypoints(1)[:, :2]
+    assert len(points) > 20
+    assert mask[tuple(np.floor(points).astype(int).T[::-1])].all()
+
+
+def test_mask_and_camera_mask_both_count(tmp_path: Path) -> None:
+    one, other = diagonal_mask((60, 50)), diagonal_mask((60, 50))[:, ::-1]
+    write_mask(tmp_path / "masks" / "x.png", one)
+    write_mask(tmp_path / "camera.png", other)
+    masks = MaskOptions(path=str(tmp_path / "masks"), camera_path=str(tmp_path / "camera.png"))
+    both = Photographs(tmp_path, masks).mask("x.jpg")
+    np.testing.assert_array_equal(both, one & other)
+    write_mask(tmp_path / "camera.png", other[:40])
+    with pytest.raises(ImageError, match="differ in size"):
+        Photographs(tmp_path, masks).mask("x.jpg")
+
+
+@pytest.mark.parametrize(
+    ("prepare_mask", "message"),
+    [
+        (Path.exists, "has no mask .*a b.png.png; make one"),
+        (lambda path: path.write_bytes(b""), "not a readable image"),
+        (lambda path: write_mask(path, diagonal_mask((300, 240))), "320 x 240 px and its mask 300"),
+    ],
+)
+def test_image_with_a_wrong_mask_is_reported_and_the_others_go_on(
+    photo_path: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    prepare_mask: Callable[[Path], None],
+    message: str,
+) -> None:
+    write_image(photo_path.with_name("good.png"), texture((90, 70), 1))
+    write_mask(tmp_path / "masks/good.png", np.ones((70, 90), bool))
+    prepare_mask(tmp_path / "masks/a b.png.png")
+    arguments = ["--image-path", photo_path.parent, "--output-path", tmp_path / "out"]
+    code = main(["extract", *map(str, arguments), "--mask-path", str(tmp_path / "masks"), "-q"])
+    assert code == 1
+    assert "could not read 1 of the images: a b.png" in capfd.readouterr().err
+    store = FeatureStore(tmp_path / "out" / "features.h5")
+    assert store.names() == ["good.png"]
+    log = (tmp_path / "out" / "run.log").read_text()
+    assert re.search(message, log)
+
+
+def test_missing_folder_of_masks_is_one_clear_line(tmp_path: Path) -> None:
+    masks = MaskOptions(path=str(tmp_path / "nowhere"))
+    with pytest.raises(OptionError, match=r"--mask-path .*nowhere: no such folder"):
+        Photographs(tmp_path, masks).check()
+    masks = MaskOptions(camera_path=str(tmp_path / "nothing.png"))
+    with pytest.raises(OptionError, match=r"--camera-mask-path .*nothing\.png: no such file"):
+        Photographs(tmp_path, masks).check()
+
+
+def test_gps_position_and_focal_length_of_exif_are_taken_over(tmp_path: Path) -> None:
+    exif = PIL.Image.Exif()
+    exif.get_ifd(PIL.ExifTags.IFD.Exif)[PIL.ExifTags.Base.FocalLengthIn35mmFilm] = 50
+    exif.get_ifd(PIL.ExifTags.IFD.GPSInfo).update(
+        {
+            PIL.ExifTags.GPS.GPSLatitudeRef: "S",
+            PIL.ExifTags.GPS.GPSLatitude: (33.0, 51.0, 36.0),
+            PIL.ExifTags.GPS.GPSLongitudeRef: "E",
+            PIL.ExifTags.GPS.GPSLongitude: (151.0, 12.0, 0.0),
+            PIL.ExifTags.GPS.GPSAltitudeRef: b"\0",
+            PIL.ExifTags.GPS.GPSAltitude: 40.0,
+        }
+    )
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    PIL.Image.fromarray(texture((240, 160), 1)).save(photos / "a.jpg", exif=exif)
+    path = tmp_path / "a.db"
+    colmap_affrect.extract_features(path, photos)
+    colmap_affrect.extract_features(tmp_path / "b.db", photos, from_database=path)
+    for copy in (path, tmp_path / "b.db"):
+        with pycolmap.Database.open(copy) as database:
+            (prior,) = database.read_all_pose_priors()
+            np.testing.assert_allclose(prior.position, [-33.86, 151.2, 40.0], atol=1e-6)
+            (camera,) = database.read_all_cameras()
+            assert camera.has_prior_focal_length
+            # 35 mm film has a diagonal of 43.27 mm.
+            assert camera.focal_length == pytest.approx(50 / 43.27 * np.hypot(240, 160), rel=1e-3)
+
+
+def test_list_images_finds_images_in_folders_and_passes_over_the_rest(tmp_path: Path) -> None:
+    for name in (
+        "z.JPG", "a b.png", "deep/er/č.tif", ".hidden.png", ".git/x.png", "notes.txt", "a.webp",
+        "folder.png/inside.bmp",
+    ):  # fmt: skip
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert list_images(tmp_path) == [
+        "a b.png", "deep/er/č.tif", "folder.png/inside.bmp", "z.JPG",
+    ]  # fmt: skip
+
+
+def test_list_images_takes_those_of_a_list(tmp_path: Path) -> None:
+    for name in ("a.png", "b c.png", "deep/č.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    listed = tmp_path / "list.txt"
+    text = "\ufeff# comment\nb c.png\n\n./deep//č.png\nb c.png\n"
+    listed.write_text(text, encoding="utf-8")
+    assert list_images(tmp_path, listed) == ["b c.png", "deep/č.png"]
+
+
+def test_list_images_refuses_a_name_that_is_not_utf8(tmp_path: Path) -> None:
+    Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.png")).write_bytes(b"")
+    with pytest.raises(ImageError, match="is not UTF-8; rename it") as error:
+        list_images(tmp_path)
+    str(error.value).encode("utf-8")
+
+
+@pytest.mark.parametrize("line", ["d.png", "../photos/a.png", "{folder}/a.png", "# a.png", ""])
+def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: str) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "a.png").write_bytes(b"")
+    listed = tmp_path / "list.txt"
+    listed.write_text(line.format(folder=folder))
+    with pytest.raises(ImageError, match=r"list\.txt: (lists .* not in|is empty)"):
+        list_images(folder, listed)

@@ -1,0 +1,178 @@
+"""Reading of images of all kinds, their sizes and regions, and OpenCV's threads."""
+
+from __future__ import annotations
+
+import re
+from contextlib import ExitStack
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from synthetic import blobs, centroid, jpeg_with_orientation, texture, write_image
+
+from colmap_affrect.conventions import resized_from_original
+from colmap_affrect.errors import ImageError
+from colmap_affrect.geometry.affine import project
+from colmap_affrect.images.masks import connected_regions
+from colmap_affrect.images.reading import read_gray, shrink_to
+from colmap_affrect.parallel.opencv_threads import SHARED_OPENCV_THREADS
+
+
+def test_connected_regions_are_cropped_and_large_enough() -> None:
+    mask = np.zeros((9, 12), bool)
+    mask[1:4, 2:5] = True
+    mask[4, 5] = True  # touches the corner of the first only
+    mask[6:9, 7:12] = True
+    mask[7, 8] = False
+    regions = connected_regions(mask, 9)
+    assert [(region.shape, origin) for region, origin in regions] == [
+        ((3, 3), (2, 1)),
+        ((3, 5), (7, 6)),
+    ]
+    assert regions[0][0].all()
+    np.testing.assert_array_equal(regions[1][0], mask[6:9, 7:12])
+    assert len(connected_regions(mask, 10)) == 1
+    assert len(connected_regions(mask, 0)) == 3
+    assert connected_regions(np.zeros((4, 5), bool), 0) == []
+
+
+def test_opencv_threads_are_shared_by_those_who_hold_them() -> None:
+    given = cv2.getNumThreads()
+    try:
+        for all_threads, shares in ((4, [4, 2, 1]), (1, [1, 1, 1])):
+            cv2.setNumThreads(all_threads)
+            with ExitStack() as stack:
+                for share in shares:
+                    stack.enter_context(SHARED_OPENCV_THREADS)
+                    assert cv2.getNumThreads() == share
+            assert cv2.getNumThreads() == all_threads
+    finally:
+        cv2.setNumThreads(given)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif", ".ppm"])
+def test_read_gray_weighs_colours_as_itu_601(tmp_path: Path, suffix: str) -> None:
+    bgr = np.zeros((2, 4, 3), np.uint8)
+    bgr[0] = [[255, 0, 0], [0, 255, 0], [0, 0, 255], [200, 100, 50]]
+    path = write_image(tmp_path / f"colours{suffix}", bgr)
+    expected = [0.114 * 255, 0.587 * 255, 0.299 * 255, 0.114 * 200 + 58.7 + 0.299 * 50]
+    assert_allclose(read_gray(path)[0], expected, atol=1)
+    assert read_gray(path)[1].tolist() == [0, 0, 0, 0]
+
+
+def test_read_gray_returns_contiguous_rows_of_eight_bits(tmp_path: Path) -> None:
+    image = np.arange(15, dtype=np.uint8).reshape(3, 5)
+    read = read_gray(write_image(tmp_path / "ramp.png", image))
+    assert read.dtype == np.uint8
+    assert read.flags.c_contiguous
+    np.testing.assert_array_equal(read, image)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_read_gray_scales_sixteen_bits_to_eight(tmp_path: Path, suffix: str) -> None:
+    values = np.array([[0, 257, 128 * 257, 65535], [256, 1000, 30000, 65000]], np.uint16)
+    read = read_gray(write_image(tmp_path / f"deep{suffix}", values))
+    assert read.dtype == np.uint8
+    assert read.tolist() == [[0, 1, 128, 255], [0, 3, 116, 252]]
+
+
+def test_read_gray_scales_sixteen_bit_colours(tmp_path: Path) -> None:
+    bgr = np.full((3, 2, 3), (10000, 20000, 60000), np.uint16)
+    read = read_gray(write_image(tmp_path / "deep.png", bgr))
+    expected = (0.114 * 10000 + 0.587 * 20000 + 0.299 * 60000) / 257
+    assert_allclose(read, np.full((3, 2), expected), atol=1)
+
+
+def test_read_gray_reads_floats_from_zero_to_one(tmp_path: Path) -> None:
+    values = np.array([[0.0, 0.5, 1.0], [-0.2, 0.25, 1.7]], np.float32)
+    read = read_gray(write_image(tmp_path / "float.tif", values))
+    assert_allclose(read, [[0, 127.5, 255], [0, 63.75, 255]], atol=1)
+
+
+def test_read_gray_ignores_transparency(tmp_path: Path) -> None:
+    bgra = np.zeros((2, 3, 4), np.uint8)
+    bgra[..., :3] = 100
+    bgra[..., 3] = [[0, 128, 255], [255, 0, 1]]
+    assert (read_gray(write_image(tmp_path / "clear.png", bgra)) == 100).all()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_read_gray_does_not_apply_the_exif_orientation(tmp_path: Path, orientation: int) -> None:
+    image = blobs((48, 32), [[10.0, 8.0]], 4.0 * np.eye(2))
+    path = tmp_path / "turned.jpg"
+    path.write_bytes(jpeg_with_orientation(image, orientation))
+    if orientation >= 5:
+        obeying = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert obeying.shape == (48, 32), "the EXIF bytes of this test are not understood"
+    assert_allclose(read_gray(path).astype(int), image, atol=4)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"no image at all", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", None]
+)
+def test_read_gray_names_the_file_that_is_no_image(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "broken name.jpg"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ImageError, match=r"broken name\.jpg"):
+        read_gray(path)
+    with pytest.raises(ImageError, match=re.escape(str(tmp_path))):
+        read_gray(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".bmp"])
+@pytest.mark.parametrize("kept_frac", [0.02, 0.5, 0.9])
+def test_read_gray_of_a_truncated_file_keeps_the_size_or_is_an_image_error(
+    tmp_path: Path, suffix: str, kept_frac: float
+) -> None:
+    image = texture((120, 70), seed=2)
+    path = write_image(tmp_path / f"cut{suffix}", image)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(kept_frac * len(data))])
+    try:
+        read = read_gray(path)
+    except ImageError:
+        return
+    assert read.shape == image.shape
+    if suffix != ".bmp":  # which stores its last row first
+        assert_allclose(read[:4].astype(int), image[:4], atol=25)
+
+
+def test_read_gray_reads_names_with_spaces_and_letters_of_all_kinds(tmp_path: Path) -> None:
+    image = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    path = write_image(tmp_path / "Žižkův dům #1.png", image)
+    np.testing.assert_array_equal(read_gray(path), image)
+
+
+def test_shrink_to_keeps_an_image_that_fits() -> None:
+    image = texture((90, 60), seed=4)
+    assert shrink_to(image, 90) is image
+
+
+@pytest.mark.parametrize(
+    ("size", "limit", "expected"),
+    [((200, 100), 50, (50, 25)), ((90, 300), 100, (30, 100)), ((1000, 1), 10, (10, 1))],
+)
+def test_shrink_to_limits_the_longer_side(
+    size: tuple[int, int], limit: int, expected: tuple[int, int]
+) -> None:
+    small = shrink_to(np.full(size[::-1], 120, np.uint8), limit)
+    assert small.shape == expected[::-1]
+    assert (small == 120).all()
+
+
+def test_shrink_to_averages_areas() -> None:
+    stripes = np.zeros((40, 80), np.uint8)
+    stripes[:, ::2] = 200
+    assert (shrink_to(stripes, 40) == 100).all()
+
+
+@pytest.mark.parametrize("limit", [150, 97, 40])
+def test_shrink_to_moves_points_as_the_conventions_say(limit: int) -> None:
+    center = np.array([[101.4, 52.8]])
+    image = blobs((300, 170), center, 12.0 * np.eye(2), background=0)
+    small = shrink_to(image, limit)
+    matrix = resized_from_original((300, 170), small.shape[::-1])
+    assert_allclose(centroid(small), project(matrix, center)[0], atol=0.03)

@@ -1,0 +1,331 @@
+"""Warps are exact and free of aliasing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from strategies import IMAGE_SIZE, Array, homographies, tilt_angles
+from synthetic import texture
+
+from colmap_affrect.data import GrayImage, Mask, Rectification
+from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
+from colmap_affrect.images.warping import halved, warp, warp_mask
+
+RAMP_ERROR_PX = 0.05
+"""A plane fitted to a thousand samples or more with 8-bit rounding, at its corners."""
+
+ALIGNED_RAMP_ERROR_PX = 0.15
+"""Where the ramp runs along the warp's axes all samples of a row are rounded alike, worth up to
+0.12 px (with floats it is 0.00). Half a px of a warp would be at least 0.2 px of the image."""
+
+DITHER = 0.5
+"""Noise in gray values that makes the rounding of the ramp random."""
+
+PERSPECTIVE_RAMP_ERROR_PX = 0.1
+"""A plane fitted to the errors of 500 samples or more, at the far end of the warp."""
+
+SIZE = (150, 100)
+
+
+def rectification(tilt: float, angle_rad: float, size: tuple[int, int] = SIZE) -> Rectification:
+    """Warp of a whole image of (width, height)."""
+    width, height = size
+    corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1.0]])
+    matrix, canvas = fit_canvas(rectifying_affine(tilt, angle_rad), corners, margin_px=4.0)
+    return Rectification(matrix, canvas, np.ones((height, width), bool), tilt, angle_rad)
+
+
+def canvas_points(plan: Rectification) -> Array:
+    """(H, W, 2) pixel-centre coordinates of all pixels of the canvas."""
+    width, height = plan.canvas_size
+    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
+
+
+@settings(max_examples=60)
+@given(st.floats(1.0, 6.22), tilt_angles, st.sampled_from([0, 1]))
+@example(1.0, 0.0, 1)
+@example(6.22, 0.0, 0)
+@example(6.22, np.pi / 2, 1)
+@example(4.0, 0.6, 0)
+def test_warp_of_a_coordinate_ramp_shows_image_from_rectified(
+    tilt: float, angle_rad: float, axis: int
+) -> None:
+    plan = rectification(tilt, angle_rad)
+    slope = 240.0 / SIZE[axis]
+    noise = np.random.default_rng(0).uniform(-DITHER, DITHER, SIZE[::-1])
+    ramp = np.rint(DITHER + noise + slope * np.indices(SIZE[::-1])[1 - axis]).astype(np.uint8)
+    values = (warp(ramp, plan) - DITHER) / slope
+    assert values.shape == plan.canvas_size[::-1]
+
+    points = canvas_points(plan).reshape(-1, 2)
+    sources = project(plan.image_from_rectified, points)
+    # Outside, and as far inside as the blur reaches, the border is reflected.
+    reach = 3 * 0.8 * tilt + 1
+    inside = ((sources >= reach) & (sources <= np.array(SIZE) - 1 - reach)).all(axis=1)
+    design = np.column_stack([points[inside], np.ones(np.count_nonzero(inside))])
+    fitted, *_ = np.linalg.lstsq(design, values.ravel()[inside], rcond=None)
+    expected = plan.image_from_rectified[axis]
+    errors = design @ (fitted - expected)
+    aligned = abs(np.sin(2 * angle_rad)) < 0.1
+    assert np.abs(errors).max() < (ALIGNED_RAMP_ERROR_PX if aligned else RAMP_ERROR_PX)
+    # Single pixels: the dither, and the rounding of input, intermediate result and output.
+    assert np.abs(values.ravel()[inside] - sources[inside, axis]).max() < (DITHER + 1.5) / slope
+
+
+def grating(direction: Array, period_px: float) -> GrayImage:
+    """Sinusoid of amplitude 100 along a direction."""
+    rows, columns = np.indices(SIZE[::-1])
+    phase = 2 * np.pi * (direction[0] * columns + direction[1] * rows) / period_px
+    return np.rint(128 + 100 * np.sin(phase)).astype(np.uint8)
+
+
+def amplitude(image: GrayImage, plan: Rectification) -> float:
+    """Amplitude of a sinusoid from its standard deviation, away from the image border."""
+    sources = project(plan.image_from_rectified, canvas_points(plan).reshape(-1, 2))
+    inside = ((sources > 16) & (sources < np.array(SIZE) - 17)).all(axis=1)
+    return float(np.sqrt(2) * warp(image, plan).ravel()[inside].std())
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 0.7, np.pi / 2, 2.2])
+@pytest.mark.parametrize("tilt", [3.15, 6.22])
+def test_warp_suppresses_what_the_compressed_axis_cannot_show(
+    tilt: float, angle_rad: float
+) -> None:
+    plan = rectification(tilt, angle_rad)
+    compressed = plan.rectified_from_image[1, :2]
+    compressed = compressed / np.linalg.norm(compressed)
+    # Period below two px of the warp, i.e. 2 sqrt(t) of the image: it would alias.
+    too_fine = grating(compressed, 1.3 * np.sqrt(tilt))
+    assert amplitude(too_fine, plan) < 8.0
+    coarse = grating(compressed, 24.0)
+    assert amplitude(coarse, plan) > 80.0
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 0.7, 2.2])
+def test_warp_does_not_blur_the_stretched_axis(angle_rad: float) -> None:
+    plan = rectification(6.22, angle_rad)
+    stretched = plan.rectified_from_image[0, :2]
+    stretched = stretched / np.linalg.norm(stretched)
+    assert amplitude(grating(stretched, 8.0), plan) > 80.0
+
+
+def test_warp_by_the_identity_copies_the_image() -> None:
+    image = texture(SIZE, seed=1)
+    plan = Rectification(np.eye(3), SIZE, np.ones(SIZE[::-1], bool), 1.0, 0.0)
+    np.testing.assert_array_equal(warp(image, plan), image)
+
+
+def num_inside_mask(plan: Rectification) -> int:
+    """Check the mask of a region of columns 30-109 and rows 20-59; count its inner pixels."""
+    mask = warp_mask(plan, SIZE)
+    assert mask.shape == plan.canvas_size[::-1]
+    assert np.unique(mask).tolist() == [0, 255]
+    sources = project(plan.image_from_rectified, canvas_points(plan).reshape(-1, 2))
+    low, high = np.array([29.5, 19.5]), np.array([109.5, 59.5])
+    slack = 0.1  # of OpenCV's fixed-point coordinates
+    surely = ((sources > low + slack) & (sources < high - slack)).all(axis=1)
+    surely_not = ((sources < low - slack) | (sources > high + slack)).any(axis=1)
+    assert (mask.ravel()[surely] == 255).all()
+    assert (mask.ravel()[surely_not] == 0).all()
+    assert surely_not.any()
+    return int(surely.sum())
+
+
+def test_warp_mask_marks_the_pixels_whose_source_is_in_the_region() -> None:
+    region = np.zeros((45, 90), bool)
+    region[5:, 10:] = True
+    plan = replace(rectification(3.0, 0.5), region=region, region_origin=(20, 15))
+    assert num_inside_mask(plan) > 0
+
+
+def test_warp_mask_of_a_whole_image_marks_where_the_warp_shows_it() -> None:
+    plan = rectification(3.0, 0.5)
+    everywhere = replace(plan, region=None)
+    np.testing.assert_array_equal(warp_mask(everywhere, SIZE), warp_mask(plan, SIZE))
+    sources = project(plan.image_from_rectified, canvas_points(plan).reshape(-1, 2))
+    shown = ((sources > -0.4) & (sources < np.array(SIZE) - 0.6)).all(axis=1)
+    assert (warp_mask(everywhere, SIZE).ravel()[shown] == 255).all()
+    assert shown.mean() < 0.9
+
+
+def perspective(
+    homography: Array, scale: float, size: tuple[int, int], region: Mask | None = None
+) -> Rectification:
+    """Warp of a whole image of (width, height) by a scaled homography."""
+    width, height = size
+    corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1.0]])
+    matrix, canvas = fit_canvas(scale * np.eye(2), project(homography, corners), margin_px=4.0)
+    return Rectification(matrix @ homography, canvas, region, 1.0, 0.0)
+
+
+def turned_camera(angle_deg: float, focal_px: float, size: tuple[int, int]) -> Array:
+    """Homography to the view of a camera that turns about an oblique axis."""
+    middle = (np.array(size) - 1.0) / 2.0
+    camera = np.array([[focal_px, 0, middle[0]], [0, focal_px, middle[1]], [0, 0, 1.0]])
+    turn, _ = cv2.Rodrigues(np.deg2rad(angle_deg) * np.array([0.5, 0.8, 0.33166]))
+    return np.asarray(camera @ turn @ np.linalg.inv(camera))
+
+
+def jacobian_spans(plan: Rectification, points: Array) -> Array:
+    """(N, 2) image px that a px of the warp spans in x and in y, by finite differences."""
+    step = 1e-3
+    return np.stack(
+        [
+            np.linalg.norm(
+                project(plan.image_from_rectified, points + step * np.eye(2)[axis])
+                - project(plan.image_from_rectified, points - step * np.eye(2)[axis]),
+                axis=1,
+            )
+            / (2 * step)
+            for axis in (0, 1)
+        ],
+        axis=1,
+    )
+
+
+@settings(max_examples=30)
+@given(homographies(), st.floats(0.25, 2.5), st.sampled_from([0, 1]))
+@example(np.array([[1, 0, 0], [0, 1, 0], [0.002, 0, 1.0]]), 2.5, 0)
+@example(np.array([[1, 0, 0], [0, 1, 0], [0, 0.004, 1.0]]), 0.3, 1)
+def test_warp_by_a_homography_of_a_coordinate_ramp_shows_image_from_rectified(
+    homography: Array, scale: float, axis: int
+) -> None:
+    size = IMAGE_SIZE
+    plan = perspective(homography, scale, size)
+    slope = 240.0 / size[axis]
+    noise = np.random.default_rng(0).uniform(-DITHER, DITHER, size[::-1])
+    ramp = np.rint(DITHER + noise + slope * np.indices(size[::-1])[1 - axis]).astype(np.uint8)
+    values = ((warp(ramp, plan) - DITHER) / slope).ravel()
+    assert values.shape == (plan.canvas_area_px,)
+    points = canvas_points(plan).reshape(-1, 2)
+    sources = project(plan.image_from_rectified, points)
+    reach = 3 * 0.8 * jacobian_spans(plan, points).max(axis=1, keepdims=True) + 1
+    inside = ((sources >= reach) & (sources <= np.array(size) - 1 - reach)).all(axis=1)
+    if np.count_nonzero(inside) < 500:
+        return
+    errors = values[inside] - sources[inside, axis]
+    assert np.abs(errors).max() < (DITHER + 1.5) / slope
+    # Rounding is random over a thousand px; an error of the map would grow along the warp.
+    basis = (points[inside] - points[inside].mean(axis=0)) / np.array(plan.canvas_size)
+    design = np.column_stack([np.ones(len(basis)), basis])
+    fitted, *_ = np.linalg.lstsq(design, errors, rcond=None)
+    assert abs(fitted[0]) < RAMP_ERROR_PX
+    assert np.abs(design @ fitted).max() < PERSPECTIVE_RAMP_ERROR_PX
+
+
+def test_warp_by_a_homography_shows_frontal_detail_and_suppresses_what_it_cannot_show() -> None:
+    # The left end of the warp magnifies, its right end compresses by three and more.
+    size = (900, 300)
+    homography = np.array([[1.0, 0, 0], [0, 1.0, 0], [0.002, 0, 1.0]])
+    plan = perspective(homography, 1.2, size)
+    rows, columns = np.indices(size[::-1])
+    image = np.rint(128 + 100 * np.sin(2 * np.pi * (0.95 * columns + 0.3 * rows) / 5.0))
+    shown = warp(image.astype(np.uint8), plan).astype(float)
+    points = canvas_points(plan)
+    sources = project(plan.image_from_rectified, points.reshape(-1, 2))
+    inside = ((sources > 12) & (sources < np.array(size) - 13)).all(axis=1)
+    spans = jacobian_spans(plan, points.reshape(-1, 2)).max(axis=1)
+    magnified = inside & (spans < 1.0)
+    compressed = inside & (spans > 3.2)  # 5 px of the image are less than 2 of the warp
+    assert np.count_nonzero(magnified) > 3000
+    assert np.count_nonzero(compressed) > 3000
+    assert np.sqrt(2) * shown.ravel()[magnified].std() > 75.0
+    assert np.sqrt(2) * shown.ravel()[compressed].std() < 8.0
+
+
+def test_warp_by_a_homography_close_to_affine_is_the_affine_warp() -> None:
+    image = texture(SIZE, seed=5, finest_sigma_px=2.0)
+    for tilt, angle_rad in [(1.0, 0.0), (1.0, 0.6), (3.2, 0.0), (2.5, np.pi / 2)]:
+        plan = rectification(tilt, angle_rad)
+        matrix = plan.rectified_from_image.copy()
+        matrix[2, 0] = 1e-12
+        almost = replace(plan, rectified_from_image=matrix)
+        assert not almost.is_affine
+        # Equal but for OpenCV's coordinates in steps of 1/32 px, and but for the rim of the
+        # canvas, which one of them blurs with what lies beyond and the other with its mirror.
+        inner = (slice(3, -3), slice(None))
+        assert_allclose(warp(image, almost)[inner].astype(int), warp(image, plan)[inner], atol=4)
+        np.testing.assert_array_equal(warp_mask(almost, SIZE), warp_mask(plan, SIZE))
+
+
+def test_warp_by_a_homography_does_not_depend_on_its_scale_as_a_matrix() -> None:
+    image = texture(SIZE, seed=5)
+    plan = perspective(turned_camera(30.0, 120.0, SIZE), 1.0, SIZE)
+    for factor in (1e-12, 1e12):
+        scaled = replace(plan, rectified_from_image=factor * plan.rectified_from_image)
+        assert_allclose(warp(image, scaled).astype(int), warp(image, plan), atol=1)
+        np.testing.assert_array_equal(warp_mask(scaled, SIZE), warp_mask(plan, SIZE))
+
+
+def test_warp_by_a_homography_reflects_the_border() -> None:
+    shift = np.array([[1, 0, 20.0], [0, 1, 10.0], [1e-9, 0, 1.0]])
+    image = texture(SIZE, seed=9)
+    shifted = warp(image, Rectification(shift, (120, 80), None, 1.0, 0.0))
+    reflected = np.pad(image, ((10, 0), (20, 0)), mode="reflect")[:80, :120]
+    assert_allclose(shifted.astype(int), reflected, atol=1)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (3, 2)])
+def test_warps_of_tiny_flat_images_are_flat_and_of_the_planned_size(size: tuple[int, int]) -> None:
+    matrix = np.array([[3.0, 0.2, 4.0], [0.1, 2.5, 4.0], [1e-3, 2e-3, 1.0]])
+    for plan in (rectification(4.0, 0.8, size), Rectification(matrix, (150, 140), None, 1.0, 0.0)):
+        shown = warp(np.full(size[::-1], 90, np.uint8), plan)
+        assert shown.shape == warp_mask(plan, size).shape == plan.canvas_size[::-1]
+        assert np.unique(shown).tolist() == [90]
+
+
+def test_warp_mask_of_a_homography_marks_the_pixels_whose_source_is_in_the_region() -> None:
+    region = np.zeros((45, 90), bool)
+    region[5:, 10:] = True
+    homography = turned_camera(35.0, 120.0, SIZE)
+    plan = replace(perspective(homography, 1.6, SIZE), region=region, region_origin=(20, 15))
+    assert num_inside_mask(plan) > 1000
+
+
+def test_warp_mask_is_zero_behind_the_camera() -> None:
+    # A camera that turned by 70 degrees; the canvas reaches beyond the image's vanishing line.
+    homography = turned_camera(70.0, 60.0, SIZE)
+    plan = Rectification(np.array([[1, 0, 400.0], [0, 1, 300], [0, 0, 1]]) @ homography,
+                         (800, 600), None, 1.0, 0.0)  # fmt: skip
+    points = canvas_points(plan).reshape(-1, 2)
+    third = points @ plan.image_from_rectified[2, :2] + plan.image_from_rectified[2, 2]
+    sources = project(plan.image_from_rectified, points)
+    mirrored = (third < 0) & ((sources > 0) & (sources < np.array(SIZE) - 1)).all(axis=1)
+    assert mirrored.any(), "the canvas of this test shows no mirror image"
+    mask = warp_mask(plan, SIZE).ravel()
+    assert (mask[third <= 0] == 0).all()
+    assert (mask == 255).any()
+    assert warp(texture(SIZE, seed=1), plan).shape == (600, 800)
+
+
+@pytest.mark.parametrize(("width", "height"), [(64, 40), (65, 41)])
+def test_halved_samples_at_pixel_centres(width: int, height: int) -> None:
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    for axis, ramp in enumerate((x, y)):
+        small = halved(ramp.astype(np.float32))
+        assert small.shape == (height // 2, width // 2)
+        steps = np.arange(small.shape[1 - axis])
+        along = (steps + 0.5) * (width, height)[axis] / len(steps) - 0.5
+        found = small[10] if axis == 0 else small[:, 10]
+        # Near the border the blur sees the reflected ramp.
+        assert_allclose(found[2:-2], along[2:-2], atol=1e-4)
+
+
+@pytest.mark.parametrize("perspective", [0.0, 0.002])
+def test_warp_of_colours_is_that_of_each_channel(perspective: float) -> None:
+    plan = rectification(2.5, 0.6)
+    bent = np.diag([1.0, 1.0, 1.0])
+    bent[2, 0] = perspective
+    plan = replace(plan, rectified_from_image=plan.rectified_from_image @ bent)
+    channels = [texture(SIZE, seed) for seed in (1, 2, 3)]
+    warped = warp(np.stack(channels, axis=2), plan)
+    assert warped.shape == (*plan.canvas_size[::-1], 3)
+    for index, channel in enumerate(channels):
+        np.testing.assert_array_equal(warped[:, :, index], warp(channel, plan))

@@ -1,0 +1,352 @@
+"""Scripts written for pycolmap go on working when two of their calls are replaced."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_scene import NAMES, write_photographs
+from synthetic import write_image
+
+import colmap_affrect
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.errors import (
+    AffrectError,
+    DatabaseError,
+    OptionError,
+    PairListError,
+    StaleStoreError,
+)
+from colmap_affrect.images.reading import read_gray
+from colmap_affrect.matchers import nearest
+from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.verify import recorded_verification
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos")
+    write_photographs(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def sift(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A SIFT database of COLMAP: two images share a camera of known focal length, one has GPS."""
+    path = tmp_path_factory.mktemp("sift") / "old.db"
+    pycolmap.extract_features(
+        path,
+        photos,
+        camera_mode=pycolmap.CameraMode.PER_FOLDER,
+        reader_options=dict(camera_model="PINHOLE", camera_params="301,302,161,122"),
+    )
+    pycolmap.match_exhaustive(path)
+    with open_database(path) as database:
+        image = database.read_all_images()[1]
+        prior = pycolmap.PosePrior(position=np.array([1.0, 2.0, 3.0]))
+        prior.corr_data_id = image.data_id
+        database.write_pose_prior(prior)
+    return path
+
+
+def content(path: Path) -> dict[str, bytes]:
+    """Digests of all files of a folder."""
+    files = (file for file in path.parent.rglob("*") if file.is_file())
+    return {file.name: hashlib.sha256(file.read_bytes()).digest() for file in files}
+
+
+def keypoints(path: Path) -> dict[str, Any]:
+    with open_database(path) as database:
+        images = database.read_all_images()
+        return {image.name: database.read_keypoints(image.image_id) for image in images}
+
+
+def test_the_documented_example_of_pycolmap_registers_the_scene(
+    photos: Path, tmp_path: Path
+) -> None:
+    # pycolmap's example pipeline, with its name replaced in the two calls that make features.
+    output_path = tmp_path / "out"
+    output_path.mkdir()
+    database_path = output_path / "database.db"
+
+    colmap_affrect.extract_features(database_path, photos)
+    colmap_affrect.match_exhaustive(database_path)
+    maps = pycolmap.incremental_mapping(database_path, photos, output_path)
+    maps[0].write(output_path)
+
+    assert {image.name for image in maps[0].images.values()} == set(NAMES)
+    assert pycolmap.Reconstruction(output_path).num_reg_images() == len(NAMES)
+
+
+def test_database_is_that_of_a_run(photos: Path, tmp_path: Path) -> None:
+    colmap_affrect.extract_features(str(tmp_path / "a.db"), str(photos))
+    colmap_affrect.match_exhaustive(str(tmp_path / "a.db"))
+    colmap_affrect.run(photos, tmp_path / "run")
+    one, other = keypoints(tmp_path / "a.db"), keypoints(tmp_path / "run" / "database.db")
+    assert one.keys() == other.keys() == set(NAMES)
+    for name in NAMES:
+        np.testing.assert_array_equal(one[name], other[name])
+    with (
+        open_database(tmp_path / "a.db") as first,
+        open_database(tmp_path / "run/database.db") as second,
+    ):
+        for ids in itertools.combinations(range(1, 5), 2):
+            np.testing.assert_array_equal(first.read_matches(*ids), second.read_matches(*ids))
+        assert first.num_verified_image_pairs() == second.num_verified_image_pairs() == 6
+
+
+def test_images_and_pairs_are_added_call_by_call(photos: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    listed = tmp_path / "pairs.txt"
+    first = colmap_affrect.extract_features(path, photos, image_names=NAMES[2:])
+    assert (first.num_done, first.num_kept) == (2, 0)
+    listed.write_text(f"{NAMES[3]} {NAMES[2]}\n")
+    match, _ = colmap_affrect.match_image_pairs(
+        path, pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed)
+    )
+    assert match.num_done == 1
+    second = colmap_affrect.extract_features(path, photos)
+    assert (second.num_done, second.num_kept) == (2, 2)
+    match, verify = colmap_affrect.match_exhaustive(path)
+    assert (match.num_done, match.num_kept) == (5, 1)
+    assert verify.num_done == 5
+
+
+def test_what_pycolmap_imported_before_is_kept(photos: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    with open_database(path):
+        pass
+    options = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params="301,302,161,122")
+    pycolmap.import_images(path, photos, pycolmap.CameraMode.SINGLE, NAMES[::-1], options)
+    ids = image_ids(path)
+    colmap_affrect.extract_features(path, photos)
+    assert image_ids(path) == ids
+    with open_database(path) as database:
+        (camera,) = database.read_all_cameras()
+        assert camera.params.tolist() == [301, 302, 161, 122]
+
+
+def test_reader_options_and_camera_mode_are_those_of_pycolmap(photos: Path, tmp_path: Path) -> None:
+    options = dict(camera_model="PINHOLE", camera_params="301,302,161,122")
+    colmap_affrect.extract_features(
+        tmp_path / "a.db", photos, NAMES, pycolmap.CameraMode.PER_FOLDER, options
+    )
+    colmap_affrect.extract_features(
+        tmp_path / "b.db", photos, NAMES[:1], "per_image", dict(default_focal_length_factor=2.0)
+    )
+    with open_database(tmp_path / "a.db") as database:
+        cameras = database.read_all_cameras()
+        assert [camera.params.tolist() for camera in cameras] == [[301, 302, 161, 122]] * 2
+    with open_database(tmp_path / "b.db") as database:
+        (camera,) = database.read_all_cameras()
+        assert camera.focal_length == 2.0 * 320
+
+
+def test_features_are_replaced_in_a_new_database_and_the_old_one_stays(
+    photos: Path, sift: Path, tmp_path: Path
+) -> None:
+    before = content(sift)
+    colmap_affrect.extract_features(tmp_path / "new.db", photos, from_database=sift)
+    colmap_affrect.match_exhaustive(tmp_path / "new.db")
+    assert content(sift) == before
+
+    with open_database(sift) as old, open_database(tmp_path / "new.db") as new:
+        for kind in ("cameras", "rigs", "frames", "pose_priors"):
+            items = [getattr(data, f"read_all_{kind}")() for data in (old, new)]
+            assert len(items[0]) > 0
+            assert repr(items[0]) == repr(items[1])
+        images = [data.read_all_images() for data in (old, new)]
+        assert [(i.image_id, i.name, i.camera_id, i.frame_id) for i in images[0]] == [
+            (i.image_id, i.name, i.camera_id, i.frame_id) for i in images[1]
+        ]
+        assert new.num_verified_image_pairs() == 6
+        assert not new.exists_descriptors(1)
+    store = FeatureStore(Workspace.beside(tmp_path / "new.db").features)
+    for name, points in keypoints(tmp_path / "new.db").items():
+        np.testing.assert_allclose(points[:, :2], store.read(name).keypoints + 0.5, atol=1e-4)
+
+
+def test_features_of_another_program_are_never_replaced_in_place(photos: Path, sift: Path) -> None:
+    before = keypoints(sift)
+    with pytest.raises(DatabaseError, match=r"has other features of a\.png.*from_database"):
+        colmap_affrect.extract_features(sift, photos)
+    after = keypoints(sift)
+    for name in NAMES:
+        np.testing.assert_array_equal(before[name], after[name])
+
+
+def test_images_of_another_size_than_their_camera_are_reported(
+    photos: Path, sift: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "photos"
+    write_photographs(folder)
+    write_image(folder / "b c.png", read_gray(photos / "b c.png")[:200, :310])
+    report = colmap_affrect.extract_features(tmp_path / "new.db", folder, from_database=sift)
+    assert report.num_done == 3
+    assert report.failures.keys() == {"b c.png"}
+    assert "is 310 x 200 px, and its camera in the database 320 x 240" in report.failures["b c.png"]
+
+
+def test_image_of_the_database_that_is_not_there_is_named(sift: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    write_photographs(folder, 2)
+    with pytest.raises(AffrectError, match=r"old\.db: lists side/d\.png \(and 1 more\)"):
+        colmap_affrect.extract_features(tmp_path / "new.db", folder, from_database=sift)
+
+
+def test_cameras_of_the_database_and_camera_options_exclude_each_other(
+    photos: Path, sift: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(OptionError, match="leave out camera mode"):
+        colmap_affrect.extract_features(
+            tmp_path / "new.db", photos, camera_mode="single", from_database=sift
+        )
+
+
+def test_masks_of_the_reader_options_are_used(photos: Path, tmp_path: Path) -> None:
+    mask = np.zeros((240, 320), np.uint8)
+    mask[30:, 60:] = 1
+    write_image(tmp_path / "mask.png", mask)
+    colmap_affrect.extract_features(
+        tmp_path / "a.db",
+        photos,
+        NAMES[:1],
+        reader_options=pycolmap.ImageReaderOptions(camera_mask_path=tmp_path / "mask.png"),
+    )
+    points = keypoints(tmp_path / "a.db")["a.png"][:, :2]
+    assert len(points) > 100
+    assert (np.floor(points) >= (60, 30)).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"extraction_options": {"sift": {}}}, "unknown option 'sift'"),
+        ({"extraction_options": {"max_image_size_px": "big"}}, "expected int"),
+        ({"extraction_options": pycolmap.FeatureExtractionOptions()}, "does not apply here"),
+        ({"extraction_options": "defualt"}, "did you mean 'default'"),
+        ({"reader_options": {"camera_modell": "PINHOLE"}}, "did you mean 'camera_model'"),
+        ({"camera_mode": "two"}, "mode='two' is not one of"),
+        ({"image_names": ["a.png", "../x.png"]}, r"lists \.\./x\.png"),
+        ({"device": "cuda:77"}, "cuda:77"),
+        ({"from_database": "missing.db"}, "no such file"),
+        ({"from_database": "missing.db", "image_names": ["a.png"]}, "missing.db: no such file"),
+        ({"image_path": "nowhere", "image_names": ["a.png"]}, "nowhere: no such folder"),
+        ({"reader_options": {"default_focal_length_factor": "big"}}, "expected float, got str"),
+    ],
+)
+def test_wrong_arguments_are_one_clear_line(
+    photos: Path, tmp_path: Path, arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(AffrectError, match=message) as error:
+        colmap_affrect.extract_features(tmp_path / "a.db", **{"image_path": photos, **arguments})
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "a.db").exists()
+
+
+def test_options_of_verification_come_from_pycolmap_or_a_dictionary(
+    photos: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.db"
+    colmap_affrect.extract_features(path, photos, NAMES[:2], extraction_options={})
+    pycolmaps = pycolmap.TwoViewGeometryOptions(min_num_inliers=31, ransac=dict(max_error=2.5))
+    colmap_affrect.match_exhaustive(path, verification_options=pycolmaps)
+    recorded = recorded_verification(Workspace.beside(path))
+    assert (recorded.min_num_inliers, recorded.max_error_px) == (31, 2.5)
+    with pytest.raises(StaleStoreError, match=r"max_error_px=2\.5, and it is 3\.0 now; use a new"):
+        colmap_affrect.match_exhaustive(path)
+    with pytest.raises(OptionError, match="multiple_models=True cannot be carried over"):
+        colmap_affrect.match_exhaustive(
+            path, verification_options=pycolmap.TwoViewGeometryOptions(multiple_models=True)
+        )
+    with pytest.raises(OptionError, match="unknown option 'max_err'"):
+        colmap_affrect.match_exhaustive(path, verification_options={"max_err": 1})
+    with pytest.raises(PairListError, match="give match_list_path"):
+        colmap_affrect.match_image_pairs(path)
+
+
+def test_seed_of_the_options_counts_unless_another_is_given(photos: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    colmap_affrect.extract_features(path, photos, NAMES[:2], extraction_options={})
+    colmap_affrect.match_exhaustive(path, verification_options={"random_seed": 5})
+    assert recorded_verification(Workspace.beside(path)).random_seed == 5
+    with pytest.raises(StaleStoreError, match="random_seed=5, and it is 3 now"):
+        colmap_affrect.match_exhaustive(
+            path, verification_options={"random_seed": 5}, random_seed=3
+        )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_ratio": 3.0}, "^matching_options: max_ratio=3.0 is outside .0.1, 1.$"),
+        ({"max_rato": 0.8}, "^matching_options: unknown option 'max_rato'"),
+        (3, "^matching_options: int does not apply here; give colmap_affrect.NearestOptions or"),
+    ],
+)
+def test_wrong_options_of_matching_name_the_argument(
+    photos: Path, tmp_path: Path, options: Any, message: str
+) -> None:
+    colmap_affrect.extract_features(tmp_path / "a.db", photos, NAMES[:2])
+    with pytest.raises(OptionError, match=message):
+        colmap_affrect.match_exhaustive(tmp_path / "a.db", options)
+
+
+def test_sections_of_a_recipe_are_kept_for_later_calls(photos: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    sections = {"rectifier": "identity", "matching": {"max_ratio": 0.8}}
+    colmap_affrect.extract_features(path, photos, NAMES[:2], extraction_options=sections)
+    colmap_affrect.match_exhaustive(path)
+    assert Workspace.beside(path).require("match")["max_ratio"] == 0.8
+
+
+def test_device_reaches_matching(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    devices: list[str] = []
+    monkeypatch.setattr(nearest, "coarse_descriptors", lambda _, device: devices.append(device))
+    listed = tmp_path / "pairs.txt"
+    listed.write_text(f"{NAMES[0]} {NAMES[1]}\n")
+    path = tmp_path / "a.db"
+    colmap_affrect.extract_features(path, photos, NAMES[:3])
+    colmap_affrect.match_image_pairs(path, None, {"match_list_path": listed}, device="cpu")
+    colmap_affrect.match_exhaustive(path, device=pycolmap.Device.cpu)
+    assert devices == ["cpu", "cpu"]
+
+
+def test_recipe_that_escalates_climbs(photos: Path, tmp_path: Path) -> None:
+    colmap_affrect.extract_features(
+        tmp_path / "a.db", photos, NAMES[:2], extraction_options="on-demand"
+    )
+    reports = colmap_affrect.match_exhaustive(tmp_path / "a.db")
+    assert [report.name for report in reports] == ["match", "verify", "escalate"]
+
+
+def test_verify_refuses_matches_that_would_end_the_process(photos: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    pycolmap.extract_features(path, photos)
+    with open_database(path) as database:
+        count = database.num_keypoints_for_image(2)
+        database.write_matches(1, 2, np.array([[0, 0], [1, count]], np.uint32))
+    with pytest.raises(DatabaseError, match="point at keypoints that do not exist"):
+        colmap_affrect.verify(path)
+
+
+def test_verify_works_on_a_database_of_colmap(photos: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    pycolmap.extract_features(path, photos)
+    pycolmap.match_exhaustive(
+        path, matching_options=pycolmap.FeatureMatchingOptions(skip_geometric_verification=True)
+    )
+    colmap_affrect.verify(path, {"min_num_inliers": 25})
+    with open_database(path) as database:
+        counts = database.read_two_view_geometry_num_inliers()[1]
+        assert len(counts) == 6
+        assert all(count == 0 or count >= 25 for count in counts)
+        assert max(counts) > 25

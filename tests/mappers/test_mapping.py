@@ -1,0 +1,288 @@
+"""Mapping: what is passed on to pycolmap, its two mappers, several models, and interruptions."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_scene import INTRINSICS, NAMES, write_photographs
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.native_options import differences, set_values
+from colmap_affrect.errors import MappingError, OptionError
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.mappers import attempts
+from colmap_affrect.mappers.attempts import map_database
+from colmap_affrect.mappers.base import MAPPERS, Mapper, MappingTask
+from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions, map_globally
+from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
+from colmap_affrect.options import PRESETS
+from colmap_affrect.pipeline import RunOptions, map_and_report, run
+from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.stages.context import Context
+
+SEED = 3
+TIMEOUT_S = 60
+
+ROTATION_ERROR_DEG = 0.05
+"""Keypoints are exact; what is left are float32 coordinates and the optimiser's tolerance."""
+
+
+def options_of(mapper: str) -> object:
+    if mapper == "global":
+        return pycolmap.GlobalPipelineOptions()
+    return pycolmap.IncrementalPipelineOptions()
+
+
+@pytest.mark.parametrize("mapper", MAPPERS.names())
+def test_differences_say_all_that_another_process_must_know(mapper: str) -> None:
+    values = {"min_num_matches": 16, "ignore_watermarks": True}
+    made = mapper_of(mapper, mapper_options=values)
+    told = made.differences(intrinsics_given=True)
+    native = options_of(mapper)
+    set_values(native, json.loads(json.dumps(told)))
+    ours = made.native(SEED, intrinsics_given=True)
+    assert differences(native, ours) == {}
+    assert (told["min_num_matches"], told["ignore_watermarks"]) == (16, True)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_mapper_options_win_over_the_preset(preset: str) -> None:
+    given = {"min_model_size": "4", "init_min_num_inliers": "33", "ignore_two_view_tracks": "1"}
+    mapper = IncrementalMapper(IncrementalOptions.preset(preset, mapper_options=given))
+    native = mapper.native(SEED, intrinsics_given=False)
+    assert (native.min_model_size, native.mapper.init_min_num_inliers) == (4, 33)
+    assert native.triangulation.ignore_two_view_tracks is True
+    assert native.random_seed == SEED
+    assert mapper.options.preset_name == preset
+    given = {"min_model_size": 5, "track_min_num_views_per_track": 4}
+    global_mapper = GlobalMapper(GlobalOptions.preset(preset, mapper_options=given))
+    native = global_mapper.native(SEED, intrinsics_given=False)
+    assert (native.min_model_size, native.mapper.track_min_num_views_per_track) == (5, 4)
+
+
+def test_values_that_colmap_does_not_accept_are_named() -> None:
+    given = {"init_min_num_inliers": -4, "min_num_matches": 16}
+    with pytest.raises(OptionError, match=r"mapper\.init_min_num_inliers=-4 .*does not accept"):
+        mapper_of("incremental", mapper_options=given)
+
+
+def synthesize(path: Path, num_images: int, num_points: int = 150) -> pycolmap.Reconstruction:
+    """Let COLMAP make a verified database; return the truth."""
+    pycolmap.set_random_seed(SEED)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_frames_per_rig=num_images, num_points3D=num_points
+    )
+    with open_database(path) as database:
+        return pycolmap.synthesize_dataset(options, database)
+
+
+def mapper_of(name: str, **options: Any) -> Any:
+    return MAPPERS.make(MAPPERS.options({"name": name, "random_seed": SEED, **options}))
+
+
+def reconstruct(path: Path, mapper: Mapper) -> tuple[list[ModelSummary], int]:
+    """Map into path/../sparse; return the models and the number of images shown."""
+    shown: list[int] = []
+    task = MappingTask(path, path.parent, intrinsics_given=True)
+    found = map_database(mapper, task, path.parent / "sparse", shown.append)
+    assert not (path.parent / "sparse.partial").exists()
+    return found, sum(shown)
+
+
+def test_global_mapper_registers_all_images_in_place_and_repeatably(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    truth = synthesize(path, 5)
+    files = []
+    for _ in range(2):
+        (model,), num_shown = reconstruct(path, mapper_of("global"))
+        assert len(model.registered_names) == num_shown == 5
+        files.append((tmp_path / "sparse" / "0" / "images.bin").read_bytes())
+    assert files[0] == files[1]
+    found = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    for id1, id2 in combinations(sorted(found.reg_image_ids()), 2):
+        relative = [
+            scene.images[id2].cam_from_world().rotation
+            * scene.images[id1].cam_from_world().rotation.inverse()
+            for scene in (found, truth)
+        ]
+        angle = np.rad2deg((relative[0] * relative[1].inverse()).angle())
+        assert angle < ROTATION_ERROR_DEG
+
+
+def test_global_mapper_has_a_model_of_two_images_by_our_preset_only(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, 2, 400)
+    (model,), num_shown = reconstruct(path, mapper_of("global"))
+    assert len(model.registered_names) == num_shown == 2
+    assert reconstruct(path, GlobalMapper(GlobalOptions.preset("colmap"))) == ([], 0)
+    assert list((tmp_path / "sparse").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("mapper", "key", "message"),
+    [
+        ("incremental", "ba_global_function_tolerance", r"incremental mapper failed: .*tolerance"),
+        ("global", "function_tolerance", r"global mapper failed \(exit code 1\): .*tolerance"),
+    ],
+)
+def test_mapper_that_fails_is_one_clear_line_and_leaves_nothing(
+    tmp_path: Path, mapper: str, key: str, message: str
+) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, 3)
+    with pytest.raises(MappingError, match=message) as error:
+        reconstruct(path, mapper_of(mapper, mapper_options={key: -1}))
+    assert "\n" not in str(error.value)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
+
+
+@pytest.mark.parametrize(
+    ("num_views", "large", "seeds"),
+    [
+        (0, 100, [SEED, SEED + 1_000_003, SEED + 2_000_006]),
+        (3, 100, [SEED, SEED + 1_000_003, SEED + 2_000_006]),
+        (3, 3, [SEED]),
+        (4, 100, [SEED]),
+    ],
+)
+def test_mapping_is_tried_again_while_images_are_missing_in_a_small_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_views: int, large: int, seeds: list[int]
+) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, 4)
+    model = synthesize(tmp_path / "model.db", num_views) if num_views else None
+    given: list[int] = []
+
+    def map_some(_: object, __: Path, seed: int, ___: object) -> list[pycolmap.Reconstruction]:
+        given.append(seed)
+        return [model] if model else []
+
+    mapper = mapper_of("incremental")
+    monkeypatch.setattr(mapper, "map", map_some)
+    monkeypatch.setattr(attempts, "LARGE_MODEL", large)
+    reconstruct(path, mapper)
+    assert given == seeds
+
+
+def test_global_mapper_that_dies_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "database.db").write_bytes(b"no database" * 100)
+    with pytest.raises(MappingError, match=r"^COLMAP's global mapper failed \(exit code -?\d+\)"):
+        map_globally(tmp_path / "database.db", tmp_path, tmp_path, {})
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_mapping_that_is_stopped_leaves_nothing_and_can_be_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
+) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path, 3)
+
+    def fail(_: Path, __: Path, output_path: Path, **___: object) -> None:
+        (output_path / "0").mkdir()
+        (output_path / "0" / "images.bin").write_bytes(b"half")
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pycolmap, "incremental_mapping", fail)
+        with pytest.raises(error):
+            reconstruct(path, mapper_of("incremental"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
+    (model,), _ = reconstruct(path, mapper_of("incremental"))
+    assert len(model.registered_names) == 3
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from colmap_affrect.mappers.global_mapper import map_globally
+
+out = Path(sys.argv[1])
+print("begin", flush=True)
+endless = {"max_num_irls_iterations": 2**31 - 1, "irls_step_convergence_threshold": -1.0}
+values = {f"mapper.rotation_averaging.{key}": value for key, value in endless.items()}
+map_globally(out / "database.db", out, out, values)
+"""
+
+
+def processes_that_name(text: str) -> list[str]:
+    """Command lines of the processes with a text among their arguments."""
+    commands = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            command = path.read_bytes().decode(errors="replace")
+        except OSError:
+            continue
+        if text in command and "global_mapper" in command.split("{")[0]:
+            commands.append(command)
+    return commands
+
+
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_global_mapper_ends_with_the_process_that_started_it(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    synthesize(tmp_path / "database.db", 5)
+    with subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # noqa: PLW1509
+    ) as process:
+        assert process.stdout.readline() == b"begin\n"
+        deadline = time.monotonic() + TIMEOUT_S
+        while not (running := processes_that_name(f'"{tmp_path}"')):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        assert len(running) == 1
+        os.kill(process.pid, number)
+        process.wait(timeout=TIMEOUT_S)
+    assert process.returncode == -number
+    while processes_that_name(f'"{tmp_path}"'):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def two_places(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """A run on two photographs of one room and three of another."""
+    photos = tmp_path_factory.mktemp("photos")
+    write_photographs(photos / "here", 2)
+    write_photographs(photos / "there", 3, first_seed=10)
+    options = RunOptions(
+        recipe=load_recipe("unrectified-rootsift"),
+        cameras=CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS),
+    )
+    out = tmp_path_factory.mktemp("places") / "out"
+    run(photos, out, options)
+    return Workspace(out)
+
+
+@pytest.mark.parametrize("mapper", MAPPERS.names())
+def test_two_places_make_two_models_the_largest_first(two_places: Workspace, mapper: str) -> None:
+    report = map_and_report(Context(two_places), mapper_of(mapper), overwrite=True)
+    large = tuple(sorted(f"there/{name}" for name in NAMES[:3]))
+    small = tuple(sorted(f"here/{name}" for name in NAMES[:2]))
+    assert [model.registered_names for model in report.models] == [large, small]
+    assert report.status == "partial"
+    assert report.unregistered == dict.fromkeys(small, "in another model, sparse/1")
+    assert "models      2, of 3, 2 images" in report.summary()
+    assert report.to_mapping()["models"] == [list(large), list(small)]
+    folders = sorted(path for path in two_places.sparse.iterdir() if path.is_dir())
+    assert [folder.name for folder in folders] == ["0", "1"]
+    for folder, names in zip(folders, (large, small), strict=True):
+        model = pycolmap.Reconstruction(folder)
+        assert sorted(model.images[i].name for i in model.reg_image_ids()) == list(names)

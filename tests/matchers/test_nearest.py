@@ -1,0 +1,237 @@
+"""Matching against a plain loop, and what must not change it: order, chunks, empty images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+
+from colmap_affrect.matchers import nearest
+from colmap_affrect.matchers.nearest import (
+    NearestOptions,
+    PutativeMatches,
+    match_features,
+    matchable,
+)
+
+RATIO_ERROR = 2e-3
+"""Ratios are roots of differences of float32 cosines near 1: sqrt(1e-7) where a distance is 0."""
+
+Features = tuple[NDArray[np.float32], NDArray[np.float64]]
+
+
+def unit_rows(rows: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Rows of unit length."""
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)
+
+
+def two_views(
+    seed: int, count1: int, count2: int, size_px: float, noise: float, dimension: int = 16
+) -> tuple[Features, Features]:
+    """Features of two images, some of which are the same points with noise.
+
+    The images are crowded, so that neighbours within a few px and repeated matches occur.
+    """
+    rng = np.random.default_rng(seed)
+    descriptors1 = rng.random((count1, dimension)) + 1e-3
+    keypoints1 = rng.uniform(0, size_px, (count1, 2))
+    source = rng.integers(0, count1, count2)
+    same = rng.random(count2) < 0.7
+    descriptors2 = rng.random((count2, dimension)) + 1e-3
+    near = np.abs(descriptors1[source] + noise * rng.standard_normal((count2, dimension)))
+    descriptors2[same] = near[same] + 1e-3
+    keypoints2 = rng.uniform(0, size_px, (count2, 2))
+    keypoints2[same] = keypoints1[source][same] + rng.normal(0, 1.5, (count2, 2))[same]
+    return (unit_rows(descriptors1), keypoints1), (unit_rows(descriptors2), keypoints2)
+
+
+def best_and_ratio(
+    query: NDArray[np.floating], other: Features, min_distance_px: float
+) -> tuple[int, float]:
+    """Nearest descriptor, and its distance over that of the nearest one far enough from it.
+
+    Where none is far enough, the largest distance of unit vectors stands in for it.
+    """
+    descriptors, keypoints = other
+    distances = [float(np.linalg.norm(query - row)) for row in descriptors.astype(np.float64)]
+    best = min(range(len(distances)), key=distances.__getitem__)
+    second = 2.0
+    for index, distance in enumerate(distances):
+        apart = float(np.hypot(*(keypoints[index] - keypoints[best])))
+        if apart > min_distance_px:
+            second = min(second, distance)
+    return best, distances[best] / second
+
+
+def slow_matches(
+    first: Features, second: Features, options: NearestOptions
+) -> list[tuple[int, int, float]]:
+    """The matcher's definition as plain loops."""
+    radius_px = options.min_contrast_distance_px
+    matches = []
+    for row, query in enumerate(first[0].astype(np.float64)):
+        target, ratio = best_and_ratio(query, second, radius_px)
+        back, back_ratio = best_and_ratio(second[0][target].astype(np.float64), first, radius_px)
+        if back == row and max(ratio, back_ratio) < options.max_ratio:
+            matches.append((row, target, max(ratio, back_ratio)))
+    kept: list[tuple[int, int, float]] = []
+    for row, target, ratio in sorted(matches, key=lambda match: match[2]):
+        duplicate = any(
+            np.hypot(*(first[1][row] - first[1][other])) <= options.duplicate_radius_px
+            and np.hypot(*(second[1][target] - second[1][partner])) <= options.duplicate_radius_px
+            for other, partner, _ in kept
+        )
+        if not duplicate:
+            kept.append((row, target, ratio))
+    return sorted(kept)
+
+
+def run(first: Features, second: Features, options: NearestOptions) -> PutativeMatches:
+    """Match two sets of (descriptors, keypoints)."""
+    return match_features(matchable(*first, options), matchable(*second, options), options)
+
+
+@given(
+    st.integers(0, 100_000),
+    st.integers(3, 45),
+    st.integers(3, 45),
+    st.sampled_from([15.0, 60.0, 400.0]),
+    st.sampled_from([0.02, 0.1, 0.25]),
+    st.sampled_from([0.75, 0.9, 1.0]),
+    st.sampled_from([2.0, 10.0, 30.0]),
+    st.sampled_from([0.5, 3.0]),
+)
+def test_match_features_equals_plain_loops(
+    seed: int,
+    count1: int,
+    count2: int,
+    size_px: float,
+    noise: float,
+    max_ratio: float,
+    min_contrast_distance_px: float,
+    duplicate_radius_px: float,
+) -> None:
+    first, second = two_views(seed, count1, count2, size_px, noise)
+    options = NearestOptions(
+        max_ratio=max_ratio,
+        min_contrast_distance_px=min_contrast_distance_px,
+        duplicate_radius_px=duplicate_radius_px,
+    )
+    expected = slow_matches(first, second, options)
+    actual = run(first, second, options)
+    assert actual.indices.tolist() == [[row, target] for row, target, _ in expected]
+    assert_allclose(actual.ratios, [ratio for *_, ratio in expected], atol=RATIO_ERROR)
+
+
+@pytest.mark.parametrize("count1", [0, 1, 7])
+@pytest.mark.parametrize("count2", [0, 1])
+def test_match_features_of_empty_or_single_features_has_the_layout_of_matches(
+    count1: int, count2: int
+) -> None:
+    first = (unit_rows(np.random.default_rng(0).random((count1, 8)) + 1), np.zeros((count1, 2)))
+    second = (np.eye(8, dtype=np.float32)[:count2], np.zeros((count2, 2)))
+    matches = run(first, second, NearestOptions())
+    assert matches.indices.shape == (len(matches.ratios), 2)
+    assert matches.indices.dtype == np.int64
+    assert matches.ratios.dtype == np.float32
+    assert len(matches.indices) <= min(count1, count2)
+
+
+@pytest.mark.parametrize("chunk_elements", [1, 50, 333, 10_000])
+def test_match_features_gives_the_same_result_in_chunks_of_any_size(
+    monkeypatch: pytest.MonkeyPatch, chunk_elements: int
+) -> None:
+    first, second = two_views(5, 137, 90, 150.0, 0.08)
+    whole = run(first, second, NearestOptions(max_ratio=0.95))
+    assert len(whole.indices) > 20
+    monkeypatch.setattr(nearest, "CHUNK_ELEMENTS", chunk_elements)
+    chunked = run(first, second, NearestOptions(max_ratio=0.95))
+    np.testing.assert_array_equal(chunked.indices, whole.indices)
+    assert_allclose(chunked.ratios, whole.ratios, atol=RATIO_ERROR)
+
+
+def spread(count: int) -> NDArray[np.float64]:
+    """Keypoints 100 px apart in a row."""
+    return np.stack([100.0 * np.arange(count), np.full(count, 7.0)], axis=1)
+
+
+def by_angles(*angles_deg: float) -> NDArray[np.float32]:
+    """Descriptors in the plane; the angle between two grows with their distance."""
+    angles = np.deg2rad(angles_deg)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
+
+
+def chord(degrees: float) -> float:
+    """Distance of unit vectors that are so many degrees apart."""
+    return float(2 * np.sin(np.deg2rad(degrees) / 2))
+
+
+def test_match_features_rejects_ambiguity_on_the_side_of_the_second_image() -> None:
+    # Seen from image 1 the match is clear; its partner has two nearly equal neighbours.
+    first = (by_angles(12.0, 7.9, 79.0), spread(3))
+    second = (by_angles(10.0, 80.0), spread(2))
+    assert run(first, second, NearestOptions()).indices.tolist() == [[2, 1]]
+
+
+def test_match_features_does_not_count_the_same_place_as_second_neighbour() -> None:
+    first = (by_angles(10.0, 80.0), spread(2))
+    keypoints2 = np.array([[40.0, 40.0], [46.0, 44.0], [300.0, 5.0]])
+    second = (by_angles(12.0, 7.9, 79.0), keypoints2)
+    options = NearestOptions(min_contrast_distance_px=10.0)
+    matches = run(first, second, options)
+    assert matches.indices.tolist() == [[0, 0], [1, 2]]
+    assert_allclose(matches.ratios[0], chord(2.0) / chord(68.0), rtol=1e-2)
+    # With a smaller radius the neighbour 7.2 px away is a competitor again.
+    strict = options.changed(min_contrast_distance_px=7.0)
+    assert run(first, second, strict).indices.tolist() == [[1, 2]]
+
+
+def test_match_features_keeps_the_better_of_two_matches_at_the_same_places() -> None:
+    keypoints1 = np.array([[20.0, 30.0], [21.0, 30.5], [200.0, 9.0]])
+    keypoints2 = np.array([[120.0, 60.0], [119.0, 61.0], [500.0, 9.0]])
+    first = (by_angles(10.0, 40.0, 85.0), keypoints1)
+    second = (by_angles(11.5, 40.5, 84.0), keypoints2)
+    matches = run(first, second, NearestOptions(duplicate_radius_px=2.0))
+    assert matches.indices.tolist() == [[1, 1], [2, 2]]
+    both = run(first, second, NearestOptions(duplicate_radius_px=1.0))
+    assert both.indices.tolist() == [[0, 0], [1, 1], [2, 2]]
+
+
+def test_match_features_keeps_a_match_near_a_dropped_one_only() -> None:
+    # The second is near the better first, the third near the second but not the first.
+    places = np.array([[20.0, 30.0], [21.5, 30.0], [23.0, 30.0]])
+    first = (by_angles(10.0, 40.0, 70.0), places)
+    second = (by_angles(10.2, 40.5, 70.9), places)
+    matches = run(first, second, NearestOptions(duplicate_radius_px=2.0))
+    assert matches.indices.tolist() == [[0, 0], [2, 2]]
+
+
+def test_match_features_does_not_wrap_indices_of_40000_keypoints() -> None:
+    count, dimension = 40_000, 8
+    rng = np.random.default_rng(1)
+    keypoints = np.stack(np.divmod(np.arange(count), 200), axis=1) * 25.0
+    # Only the last twenty are alike in both images; the others point elsewhere.
+    common = rng.standard_normal((20, dimension))
+    common[:, 4:6] += 9.0
+    common = unit_rows(common)
+    clutter = np.zeros((count - 20, dimension), np.float32)
+    clutter[:, 0] = 1.0
+    first = (np.concatenate([clutter, common]), keypoints)
+    second = (common[::-1].copy(), spread(20))
+    matches = run(second, first, NearestOptions(max_ratio=1.0))
+    expected = np.stack([np.arange(20), count - 1 - np.arange(20)], axis=1)
+    np.testing.assert_array_equal(matches.indices, expected)
+    reverse = run(first, second, NearestOptions(max_ratio=1.0))
+    np.testing.assert_array_equal(reverse.indices, expected[::-1, ::-1])
+
+
+def test_match_features_rejects_the_same_descriptor_at_two_far_places() -> None:
+    # Repeated structure, the same to the last bit: rounding must not make it look unique.
+    rng = np.random.default_rng(8)
+    descriptors = unit_rows(rng.random((60, 128)))
+    first = (descriptors, spread(60))
+    second = (np.concatenate([descriptors, descriptors]), spread(120))
+    assert run(first, second, NearestOptions()).indices.tolist() == []

@@ -1,0 +1,236 @@
+"""Matching by short lists: the matches are those of exact similarities."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.errors import DeviceError
+from colmap_affrect.geometry.neighbors import neighbors_within
+from colmap_affrect.matchers import nearest
+from colmap_affrect.matchers import nearest_8bit as coarse
+from colmap_affrect.matchers.base import ImageFeatures, MatcherContext
+from colmap_affrect.matchers.nearest import (
+    NearestNeighbors,
+    NearestOptions,
+    _nearest_of_listed,
+    match_features,
+    matchable,
+)
+from colmap_affrect.matchers.nearest_8bit import (
+    EightBitDescriptors,
+    HalfDescriptors,
+    MakeCoarse,
+    ShortList,
+    coarse_descriptors,
+    has_fast_8_bit_products,
+)
+
+KINDS: dict[str, MakeCoarse] = {
+    "8 bit": EightBitDescriptors.of,
+    "16 bit": lambda descriptors: HalfDescriptors.of(descriptors, "cpu"),
+}
+
+
+@pytest.fixture(params=KINDS)
+def kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> MakeCoarse:
+    """Each kind, on any processor."""
+    if not has_fast_8_bit_products():
+        monkeypatch.setattr(coarse, "_packed", lambda codes: codes)
+        monkeypatch.setattr(coarse, "_similarity_codes", similarity_codes)
+    return KINDS[request.param]
+
+
+def similarity_codes(
+    codes1: NDArray[np.int8], codes2: NDArray[np.int8], unit: float
+) -> NDArray[np.uint8]:
+    products = codes1.astype(np.int32) @ codes2.astype(np.int32).T
+    return np.clip(np.rint(unit / coarse.CODE_STEP * products), 0, 255).astype(np.uint8)
+
+
+def unit_rows(rows: NDArray[np.float64]) -> NDArray[np.float32]:
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
+def crowded_views(seed: int, noise: float, *, signed: bool) -> list[tuple[NDArray, NDArray]]:
+    """350 and 450 features, of which 250 are the same; some are repeated beside themselves."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(550, 128)) if signed else rng.gamma(0.4, size=(550, 128))
+    places = rng.uniform(0, 180, (550, 2))
+    rows[150:180] = rows[:30] * (1 + 0.02 * rng.normal(size=(30, 128)))
+    places[150:180] = places[:30] + 1.0
+    views = []
+    for chosen in (slice(0, 350), slice(100, 550)):
+        seen = rows[chosen] + noise * np.abs(rows).mean() * rng.normal(size=rows[chosen].shape)
+        views.append((unit_rows(seen if signed else np.abs(seen)), places[chosen] * (1.0, 0.8)))
+    return views
+
+
+@pytest.mark.parametrize("options", [
+    NearestOptions(),
+    NearestOptions(max_ratio=0.97, ratio_both_ways=False),
+    NearestOptions(max_ratio=0.9, min_contrast_distance_px=40.0),
+], ids=str)  # fmt: skip
+@pytest.mark.parametrize("noise", [0.3, 1.0])
+@pytest.mark.parametrize("signed", [False, True])
+def test_matches_are_those_of_exact_similarities(
+    kind: MakeCoarse, options: NearestOptions, noise: float, signed: bool
+) -> None:
+    views = crowded_views(3, noise, signed=signed)
+    exact = match_features(*(matchable(*view, options) for view in views), options)
+    assert 30 < len(exact.indices) < 260
+    found = match_features(*(matchable(*view, options, kind) for view in views), options)
+    np.testing.assert_array_equal(found.indices, exact.indices)
+    np.testing.assert_allclose(found.ratios, exact.ratios, atol=1e-4)
+
+
+def test_short_list_has_few_rows_and_few_entries(kind: MakeCoarse) -> None:
+    first, second = (kind(descriptors) for descriptors, _ in crowded_views(4, 1.0, signed=False))
+    rivals = neighbors_within(crowded_views(4, 1.0, signed=False)[1][1], 10.0)
+    short = first.short_list(np.arange(350), second, rivals, 0.85)
+    assert len(short.rows) < 300
+    assert len(short.entry_rows) < 0.05 * len(short.rows) * 450
+    part = first.short_list(np.arange(100, 140), second, rivals, 0.85)
+    inside = (short.rows >= 100) & (short.rows < 140)
+    np.testing.assert_array_equal(part.rows, short.rows[inside])
+    np.testing.assert_array_equal(part.runners_up, short.runners_up[inside])
+
+
+def test_lists_of_several_chunks_are_those_of_one(
+    kind: MakeCoarse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = NearestOptions()
+    views = crowded_views(5, 0.5, signed=False)
+    whole = match_features(*(matchable(*view, options, kind) for view in views), options)
+    monkeypatch.setattr(coarse, "NUM_ROWS_8_BIT", 33)
+    monkeypatch.setattr(coarse, "NUM_ROWS_16_BIT", 47)
+    monkeypatch.setattr(nearest, "CHUNK_ROWS", 101)
+    parts = match_features(*(matchable(*view, options, kind) for view in views), options)
+    np.testing.assert_array_equal(parts.indices, whole.indices)
+
+
+def test_nearest_whose_rival_is_the_coarse_runner_up_is_doubtful() -> None:
+    # Of the queries' nearest, 1 and 3, the first has the runner-up 2 at the same place.
+    others = np.eye(4, dtype=np.float32)
+    image = matchable(others, np.array([(0, 0), (50, 0), (52, 0), (99, 0)]), NearestOptions())
+    queries = unit_rows(np.array([(0.2, 1.0, 0.4, 0.3), (0.3, 0.0, 0.2, 1.0)]))
+    short = ShortList(
+        np.array([0, 1]),
+        np.array([2, 0]),
+        np.array([False, False]),
+        np.array([0, 0, 0, 1, 1]),
+        np.array([1, 2, 3, 0, 3]),
+    )
+    found, ratios, doubtful = _nearest_of_listed(queries, image, short)
+    assert found.tolist() == [1, 3]
+    assert doubtful.tolist() == [True, False]
+    cosines = (queries[0, 1], queries[0, 3]), (queries[1, 3], queries[1, 0])
+    expected = [np.sqrt((1 - first) / (1 - second)) for first, second in cosines]
+    np.testing.assert_allclose(ratios, expected, rtol=1e-6)
+
+
+def test_ambiguous_copies_do_not_hide_a_match(kind: MakeCoarse) -> None:
+    # The query is nearest to feature 0 or 1, copies of each other. Feature 2, a bit less similar,
+    # is a rival of 1 only: with 1 as the nearest the ratio is small, with 0 it is near 1.
+    options = NearestOptions(ratio_both_ways=False, min_contrast_distance_px=10.0)
+    angles = np.arccos([0.5999, 0.6, 0.597, 0.3])
+    others = np.zeros((4, 128), np.float32)
+    others[:, 0] = np.cos(angles)
+    others[np.arange(4), 1 + np.arange(4)] = np.sin(angles)
+    query = np.zeros((1, 128), np.float32)
+    query[0, 0] = 1.0
+    places = np.array([(0.0, 0.0), (8.0, 0.0), (16.0, 0.0), (99.0, 0.0)])
+    for order in itertools.permutations(range(4)):
+        views = [(query, np.zeros((1, 2))), (others[list(order)], places[list(order)])]
+        exact = match_features(*(matchable(*view, options) for view in views), options)
+        found = match_features(*(matchable(*view, options, kind) for view in views), options)
+        assert len(exact.indices) == 1
+        np.testing.assert_array_equal(found.indices, exact.indices)
+        np.testing.assert_allclose(found.ratios, exact.ratios, rtol=1e-4)
+
+
+@pytest.mark.parametrize("counts", [(0, 5), (5, 0), (1, 1), (1, 7), (300, 1)])
+def test_few_features(kind: MakeCoarse, counts: tuple[int, int]) -> None:
+    rng = np.random.default_rng(7)
+    options = NearestOptions()
+    views = [(unit_rows(rng.gamma(0.4, size=(n, 128))), rng.uniform(0, 99, (n, 2))) for n in counts]
+    found = match_features(*(matchable(*view, options, kind) for view in views), options)
+    exact = match_features(*(matchable(*view, options) for view in views), options)
+    np.testing.assert_array_equal(found.indices, exact.indices)
+
+
+def test_memory_of_all_arrays_is_counted(kind: MakeCoarse) -> None:
+    rows, places = np.eye(128, dtype=np.float32)[:5], 100.0 * np.arange(10).reshape(5, 2)
+    exact = matchable(rows, places, NearestOptions())
+    assert exact.nbytes == 5 * 128 * 4 + 5 * 2 * 8 + 6 * 8 + 5 * 8
+    coarse_bytes = matchable(rows, places, NearestOptions(), kind).nbytes - exact.nbytes
+    assert coarse_bytes == 5 * 128 * 2
+
+
+def test_coarse_descriptors_are_made_where_they_pay(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> bool:
+        raise AssertionError("asked")
+
+    monkeypatch.setattr(coarse, "has_fast_8_bit_products", refuse)
+    monkeypatch.setattr(coarse, "available_cores", lambda: 3)
+    assert coarse_descriptors(1.7e9) is None
+    assert coarse_descriptors(1.7e9, "cpu") is None
+    with pytest.raises(AssertionError, match="asked"):
+        coarse_descriptors(1.9e9, "cpu")
+    monkeypatch.setattr(coarse, "has_fast_8_bit_products", lambda: False)
+    assert coarse_descriptors(1e15, "cpu") is None
+    monkeypatch.setattr(coarse, "has_fast_8_bit_products", lambda: True)
+    assert coarse_descriptors(1e15, "cpu") == EightBitDescriptors.of
+    with pytest.raises(DeviceError, match="--device cuda:99"):
+        coarse_descriptors(0, "cuda:99")
+
+
+def test_torch_without_the_products_matches_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their operators are not part of torch's public interface and may go or change."""
+
+    class Namespace:
+        def __getattr__(self, name: str) -> object:
+            raise AttributeError(f"'_OpNamespace' 'onednn' object has no attribute '{name}'")
+
+    monkeypatch.setattr("torch.backends.cpu.get_cpu_capability", lambda: "AVX512")
+    monkeypatch.setattr("torch.ops.onednn", Namespace(), raising=False)
+    has_fast_8_bit_products.cache_clear()
+    matcher = NearestNeighbors(
+        NearestOptions(), MatcherContext(device="cpu", num_similarities=1e15)
+    )
+    has_fast_8_bit_products.cache_clear()
+    features = LocalFeatures.empty(128)
+    assert matcher.prepare(ImageFeatures(features, (32, 32), "rootsift")).coarse is None
+
+
+def test_product_of_the_library_is_that_of_numbers() -> None:
+    if not has_fast_8_bit_products():
+        pytest.skip("this processor has no fast 8-bit products")
+    codes = np.random.default_rng(0).integers(-127, 128, (37, 128)).astype(np.int8)
+    unit = 1.0 / (128 * 127.0**2)
+    found = coarse._similarity_codes(codes[:20], coarse._packed(codes[10:]), unit)
+    assert found.shape == (20, 256)
+    expected = similarity_codes(codes[:20], codes[10:], unit)
+    np.testing.assert_array_less(np.abs(found[:, :27].astype(int) - expected), 2)
+    assert not found[:, 27:].any()
+
+
+def test_products_that_saturate_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    def saturating(
+        codes1: NDArray[np.int8], codes2: NDArray[np.int8], unit: float
+    ) -> NDArray[np.uint8]:
+        products = np.clip(codes1.astype(np.int32) @ codes2.astype(np.int32).T, -(2**15), 2**15)
+        return np.clip(np.rint(unit / coarse.CODE_STEP * products), 0, 255).astype(np.uint8)
+
+    def missing(*_: object) -> NDArray[np.uint8]:
+        raise AttributeError("'_OpNamespace' 'onednn' object has no attribute 'qlinear_pointwise'")
+
+    monkeypatch.setattr("torch.backends.cpu.get_cpu_capability", lambda: "AVX512")
+    monkeypatch.setattr(coarse, "_packed", lambda codes: codes)
+    for product, expected in ((similarity_codes, True), (saturating, False), (missing, False)):
+        monkeypatch.setattr(coarse, "_similarity_codes", product)
+        assert has_fast_8_bit_products.__wrapped__() is expected

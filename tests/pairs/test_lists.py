@@ -1,0 +1,227 @@
+"""Pair lists as COLMAP and hloc write them, and with names that those cannot handle."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from colmap_affrect.errors import PairListError
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.lists import (
+    exhaustive_pairs,
+    most_similar_pairs,
+    ordered_for_reuse,
+    read_pairs,
+    sequence_pairs,
+    write_pairs,
+)
+
+NAMES = ["a.png", "b.png", "new wing/a 1.png", "new wing/b.png", "č, d.png"]
+
+
+@pytest.fixture
+def pair_list(tmp_path: Path) -> Path:
+    return tmp_path / "list of pairs.txt"
+
+
+@pytest.mark.parametrize(
+    ("names", "count"), [([], 0), (["a"], 0), (["b", "a"], 1), (["c", "a", "b", "d"], 6)]
+)
+def test_exhaustive_pairs_are_all_pairs_once(names: list[str], count: int) -> None:
+    pairs = exhaustive_pairs(names)
+    assert len(set(pairs)) == len(pairs) == count
+    assert all(first < second for first, second in pairs)
+    assert pairs == sorted(pairs)
+
+
+def test_sequence_pairs_follow_the_numbers_in_names() -> None:
+    names = ["b/1.png", "a/10.png", "a/9.png", "a/8.png"]
+    assert sequence_pairs(names, 1) == [
+        ("a/10.png", "a/9.png"), ("a/10.png", "b/1.png"), ("a/8.png", "a/9.png"),
+    ]  # fmt: skip
+    assert sequence_pairs(names, 2) == sorted(
+        [*sequence_pairs(names, 1), ("a/10.png", "a/8.png"), ("a/9.png", "b/1.png")]
+    )
+    assert sequence_pairs(names, 9) == exhaustive_pairs(names)
+
+
+def num_read(pairs: Sequence[Pair], num_kept: int) -> int:
+    """How many images are read when the most recently used ones are kept."""
+    kept: list[str] = []
+    count = 0
+    for name in itertools.chain.from_iterable(pairs):
+        count += name not in kept
+        kept = [name, *(other for other in kept if other != name)][:num_kept]
+    return count
+
+
+@pytest.mark.parametrize("num_images", [1, 2, 5, 40])
+def test_ordered_pairs_are_the_same_pairs(num_images: int) -> None:
+    pairs = [("a", "b"), ("c", "d"), ("b", "c"), ("x", "y"), ("a", "y")]
+    assert sorted(ordered_for_reuse(pairs, num_images)) == sorted(pairs)
+    assert ordered_for_reuse([], num_images) == []
+
+
+def test_few_images_are_read_again_for_all_pairs() -> None:
+    pairs = exhaustive_pairs([f"{index:02d}" for index in range(40)])
+    ordered = ordered_for_reuse(pairs, 5)
+    assert num_read(ordered, 10) <= 8 * 9 // 2 * 10 < num_read(pairs, 10) // 2
+    assert ordered_for_reuse(pairs, 40) == pairs
+
+
+def test_few_images_are_read_again_for_near_ones_whose_names_are_in_disorder() -> None:
+    places = np.random.default_rng(0).permutation(200)
+    pairs = sorted(
+        (f"{min(i, j):03d}", f"{max(i, j):03d}")
+        for i, j in itertools.combinations(range(200), 2)
+        if abs(places[i] - places[j]) <= 3
+    )
+    assert num_read(ordered_for_reuse(pairs, 10), 20) < 230 < 600 < num_read(pairs, 20)
+
+
+def crowd_and_few() -> tuple[list[str], np.ndarray]:
+    """Similarities of 8 images of one place, and of 4 of another where all are less alike."""
+    random = np.random.default_rng(0)
+    similarity = random.uniform(0.0, 0.1, (12, 12))
+    similarity[:8, :8] = random.uniform(0.8, 0.9, (8, 8))
+    similarity[8:, 8:] = random.uniform(0.4, 0.5, (4, 4))
+    similarity = np.maximum(similarity, similarity.T)
+    return [f"{index:02d}" for index in range(12)], similarity
+
+
+def neighbors(pairs: list[Pair], name: str) -> set[str]:
+    """What a name is paired with."""
+    return {other for pair in pairs if name in pair for other in pair} - {name}
+
+
+def test_most_similar_pairs_are_asked_for_on_average_and_half_of_it_for_each() -> None:
+    names, similarity = crowd_and_few()
+    pairs = most_similar_pairs(names, similarity, 4)
+    assert len(pairs) == len(set(pairs)) == 12 * 4 // 2
+    assert pairs == sorted(pairs)
+    assert all(first < second for first, second in pairs)
+    for index, name in enumerate(names):
+        order = [names[other] for other in np.argsort(-similarity[index]) if other != index]
+        assert set(order[:2]) <= neighbors(pairs, name)
+    chosen = [pair for pair in pairs if pair[0] < "08"]
+    # What is over goes to the crowd, although the few have pairs left.
+    assert len(pairs) - len(chosen) < 6
+    assert all(second < "08" for _, second in chosen)
+
+
+def test_most_similar_pairs_with_many_neighbors_are_all() -> None:
+    names, similarity = crowd_and_few()
+    shuffled = names[::-1]
+    assert most_similar_pairs(shuffled, similarity, 11) == exhaustive_pairs(names)
+    assert most_similar_pairs(names[:2], similarity[:2, :2], 20) == [("00", "01")]
+    assert most_similar_pairs(names[:1], similarity[:1, :1], 20) == []
+    assert most_similar_pairs([], [], 20) == []
+
+
+def test_most_similar_pairs_leave_no_image_out() -> None:
+    names, similarity = crowd_and_few()
+    for num_neighbors in range(1, 12):
+        pairs = most_similar_pairs(names, similarity, num_neighbors)
+        assert len(pairs) >= 12 * num_neighbors // 2
+        assert {name for pair in pairs for name in pair} == set(names)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "a.png b.png",
+        "a.png   b.png",
+        "a.png\tb.png",
+        "a.png,b.png",
+        "a.png, b.png",
+        "  a.png b.png  ",
+        "\ufeffa.png b.png",
+        "a.png b.png\r",
+    ],
+)
+def test_read_pairs_takes_space_tab_and_comma(pair_list: Path, line: str) -> None:
+    pair_list.write_bytes(f"{line}\n".encode())
+    assert read_pairs(pair_list, NAMES) == [("a.png", "b.png")]
+
+
+@pytest.mark.parametrize("separator", [" ", "\t", ",", ", ", "  "])
+def test_read_pairs_takes_names_with_spaces_and_commas(pair_list: Path, separator: str) -> None:
+    pairs = [("new wing/a 1.png", "new wing/b.png"), ("a.png", "č, d.png")]
+    text = "".join(f"{first}{separator}{second}\n" for first, second in pairs)
+    pair_list.write_text(text, encoding="utf-8")
+    assert read_pairs(pair_list, NAMES) == sorted(pairs)
+
+
+def test_read_pairs_skips_comments_and_empty_lines(pair_list: Path) -> None:
+    pair_list.write_text("# a.png b.png\n\n   \n  # more\na.png new wing/b.png\n")
+    assert read_pairs(pair_list, NAMES) == [("a.png", "new wing/b.png")]
+
+
+def test_read_pairs_counts_a_pair_once_and_drops_self_pairs(pair_list: Path) -> None:
+    pair_list.write_text("b.png a.png\na.png a.png\na.png b.png\na.png b.png\n")
+    assert read_pairs(pair_list, NAMES) == [("a.png", "b.png")]
+
+
+def test_read_pairs_lists_unknown_names_with_line_and_suggestion(pair_list: Path) -> None:
+    pair_list.write_text("a.png b.png\na.png bb.png\n\nzzzz 1234\n")
+    with pytest.raises(PairListError) as error:
+        read_pairs(pair_list, NAMES)
+    text = str(error.value)
+    assert "\n" not in text
+    assert str(pair_list) in text
+    assert "line 2: 'a.png bb.png' (did you mean b.png?)" in text
+    assert "line 4: 'zzzz 1234'" in text
+    assert "line 1" not in text
+
+
+def test_read_pairs_of_many_unknown_names_stays_short(pair_list: Path) -> None:
+    pair_list.write_text("".join(f"x{index}.jpg a.png\n" for index in range(300)))
+    with pytest.raises(PairListError, match="and 295 more") as error:
+        read_pairs(pair_list, NAMES)
+    assert len(str(error.value)) < 1000
+
+
+@pytest.mark.parametrize("text", ["", "\n \n", "# nothing\n", "a.png a.png\n"])
+def test_read_pairs_of_a_list_without_pairs_is_refused(pair_list: Path, text: str) -> None:
+    pair_list.write_text(text)
+    with pytest.raises(PairListError, match="holds no pair of two different images"):
+        read_pairs(pair_list, NAMES)
+
+
+@pytest.mark.parametrize("content", [None, b"\xff\xfe\x00a"], ids=["missing", "not UTF-8"])
+def test_read_pairs_of_an_unreadable_file_is_refused(
+    pair_list: Path, content: bytes | None
+) -> None:
+    if content:
+        pair_list.write_bytes(content)
+    with pytest.raises(PairListError, match=r"list of pairs\.txt: cannot be read"):
+        read_pairs(pair_list, NAMES)
+
+
+def test_write_pairs_of_plain_names_is_what_hloc_and_colmap_read(pair_list: Path) -> None:
+    write_pairs(pair_list, [("a.png", "b.png"), ("a.png", "c/d.png")])
+    assert pair_list.read_text() == "a.png b.png\na.png c/d.png\n"
+
+
+IMAGE_NAMES = st.lists(
+    st.text(st.sampled_from("ab. ,#č图/"), min_size=1, max_size=6).map(lambda stem: f"{stem}.png"),
+    min_size=2,
+    max_size=6,
+    unique=True,
+)
+
+
+@given(names=IMAGE_NAMES)
+def test_written_list_reads_back(
+    names: list[str], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "written.txt"
+    pairs = exhaustive_pairs(names)
+    write_pairs(path, pairs)
+    assert read_pairs(path, names) == pairs

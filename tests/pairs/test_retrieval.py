@@ -1,0 +1,118 @@
+"""Image vectors against plain loops, and whether images of one place find each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+
+from colmap_affrect.pairs import retrieval
+from colmap_affrect.pairs.lists import most_similar_pairs
+from colmap_affrect.pairs.retrieval import (
+    build_vocabulary,
+    image_vector,
+    nearest_words,
+    similarities,
+)
+
+SIZE = 32
+
+
+def unit(rows: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Rows of unit length."""
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)
+
+
+def images_of_places(counts: list[int], seed: int) -> tuple[list[NDArray[np.float32]], list[int]]:
+    """Descriptors of so many images of each place: half of an image is what the place has."""
+    random = np.random.default_rng(seed)
+    images, places = [], []
+    for place, count in enumerate(counts):
+        structure = random.random((200, SIZE))
+        for _ in range(count):
+            seen = random.choice(structure, 100, replace=False) + random.normal(0, 0.1, (100, SIZE))
+            images.append(unit(np.concatenate([seen, random.random((100, SIZE))])))
+            places.append(place)
+    return images, places
+
+
+def vectors_of(images: list[NDArray[np.float32]]) -> NDArray[np.float16]:
+    """Vectors of images by a vocabulary of their own."""
+    random = np.random.default_rng(0)
+    vocabulary = build_vocabulary(np.concatenate(images), random)
+    return np.stack([image_vector(image, vocabulary) for image in images])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_images_of_one_place_find_each_other(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retrieval, "NUM_WORDS", 64)
+    images, places = images_of_places([8, 3, 5, 4], seed)
+    order = np.random.default_rng(seed).permutation(len(images))
+    names = [f"{number:02d}" for number in range(len(order))]
+    place_of = {name: places[index] for name, index in zip(names, order, strict=True)}
+    rows = similarities(vectors_of([images[index] for index in order]))
+    pairs = most_similar_pairs(names, rows, 5)
+    right = sum(place_of[first] == place_of[second] for first, second in pairs)
+    assert len(pairs) == 50
+    assert right >= 45  # of 28 + 3 + 10 + 6 = 47 that there are
+
+
+def test_vector_is_that_of_a_plain_loop() -> None:
+    random = np.random.default_rng(1)
+    vocabulary, descriptors = unit(random.random((5, 8))), unit(random.random((40, 8)))
+    words = [
+        int(np.argmin([np.linalg.norm(row - word) for word in vocabulary])) for row in descriptors
+    ]
+    expected = np.zeros((5, 8))
+    for word in set(words):
+        members = [row for row, other in zip(descriptors, words, strict=True) if other == word]
+        expected[word] = sum(row - vocabulary[word] for row in members)
+        expected[word] /= np.linalg.norm(expected[word])
+    expected = np.sign(expected) * np.sqrt(np.abs(expected))
+    expected /= np.linalg.norm(expected)
+    assert nearest_words(descriptors, vocabulary).tolist() == words
+    assert_allclose(image_vector(descriptors, vocabulary), expected.ravel(), atol=1e-3)
+
+
+def test_image_without_descriptors_has_a_vector_of_zeros() -> None:
+    vocabulary = unit(np.random.default_rng(2).random((4, 8)))
+    vector = image_vector(np.zeros((0, 8), np.float32), vocabulary)
+    assert (vector.shape, vector.dtype, vector.any()) == ((32,), np.float16, False)
+
+
+def test_vocabulary_is_nearer_to_the_descriptors_than_where_it_began(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(retrieval, "NUM_WORDS", 20)
+    random = np.random.default_rng(3)
+    centers = random.random((20, SIZE))
+    samples = unit(centers[random.integers(0, 20, 1000)] + random.normal(0, 0.05, (1000, SIZE)))
+
+    def mean_distance(words: NDArray[np.float32]) -> float:
+        nearest = words[nearest_words(samples, words)]
+        return float(np.linalg.norm(samples - nearest, axis=1).mean())
+
+    words = build_vocabulary(samples, np.random.default_rng(4))
+    begin = np.random.default_rng(4).permutation(samples)[:20]
+    assert words.shape == begin.shape == (20, SIZE)
+    assert words.dtype == np.float32
+    assert mean_distance(words) < 0.8 * mean_distance(begin)
+    again = build_vocabulary(samples, np.random.default_rng(4))
+    assert np.array_equal(again, words), "the same samples and seed give the same words"
+
+
+def test_vocabulary_of_few_descriptors_is_these() -> None:
+    samples = unit(np.random.default_rng(5).random((7, SIZE)))
+    words = build_vocabulary(samples, np.random.default_rng(6))
+    assert sorted(words.tolist()) == sorted(samples.tolist())
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 100])
+def test_similarities_are_cosines_about_the_mean_however_many_at_once(
+    at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retrieval, "VECTORS_AT_ONCE", at_once)
+    vectors = unit(np.random.default_rng(7).random((7, 24)) + 0.5).astype(np.float16)
+    centered = unit(vectors.astype(np.float64) - vectors.astype(np.float64).mean(axis=0))
+    assert_allclose(np.stack(list(similarities(vectors))), centered @ centered.T, atol=2e-3)

@@ -1,0 +1,168 @@
+"""Extraction and matching elsewhere: on a cluster of this machine, some of it lost midway."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from local_cluster import local_cluster
+from results import hdf5_content
+from small_scene import INTRINSICS, write_photographs
+from synthetic import write_image
+
+from colmap_affrect.errors import ClusterError
+from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+from colmap_affrect.parallel import cluster as cluster_module
+from colmap_affrect.parallel.cluster import Cluster, WorkerEnvironment, connected
+from colmap_affrect.parallel.executor import Executor
+from colmap_affrect.progress import SILENT, Advance, Progress
+from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.match import match
+from colmap_affrect.stages.pairs import choose_pairs
+
+CAMERAS = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
+RECIPE = load_recipe("unrectified-rootsift")
+DAMAGED = "damaged.png"
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four photographs and one that cannot be read."""
+    folder = tmp_path_factory.mktemp("photos č")
+    write_photographs(folder)
+    (folder / DAMAGED).write_bytes(b"no image")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A scheduler and two workers of one thread each, in processes of their own."""
+    with local_cluster(tmp_path_factory.mktemp("cluster"), 2) as started:
+        yield started
+
+
+def run_stages(
+    out: Path,
+    photos: Path,
+    executor: Executor | None,
+    *,
+    masks: MaskOptions | None = None,
+    progress: Progress = SILENT,
+) -> StageReport:
+    inputs = Inputs.of(photos, cameras=CAMERAS, masks=masks)
+    with Workspace(out).locked() as workspace:
+        context = Context(workspace, executor=executor, progress=progress)
+        report = extract(context, inputs, RECIPE)
+        choose_pairs(context)
+        match(context)
+    return report
+
+
+def hdf5_contents(out: Path) -> list[dict[str, tuple[str, bytes]]]:
+    return [hdf5_content(path) for path in (Workspace(out).features, Workspace(out).matches)]
+
+
+class KillsOneWorker(Progress):
+    """When the first image is done, the worker that has most of the others is killed."""
+
+    def __init__(self, cluster: Cluster) -> None:
+        super().__init__()
+        self._client = cluster._client
+        self.lost_tasks: Sequence[str] = ()
+
+    @contextmanager
+    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
+        del name, total, unit
+        yield self._advance
+
+    def _advance(self, count: int) -> None:
+        del count
+        if self.lost_tasks:
+            return
+        there, doing = self._client.has_what(), self._client.processing()
+        tasks = {worker: [*there[worker], *doing[worker]] for worker in there}
+        victim = max(tasks, key=lambda worker: len(tasks[worker]))
+        self.lost_tasks = tasks[victim]
+        os.kill(self._client.run(os.getpid)[victim], signal.SIGKILL)
+
+
+class WithoutSharedStorage(Cluster):
+    def sees(self, paths: Sequence[Path]) -> bool:
+        del paths
+        return False
+
+
+@pytest.mark.long
+def test_cluster_that_loses_a_worker_leaves_what_a_local_run_leaves(
+    tmp_path: Path, photos: Path, address: str
+) -> None:
+    expected = run_stages(tmp_path / "local", photos, None)
+    with connected(address) as cluster:
+        cluster._client.wait_for_workers(2, timeout=60)
+        killing = KillsOneWorker(cluster)
+        report = run_stages(tmp_path / "cluster", photos, cluster, progress=killing)
+        assert len(killing.lost_tasks) > 0
+        assert len(cluster._client.nthreads()) == 1
+    assert report.failures == expected.failures
+    assert list(report.failures) == [DAMAGED]
+    assert hdf5_contents(tmp_path / "cluster") == hdf5_contents(tmp_path / "local")
+
+
+def test_files_that_workers_do_not_see_are_sent(tmp_path: Path, photos: Path, address: str) -> None:
+    for name in ("a.png", "b c.png", "side/d.png"):  # side/č.png has none
+        mask = np.zeros((240, 320), np.uint8)
+        mask[40:, 30:] = 255
+        path = tmp_path / "masks" / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_image(path, mask)
+    masks = MaskOptions(path=str(tmp_path / "masks"))
+    expected = run_stages(tmp_path / "local", photos, None, masks=masks)
+    with connected(address) as cluster:
+        sending = WithoutSharedStorage(cluster._client, address)
+        report = run_stages(tmp_path / "cluster", photos, sending, masks=masks)
+    assert report.failures == expected.failures
+    assert list(report.failures) == [DAMAGED, "side/č.png"]
+    assert hdf5_contents(tmp_path / "cluster") == hdf5_contents(tmp_path / "local")
+
+
+def test_files_are_seen_when_their_content_is_the_same(photos: Path, address: str) -> None:
+    with connected(address) as cluster:
+        assert cluster.sees([photos, photos / "a.png"])
+        assert not cluster.sees([Path("relative.png"), Path(os.path.relpath(photos / "a.png"))])
+
+
+def test_cluster_that_is_no_use_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster_module, "CONNECT_TIMEOUT_S", 0.2)
+    with pytest.raises(ClusterError, match=r"tcp://127\.0\.0\.1:1: no scheduler answers"):
+        connected("tcp://127.0.0.1:1").__enter__()
+    with pytest.raises(ClusterError, match="not an address such as"):
+        connected("10.0.0.1").__enter__()
+    with pytest.raises(ClusterError, match="needs certificates"):
+        connected("tls://10.0.0.1:8786").__enter__()
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ClusterError, match=r"distributed is not installed; .*\[cluster\]"):
+        connected("tcp://10.0.0.1:8786").__enter__()
+
+
+def test_worker_that_would_give_other_results_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"1")
+    paths = [str(tmp_path / "a.png"), str(tmp_path)]
+    here = WorkerEnvironment.of(paths)
+    here.require_same(WorkerEnvironment.of(paths))
+    other = replace(here, host="far", versions=(*here.versions[:-1], ("kornia", "0.1")))
+    with pytest.raises(ClusterError, match=r"worker on far: has kornia 0\.1, and the machine"):
+        here.require_same(other)
+    (tmp_path / "a.png").write_bytes(b"2")
+    with pytest.raises(ClusterError, match=r"does not see .*a\.png"):
+        here.require_same(WorkerEnvironment.of(paths))

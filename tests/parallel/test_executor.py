@@ -1,0 +1,38 @@
+"""Work in threads: order, what is in flight, errors."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from colmap_affrect.parallel.executor import map_ordered
+
+
+def test_map_ordered_keeps_the_order_and_bounds_what_is_in_flight() -> None:
+    started: list[int] = []
+    lock = threading.Lock()
+
+    def work(task: int) -> int:
+        with lock:
+            started.append(task)
+        return task * task
+
+    def tasks() -> Iterator[int]:
+        for task in range(50):
+            assert task - len(results) <= 6
+            yield task
+
+    results: list[int] = []
+    for result in map_ordered(work, tasks(), 3):
+        results.append(result)
+    assert results == [task * task for task in range(50)]
+    assert sorted(started) == list(range(50))
+
+
+def test_map_ordered_raises_an_error_in_its_place() -> None:
+    results = map_ordered(lambda task: 10 // (3 - task), range(100), 2)
+    assert [next(results) for _ in range(3)] == [3, 5, 10]
+    with pytest.raises(ZeroDivisionError):
+        next(results)

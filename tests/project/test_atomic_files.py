@@ -1,0 +1,279 @@
+"""Changes of files: all or nothing, wherever writing stops."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import signal
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+
+from colmap_affrect.errors import WorkspaceError
+from colmap_affrect.project import atomic_files as files
+from colmap_affrect.project.atomic_files import (
+    PAGE_BYTES,
+    FileTransaction,
+    apply_journal,
+    journal_of,
+    replace_text,
+    require_space,
+    uninterrupted,
+)
+
+SIZES = st.integers(0, 3 * PAGE_BYTES)
+STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.just("write"), SIZES, st.binary(max_size=60)),
+        st.tuples(st.just("fill"), SIZES, st.integers(0, 2 * PAGE_BYTES)),
+        st.tuples(st.just("truncate"), SIZES, st.none()),
+        st.tuples(st.just("read"), SIZES, st.integers(0, 2 * PAGE_BYTES)),
+    ),
+    max_size=12,
+)
+
+
+def apply_step(file: io.RawIOBase | io.BytesIO, step: tuple) -> bytes:
+    """Do one step; return what was read."""
+    kind, position, argument = step
+    if kind == "truncate":
+        if position > file.seek(0, os.SEEK_END):  # BytesIO would not grow
+            file.write(bytes(position - file.tell()))
+        file.truncate(position)
+    else:
+        file.seek(position)
+        if kind == "read":
+            return file.read(argument)
+        file.write(argument if kind == "write" else b"\x07" * argument)
+    return b""
+
+
+@example(b"", 0, [("write", 1, b"")])
+@given(st.binary(max_size=2 * PAGE_BYTES), st.integers(0, 2 * PAGE_BYTES), STEPS)
+def test_transaction_is_a_file_and_commits_all_of_it(
+    tmp_path_factory: pytest.TempPathFactory, start: bytes, filled: int, steps: list[tuple]
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "transaction"
+    start += b"\x05" * filled
+    path.write_bytes(start)
+    expected = io.BytesIO(start)
+    with FileTransaction(path) as changes:
+        for step in steps:
+            apply_step(changes, step)
+    assert path.read_bytes() == start, "what is not committed changes nothing"
+    with FileTransaction(path) as changes:
+        for step in steps:
+            assert apply_step(changes, step) == apply_step(expected, step)
+        changes.commit()
+    assert path.read_bytes() == expected.getvalue()
+    assert sorted(path.parent.glob("transaction*")) == [path]
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: nothing after it is done."""
+
+
+class FailingFiles:
+    """Lets the first changes of files pass and then raises: an OSError once, others for ever."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, passing: int, error: BaseException) -> None:
+        self.left, self.error = passing, error
+        for name in ("open", "replace", "unlink"):
+            monkeypatch.setattr(Path, name, self._counted(getattr(Path, name)))
+
+    def count(self) -> None:
+        self.left -= 1
+        if self.left < 0 and not (self.left < -1 and isinstance(self.error, OSError)):
+            raise self.error
+
+    def _counted(self, operation: Callable) -> Callable:
+        def call(path: Path, *arguments: object, **options: object) -> object:
+            if operation.__name__ != "open":
+                self.count()
+                return operation(path, *arguments, **options)
+            mode = arguments[0] if arguments else options["mode"]
+            return CountedFile(operation(path, mode, buffering=0), self.count)
+
+        return call
+
+
+class CountedFile:
+    """A file whose changes are counted before they are made."""
+
+    def __init__(self, file: io.FileIO, count: Callable[[], None]) -> None:
+        self.file, self.count = file, count
+
+    def __enter__(self) -> CountedFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.file.close()
+
+    def __getattr__(self, name: str) -> object:
+        if name in ("write", "truncate"):
+            self.count()
+        return getattr(self.file, name)
+
+
+def grown_hdf5(path: Path) -> tuple[bytes, bytes]:
+    """Content of a HDF5 file before and after a change of it."""
+    with h5py.File(path, "w") as file:
+        for index in range(40):
+            file[f"old {index}"] = np.arange(index)
+    before = path.read_bytes()
+    with FileTransaction(path) as changes:
+        change_hdf5(changes)
+        changes.commit()
+    after = path.read_bytes()
+    path.write_bytes(before)
+    return before, after
+
+
+def change_hdf5(changes: FileTransaction) -> None:
+    with h5py.File(changes, "r+") as file:
+        del file["old 3"]
+        file["new"] = np.arange(3000)
+
+
+def test_kill_between_any_two_writes_leaves_all_changes_or_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "file.h5"
+    before, after = grown_hdf5(path)
+    seen = set()
+    for passing in range(1000):
+        path.write_bytes(before)
+        for left in tmp_path.glob("file.h5.*"):
+            left.unlink()
+        with FileTransaction(path) as changes:
+            change_hdf5(changes)
+            with monkeypatch.context() as patch:
+                FailingFiles(patch, passing, Killed())
+                try:
+                    changes.commit()
+                    ended = True
+                except Killed:
+                    ended = False
+        apply_journal(path)
+        with h5py.File(path, "r") as file:
+            whole = set(file)
+            assert_array_equal(file["old 39"], np.arange(39))
+            if "new" in whole:
+                assert_array_equal(file["new"], np.arange(3000))
+        assert whole == {f"old {index}" for index in range(40)} ^ (
+            {"old 3", "new"} if "new" in whole else set()
+        )
+        seen.add("new" in whole)
+        if ended:
+            break
+    assert path.read_bytes() == after
+    assert seen == {True, False}
+    assert passing > 10
+
+
+def test_full_disk_at_any_write_before_the_changes_count_leaves_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "file.h5"
+    before, after = grown_hdf5(path)
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    for passing in range(1000):
+        path.write_bytes(before)
+        with FileTransaction(path) as changes:
+            change_hdf5(changes)
+            with monkeypatch.context() as patch:
+                FailingFiles(patch, passing, full)
+                with suppress(OSError):
+                    changes.commit()
+                    break
+        if journal_of(path).exists():  # the changes count already, and only have to be put in place
+            apply_journal(path)
+            assert path.read_bytes() == after
+        else:
+            assert path.read_bytes() == before
+    assert passing > 10
+
+
+def test_journal_of_a_file_is_applied_before_it_is_changed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"old" * 3000)
+    with FileTransaction(path) as changes, monkeypatch.context() as patch:
+        changes.write(b"NEW")
+        patch.setattr(files, "apply_journal", lambda _: None)
+        changes.commit()
+    assert path.read_bytes()[:6] == b"oldold"
+    with FileTransaction(path) as changes:
+        assert changes.read(6) == b"NEWold"
+
+
+@pytest.mark.parametrize("passing", [0, 1])
+def test_replace_text_that_fails_keeps_the_old_text(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, passing: int
+) -> None:
+    path = tmp_path / "file.txt"
+    replace_text(path, "old č")
+    with monkeypatch.context() as patch:
+        FailingFiles(patch, passing, OSError(errno.ENOSPC, "No space left on device"))
+        with pytest.raises(WorkspaceError, match=r"file\.txt: cannot be written \(No space left"):
+            replace_text(path, "new")
+    assert path.read_text(encoding="utf-8") == "old č"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "error", [None, AttributeError(), OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))]
+)
+def test_require_space_finds_room_or_says_that_there_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception | None
+) -> None:
+    def refuse(*_: object) -> None:
+        raise error
+
+    if error is not None:  # where blocks cannot be allocated
+        monkeypatch.setattr(os, "posix_fallocate", refuse)
+    require_space(tmp_path / "file", 1 << 20)
+    with pytest.raises(WorkspaceError, match=r"file: cannot be written .*; free space"):
+        require_space(tmp_path / "file", 1 << 60)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_interrupt_is_put_off_until_the_block_has_ended() -> None:
+    done = []
+
+    def work() -> None:
+        with uninterrupted():
+            os.kill(os.getpid(), signal.SIGINT)
+            done.append("rest of the block")
+
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            work()
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert done
+
+
+def test_uninterrupted_works_in_any_thread() -> None:
+    done = []
+
+    def work() -> None:
+        with uninterrupted():
+            done.append(1)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert done

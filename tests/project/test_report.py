@@ -1,0 +1,147 @@
+"""What a run reports: the keys of report.json, and one screen for people."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
+
+LARGE = ModelSummary(("a.png", "č d.png"), 120, 2.25, 0.512)
+SMALL = ModelSummary(("e.png", "f.png"), 50, 2.0, 0.25)
+
+REPORT = ReconstructionReport(
+    images_total=5,
+    unregistered={"broken.png": "unreadable", "e.png": "not registered", "f.png": "no features"},
+    models=(LARGE, SMALL),
+    num_verified_pairs=3,
+    num_pairs=10,
+    stages=(
+        StageReport("extract", 1.25, 3, 1, {"broken.png": "broken.png: not a readable image"}),
+        StageReport("map", 0.5, 2),
+    ),
+    recipe="default",
+    versions={"pycolmap": "4.2.1"},
+    presets=("sparse", "sparse"),
+    verification={"min_num_inliers": 20, "random_seed": 7},
+    mapping={
+        "name": "incremental",
+        "min_model_size": 2,
+        "random_seed": 7,
+        "mapper_options": {"mapper.init_max_error": 3.0},
+    },
+    differs_from_colmap={"verification": {"min_num_inliers": 20}, "mapping": {}},
+    pair_levels={"identity": 2, "asift": 1, "none": 7},
+)
+
+EMPTY = replace(REPORT, models=(), unregistered={"a.png": "no verified pair"}, images_total=1)
+
+
+def test_report_has_the_promised_keys_and_reads_back() -> None:
+    read = json.loads(REPORT.to_json())
+    stages = read.pop("stages")
+    assert read == {
+        "status": "partial",
+        "images_total": 5,
+        "images_registered": 2,
+        "registered_names": ["a.png", "č d.png"],
+        "unregistered": REPORT.unregistered,
+        "num_models": 2,
+        "points3D": 120,
+        "mean_track_length": 2.25,
+        "mean_reprojection_error_px": 0.512,
+        "models": [["a.png", "č d.png"], ["e.png", "f.png"]],
+        "num_pairs": 10,
+        "num_verified_pairs": 3,
+        "pair_levels": {"identity": 2, "asift": 1, "none": 7},
+        "recipe": "default",
+        "preset": "sparse",
+        "mapper": "incremental",
+        "mapper_options": {"mapper.init_max_error": 3.0},
+        "verification": {"min_num_inliers": 20},
+        "mapping": {"min_model_size": 2},
+        "differs_from_colmap": {"verification": {"min_num_inliers": 20}, "mapping": {}},
+        "random_seed": 7,
+        "versions": {"pycolmap": "4.2.1"},
+    }
+    assert [(stage["name"], stage["wall_s"]) for stage in stages] == [
+        ("extract", 1.25),
+        ("map", 0.5),
+    ]
+    assert "č d.png" in REPORT.to_json()
+
+
+@pytest.mark.parametrize(
+    ("report", "status"),
+    [
+        (REPORT, "partial"),
+        (replace(REPORT, unregistered={}), "ok"),
+        (EMPTY, "no_model"),
+        (replace(EMPTY, unregistered={}), "no_model"),
+    ],
+)
+def test_status_tells_whether_all_images_are_in_the_largest_model(
+    report: ReconstructionReport, status: str
+) -> None:
+    assert report.status == report.to_mapping()["status"] == status
+
+
+def test_report_without_a_model_is_all_zero() -> None:
+    values = EMPTY.to_mapping()
+    assert (values["num_models"], values["images_registered"], values["points3D"]) == (0, 0, 0)
+    assert values["registered_names"] == values["models"] == []
+    assert values["mean_track_length"] == values["mean_reprojection_error_px"] == 0.0
+    assert "registered  0 of 1 images" in EMPTY.summary()
+    assert "points" not in EMPTY.summary()
+
+
+def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
+    text = REPORT.summary()
+    assert len(text.splitlines()) < 24
+    for part in (
+        "registered  2 of 5 images",
+        "not broken.png: unreadable",
+        "not e.png: not registered",
+        "3 of 10 verified",
+        "points      120",
+        "2.25 images",
+        "0.51 px",
+        "2, of 2, 2 images",
+        "preset      sparse, incremental mapper, mapper.init_max_error=3.0\n",
+        "extract 1.2  map 0.5",
+    ):
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("presets", "preset"),
+    [
+        (("sparse", "sparse"), "sparse"),
+        (("custom", "custom"), "custom"),
+        (("colmap", "sparse"), "colmap for verification, sparse for mapping"),
+    ],
+)
+def test_preset_names_that_of_verification_where_it_is_another_one(
+    presets: tuple[str, str], preset: str
+) -> None:
+    report = replace(REPORT, presets=presets)
+    assert report.preset == report.to_mapping()["preset"] == preset
+    assert f"preset      {preset}, incremental mapper" in report.summary()
+
+
+def test_failures_are_those_of_all_stages() -> None:
+    assert REPORT.failures == {"broken.png": "broken.png: not a readable image"}
+
+
+@pytest.mark.parametrize(
+    ("stage", "line"),
+    [
+        (StageReport("match", 2.04, 6), "match: 6 done in 2.0 s"),
+        (StageReport("match", 0.1, 3, 3), "match: 3 done, 3 already there in 0.1 s"),
+        (REPORT.stages[0], "extract: 3 done, 1 already there, 1 failed in 1.2 s"),
+    ],
+)
+def test_stage_summary_is_one_line(stage: StageReport, line: str) -> None:
+    assert stage.summary() == line

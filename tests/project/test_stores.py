@@ -1,0 +1,329 @@
+"""Features and matches come back as written, in hloc's layout, whatever happened to the writer."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.errors import StaleStoreError, StoreError
+from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches, pair_key
+
+NAMES = ["a.png", "b c.png", "west wing/č ñ 图.jpg", "west wing/upper floor/a.png"]
+
+FLOAT16_ROUNDING = 1e-3
+"""Descriptors and scores are at most 1 in size and stored as float16."""
+
+
+def some_features(count: int, seed: int = 0) -> LocalFeatures:
+    rng = np.random.default_rng(seed)
+    lafs = rng.uniform(0, 300, (count, 2, 3))
+    lafs[:, :, :2] = np.eye(2) * rng.uniform(1, 50, (count, 1, 1)) + rng.normal(0, 0.1, (2, 2))
+    descriptors = rng.uniform(0.1, 1, (count, 128)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    responses = rng.uniform(0.01, 1, count).astype(np.float32)
+    return LocalFeatures(lafs, responses, descriptors, rng.integers(0, 9, count).astype(np.int32))
+
+
+def assert_same_features(read: LocalFeatures, written: LocalFeatures) -> None:
+    assert_array_equal(read.lafs, written.lafs.astype(np.float32))
+    assert_array_equal(read.responses, written.responses)
+    assert_array_equal(read.rectification_ids, written.rectification_ids)
+    assert read.descriptors.shape == written.descriptors.shape
+    assert_allclose(read.descriptors, written.descriptors, atol=FLOAT16_ROUNDING)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> FeatureStore:
+    return FeatureStore(tmp_path / "features.h5")
+
+
+@pytest.fixture
+def matches(tmp_path: Path) -> MatchStore:
+    return MatchStore(tmp_path / "matches.h5")
+
+
+def test_store_of_other_options_is_refused(tmp_path):
+    path = tmp_path / "matches.h5"
+    pair = PairMatches(("a", "b"), np.array([[0, 1]]), np.ones(1, np.float32), 2)
+    MatchStore(path, "digest of old options").write([pair])
+    with pytest.raises(StaleStoreError, match="other options"):
+        MatchStore(path, "digest of new options").complete(["a/b"])
+    assert MatchStore(path, "digest of old options").complete(["a/b"]) == {"a/b"}
+
+
+@pytest.mark.parametrize("count", [0, 1, 40_000])
+def test_read_returns_what_was_written(store: FeatureStore, count: int) -> None:
+    written = some_features(count)
+    store.write("a.png", written, (320, 240))
+    read = store.read("a.png")
+    assert_same_features(read, written)
+    assert read.descriptors.flags.c_contiguous
+    assert read.descriptors.dtype == np.float32
+    assert read.lafs.dtype == np.float64
+    assert store.num_keypoints() == {"a.png": count}
+    assert_array_equal(store.read_frames("a.png"), written.lafs.astype(np.float32))
+
+
+def test_names_and_values_are_kept_with_spaces_unicode_and_folders(store: FeatureStore) -> None:
+    for seed, name in enumerate(NAMES):
+        store.write(name, some_features(5 + seed, seed), (100 + seed, 50))
+    assert store.names() == sorted(NAMES)
+    assert store.num_keypoints() == {name: 5 + seed for seed, name in enumerate(NAMES)}
+    assert store.image_sizes() == {name: (100 + seed, 50) for seed, name in enumerate(NAMES)}
+    for seed, name in enumerate(NAMES):
+        assert_same_features(store.read(name), some_features(5 + seed, seed))
+
+
+def test_features_have_the_layout_of_hloc(store: FeatureStore) -> None:
+    written = some_features(7)
+    store.write("west wing/a.png", written, (320, 240))
+    with h5py.File(store.path, "r") as file:
+        group = file["west wing"]["a.png"]
+        keypoints = group["keypoints"][()]
+        assert (keypoints.shape, keypoints.dtype) == ((7, 2), np.float32)
+        # hloc counts from the centre of the first pixel, as we do.
+        assert_array_equal(keypoints, written.keypoints.astype(np.float32))
+        assert group["descriptors"].shape == (128, 7)
+        assert_allclose(group["descriptors"][()], written.descriptors.T, atol=FLOAT16_ROUNDING)
+        assert group["scores"].shape == (7,)
+        assert group["image_size"][()].tolist() == [320, 240]
+        assert group["image_size"].dtype.kind == "i"
+        assert (group["lafs"].shape, group["lafs"].dtype) == ((7, 2, 3), np.float32)
+        assert all(np.issubdtype(item.dtype, np.number) for item in group.values())
+        assert file.attrs["pixel_origin"] == "center"
+        assert file.attrs["format"] == "colmap_affrect/features"
+
+
+def test_files_do_not_need_the_newest_hdf5(store: FeatureStore) -> None:
+    store.write("a.png", some_features(3), (4, 3))
+    # Superblock 0 is HDF5 1.0's; with libver="latest" it is 2 or 3, and a kill loses the file.
+    assert store.path.read_bytes()[8] == 0
+
+
+def test_write_again_replaces_the_features(store: FeatureStore) -> None:
+    store.write("a.png", some_features(9, 1), (4, 3))
+    store.write("a.png", some_features(5, 2), (8, 6))
+    assert_same_features(store.read("a.png"), some_features(5, 2))
+    assert store.image_sizes() == {"a.png": (8, 6)}
+
+
+def test_store_without_file_is_empty(store: FeatureStore) -> None:
+    assert store.names() == []
+    assert store.num_keypoints() == store.image_sizes() == {}
+    assert store.complete(["a.png"]) == set()
+    assert not store.path.exists()
+
+
+def test_incomplete_group_counts_as_absent_and_is_replaced(store: FeatureStore) -> None:
+    for name in NAMES:
+        store.write(name, some_features(4), (4, 3))
+    with h5py.File(store.path, "a") as file:
+        del file[NAMES[1]].attrs["complete"]
+        del file[NAMES[3]].attrs["complete"]
+        del file[NAMES[3]]["descriptors"]
+    assert store.names() == [NAMES[0], NAMES[2]]
+    assert store.complete(NAMES) == {NAMES[0], NAMES[2]}
+    assert set(store.num_keypoints()) == {NAMES[0], NAMES[2]}
+    with pytest.raises(StoreError, match=r"no features of b c\.png; run extract"):
+        store.read(NAMES[1])
+    store.write(NAMES[3], some_features(6), (4, 3))
+    assert_same_features(store.read(NAMES[3]), some_features(6))
+
+
+def test_read_of_an_unknown_name_says_what_to_run(store: FeatureStore) -> None:
+    store.write("a.png", some_features(4), (4, 3))
+    with pytest.raises(StoreError, match=r"features\.h5: no features of z\.png; run extract"):
+        store.read("z.png")
+
+
+def one_line(error: pytest.ExceptionInfo[StoreError]) -> str:
+    text = str(error.value)
+    assert "\n" not in text
+    return text
+
+
+@pytest.mark.parametrize("access", ["read", "write"])
+@pytest.mark.parametrize(
+    ("attributes", "found"),
+    [
+        ({}, "another program"),
+        ({"format": "colmap_affrect/features", "format_version": 3}, "colmap_affrect/features 3"),
+        ({"format": "colmap_affrect/matches", "format_version": 2}, "colmap_affrect/matches 2"),
+    ],
+    ids=["foreign", "newer", "other kind"],
+)
+def test_foreign_or_newer_file_is_refused_and_left_as_it_is(
+    store: FeatureStore, attributes: dict[str, object], found: str, access: str
+) -> None:
+    with h5py.File(store.path, "w") as file:
+        file.attrs.update(attributes)
+        file.create_group("a.png").attrs["complete"] = True
+    before = store.path.read_bytes()
+    with pytest.raises(StoreError, match=found) as error:
+        store.names() if access == "read" else store.write("b.png", some_features(2), (4, 3))
+    assert str(store.path) in one_line(error)
+    assert "--output-path" in str(error.value)
+    assert store.path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "content", [b"\0", b"no HDF5 at all" * 100, b"\x89HDF\r\n\x1a\n" + b"\0" * 88]
+)
+def test_damaged_file_is_refused_with_one_line(store: FeatureStore, content: bytes) -> None:
+    store.path.write_bytes(content)
+    for access in (store.names, lambda: store.write("a.png", some_features(2), (4, 3))):
+        with pytest.raises(StoreError, match=r"cannot be opened as HDF5 .*--overwrite") as error:
+            access()
+        one_line(error)
+    assert store.path.read_bytes() == content
+
+
+@pytest.mark.parametrize(
+    ("name1", "name2", "key"),
+    [
+        ("a.png", "b.png", "a.png/b.png"),
+        ("west wing/a.png", "east/up/č.png", "west wing-a.png/east-up-č.png"),
+    ],
+)
+def test_pair_key_is_that_of_hloc(name1: str, name2: str, key: str) -> None:
+    assert pair_key(name1, name2) == key
+
+
+def pair_matches(names: tuple[str, str], indices: list[list[int]], count: int) -> PairMatches:
+    array = np.asarray(indices, np.int64).reshape(-1, 2)
+    scores = np.linspace(0.25, 0.5, len(array)).astype(np.float32)
+    return PairMatches(names, array, scores, count)
+
+
+def test_matches_have_the_layout_of_hloc(matches: MatchStore) -> None:
+    matches.write([pair_matches(("west/a.png", "b c.png"), [[1, 0], [4, 32_767]], 6)])
+    with h5py.File(matches.path, "r") as file:
+        group = file["west-a.png"]["b c.png"]
+        assert group["matches0"].dtype == np.int16
+        assert group["matches0"][()].tolist() == [-1, 0, -1, -1, 32_767, -1]
+        assert group["matching_scores0"].dtype == np.float16
+        assert group["matching_scores0"][()].tolist() == [0.0, 0.25, 0.0, 0.0, 0.5, 0.0]
+
+
+def test_matches_beyond_16_bits_are_stored_in_32(matches: MatchStore) -> None:
+    pair = ("a.png", "b.png")
+    matches.write([pair_matches(pair, [[0, 32_768], [39_999, 3]], 40_000)])
+    with h5py.File(matches.path, "r") as file:
+        assert file[pair_key(*pair)]["matches0"].dtype == np.int32
+    (found,) = matches.read([pair])
+    assert found.indices.tolist() == [[0, 32_768], [39_999, 3]]
+
+
+@pytest.mark.parametrize(("indices", "count"), [([], 0), ([], 5), ([[0, 0]], 1)])
+def test_read_returns_the_matches_that_were_written(
+    matches: MatchStore, indices: list[list[int]], count: int
+) -> None:
+    other = pair_matches(("č/a.png", "d.png"), [[2, 1], [3, 0]], 4)
+    matches.write([pair_matches(("a.png", "b.png"), indices, count), other])
+    found = matches.read([("a.png", "b.png"), ("č/a.png", "d.png")])
+    first, second = (pair.indices for pair in found)
+    assert first.shape == (len(indices), 2)
+    assert first.tolist() == indices
+    assert second.dtype == np.int64
+    assert second.tolist() == [[2, 1], [3, 0]]
+
+
+@pytest.mark.parametrize("gone", ["group", "marker"])
+def test_read_of_a_pair_without_matches_says_what_to_run(matches: MatchStore, gone: str) -> None:
+    matches.write([pair_matches((name, "z.png"), [[0, 0]], 1) for name in ("a.png", "b.png")])
+    with h5py.File(matches.path, "a") as file:
+        if gone == "group":
+            del file["b.png/z.png"]
+        else:
+            del file["b.png/z.png"].attrs["complete"]
+    assert matches.complete(["a.png/z.png", "b.png/z.png"]) == {"a.png/z.png"}
+    with pytest.raises(StoreError, match=r"no matches of b\.png, z\.png; run match"):
+        list(matches.read([("a.png", "z.png"), ("b.png", "z.png")]))
+
+
+WRITER = """
+import os, signal, sys
+from pathlib import Path
+import h5py
+import numpy as np
+from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.data import LocalFeatures
+
+path, deadly = Path(sys.argv[1]), int(sys.argv[2])
+created = 0
+create_dataset = h5py.Group.create_dataset
+
+
+def create(*arguments, **options):
+    global created
+    created += 1
+    if created == deadly:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return create_dataset(*arguments, **options)
+
+
+h5py.Group.create_dataset = create
+store = FeatureStore(path)
+for index in range(100_000):
+    count = 1000 + index
+    lafs = np.tile(np.eye(2, 3), (count, 1, 1)) * (index + 1)
+    store.write(
+        f"folder/{index}.png",
+        LocalFeatures(lafs, np.ones(count, np.float32), np.ones((count, 128), np.float32)),
+        (640, 480),
+    )
+    print(index, flush=True)
+"""
+
+
+def start_writer(path: Path, deadly: int = 0) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(path), str(deadly)], stdout=subprocess.PIPE, text=True
+    )
+
+
+def assert_holds_images(store: FeatureStore, least: int, most: int) -> None:
+    """The store is readable and holds the writer's images 0, 1, ..., each as written."""
+    counts = store.num_keypoints()
+    assert least <= len(counts) <= most
+    for index in range(len(counts)):
+        assert counts[f"folder/{index}.png"] == 1000 + index
+        lafs = store.read(f"folder/{index}.png").lafs
+        assert_array_equal(lafs, np.tile(np.eye(2, 3), (1000 + index, 1, 1)) * (index + 1))
+
+
+@pytest.mark.parametrize(("deadly", "complete"), [(1, 0), (4, 0), (8, 1), (21, 2)])
+def test_complete_groups_are_readable_after_a_kill_within_a_group(
+    store: FeatureStore, deadly: int, complete: int
+) -> None:
+    with start_writer(store.path, deadly) as writer:
+        writer.communicate(timeout=60)
+    assert writer.returncode == -signal.SIGKILL
+    assert_holds_images(store, complete, complete)
+    store.write("more.png", some_features(3), (4, 3))
+    assert "more.png" in store.names()
+
+
+@pytest.mark.parametrize("delay_s", [0.005, 0.023, 0.07])
+def test_complete_groups_are_readable_after_a_kill_at_any_time(
+    store: FeatureStore, delay_s: float
+) -> None:
+    with start_writer(store.path) as writer:
+        for _ in range(3):
+            writer.stdout.readline()
+        time.sleep(delay_s)
+        os.kill(writer.pid, signal.SIGKILL)
+        printed = writer.stdout.read().split()
+    written = 3 + len([line for line in printed if line.isdigit()])
+    # The last one may be complete before it is printed.
+    assert_holds_images(store, written, written + 1)

@@ -1,0 +1,221 @@
+"""The output folder: what may be done in it, and what is on record."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from colmap_affrect.errors import StaleStoreError, WorkspaceError
+from colmap_affrect.project.workspace import STAGES, Workspace
+
+OPTIONS = {"image_path": "photos", "camera": {"mode": "auto"}, "sigmas": (8.0, 16.0), "size": 3}
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    return Workspace(tmp_path)
+
+
+@pytest.fixture
+def finished(workspace: Workspace) -> Workspace:
+    """A workspace with all stages on record and something in each of their files."""
+    for stage in STAGES:
+        workspace.record_options(stage, {"by": stage}, recipe="default")
+    for path in (workspace.features, workspace.pairs, workspace.matches, workspace.database):
+        path.write_bytes(path.name.encode())
+    (workspace.sparse / "0").mkdir(parents=True)
+    (workspace.sparse / "0" / "images.bin").write_bytes(b"model")
+    workspace.report.write_text("{}")
+    return workspace
+
+
+def test_record_options_puts_the_options_on_record(workspace: Workspace) -> None:
+    plan = {"match": {"max_ratio": 0.8}, "extract": {}}
+    workspace.record_options("extract", OPTIONS, plan=plan, recipe="default")
+    workspace.record_options("pairs", {"match_list_path": ""})
+    assert workspace.recorded() == {
+        "recipe": "default",
+        "begun": ["extract", "pairs"],
+        "match": {"max_ratio": 0.8},
+        "extract": {**OPTIONS, "sigmas": [8.0, 16.0]},
+        "pairs": {"match_list_path": ""},
+    }
+    assert workspace.recipe() == "default"
+    assert workspace.planned("match") == {"max_ratio": 0.8}
+    with pytest.raises(WorkspaceError, match="the match stage has not been run"):
+        workspace.require("match")
+    assert workspace.require("extract")["camera"] == {"mode": "auto"}
+    assert [path.name for path in workspace.path.iterdir()] == ["config.toml"]
+
+
+def test_record_options_again_with_the_same_options_is_accepted(workspace: Workspace) -> None:
+    workspace.record_options("extract", OPTIONS)
+    before = workspace.config.read_bytes()
+    workspace.record_options("extract", {**OPTIONS, "sigmas": [8, 16]})
+    assert tomllib.loads(workspace.config.read_text()) == tomllib.loads(before.decode())
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({**OPTIONS, "size": 4}, "size=3, and it is 4 now"),
+        ({**OPTIONS, "camera": {"mode": "single"}}, "camera.mode='auto', and it is 'single' now"),
+        ({**OPTIONS, "sigmas": (8.0,)}, "sigmas=[8.0, 16.0], and it is [8.0] now"),
+        ({**OPTIONS, "more": True}, "more=None, and it is True now"),
+        ({"image_path": "photos"}, "camera.mode='auto', and it is None now"),
+    ],
+)
+def test_record_options_with_other_options_names_the_first_that_differs(
+    workspace: Workspace, changed: dict[str, object], named: str
+) -> None:
+    workspace.record_options("extract", OPTIONS)
+    before = workspace.config.read_bytes()
+    with pytest.raises(StaleStoreError) as error:
+        workspace.record_options("extract", changed)
+    text = str(error.value)
+    assert named in text
+    assert "extract stage" in text
+    assert "--overwrite" in text
+    assert "\n" not in text
+    assert workspace.config.read_bytes() == before
+
+
+def test_another_part_is_named_before_its_options(workspace: Workspace) -> None:
+    workspace.record_options("extract", OPTIONS)
+    workspace.record_options("match", {"max_ratio": 0.8, "name": "nearest"})
+    with pytest.raises(StaleStoreError, match="run there with name='nearest', and it is 'other'"):
+        workspace.record_options("match", {"depth": 2, "name": "other"})
+
+
+KEPT = {
+    "extract": [],
+    "pairs": ["features.h5"],
+    "match": ["features.h5", "pairs.txt"],
+    "verify": ["features.h5", "matches.h5", "pairs.txt"],
+    "escalate": ["database.db", "features.h5", "matches.h5", "pairs.txt"],
+    "map": ["database.db", "features.h5", "matches.h5", "pairs.txt"],
+}
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_record_options_with_overwrite_discards_this_stage_and_later_ones(
+    finished: Workspace, stage: str
+) -> None:
+    finished.record_options(stage, {"by": "somebody else"}, recipe="default", overwrite=True)
+    left = sorted(path.name for path in finished.path.iterdir())
+    assert left == sorted(["config.toml", *KEPT[stage]])
+    record = finished.recorded()
+    earlier = STAGES[: STAGES.index(stage)]
+    assert record.pop("recipe") == "default"
+    assert record.pop("begun") == [*earlier, stage]
+    # What was chosen for later stages is kept, unless everything begins anew.
+    later = STAGES[len(earlier) + 1 :] if earlier else ()
+    assert record == {
+        **{name: {"by": name} for name in (*earlier, *later)},
+        stage: {"by": "somebody else"},
+    }
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize(
+    "name", ["database.db", "sparse/0/images.bin", "features.h5", "matches.h5"]
+)
+def test_results_of_somebody_else_are_refused_and_left_as_they_are(
+    workspace: Workspace, name: str, overwrite: bool
+) -> None:
+    path = workspace.path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"SQLite format 3\0 or so")
+    with pytest.raises(StaleStoreError, match="was not made here; it is left as it is") as error:
+        workspace.record_options("extract", OPTIONS, overwrite=overwrite)
+    assert str(workspace.path / name.split("/")[0]) in str(error.value)
+    assert path.read_bytes() == b"SQLite format 3\0 or so"
+    assert not workspace.config.exists()
+
+
+def test_require_of_a_stage_not_run_says_what_to_run(workspace: Workspace) -> None:
+    with pytest.raises(WorkspaceError, match=r"run 'colmap-affrect match' .* first"):
+        workspace.require("match")
+
+
+def test_damaged_record_is_one_clear_line(workspace: Workspace) -> None:
+    workspace.config.write_text("[extract\nx = ")
+    with pytest.raises(WorkspaceError, match=r"config\.toml: damaged") as error:
+        workspace.recorded()
+    assert "\n" not in str(error.value)
+
+
+LOCK_AND_WAIT = """
+import sys
+from pathlib import Path
+from colmap_affrect.project.workspace import Workspace
+
+with Workspace(Path(sys.argv[1])).locked():
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_folder_in_use_by_another_process_is_refused_until_it_ends(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path / "new" / "out")
+    other = subprocess.Popen(
+        [sys.executable, "-c", LOCK_AND_WAIT, str(workspace.path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with other:
+        assert other.stdout.readline() == "locked\n"
+        with (
+            pytest.raises(WorkspaceError, match="another colmap-affrect is working in this folder"),
+            workspace.locked(),
+        ):
+            pass
+        other.stdin.close()
+    with workspace.locked() as again:
+        assert again is workspace
+
+
+def test_locked_releases_the_folder_after_an_error(workspace: Workspace) -> None:
+    with pytest.raises(KeyError), workspace.locked():
+        raise KeyError
+    with workspace.locked():
+        pass
+
+
+def test_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    workspace = Workspace(tmp_path / "file" / "out")
+    with (
+        pytest.raises(WorkspaceError, match=r"out: cannot be used as output folder \(Not a dir"),
+        workspace.locked(),
+    ):
+        pass
+
+
+def test_folder_that_cannot_be_written_is_one_clear_line(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Permissions do not stop root, who runs tests in containers: the error is raised by hand.
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied", str(workspace.path))
+
+    monkeypatch.setattr("filelock.FileLock.acquire", refuse)
+    with (
+        pytest.raises(WorkspaceError, match=r"output folder \(Permission denied\)"),
+        workspace.locked(),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("version", ["", "format_version = 1\n"])
+def test_record_of_another_version_is_one_clear_line(workspace: Workspace, version: str) -> None:
+    workspace.config.write_text(f'{version}recipe = "default"\n[extract]\nimage_path = "/photos"\n')
+    with pytest.raises(WorkspaceError, match="made by another version of colmap-affrect"):
+        workspace.require("extract")
+    with pytest.raises(WorkspaceError, match="use another --output-path or remove it"):
+        workspace.record_options("extract", OPTIONS, overwrite=True)

@@ -1,0 +1,205 @@
+"""Rectifier ``dense-shapes``: disjoint regions inside the image, each with a canvas that fits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from strategies import tilt_distance
+from synthetic import texture
+
+from colmap_affrect.data import Mask, Rectification, RectificationPlan, ShapeGrid
+from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
+from colmap_affrect.geometry.canvas import rectifying_affine
+from colmap_affrect.geometry.tilts import (
+    metrics_from_tilts,
+    nearest_centers,
+)
+from colmap_affrect.rectifiers.dense import DenseShapesOptions, plan_dense_shapes
+
+STEP_PX = 4
+
+Tilts = list[tuple[float, float]]
+
+
+def shape_grid(classes: Tilts, labels: np.ndarray, textured: np.ndarray | None = None) -> ShapeGrid:
+    """A grid whose cell (r, c) has the class ``classes[labels[r, c]]``."""
+    metrics = metrics_from_tilts(*np.array(classes).T)[labels]
+    textured = np.ones(labels.shape, bool) if textured is None else textured
+    return ShapeGrid(metrics, textured, 1.5, STEP_PX)
+
+
+def image_region(item: Rectification, size: tuple[int, int]) -> Mask:
+    """The region as a mask of the whole image of (width, height)."""
+    left, top = item.region_origin
+    height, width = item.region.shape
+    mask = np.zeros(size[::-1], bool)
+    mask[top : top + height, left : left + width] = item.region
+    return mask
+
+
+def check_invariants(plan: RectificationPlan, size: tuple[int, int]) -> None:
+    """What every plan promises; that canvases fit their regions is in test_regions."""
+    width, height = size
+    assert plan.image_size == size
+    claimed = np.zeros((height, width), int)
+    for item in plan.items:
+        assert item.region.dtype == bool
+        # The mask is cropped to the region: no free row or column at its sides.
+        sides = (item.region[0], item.region[-1], item.region[:, 0], item.region[:, -1])
+        assert all(side.any() for side in sides)
+        region = image_region(item, size)
+        assert np.count_nonzero(region) == np.count_nonzero(item.region)
+        claimed += region
+        linear = item.rectified_from_image[:2, :2]
+        assert_allclose(linear, rectifying_affine(item.tilt, item.tilt_angle_rad))
+    assert claimed.max(initial=0) <= 1, "regions overlap"
+    assert plan.rectified_area_px == sum(item.canvas_area_px for item in plan.items)
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 10_000), st.integers(1, 12), st.integers(1, 12), st.integers(0, 15))
+def test_plan_dense_shapes_partitions_any_grid(
+    seed: int, rows: int, columns: int, cut_px: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    classes = [(float(7.0 ** rng.random()), float(np.pi * rng.random())) for _ in range(5)]
+    labels = rng.integers(0, 5, (rows, columns))
+    textured = rng.random((rows, columns)) < 0.8
+    size = (STEP_PX * columns - cut_px % 4, STEP_PX * rows - cut_px // 4)
+    options = DenseShapesOptions(min_region_frac=0.0, min_part_frac=0.0, covered_frac=1.0)
+    grid = shape_grid(classes, labels, textured)
+    plan = plan_dense_shapes(grid, size, options)
+    check_invariants(plan, size)
+    # With no smallest region, the regions are exactly the textured blocks in their balls.
+    warps = [(item.tilt, item.tilt_angle_rad) for item in plan.items]
+    centers = np.array(list(dict.fromkeys(warps))).reshape(-1, 2)
+    nearest = nearest_centers(grid.metrics.reshape(-1, 3), centers, options.tilt_radius)
+    nearest = np.where(textured, nearest.reshape(labels.shape), -1)
+    for index, center in enumerate(centers):
+        blocks = np.kron(nearest == index, np.ones((STEP_PX, STEP_PX), bool))
+        parts = [
+            image_region(item, size)
+            for item, warp in zip(plan.items, warps, strict=True)
+            if warp == tuple(center)
+        ]
+        np.testing.assert_array_equal(np.any(parts, axis=0), blocks[: size[1], : size[0]])
+
+
+def test_plan_dense_shapes_gives_each_plane_its_own_warp() -> None:
+    labels = np.zeros((20, 30), int)
+    labels[:, 12:] = 1
+    labels[14:, :12] = 2
+    classes = [(3.0, 0.4), (4.5, 1.7), (1.0, 0.0)]
+    size = (120, 80)
+    plan = plan_dense_shapes(shape_grid(classes, labels), size, DenseShapesOptions())
+    check_invariants(plan, size)
+    assert len(plan.items) == 2
+    # The larger region has more votes and comes first.
+    for item, label in zip(plan.items, (1, 0), strict=True):
+        distance = tilt_distance(item.tilt, item.tilt_angle_rad, *classes[label])
+        assert distance < np.log(1.7)
+        expected = np.kron(labels == label, np.ones((4, 4), bool))
+        np.testing.assert_array_equal(image_region(item, size), expected)
+
+
+def test_plan_dense_shapes_skips_regions_below_the_smallest_share() -> None:
+    labels = np.zeros((10, 20), int)
+    labels[:2, :5] = 1  # 5 % of the blocks
+    grid = shape_grid([(1.0, 0.0), (4.0, 0.9)], labels)
+    kept = plan_dense_shapes(
+        grid, (80, 40), DenseShapesOptions(min_region_frac=0.04, covered_frac=1.0)
+    )
+    skipped = plan_dense_shapes(
+        grid, (80, 40), DenseShapesOptions(min_region_frac=0.06, covered_frac=1.0)
+    )
+    assert (len(kept.items), len(skipped.items)) == (1, 0)
+
+
+def test_plan_dense_shapes_obeys_the_limit_on_warps() -> None:
+    rng = np.random.default_rng(4)
+    classes = [(float(t), float(a)) for t in (2.5, 5.0) for a in np.arange(8) * np.pi / 8]
+    grid = shape_grid(classes, rng.integers(0, 16, (40, 50)))
+    for limit in (0, 1, 3):
+        options = DenseShapesOptions(max_num_rectifications=limit, min_region_frac=0.0)
+        plan = plan_dense_shapes(grid, (200, 160), options)
+        assert len({(item.tilt, item.tilt_angle_rad) for item in plan.items}) == limit
+        check_invariants(plan, (200, 160))
+
+
+def test_plan_dense_shapes_does_not_let_untextured_blocks_vote_or_join() -> None:
+    labels = np.zeros((10, 20), int)
+    labels[:, 10:] = 1
+    textured = np.ones(labels.shape, bool)
+    textured[:, 10:] = False
+    textured[:4, :10] = False
+    plan = plan_dense_shapes(
+        shape_grid([(3.0, 0.5), (3.0, 2.0)], labels, textured), (80, 40), DenseShapesOptions()
+    )
+    assert len(plan.items) == 1
+    np.testing.assert_array_equal(
+        image_region(plan.items[0], (80, 40)), np.kron(textured, np.ones((4, 4), bool))
+    )
+
+
+def test_plan_dense_shapes_warps_scattered_parts_of_a_region_apart() -> None:
+    # Two places of the same class 20 blocks apart, and crumbs 1 block from the first.
+    labels = np.zeros((30, 60), int)
+    labels[4:14, 3:13] = 1
+    labels[4:14, 14] = 1
+    labels[10:25, 35:55] = 1
+    grid = shape_grid([(1.0, 0.0), (4.0, 0.9)], labels)
+    size = (240, 120)
+    plan = plan_dense_shapes(grid, size, DenseShapesOptions())
+    check_invariants(plan, size)
+    assert len(plan.items) == 2
+    assert {(item.tilt, item.tilt_angle_rad) for item in plan.items} == {
+        (plan.items[0].tilt, plan.items[0].tilt_angle_rad)
+    }
+    blocks = np.kron(labels == 1, np.ones((4, 4), bool))
+    left, right = sorted(plan.items, key=lambda item: item.region_origin)
+    np.testing.assert_array_equal(image_region(left, size)[:, :100], blocks[:, :100])
+    np.testing.assert_array_equal(image_region(right, size)[:, 100:], blocks[:, 100:])
+
+
+def test_plan_dense_shapes_leaves_out_parts_below_their_smallest_share() -> None:
+    labels = np.zeros((30, 60), int)
+    labels[4:24, 3:23] = 1
+    labels[10:13, 45:48] = 1  # 9 of 1800 blocks, 0.5 %
+    grid = shape_grid([(1.0, 0.0), (4.0, 0.9)], labels)
+    for min_part_frac, count in [(0.004, 2), (0.006, 1)]:
+        options = DenseShapesOptions(min_part_frac=min_part_frac)
+        assert len(plan_dense_shapes(grid, (240, 120), options).items) == count
+
+
+@pytest.mark.parametrize("size", [(80, 61), (1, 1), (90, 1), (1, 90), (7, 9)])
+def test_plan_of_a_flat_image_has_no_warps(size: tuple[int, int]) -> None:
+    image = np.full(size[::-1], 140, np.uint8)
+    grid = SecondMoment(SecondMomentOptions()).grid(image)
+    plan = plan_dense_shapes(grid, size, DenseShapesOptions())
+    assert (plan.image_size, plan.items) == (size, ())
+    assert plan.rectified_area_px == 0
+
+
+def test_plan_dense_shapes_of_isotropic_texture_needs_no_warp() -> None:
+    image = texture((320, 240), seed=6, finest_sigma_px=2.0)
+    grid = SecondMoment(SecondMomentOptions()).grid(image)
+    plan = plan_dense_shapes(grid, (320, 240), DenseShapesOptions(min_region_frac=0.05))
+    assert len(plan.items) == 0
+
+
+def test_region_in_two_places_is_one_warp_if_pieces_of_any_size_count() -> None:
+    labels = np.zeros((40, 60), int)
+    labels[5:12, 4:14] = labels[30:36, 45:50] = 1
+    grid = shape_grid([(1.0, 0.0), (3.0, 0.7)], labels)
+    split = plan_dense_shapes(grid, (240, 160), DenseShapesOptions(covered_frac=1.0))
+    whole = plan_dense_shapes(
+        grid, (240, 160), DenseShapesOptions(covered_frac=1.0, min_part_frac=0.0)
+    )
+    assert (len(split.items), split.num_regions) == (2, 1)
+    assert (len(whole.items), whole.num_regions) == (1, 1)
+    both = sum(image_region(item, (240, 160)) for item in split.items)
+    assert_allclose(image_region(whole.items[0], (240, 160)), both)
+    assert whole.rectified_area_px > 2 * split.rectified_area_px

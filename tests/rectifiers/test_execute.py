@@ -1,0 +1,310 @@
+"""Features of rectifying warps: where they lie in the image, which are kept, what they gain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from strategies import Array
+from synthetic import blobs, texture
+
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS, is_inside
+from colmap_affrect.data import (
+    GrayImage,
+    LocalFeatures,
+    Mask,
+    Rectification,
+    RectificationPlan,
+)
+from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
+from colmap_affrect.features.sift import RootSift, SiftOptions
+from colmap_affrect.geometry.affine import (
+    ellipse_extents,
+    lafs_from_keypoints,
+    project,
+)
+from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
+from colmap_affrect.matchers.nearest import NearestOptions, match_features, matchable
+from colmap_affrect.rectifiers.dense import DenseShapesOptions, plan_dense_shapes
+from colmap_affrect.rectifiers.execute import extract_rectified, found_again
+
+KEYPOINT_ERROR_PX = 0.1
+BIAS_PX = 0.05
+"""Mean error of a warp's keypoints, which the map's own error (centroids) bounds."""
+
+MAPS = [(1.0, 0.0), (2.0, 0.9), (2.51, 2.6), (3.15, 1.57), (4.96, 0.4), (5.8, 2.1)]
+"""(tilt, angle) of the rectifying maps under test, up to the largest of the paper."""
+
+SIZE = (420, 330)
+
+SIGMA_PX = 4.6
+"""Of blobs in warps. At 1.6 * 2^(k/3), e.g. 4.03, SIFT's search for the extremum swings between
+two octaves and gives up."""
+
+
+PROFILE = RootSift(SiftOptions())
+
+
+def one_warp(
+    tilt: float, angle_rad: float, size: tuple[int, int], region: Mask | None = None
+) -> RectificationPlan:
+    """Plan with one warp of a region, or of the whole image."""
+    width, height = size
+    region = np.ones((height, width), bool) if region is None else region
+    rows, columns = np.nonzero(region)
+    matrix, canvas = fit_canvas(
+        rectifying_affine(tilt, angle_rad), np.column_stack([columns, rows]).astype(float), 16.0
+    )
+    return RectificationPlan(size, (Rectification(matrix, canvas, region, tilt, angle_rad),))
+
+
+def of_warps(features: LocalFeatures) -> LocalFeatures:
+    """The features that do not come from the image itself."""
+    return features.select(features.rectification_ids > 0)
+
+
+def keypoint_errors(features: LocalFeatures, centers: Array) -> Array:
+    """Error of the keypoint next to each centre, (N, 2) px."""
+    distances = np.linalg.norm(features.keypoints[:, None] - centers[None], axis=2)
+    return np.asarray(features.keypoints[distances.argmin(axis=0)] - centers)
+
+
+@pytest.mark.parametrize(("tilt", "angle_rad"), MAPS)
+def test_extract_rectified_finds_blobs_of_a_tilted_plane_with_their_place_and_ellipse(
+    tilt: float, angle_rad: float
+) -> None:
+    # Round blobs of a tilted plane: ellipses in the image that the map makes round.
+    shape = np.linalg.inv(rectifying_affine(tilt, angle_rad))
+    rng = np.random.default_rng(round(10 * tilt))
+    xs, ys = np.meshgrid([90.0, 210.0, 330.0], [80.0, 165.0, 250.0])
+    centers = np.stack([xs.ravel(), ys.ravel()], axis=1) + rng.uniform(-4, 4, (9, 2))
+    image = blobs(SIZE, centers, SIGMA_PX * shape)
+    features = of_warps(extract_rectified(image, one_warp(tilt, angle_rad, SIZE), PROFILE, 5000))
+    errors = keypoint_errors(features, centers)
+    assert np.linalg.norm(errors, axis=1).max() < KEYPOINT_ERROR_PX
+    assert np.abs(errors.mean(axis=0)).max() < BIAS_PX
+    # A A^T does not depend on the orientation; a tenth in scale is a fifth here.
+    expected = SIGMA_PX**2 * shape @ shape.T
+    for center in centers:
+        nearest = np.linalg.norm(features.keypoints - center, axis=1).argmin()
+        found = features.lafs[nearest, :, :2] / MEASUREMENT_SIGMAS
+        covariance = found @ found.T
+        assert_allclose(covariance, expected, atol=0.25 * np.abs(expected).max())
+        shape_only = covariance / np.linalg.det(covariance) ** 0.5
+        assert_allclose(shape_only, expected / np.linalg.det(expected) ** 0.5, atol=1e-6)
+
+
+def test_extract_rectified_rejects_ellipses_that_reach_beyond_the_image() -> None:
+    tilt, angle_rad = 3.0, 0.7
+    shape = 3.0 * np.linalg.inv(rectifying_affine(tilt, angle_rad))
+    reach = MEASUREMENT_SIGMAS * ellipse_extents(shape[None])[0]
+    # A fifth more than the reach is well inside, a fifth less well out, on all four sides.
+    width, height = SIZE
+    inside = np.array([[1.2 * reach[0], 120.3], [width - 1.2 * reach[0], 190.6],
+                       [150.2, 1.2 * reach[1]], [260.7, height - 1.2 * reach[1]]])  # fmt: skip
+    outside = np.array([[0.6 * reach[0], 230.4], [width - 0.6 * reach[0], 80.1],
+                        [310.2, 0.6 * reach[1]], [90.7, height - 0.6 * reach[1]]])  # fmt: skip
+    image = blobs(SIZE, np.concatenate([inside, outside]), shape)
+    features = of_warps(extract_rectified(image, one_warp(tilt, angle_rad, SIZE), PROFILE, 5000))
+    errors = np.linalg.norm(keypoint_errors(features, inside), axis=1)
+    assert errors.max() < KEYPOINT_ERROR_PX
+    assert np.linalg.norm(keypoint_errors(features, outside), axis=1).min() > 3.0
+
+
+def test_extract_rectified_keeps_centers_in_the_region_of_their_warp() -> None:
+    image = texture(SIZE, seed=22)
+    rows, columns = np.indices(SIZE[::-1])
+    left = columns + 0.5 * rows < 250
+    lower_right = ~left & (rows > 170)
+    first = one_warp(2.5, 0.6, SIZE, left).items[0]
+    second = one_warp(4.0, 2.0, SIZE, lower_right).items[0]
+    plan = RectificationPlan(SIZE, (first, second))
+    features = extract_rectified(image, plan, PROFILE, 5000)
+    ids = features.rectification_ids
+    assert (np.diff(ids) >= 0).all()
+    assert set(ids.tolist()) == {0, 1, 2}
+    x, y = np.rint(features.keypoints).astype(int).T
+    assert left[y[ids == 1], x[ids == 1]].all()
+    assert lower_right[y[ids == 2], x[ids == 2]].all()
+    upper_right = ~left & ~lower_right
+    assert upper_right[y[ids == 0], x[ids == 0]].any()
+
+
+def test_extract_rectified_without_warps_returns_the_features_of_the_image() -> None:
+    image = texture((200, 150), seed=23)
+    expected = PROFILE.detect((image, None))
+    actual = extract_rectified(image, RectificationPlan((200, 150), ()), PROFILE, 5000)
+    np.testing.assert_array_equal(actual.lafs, expected.lafs)
+    np.testing.assert_array_equal(actual.descriptors, expected.descriptors)
+    assert (actual.rectification_ids == 0).all()
+
+
+def test_extract_rectified_keeps_the_strongest_features_of_all_warps() -> None:
+    image = texture(SIZE, seed=24)
+    columns = np.indices(SIZE[::-1])[1]
+    plan = RectificationPlan(
+        SIZE,
+        (
+            one_warp(2.0, 0.6, SIZE, columns < 200).items[0],
+            one_warp(3.0, 2.0, SIZE, columns >= 200).items[0],
+        ),
+    )
+    everything = of_warps(extract_rectified(image, plan, PROFILE, 100_000))
+    some = of_warps(extract_rectified(image, plan, PROFILE, 75))
+    alone = extract_rectified(image, plan, PROFILE, 75, with_original=False)
+    np.testing.assert_array_equal(alone.lafs, some.lafs)
+    assert len(some) == 75 < len(everything)
+    assert_allclose(
+        np.sort(some.responses), np.sort(everything.responses)[-75:], err_msg="not the strongest"
+    )
+    assert (np.diff(some.rectification_ids) >= 0).all()
+    assert set(some.rectification_ids.tolist()) == {1, 2}
+
+
+def test_extract_rectified_replaces_features_of_the_image_that_a_warp_found_again() -> None:
+    image = texture(SIZE, seed=25, finest_sigma_px=2.5)
+    original = PROFILE.detect((image, None))
+    # A map next to the identity finds nearly all of them again.
+    plan = replace(one_warp(1.01, 0.3, SIZE), replaces_original=True)
+    union = extract_rectified(image, plan, PROFILE, 100_000)
+    kept = union.select(union.rectification_ids == 0)
+    rectified = of_warps(union)
+    deep = is_inside(original.keypoints, SIZE, 1.5 * ellipse_extents(original.lafs[:, :, :2]))
+    places = {tuple(laf.ravel()) for laf in kept.lafs}
+    gone = np.array([tuple(laf.ravel()) not in places for laf in original.lafs])
+    assert np.count_nonzero(gone[deep]) > 0.8 * np.count_nonzero(deep)
+    # None is lost without another one in its place.
+    for laf in original.lafs[gone]:
+        assert np.linalg.norm(rectified.keypoints - laf[:, 2], axis=1).min() < 4.0
+
+
+def test_extract_rectified_keeps_the_features_of_the_image_unless_the_plan_says_otherwise() -> None:
+    image = texture(SIZE, seed=25, finest_sigma_px=2.5)
+    original = PROFILE.detect((image, None))
+    plan = one_warp(1.01, 0.3, SIZE)
+    kept = extract_rectified(image, plan, PROFILE, 100_000)
+    assert_allclose(kept.lafs[kept.rectification_ids == 0], original.lafs)
+    left = np.zeros((SIZE[1], SIZE[0]), bool)
+    left[:, :150] = True
+    partly = extract_rectified(image, replace(plan, original_region=left), PROFILE, 100_000)
+    of_image = partly.select(partly.rectification_ids == 0)
+    assert (np.rint(of_image.keypoints[:, 0]) < 150).all()
+    assert len(of_image) == np.count_nonzero(np.rint(original.keypoints[:, 0]) < 150)
+    alone = extract_rectified(image, plan, PROFILE, 100_000, with_original=False)
+    assert_allclose(alone.lafs, kept.lafs[kept.rectification_ids == 1])
+    assert (alone.rectification_ids == 1).all()
+
+
+def features_at(places: list[tuple[float, float]], sigmas_px: list[float]) -> LocalFeatures:
+    """Features with round frames."""
+    count = len(places)
+    radii = MEASUREMENT_SIGMAS * np.array(sigmas_px, dtype=float)
+    lafs = lafs_from_keypoints(np.array(places, dtype=float).reshape(-1, 2), radii, np.zeros(count))
+    return LocalFeatures(lafs, np.ones(count, np.float32), np.zeros((count, 4), np.float32))
+
+
+def test_found_again_needs_the_same_place_and_scale() -> None:
+    original = features_at(
+        [(50, 50), (80, 50), (110, 50), (140, 50), (170, 50), (200, 50)], [4, 4, 4, 4, 4, 2]
+    )
+    rectified = features_at(
+        [(51.9, 50), (82.1, 50), (110, 50), (140, 50), (170.5, 49), (201.5, 50)],
+        [4, 4, 4 * 1.30, 4 / 1.22, 4 * 1.22, 2],
+    )
+    # Radius half a sigma: 2 px, and 1 px for the last; scales within 2^(1/3) = 1.26.
+    expected = [True, False, False, True, True, False]
+    assert found_again(original, rectified).tolist() == expected
+
+
+def test_found_again_uses_the_geometric_mean_of_elliptic_frames() -> None:
+    original = features_at([(60, 40)], [4.0])
+    rectified = features_at([(60.5, 40)], [4.0])
+    lafs = rectified.lafs.copy()
+    lafs[0, :, :2] = MEASUREMENT_SIGMAS * np.diag([8.0, 2.0])
+    assert found_again(original, rectified.with_frames(lafs)).tolist() == [True]
+
+
+@pytest.mark.parametrize(("count1", "count2"), [(0, 0), (0, 3), (3, 0)])
+def test_found_again_without_features_finds_none(count1: int, count2: int) -> None:
+    first, second = (features_at([(9.0, 9.0)] * n, [3.0] * n) for n in (count1, count2))
+    assert found_again(first, second).tolist() == [False] * count1
+
+
+def oblique_view(
+    frontal: GrayImage, tilt_deg: float, size: tuple[int, int]
+) -> tuple[GrayImage, Array]:
+    """Photograph a picture that is turned about its vertical axis; and view_from_frontal."""
+    distance = 1400.0
+    angle = np.deg2rad(tilt_deg)
+    to_center, from_center = np.eye(3), np.eye(3)
+    to_center[:2, 2] = -(np.array(frontal.shape[::-1]) - 1) / 2
+    from_center[:2, 2] = (np.array(size) - 1) / 2
+    turn = np.array(
+        [
+            [distance * np.cos(angle), 0.0, 0.0],
+            [0.0, distance, 0.0],
+            [np.sin(angle), 0.0, distance],
+        ]
+    )
+    view_from_frontal = from_center @ turn @ to_center
+    factor = 4
+    enlarged = np.diag([factor, factor, 1.0])
+    enlarged[:2, 2] = (factor - 1) / 2
+    large = cv2.warpPerspective(
+        frontal,
+        enlarged @ view_from_frontal,
+        (factor * size[0], factor * size[1]),
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=128,
+    )
+    return cv2.resize(large, size, interpolation=cv2.INTER_AREA), view_from_frontal
+
+
+def rectified_features(image: GrayImage) -> LocalFeatures:
+    """Features with the default rectifier."""
+    size = (image.shape[1], image.shape[0])
+    grid = SecondMoment(SecondMomentOptions()).grid(image)
+    plan = plan_dense_shapes(grid, size, DenseShapesOptions())
+    return extract_rectified(image, plan, PROFILE, SiftOptions().max_num_rectified_features)
+
+
+def correct_matches(first: LocalFeatures, second: LocalFeatures, homography: Array) -> int:
+    """Number of matches whose second keypoint is within 3 px of its true place."""
+    options = NearestOptions()
+    matches = match_features(
+        matchable(first.descriptors, first.keypoints, options),
+        matchable(second.descriptors, second.keypoints, options),
+        options,
+    ).indices
+    predicted = project(homography, first.keypoints[matches[:, 0]])
+    errors = np.linalg.norm(predicted - second.keypoints[matches[:, 1]], axis=1)
+    return int(np.count_nonzero(errors < 3.0))
+
+
+@pytest.mark.parametrize(("tilt_deg", "min_gain"), [(60.0, 700), (75.0, 80)])
+def test_rectified_features_of_an_oblique_plane_match_more_often_than_plain_ones(
+    tilt_deg: float, min_gain: int
+) -> None:
+    frontal = texture((480, 400), seed=30, finest_sigma_px=2.0)
+    oblique, homography = oblique_view(frontal, tilt_deg, (300, 400))
+    reference = PROFILE.detect((frontal, None))
+    plain = correct_matches(reference, PROFILE.detect((oblique, None)), homography)
+    rectified = correct_matches(reference, rectified_features(oblique), homography)
+    assert rectified > 3 * plain
+    assert rectified - plain > min_gain
+
+
+def test_extract_rectified_uses_regions_that_are_cropped_to_a_part_of_the_image() -> None:
+    image = texture(SIZE, seed=27)
+    region = np.zeros(SIZE[::-1], bool)
+    region[90:230, 150:330] = True
+    region[90:150, 150:200] = False
+    whole = one_warp(2.5, 0.6, SIZE, region)
+    cropped = replace(whole.items[0], region=region[90:230, 150:330], region_origin=(150, 90))
+    expected = extract_rectified(image, whole, PROFILE, 5000)
+    actual = extract_rectified(image, RectificationPlan(SIZE, (cropped,)), PROFILE, 5000)
+    assert len(of_warps(expected)) > 30
+    np.testing.assert_array_equal(actual.lafs, expected.lafs)

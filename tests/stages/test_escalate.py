@@ -1,0 +1,332 @@
+"""On demand: only pairs that fail climb, what succeeded stays, and a killed run goes on."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import Call
+from numpy.testing import assert_array_equal
+from results import database_content
+
+from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stores import FeatureStore, MatchStore
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import EscalateOptions, load_recipe
+from colmap_affrect.stages import escalate as escalation
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.escalate import Escalation, recorded_escalation
+from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.match import match
+from colmap_affrect.stages.pairs import choose_pairs
+from colmap_affrect.stages.verify import verify_matches
+
+FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images"
+NAMES = ["view_1_tilt00.jpg", "view_2_tilt30.jpg", "view_6_tilt75.jpg"]
+EASY, HARD = (NAMES[0], NAMES[1]), (NAMES[0], NAMES[2])
+CAMERAS = CameraOptions(mode="single", model="PINHOLE", params="720,720,360,270")
+SMALL = ["max_image_size_px=480", "features.max_num_features=1500",
+         "features.max_num_rectified_features=3000"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("facade")
+    for name in NAMES:
+        shutil.copy(FACADE / name, folder / name)
+    return folder
+
+
+def verified(photos: Path, output: Path, recipe: str) -> Workspace:
+    """A workspace after the stages that every recipe has."""
+    workspace = Workspace(output)
+    with workspace.locked():
+        context = Context(workspace)
+        extract(context, Inputs.of(photos, cameras=CAMERAS), load_recipe(recipe, SMALL))
+        choose_pairs(context)
+        match(context)
+        verify_matches(context)
+    return workspace
+
+
+def escalate(workspace: Workspace, **options: bool) -> StageReport:
+    with workspace.locked():
+        return escalation.escalate(Context(workspace), **options)
+
+
+@pytest.fixture(scope="module")
+def before(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    return verified(photos, tmp_path_factory.mktemp("before"), "on-demand")
+
+
+@pytest.fixture(scope="module")
+def plain(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    return verified(photos, tmp_path_factory.mktemp("plain"), "unrectified-rootsift")
+
+
+@pytest.fixture(scope="module")
+def climbed(
+    before: Workspace, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Workspace, StageReport]:
+    workspace = copy(before, tmp_path_factory.mktemp("climbed"))
+    return workspace, escalate(workspace)
+
+
+def copy(workspace: Workspace, folder: Path) -> Workspace:
+    shutil.copytree(workspace.path, folder, dirs_exist_ok=True)
+    return Workspace(folder)
+
+
+def geometry(workspace: Workspace, pair: tuple[str, str]) -> np.ndarray:
+    """Inlier matches of a pair in the database."""
+    ids = image_ids(workspace.database)
+    with open_database(workspace.database) as database:
+        return database.read_two_view_geometry(*(ids[name] for name in pair)).inlier_matches
+
+
+def matches(workspace: Workspace, pair: tuple[str, str]) -> np.ndarray:
+    ids = image_ids(workspace.database)
+    with open_database(workspace.database) as database:
+        return database.read_matches(*(ids[name] for name in pair))
+
+
+def same_state(first: Workspace, second: Workspace) -> None:
+    for pair in (EASY, HARD):
+        assert_array_equal(matches(first, pair), matches(second, pair))
+        assert_array_equal(geometry(first, pair), geometry(second, pair))
+    for name in NAMES:
+        one, other = (FeatureStore(item.features).read(name) for item in (first, second))
+        assert_array_equal(one.lafs, other.lafs)
+        assert_array_equal(one.rectification_ids, other.rectification_ids)
+    assert escalation.pair_levels(Context(first)) == escalation.pair_levels(Context(second))
+
+
+def test_escalation_before_its_turn_leaves_nothing_on_record(tmp_path: Path, call: Call) -> None:
+    ended = call("escalate", "--output-path", tmp_path)
+    assert ended.code == 1
+    assert "the verify stage has not been run there" in ended.errors[0]
+    assert not Workspace(tmp_path).config.exists()
+
+
+def test_other_thresholds_than_before_need_no_new_features(
+    climbed: tuple[Workspace, StageReport], tmp_path: Path, call: Call
+) -> None:
+    workspace = copy(climbed[0], tmp_path)
+    setting = ["--set", "escalate.min_num_tracks=5"]
+    digest = workspace.options_digest("extract", "match")
+    refused = call("escalate", "--output-path", tmp_path, *setting)
+    assert "with min_num_tracks=30, and it is 5 now; use --overwrite" in refused.errors[0]
+    assert call("escalate", "--output-path", tmp_path, *setting, "--overwrite").code == 0
+    assert recorded_escalation(workspace).min_num_tracks == 5
+    assert workspace.options_digest("extract", "match") == digest
+    wrong = call("escalate", "--output-path", tmp_path, "--set", "matching.max_ratio=0.8")
+    assert wrong.errors == ["error: --set: only options of escalate can be changed here"]
+
+
+def test_device_that_is_not_there_discards_nothing(
+    climbed: tuple[Workspace, StageReport], tmp_path: Path, call: Call
+) -> None:
+    workspace = copy(climbed[0], tmp_path)
+    before = database_content(workspace.database)
+    for stage in ("match", "escalate"):
+        ended = call(stage, "--output-path", tmp_path, "--device", "cuda:99", "--overwrite")
+        assert (ended.code, len(ended.errors)) == (1, 1)
+        assert "--device cuda:99" in ended.errors[0]
+    assert workspace.matches.exists()
+    assert database_content(workspace.database) == before
+
+
+def test_first_level_is_the_unrectified_recipe(before: Workspace, plain: Workspace) -> None:
+    for name in NAMES:
+        one, other = (FeatureStore(item.features).read(name) for item in (before, plain))
+        assert_array_equal(one.lafs, other.lafs)
+        assert_array_equal(one.descriptors, other.descriptors)
+    assert len(geometry(before, EASY)) >= VerificationOptions().min_num_inliers
+    assert len(geometry(before, HARD)) < VerificationOptions().min_num_inliers
+
+
+def test_hard_pair_climbs_and_succeeds(climbed: tuple[Workspace, StageReport]) -> None:
+    workspace, report = climbed
+    assert len(geometry(workspace, HARD)) >= VerificationOptions().min_num_inliers
+    store = MatchStore(workspace.matches)
+    level = store.levels([HARD])[HARD]
+    assert level == store.tried_levels([HARD])[HARD] > 0
+    assert report.num_done >= 1
+    # The other pair of an image that gained follows it, and no further.
+    assert store.tried_levels([EASY])[EASY] <= level
+
+
+def test_trial_of_a_pair_is_what_the_database_then_holds(
+    climbed: tuple[Workspace, StageReport],
+) -> None:
+    workspace = climbed[0]
+    verifier = PairVerifier(workspace.database, VerificationOptions())
+    store = FeatureStore(workspace.features)
+    for pair in (EASY, HARD, HARD[::-1]):
+        keypoints = [store.read_frames(name)[:, :, 2] for name in pair]
+        indices = matches(workspace, pair).astype(np.int64)
+        count = verifier.num_inliers(pair, tuple(keypoints), indices)
+        assert count == len(geometry(workspace, pair))
+
+
+@pytest.mark.parametrize(
+    ("counts", "expected"),
+    [
+        ({("a", "b"): 200, ("a", "c"): 150, ("b", "c"): 30}, []),
+        ({("a", "b"): 200, ("a", "c"): 30, ("b", "c"): 0}, [("a", "c"), ("b", "c")]),
+        ({("a", "b"): 200, ("a", "c"): 100, ("b", "c"): 0}, [("b", "c")]),
+        ({("a", "b"): 99}, [("a", "b")]),
+        ({}, []),
+    ],
+)
+def test_pairs_that_fail_and_the_only_pairs_of_an_image_are_open(counts, expected) -> None:
+    assert escalation.open_pairs(counts, 100) == expected
+
+
+def test_pairs_of_a_weakly_connected_image_are_open_however_strong() -> None:
+    counts = {("a", "b"): 200, ("a", "c"): 150, ("b", "c"): 100}
+    assert escalation.open_pairs(counts, 100, {"c"}) == [("a", "c"), ("b", "c")]
+
+
+def numbered(*rows: tuple[int, int]) -> np.ndarray:
+    return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+@pytest.mark.parametrize(
+    ("matches", "tracks"),
+    [
+        # Features 5 and 6 of b lead from a to c; feature 7 of b does not.
+        (
+            {("a", "b"): numbered((1, 5), (2, 6), (3, 7)), ("b", "c"): numbered((5, 8), (6, 9))},
+            {"a": 2, "b": 2, "c": 2},
+        ),
+        # The same numbers in another image are other features.
+        (
+            {("a", "b"): numbered((1, 5), (2, 6)), ("b", "c"): numbered((1, 5), (2, 6))},
+            {"a": 0, "b": 0, "c": 0},
+        ),
+        # d is matched with a feature of c that leads on, by one of its two matches.
+        (
+            {("c", "a"): numbered((4, 1), (5, 2)), ("c", "d"): numbered((6, 2), (4, 3))},
+            {"a": 1, "c": 1, "d": 1},
+        ),
+        ({("a", "b"): numbered((1, 1), (2, 2), (3, 3))}, {"a": 0, "b": 0}),
+        ({("b", "a"): numbered()}, {"a": 0, "b": 0}),
+        ({}, {}),
+    ],
+)
+def test_images_with_few_features_in_tracks_of_three_are_weakly_connected(matches, tracks) -> None:
+    for limit in range(4):
+        expected = {name for name, count in tracks.items() if count < limit}
+        assert escalation.weakly_connected_images(matches, limit) == expected
+
+
+def test_strong_pairs_without_a_track_of_three_climb(
+    before: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    climb = Escalation(Context(before), EscalateOptions())
+    chain = {EASY: 200, (NAMES[1], NAMES[2]): 150}
+    matches = {pair: np.arange(80).reshape(40, 2) for pair in chain}
+    apart = {**matches, (NAMES[1], NAMES[2]): np.arange(1, 81).reshape(40, 2)}
+    monkeypatch.setattr(climb, "num_inliers", lambda: chain)
+    monkeypatch.setattr(climb, "inlier_matches", lambda: apart)
+    assert climb.open_pairs() == []
+    monkeypatch.setattr(climb, "inlier_matches", lambda: matches)
+    assert climb.open_pairs() == list(chain)
+
+
+def test_no_pair_that_verifies_unrectified_loses_inliers(
+    climbed: tuple[Workspace, StageReport], plain: Workspace
+) -> None:
+    assert len(geometry(climbed[0], EASY)) >= len(geometry(plain, EASY))
+
+
+def test_pairs_that_verify_well_climb_nowhere(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "easy"
+    folder.mkdir()
+    for name in EASY:
+        shutil.copy(photos / name, folder / name)
+    workspace = verified(folder, tmp_path / "out", "on-demand")
+    first = matches(workspace, EASY)
+    monkeypatch.setattr(escalation, "prepared_recipe", None)  # nothing to extract
+    assert escalate(workspace).num_done == 0
+    assert_array_equal(matches(workspace, EASY), first)
+
+
+def test_features_of_levels_follow_one_another(
+    climbed: tuple[Workspace, StageReport], before: Workspace
+) -> None:
+    store, earlier = FeatureStore(climbed[0].features), FeatureStore(before.features)
+    for name in NAMES:
+        ends = store.level_ends(name)
+        first = store.read(name).select(store.level_indices(name, 0))
+        assert_array_equal(first.lafs, earlier.read(name).lafs)
+        if len(ends) > 1:
+            ids = store.read(name).rectification_ids
+            assert (ids[: ends[0]] == 0).all()
+            assert (ids[ends[0] :] > 0).all()
+            assert ends == sorted(ends)
+    ids = image_ids(climbed[0].database)
+    with open_database(climbed[0].database) as database:
+        for name in NAMES:
+            assert database.num_keypoints_for_image(ids[name]) == len(store.read(name))
+
+
+def test_count_of_pairs_by_level_adds_up(climbed: tuple[Workspace, StageReport]) -> None:
+    counts = escalation.pair_levels(Context(climbed[0]))
+    assert list(counts) == ["identity", "dense-shapes", "affnet-shapes", "asift", "none"]
+    assert sum(counts.values()) == 3
+    assert counts["none"] <= 1
+
+
+def test_again_does_nothing(
+    climbed: tuple[Workspace, StageReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workspace = copy(climbed[0], tmp_path / "again")
+    monkeypatch.setattr(escalation, "prepared_recipe", None)  # no features, so nothing to prepare
+    assert escalate(workspace).num_done == 0
+    same_state(workspace, climbed[0])
+
+
+@pytest.mark.parametrize("where", ["write_images_and_keypoints", "verify_new"])
+def test_killed_run_goes_on_to_the_same_result(
+    before: Workspace,
+    climbed: tuple[Workspace, StageReport],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
+) -> None:
+    workspace = copy(before, tmp_path / "killed")
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(escalation, where, killed)
+        with pytest.raises(KeyboardInterrupt):
+            escalate(workspace)
+    escalate(workspace)
+    same_state(workspace, climbed[0])
+
+
+def test_overwrite_climbs_anew_to_the_same_result(
+    climbed: tuple[Workspace, StageReport], tmp_path: Path
+) -> None:
+    workspace = copy(climbed[0], tmp_path / "overwritten")
+    report = escalate(workspace, overwrite=True)
+    assert report.num_done == climbed[1].num_done
+    same_state(workspace, climbed[0])
+
+
+def test_recipe_without_levels_has_nothing_to_climb(plain: Workspace, tmp_path: Path) -> None:
+    workspace = copy(plain, tmp_path / "plain")
+    assert escalate(workspace).num_done == 0
+    assert escalation.pair_levels(Context(workspace)) == {}
+    assert_array_equal(geometry(workspace, EASY), geometry(plain, EASY))

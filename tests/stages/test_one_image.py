@@ -1,0 +1,246 @@
+"""From a file to the database: where features end up, at several sizes of processing."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from colmap_affrect.colmap.database import image_ids, open_database, read_camera_matrix
+from colmap_affrect.conventions import camera_matrix
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.errors import DepthError, DeviceError, OptionError, WeightsError
+from colmap_affrect.features.base import FeatureOptions
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.images.warping import warp
+from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import ExtractionOptions, load_recipe
+from colmap_affrect.stages import one_image
+from colmap_affrect.stages.context import Context, Resources
+from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.one_image import num_images_at_once, prepare
+
+WIDTH, HEIGHT = 480, 360
+GRID = np.stack(np.meshgrid(np.arange(30, WIDTH - 20, 45), np.arange(30, HEIGHT - 20, 45)), -1)
+BLOBS = GRID.reshape(-1, 2) + np.random.default_rng(5).uniform(-2, 2, (GRID.size // 2, 2))
+BLOB_SIGMA_PX = 5.2
+MAX_BIAS_PX = 0.06
+"""Half a pixel too much or too little at any step would be a bias of 0.17 px or more."""
+MAX_ERROR_PX = 0.3
+
+
+def write_blobs(path: Path) -> None:
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    image = np.full((HEIGHT, WIDTH), 100.0)
+    for center_x, center_y in BLOBS:
+        squared = (x - center_x) ** 2 + (y - center_y) ** 2
+        image += 120.0 * np.exp(-squared / (2 * BLOB_SIGMA_PX**2))
+    path.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(path), np.clip(np.rint(image), 0, 255).astype(np.uint8))
+
+
+@pytest.mark.parametrize("max_size", [WIDTH, 360, 240])
+def test_blob_is_half_a_pixel_further_in_the_database_at_every_size(tmp_path, max_size):
+    write_blobs(tmp_path / "photos" / "blobs.png")
+    workspace = Workspace(tmp_path / "out")
+    recipe = load_recipe("default", [f"max_image_size_px={max_size}"])
+    with workspace.locked():
+        extract(Context(workspace), Inputs.of(tmp_path / "photos"), recipe)
+    with open_database(workspace.database) as database:
+        keypoints = database.read_keypoints(image_ids(workspace.database)["blobs.png"])
+    assert keypoints.shape[1] == 6
+    centers = keypoints[:, None, :2] - (BLOBS + 0.5)[None]
+    nearest = np.linalg.norm(centers, axis=2).argmin(axis=0)
+    offsets = keypoints[nearest, :2] - (BLOBS + 0.5)
+    found = np.linalg.norm(offsets, axis=1) < 2.0
+    assert found.mean() > 0.5  # DoG misses round blobs of some sizes
+    assert np.abs(offsets[found]).max() < MAX_ERROR_PX
+    assert np.abs(offsets[found].mean(axis=0)).max() < MAX_BIAS_PX
+
+
+def test_features_of_a_shrunk_image_lie_within_the_stored_one(tmp_path):
+    path = tmp_path / "noise.png"
+    noise = np.random.default_rng(3).integers(0, 255, (301, 457), dtype=np.uint8)
+    cv2.imwrite(str(path), cv2.GaussianBlur(noise, (0, 0), 2.0))
+    recipe = load_recipe("default", ["max_image_size_px=200"])
+    extracted = prepare(recipe.extraction).extract_file(path)
+    features, size = extracted.features, extracted.image_size
+    assert size == (457, 301)
+    assert len(features) > 20
+    assert features.keypoints[:, 0].max() > 380
+    assert features.inside(size).all()
+
+
+COURTYARD = Path(__file__).parents[2] / "sample_scenes" / "courtyard"
+COURTYARD_CAMERA = CameraOptions(mode="single", model="PINHOLE", params="1080,1080,360,270")
+DEPTH = ["depth.png_scale=0.002", "max_image_size_px=360"]
+
+
+def courtyard(tmp_path: Path, num_maps: int) -> tuple[Path, Path]:
+    """Two photographs and the depth maps of some of them."""
+    photos, depth = tmp_path / "photos", tmp_path / "depth"
+    photos.mkdir()
+    depth.mkdir()
+    for name in ["court_3", "court_4"]:
+        shutil.copy(COURTYARD / "images" / f"{name}.jpg", photos)
+    for name in ["court_3", "court_4"][:num_maps]:
+        shutil.copy(COURTYARD / "depth" / f"{name}.png", depth)
+    return photos, depth
+
+
+@pytest.mark.parametrize("recipe", ["depth-planes-recommended", "depth-affnet-recommended"])
+def test_image_without_its_depth_map_is_extracted_unrectified_with_a_warning(tmp_path, recipe):
+    photos, depth = courtyard(tmp_path, 1)
+    workspace = Workspace(tmp_path / "out")
+    options = load_recipe(recipe, [*DEPTH, f"depth.path='{depth}'"])
+    with workspace.locked():
+        report = extract(Context(workspace), Inputs.of(photos, cameras=COURTYARD_CAMERA), options)
+    assert report.failures == {}
+    assert report.num_done == 2
+    assert list(report.warnings) == ["court_4.jpg"]
+    assert "not rectified" in report.warnings["court_4.jpg"]
+    store = FeatureStore(workspace.features)
+    assert (store.read("court_3.jpg").rectification_ids > 0).sum() > 50
+    plain = prepare(load_recipe("unrectified-rootsift", DEPTH[1:]).extraction)
+    expected = plain.extract_file(photos / "court_4.jpg").features
+    assert (store.read("court_4.jpg").rectification_ids == 0).all()
+    assert len(store.read("court_4.jpg")) == len(expected)
+
+
+def test_depth_is_asked_for_before_any_image_is_read(tmp_path):
+    photos, depth = courtyard(tmp_path, 0)
+    for settings, error, message in [
+        ([], OptionError, "rectifier depth-planes needs depth maps: give --depth-path"),
+        ([f"depth.path='{depth}'"], DepthError, str(depth)),
+        ([f"depth.path='{tmp_path / 'nowhere'}'"], DepthError, "nowhere"),
+    ]:
+        recipe = load_recipe("depth-planes-recommended", [*DEPTH, *settings])
+        workspace = Workspace(tmp_path / "out")
+        with workspace.locked(), pytest.raises(error, match=re.escape(message)):
+            extract(Context(workspace), Inputs.of(photos, cameras=COURTYARD_CAMERA), recipe)
+        assert not workspace.features.exists()
+
+
+class FailingExtractor:
+    """A feature extractor whose device fails."""
+
+    def __init__(self, message):
+        self._message = message
+
+    def detect(self, _):
+        raise RuntimeError(self._message)
+
+
+def test_features_of_a_gpu_without_memory_are_those_of_the_cpu():
+    photo = COURTYARD / "images" / "court_4.jpg"
+    extractor = prepare(load_recipe("default", ["max_image_size_px=200"]).extraction)
+    full = FailingExtractor("CUDA out of memory. Tried to allocate 2.00 GiB.")
+    found = replace(extractor, extractor=full).extract_file(photo)
+    assert found.warning == "extracted on the CPU, the memory of the GPU is full"
+    assert_array_equal(found.features.lafs, extractor.extract_file(photo).features.lafs)
+
+
+def test_other_failures_of_a_gpu_are_not_passed_over():
+    extractor = prepare(load_recipe("default", ["max_image_size_px=200"]).extraction)
+    broken = replace(
+        extractor, extractor=FailingExtractor("CUDA error: device-side assert triggered")
+    )
+    with pytest.raises(RuntimeError, match="device-side assert"):
+        broken.extract_file(COURTYARD / "images" / "court_4.jpg")
+
+
+def test_device_that_is_not_there_is_one_clear_line(monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(DeviceError, match=r"--device cuda: .*use --device cpu or auto") as error:
+        prepare(load_recipe("default").extraction, Resources(device="cuda"))
+    assert "\n" not in str(error.value)
+
+
+def test_intrinsics_are_those_of_the_user_else_colmaps_guess(tmp_path):
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), np.zeros((30, 50), np.uint8))
+    given = read_camera_matrix(path, CameraOptions(model="PINHOLE", params="61,62,24.5,16"))
+    np.testing.assert_allclose(given, [[61, 0, 24.0], [0, 62, 15.5], [0, 0, 1]])
+    guessed = read_camera_matrix(path, CameraOptions())
+    np.testing.assert_allclose(guessed, camera_matrix((50, 30)))
+    (tmp_path / "b.png").write_bytes(b"no image")
+    assert read_camera_matrix(tmp_path / "b.png", CameraOptions()) is None
+
+
+def test_images_at_once_are_as_many_as_there_are_cores_and_memory_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    extractor = prepare(ExtractionOptions())  # 2400 px: 1.4 GiB an image
+    monkeypatch.setattr(one_image, "available_cores", lambda: 8)
+    counts = []
+    for gibibytes in (1, 9, 100):
+        monkeypatch.setattr(one_image, "available_memory_bytes", lambda g=gibibytes: g << 30)
+        counts.append(num_images_at_once(extractor))
+    assert counts == [1, 3, 8]
+
+
+def test_extractor_in_another_process_refuses_other_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = {"affnet": tmp_path / "AffNet.pth"}
+    found["affnet"].write_bytes(b"published")
+    pickled = pickle.dumps(replace(prepare(ExtractionOptions()), weights=found))
+    monkeypatch.setattr(one_image, "resolve", lambda *_, **__: found)
+    assert pickle.loads(pickled).options == ExtractionOptions()
+    found["affnet"].write_bytes(b"of another release")
+    with pytest.raises(WeightsError, match=r"AffNet\.pth: is another file than affnet on the"):
+        pickle.loads(pickled)
+
+
+class ColorOptions(FeatureOptions):
+    """Asks for colour."""
+
+    name: str = "color"
+    in_color: ClassVar[bool] = True
+    uses_network: ClassVar[bool] = False
+
+
+class KeepsViews:
+    """An extractor that keeps what it is shown and finds nothing."""
+
+    descriptor_size = 8
+
+    def __init__(self):
+        self.views = []
+
+    def detect(self, view):
+        self.views.append(view[0])
+        return LocalFeatures.empty(8)
+
+    def describe(self, _, detected):
+        return list(detected)
+
+
+def test_extractors_that_ask_for_colour_see_the_warps_in_colour(tmp_path):
+    image = cv2.imread(str(COURTYARD / "images" / "court_4.jpg"))
+    image[:, :, 2] = 255 - image[:, :, 0] // 2  # OpenCV's order: blue, green, red
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), image)
+    keeps = KeepsViews()
+    gray = prepare(ExtractionOptions(max_image_size_px=360))
+    options = gray.options.changed(features=ColorOptions())
+    color = replace(gray, options=options, extractor=keeps)
+    assert len(color.extract_file(path).features) == 0
+    whole, *warps = keeps.views
+    assert whole.shape == (270, 360, 3)
+    assert whole[5, 7, 0] > 120  # red comes first
+    assert warps
+    photograph, _ = gray.photograph(path)
+    for view, item in zip(warps, gray.plan(photograph).items, strict=True):
+        assert view.shape == (*item.canvas_size[::-1], 3)
+        channel = warp(np.ascontiguousarray(whole[:, :, 1]), item)
+        assert_array_equal(view[:, :, 1], channel)

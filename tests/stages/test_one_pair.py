@@ -1,0 +1,100 @@
+"""Matching of pairs: what is kept in memory, and what happens when a GPU has no more of it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.matchers import nearest
+from colmap_affrect.matchers.nearest import NearestOptions
+from colmap_affrect.matchers.nearest_8bit import MakeCoarse, ShortList
+from colmap_affrect.pairs.lists import exhaustive_pairs
+from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.stages import one_pair
+from colmap_affrect.stages.one_pair import CachedMatcher, iterate_matches
+
+NAMES = [f"{index}.png" for index in range(6)]
+NUM_FEATURES = 50
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> FeatureStore:
+    """Images that show the same things, each a bit otherwise."""
+    random = np.random.default_rng(0)
+    things = random.gamma(0.4, size=(NUM_FEATURES, 128))
+    store = FeatureStore(tmp_path / "features.h5")
+    for name in NAMES:
+        rows = things + 0.05 * random.random(things.shape)
+        rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+        centers = random.uniform(10, 400, (NUM_FEATURES, 2))
+        ones = np.ones(NUM_FEATURES)
+        lafs = lafs_from_keypoints(centers, 6 * ones, 0 * ones)
+        store.write(name, LocalFeatures(lafs, ones.astype(np.float32), rows), (420, 420))
+    return store
+
+
+def matches(store: FeatureStore) -> dict[tuple[str, str], list[list[int]]]:
+    pairs = exhaustive_pairs(NAMES)
+    found = list(iterate_matches(pairs, store, NearestOptions(), 0))
+    assert sorted(item.names for item in found) == pairs
+    return {item.names: item.indices.tolist() for item in found}
+
+
+def test_images_over_the_budget_are_dropped_and_the_matches_are_the_same(
+    store: FeatureStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = matches(store)
+    assert min(map(len, expected.values())) > NUM_FEATURES // 2
+    reads: list[str] = []
+    read = CachedMatcher.read
+
+    def counted(cache: CachedMatcher, name: str) -> one_pair.StoredFeatures:
+        reads.append(name)
+        return read(cache, name)
+
+    monkeypatch.setattr(CachedMatcher, "read", counted)
+    monkeypatch.setattr(one_pair, "CACHE_BYTES", 3 * 800 * NUM_FEATURES)
+    assert matches(store) == expected
+    assert len(NAMES) < len(reads) <= 3 * len(NAMES)
+
+
+@dataclass(frozen=True)
+class OnFullGpu:
+    """Coarse descriptors that a GPU has no memory to compare."""
+
+    nbytes = 0
+
+    def short_list(self, *_: object) -> ShortList:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+
+def made_on_full_gpu(_: NDArray[np.float32]) -> OnFullGpu:
+    raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+
+@pytest.mark.parametrize("make_coarse", [lambda _: OnFullGpu(), made_on_full_gpu])
+def test_what_a_gpu_has_no_memory_for_is_matched_by_the_cpu(
+    store: FeatureStore,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    make_coarse: MakeCoarse,
+) -> None:
+    expected = matches(store)
+    nearest._warn_that_gpu_is_full.cache_clear()
+    monkeypatch.setattr(nearest, "coarse_descriptors", lambda *_: make_coarse)
+    with caplog.at_level(logging.WARNING):
+        assert matches(store) == expected
+    assert messages(caplog.records) == ["the memory of the GPU is full; the CPU matches the rest"]
+
+
+def messages(records: Sequence[logging.LogRecord]) -> list[str]:
+    return [record.getMessage() for record in records]

@@ -1,0 +1,416 @@
+"""Photographs in, COLMAP model out: the whole chain, again, and interrupted."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import sqlite3
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from command import Call, pair_list, start
+from numpy.testing import assert_array_equal
+from results import database_content, hdf5_content
+from small_scene import IMAGE_SIZE, INTRINSICS, NAMES, write_photographs
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.verification import VerificationOptions
+from colmap_affrect.errors import DatabaseError
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.mappers.incremental import IncrementalOptions
+from colmap_affrect.matchers import nearest
+from colmap_affrect.pipeline import RunOptions, run
+from colmap_affrect.project.report import ReconstructionReport
+from colmap_affrect.project.stores import FeatureStore, MatchStore, pair_key
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.verify import verify_matches
+
+CAMERAS = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
+CAMERA_ARGUMENTS = [
+    "--camera-mode", "single", "--camera-model", "PINHOLE", "--camera-params", INTRINSICS,
+]  # fmt: skip
+OPTIONS = RunOptions(
+    cameras=CAMERAS,
+    verification=VerificationOptions(random_seed=3),
+    mapping=IncrementalOptions(random_seed=3),
+)
+FAST = ["--recipe", "unrectified-rootsift", *CAMERA_ARGUMENTS]
+
+DIGITS = 9
+"""Means over a model that was read back may differ from those before in the last digits."""
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos č")
+    write_photographs(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(
+    photos: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Workspace, ReconstructionReport]:
+    """A run of all four photographs; nothing may be changed in it."""
+    path = tmp_path_factory.mktemp("finished") / "out"
+    return Workspace(path), run(photos, path, OPTIONS)
+
+
+@pytest.fixture
+def copy(finished: tuple[Workspace, ReconstructionReport], tmp_path: Path) -> Workspace:
+    """A copy of the finished run, to be changed."""
+    return Workspace(Path(shutil.copytree(finished[0].path, tmp_path / "copy")))
+
+
+def without_times(report: dict[str, object]) -> dict[str, object]:
+    """What a report says beside its times; means depend on the order of summation."""
+    return {
+        key: round(value, DIGITS) if isinstance(value, float) else value
+        for key, value in report.items()
+        if key != "stages"
+    }
+
+
+def test_run_registers_all_photographs(finished: tuple[Workspace, ReconstructionReport]) -> None:
+    _, report = finished
+    assert report.status == "ok"
+    assert report.registered_names == tuple(sorted(NAMES))
+    assert report.unregistered == {}
+    assert (report.num_pairs, report.num_verified_pairs) == (6, 6)
+    assert report.models[0].num_points3D > 300
+    assert 2.0 <= report.models[0].mean_track_length <= 4.0
+    assert 0.0 < report.models[0].mean_reprojection_error_px < 1.0
+
+
+def test_run_leaves_all_results(finished: tuple[Workspace, ReconstructionReport]) -> None:
+    workspace, report = finished
+    assert {
+        "config.toml", "database.db", "features.h5", "matches.h5", "pairs.txt", "report.json",
+        "sparse",
+    } <= {path.name for path in workspace.path.iterdir()}  # fmt: skip
+    model = pycolmap.Reconstruction(workspace.sparse / "0")
+    names = sorted(model.images[image_id].name for image_id in model.reg_image_ids())
+    assert names == list(report.registered_names)
+    (camera,) = model.cameras.values()
+    assert camera.params.tolist() == [float(value) for value in INTRINSICS.split(",")]
+    assert (camera.width, camera.height) == IMAGE_SIZE
+    assert len(workspace.pairs.read_text(encoding="utf-8").splitlines()) == 6
+    assert list(workspace.recorded()) == [
+        "recipe",
+        "begun",
+        "extract",
+        "pairs",
+        "match",
+        "verify",
+        "map",
+    ]
+
+
+def test_report_file_has_the_promised_keys(
+    finished: tuple[Workspace, ReconstructionReport],
+) -> None:
+    workspace, report = finished
+    read = json.loads(workspace.report.read_text(encoding="utf-8"))
+    assert read == json.loads(report.to_json())
+    assert {
+        "status", "images_total", "images_registered", "registered_names", "unregistered",
+        "num_models", "points3D", "mean_track_length", "mean_reprojection_error_px", "stages",
+        "recipe", "random_seed", "versions",
+    } <= set(read)  # fmt: skip
+    assert [stage["name"] for stage in read["stages"]] == [
+        "extract", "pairs", "match", "verify", "map",
+    ]  # fmt: skip
+    assert all(stage["wall_s"] >= 0.0 for stage in read["stages"])
+    assert (read["recipe"], read["random_seed"]) == ("default", 3)
+    assert read["versions"]["pycolmap"].startswith("4.")
+
+
+def test_keypoints_in_the_database_are_those_of_the_store_plus_half_a_pixel(
+    finished: tuple[Workspace, ReconstructionReport],
+) -> None:
+    workspace, _ = finished
+    ids = image_ids(workspace.database)
+    assert sorted(ids) == sorted(NAMES)
+    with h5py.File(workspace.features, "r") as file, open_database(workspace.database) as database:
+        for name in NAMES:
+            keypoints = database.read_keypoints(ids[name])
+            assert len(keypoints) > 500
+            assert_array_equal(keypoints[:, :2], file[name]["keypoints"][()] + np.float32(0.5))
+
+
+def test_matches_in_the_database_are_those_of_the_store(
+    finished: tuple[Workspace, ReconstructionReport],
+) -> None:
+    workspace, _ = finished
+    ids = image_ids(workspace.database)
+    pairs = [tuple(line.split("\t")) for line in workspace.pairs.read_text().splitlines()]
+    with open_database(workspace.database) as database:
+        stored = MatchStore(workspace.matches).read(pairs)
+        for (name1, name2), found in zip(pairs, stored, strict=True):
+            assert len(found.indices) > 50
+            assert_array_equal(database.read_matches(ids[name1], ids[name2]), found.indices)
+
+
+def test_stage_commands_do_exactly_what_run_does(
+    finished: tuple[Workspace, ReconstructionReport], photos: Path, tmp_path: Path, call: Call
+) -> None:
+    expected, _ = finished
+    out = ["--output-path", tmp_path / "out"]
+    seed = ["--random-seed", 3]
+    for command in (
+        ["extract", "--image-path", photos, *CAMERA_ARGUMENTS],
+        ["pairs"],
+        ["match"],
+        ["verify", *seed],
+        ["map", *seed],
+    ):
+        code, stdout, stderr = call(command[0], *out, *command[1:])
+        assert code == 0, stderr
+        assert stdout
+    made = Workspace(tmp_path / "out")
+    assert hdf5_content(made.features) == hdf5_content(expected.features)
+    assert hdf5_content(made.matches) == hdf5_content(expected.matches)
+    assert made.pairs.read_bytes() == expected.pairs.read_bytes()
+    assert made.config.read_bytes() == expected.config.read_bytes()
+    assert image_ids(made.database) == image_ids(expected.database)
+    assert database_content(made.database) == database_content(expected.database)
+    reports = [json.loads(space.report.read_text(encoding="utf-8")) for space in (made, expected)]
+    assert without_times(reports[0]) == without_times(reports[1])
+
+
+def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
+    before = {path: path.read_bytes() for path in (copy.features, copy.matches, copy.pairs)}
+    model = (copy.sparse / "0" / "points3D.bin").stat().st_mtime_ns
+    tables = database_content(copy.database)
+    report = run(photos, copy.path, OPTIONS)
+    done = {stage.name: (stage.num_done, stage.num_kept) for stage in report.stages}
+    assert done == {
+        "extract": (0, 4), "pairs": (6, 0), "match": (0, 6), "verify": (0, 6), "map": (0, 1),
+    }  # fmt: skip
+    assert report.status == "ok"
+    assert {path: path.read_bytes() for path in before} == before
+    assert (copy.sparse / "0" / "points3D.bin").stat().st_mtime_ns == model
+    assert database_content(copy.database) == tables
+
+
+@pytest.mark.parametrize("name", NAMES[1:3])
+def test_image_whose_features_are_lost_gets_the_same_again(
+    finished: tuple[Workspace, ReconstructionReport], copy: Workspace, photos: Path, name: str
+) -> None:
+    expected, first = finished
+    with h5py.File(copy.features, "a") as file:
+        del file[name]
+    report = run(photos, copy.path, OPTIONS)
+    assert (report.stages[0].num_done, report.stages[0].num_kept) == (1, 3)
+    assert hdf5_content(copy.features) == hdf5_content(expected.features)
+    assert without_times(report.to_mapping()) == without_times(first.to_mapping())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("line", ["extract: 2/4 images", "match: 3/6 pairs", "verify: 6/6 pairs"])
+def test_run_killed_anywhere_completes_with_the_same_result(
+    finished: tuple[Workspace, ReconstructionReport], photos: Path, tmp_path: Path, line: str
+) -> None:
+    expected, first = finished
+    out = tmp_path / "out"
+    with start(
+        "run", "--image-path", photos, "--output-path", out, "--random-seed", 3, *CAMERA_ARGUMENTS
+    ) as process:
+        while process.stderr.readline().strip() != line:
+            assert process.poll() is None
+        os.kill(process.pid, signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    assert not Workspace(out).report.exists()
+    report = run(photos, out, OPTIONS)
+    assert hdf5_content(Workspace(out).features) == hdf5_content(expected.features)
+    assert hdf5_content(Workspace(out).matches) == hdf5_content(expected.matches)
+    assert database_content(Workspace(out).database) == database_content(expected.database)
+    assert without_times(report.to_mapping()) == without_times(first.to_mapping())
+    assert report.stages[0].num_kept >= 2
+
+
+@pytest.mark.long
+def test_image_added_later_is_picked_up_and_the_others_are_kept(tmp_path: Path) -> None:
+    photos, workspace = tmp_path / "photos", Workspace(tmp_path / "out")
+    options = RunOptions(recipe=load_recipe("unrectified-rootsift"), cameras=CAMERAS)
+    write_photographs(photos, 3)
+    first = run(photos, workspace.path, options)
+    assert first.images_total == len(first.registered_names) == 3
+    before = hdf5_content(workspace.features) | hdf5_content(workspace.matches)
+    write_photographs(photos, 4)
+    report = run(photos, workspace.path, options)
+    done = {stage.name: (stage.num_done, stage.num_kept) for stage in report.stages}
+    assert (done["extract"], done["match"], done["verify"]) == ((1, 3), (3, 3), (3, 3))
+    after = hdf5_content(workspace.features) | hdf5_content(workspace.matches)
+    assert {key: after[key] for key in before} == before
+    assert report.registered_names == tuple(sorted(NAMES))
+
+
+def test_output_folder_in_use_is_refused(copy: Workspace, photos: Path, call: Call) -> None:
+    before = copy.features.read_bytes()
+    out = ["--output-path", copy.path]
+    with copy.locked():
+        for command in (["run", "--image-path", photos, *CAMERA_ARGUMENTS], ["match"], ["map"]):
+            code, stdout, stderr = call(*command, *out, "--overwrite")
+            assert (code, stdout, len(stderr)) == (1, "", 1)
+            assert "another colmap-affrect is working in this folder" in stderr[0]
+    assert copy.features.read_bytes() == before
+    assert copy.database.exists()
+
+
+def test_other_options_than_before_are_named(copy: Workspace, photos: Path, call: Call) -> None:
+    out = ["--output-path", copy.path]
+    images = ["--image-path", photos]
+    cameras, seed = CAMERA_ARGUMENTS, ["--random-seed", 3]
+    before = {path: path.read_bytes() for path in (copy.features, copy.matches, copy.config)}
+    cases = [
+        (["run", *images, *seed], "cameras.mode"),
+        (["run", *images, *seed, *cameras, "--set", "features.contrast_threshold=0.02"],
+         "features.contrast_threshold=0.013, and it is 0.02"),
+        (["run", *images, *seed, *cameras, "--set", "matching.max_ratio=0.7"], "max_ratio=0.85"),
+        (["run", *images, *cameras], "random_seed=3, and it is 0"),
+        (["run", *images, *seed, "--camera-mode", "single"], "cameras.model='PINHOLE'"),
+        (["run", "--image-path", photos / "side", *seed, *cameras], f"image_path='{photos}'"),
+        (["run", *images, *seed, *cameras, "--match-list-path",
+          pair_list(copy.path.parent, "a.png", "b c.png")], "match_list_path=''"),
+        (["extract", *images, *cameras, "--recipe", "unrectified-rootsift"], "rectifier.name"),
+        (["match", "--set", "matching.duplicate_radius_px=3"], "duplicate_radius_px=2.0"),
+        (["verify", "--random-seed", 4], "random_seed=3, and it is 4"),
+        (["map", "--random-seed", 4], "random_seed=3, and it is 4"),
+    ]  # fmt: skip
+    for command, named in cases:
+        code, stdout, stderr = call(*command, *out)
+        assert (code, stdout, len(stderr)) == (1, "", 1), stderr
+        assert named in stderr[0]
+        assert "--overwrite" in stderr[0]
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_options_survive_stage_by_stage(
+    photos: Path, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What extract was given counts later, also where a relative recipe would not be found."""
+    out = tmp_path / "out"
+    (tmp_path / "own.toml").write_text(
+        'rectifier = "identity"\nmatching.max_ratio = 0.8\nmapping.init_min_num_inliers = 40\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    extract = ["extract", "--image-path", photos, "--output-path", out, *CAMERA_ARGUMENTS]
+    assert call(*extract, "--recipe", "own.toml").code == 0
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for stage in ("pairs", "match", "verify", "map"):
+        ended = call(stage, "--output-path", out)
+        assert ended.code == 0, ended.errors
+    workspace = Workspace(out)
+    assert workspace.require("match")["max_ratio"] == 0.8
+    assert workspace.require("map")["init_min_num_inliers"] == 40
+    digest = workspace.options_digest("extract", "match")
+    assert MatchStore(workspace.matches, digest).complete([pair_key(*NAMES[:2])])
+    changed = call("match", "--output-path", out, "--set", "matching.max_ratio=0.7", "--overwrite")
+    assert changed.code == 0
+    assert workspace.require("match")["max_ratio"] == 0.7
+    assert workspace.options_digest("extract", "match") != digest
+
+
+def test_mapper_options_are_added_to_what_is_on_record(copy: Workspace, call: Call) -> None:
+    seeds = ["--preset", "colmap", "--random-seed", "4"]
+    assert call("map", "--output-path", copy.path, "--overwrite", *seeds).code in (0, 3)
+    option = ["--mapper-options", "ba_refine_principal_point=true"]
+    assert call("map", "--output-path", copy.path, "--overwrite", *option).code in (0, 3)
+    record = copy.require("map")
+    assert (record["min_model_size"], record["random_seed"]) == (10, 4)
+    assert record["mapper_options"] == {"ba_refine_principal_point": True}
+
+
+@pytest.mark.parametrize("seed", ["-5", "99999999999"])
+def test_seed_that_colmap_cannot_take_is_one_clear_line(
+    copy: Workspace, call: Call, seed: str
+) -> None:
+    for stage in ("verify", "map"):
+        ended = call(stage, "--output-path", copy.path, "--random-seed", seed, "--overwrite")
+        assert ended.code == 1
+        assert ended.errors[0].startswith(f"error: random_seed={seed} is outside [-1, ")
+    assert copy.sparse.exists()
+
+
+def test_device_reaches_matching(
+    copy: Workspace, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    devices: list[str] = []
+    monkeypatch.setattr(nearest, "coarse_descriptors", lambda _, device: devices.append(device))
+    assert call("match", "--output-path", copy.path, "--overwrite").code == 0
+    assert call("match", "--output-path", copy.path, "--overwrite", "--device", "cpu").code == 0
+    assert devices == ["auto", "cpu"]
+
+
+def test_overwrite_redoes_a_stage_and_run_goes_on_from_it(
+    finished: tuple[Workspace, ReconstructionReport], copy: Workspace, call: Call
+) -> None:
+    features = copy.features.read_bytes()
+    code, stdout, _ = call("match", "--overwrite", "--output-path", copy.path)
+    assert (code, stdout.split(" in ")[0]) == (0, "match: 6 done")
+    assert copy.features.read_bytes() == features
+    assert not copy.sparse.exists()
+    assert not database_content(copy.database)["inliers"]
+    for stage in ("verify", "map"):
+        code, _, stderr = call(stage, "--random-seed", 3, "--output-path", copy.path)
+        assert code == 0, stderr
+    assert database_content(copy.database) == database_content(finished[0].database)
+    report = json.loads(copy.report.read_text(encoding="utf-8"))
+    assert without_times(report) == without_times(finished[1].to_mapping())
+
+
+@pytest.mark.parametrize("stage", ["pairs", "match", "verify", "map"])
+def test_stage_before_its_turn_says_what_to_run(tmp_path: Path, call: Call, stage: str) -> None:
+    code, stdout, stderr = call(stage, "--output-path", tmp_path)
+    assert (code, stdout, len(stderr)) == (1, "", 1)
+    assert "stage has not been run there; run 'colmap-affrect " in stderr[0]
+
+
+def test_pair_list_that_lost_pairs_is_refused(copy: Workspace, call: Call) -> None:
+    names = FeatureStore(copy.features).names()
+    path = copy.path.parent / "list.txt"
+    for lines, overwrite, expected in [
+        ([names[:2], names[1:3]], ["--overwrite"], 0),
+        ([names[:2], names[1:3], names[2:4]], [], 0),
+        ([names[:2]], [], 1),
+        ([names[:2]], ["--overwrite"], 0),
+    ]:
+        path.write_text("".join("\t".join(line) + "\n" for line in lines), encoding="utf-8")
+        arguments = ["--output-path", copy.path, "--match-list-path", path, *overwrite]
+        code, _, stderr = call("pairs", *arguments)
+        assert code == expected, stderr
+        if expected:
+            assert names[1] in stderr[-1]
+            assert "--overwrite" in stderr[-1]
+
+
+def test_match_index_out_of_range_is_refused_before_it_is_written(copy: Workspace) -> None:
+    pair = ("a.png", "b c.png")
+    count = FeatureStore(copy.features).num_keypoints()[pair[1]]
+    with h5py.File(copy.matches, "a") as file:
+        file[pair_key(*pair)]["matches0"][3] = count
+    copy.database.unlink()
+    with pytest.raises(DatabaseError, match="point at keypoints that do not exist"):
+        verify_matches(Context(copy), VerificationOptions(random_seed=3))
+    with sqlite3.connect(copy.database) as connection:
+        assert connection.execute("SELECT count(*) FROM matches").fetchone() == (0,)
+    connection.close()
+
+
+def test_features_of_another_number_than_in_the_database_are_refused(
+    copy: Workspace, photos: Path
+) -> None:
+    store = FeatureStore(copy.features)
+    features = store.read("a.png")
+    store.write("a.png", features.select(np.arange(10)), IMAGE_SIZE)
+    with pytest.raises(DatabaseError, match=r"keypoints in the database and 10 in the"):
+        run(photos, copy.path, OPTIONS)
