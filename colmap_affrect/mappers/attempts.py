@@ -10,7 +10,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import registered_names, write_model
 from colmap_affrect.errors import StoreError
-from colmap_affrect.mappers.base import Mapper, MappingTask
+from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.project.report import ModelSummary
 
 ATTEMPT_SEED_STEP = 1_000_003
@@ -45,7 +45,7 @@ def map_database(
         shutil.rmtree(old, ignore_errors=True)
     num_images = len(image_ids(task.database_path))
     most_shown = 0
-    best: list[pycolmap.Reconstruction] = []
+    best: list[MappedModel] = []
 
     def show(count: int) -> None:
         nonlocal most_shown
@@ -65,18 +65,18 @@ def map_database(
             if _size_of_largest(best)[0] >= min(num_images, LARGE_MODEL):
                 break
         for index, model in enumerate(best):
-            write_model(model, partial / str(index))
+            write_model(model.reconstruction, partial / str(index))
         partial.rename(sparse_path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return [summarize(model) for model in best]
+    return [summarize(model.reconstruction) for model in best]
 
 
-def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
-    return model.num_reg_images(), model.num_points3D()
+def _size(model: MappedModel) -> tuple[int, int]:
+    return model.reconstruction.num_reg_images(), model.reconstruction.num_points3D()
 
 
-def _size_of_largest(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:
+def _size_of_largest(models: list[MappedModel]) -> tuple[int, int]:
     return _size(models[0]) if models else (0, 0)
 
 

@@ -74,6 +74,38 @@ class MappingTask:
     intrinsics_given: bool = False
 
 
+@dataclass(frozen=True)
+class Bridge:
+    """Images that came into a model by one verified pair, not by tracks through three images.
+
+    Attributes:
+        pair: names of an image that the model had, and of one that came in.
+        names: all images that came in with it, sorted; more than one when a whole model did.
+        num_agreeing: places whose depths agree on the scale.
+        num_ratios: places where both the model and the pair know a depth.
+        scale_error_frac: standard error of the scale.
+    """
+
+    pair: tuple[str, str]
+    names: tuple[str, ...]
+    num_agreeing: int
+    num_ratios: int
+    scale_error_frac: float
+
+
+@dataclass(frozen=True)
+class MappedModel:
+    """A model and how some of its images came in.
+
+    Attributes:
+        reconstruction: the model.
+        bridges: in the order in which they were made.
+    """
+
+    reconstruction: pycolmap.Reconstruction
+    bridges: tuple[Bridge, ...] = ()
+
+
 class Mapper(Protocol):
     """Makes models; called with its ``Options``.
 
@@ -85,7 +117,7 @@ class Mapper(Protocol):
 
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
-    ) -> list[pycolmap.Reconstruction]:
+    ) -> list[MappedModel]:
         """Map once.
 
         Args:

@@ -15,7 +15,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import read_model
 from colmap_affrect.colmap.native_options import Plain, differences, resolve, set_values
 from colmap_affrect.errors import MappingError
-from colmap_affrect.mappers.base import MapperOptions, MappingTask
+from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.parallel.executor import return_freed_memory
 from colmap_affrect.parallel.subprocesses import child, end_with_parent
 
@@ -62,13 +62,13 @@ class GlobalMapper:
 
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
-    ) -> list[pycolmap.Reconstruction]:
+    ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`; all images register at once."""
         native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
         values = differences(native, pycolmap.GlobalPipelineOptions())
         map_globally(task.database_path, task.image_path, output_path, values)
-        models = [read_model(folder) for folder in sorted(output_path.iterdir())]
-        show(max((model.num_reg_images() for model in models), default=0))
+        models = [MappedModel(read_model(path)) for path in sorted(output_path.iterdir())]
+        show(max((model.reconstruction.num_reg_images() for model in models), default=0))
         return models
 
     def native(self, random_seed: int, *, intrinsics_given: bool) -> pycolmap.GlobalPipelineOptions:

@@ -10,7 +10,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.native_options import Plain, differences, resolve, set_values
 from colmap_affrect.errors import MappingError, OptionError
-from colmap_affrect.mappers.base import MapperOptions, MappingTask
+from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.options import within
 
 FLAG = "--mapper-options"
@@ -57,7 +57,7 @@ class IncrementalMapper:
 
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
-    ) -> list[pycolmap.Reconstruction]:
+    ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
         count = 0
 
@@ -82,7 +82,7 @@ class IncrementalMapper:
         except (RuntimeError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise MappingError(f"COLMAP's incremental mapper failed: {reason}") from error
-        return list(models.values())
+        return [MappedModel(model) for model in models.values()]
 
     def native(
         self, random_seed: int, *, intrinsics_given: bool

@@ -23,7 +23,7 @@ from colmap_affrect.errors import MappingError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers.attempts import map_database
-from colmap_affrect.mappers.base import MAPPERS, Mapper, MappingTask
+from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions, map_globally
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.options import PRESETS
@@ -166,9 +166,9 @@ def test_mapping_is_tried_again_while_images_are_missing_in_a_small_model(
     model = synthesize(tmp_path / "model.db", num_views) if num_views else None
     given: list[int] = []
 
-    def map_some(_: object, __: Path, seed: int, ___: object) -> list[pycolmap.Reconstruction]:
+    def map_some(_: object, __: Path, seed: int, ___: object) -> list[MappedModel]:
         given.append(seed)
-        return [model] if model else []
+        return [MappedModel(model)] if model else []
 
     mapper = mapper_of("incremental")
     monkeypatch.setattr(mapper, "map", map_some)

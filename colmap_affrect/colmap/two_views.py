@@ -1,0 +1,88 @@
+"""Two-view geometries of a COLMAP database as plain arrays.
+
+All points here are in COLMAP's pixels, the corner of the image being (0, 0).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+
+PLANAR = (
+    pycolmap.TwoViewGeometryConfiguration.PLANAR,
+    pycolmap.TwoViewGeometryConfiguration.PANORAMIC,
+    pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
+)
+"""Pairs that a homography explains: their epipolar geometry is arbitrary."""
+
+
+@dataclass(frozen=True)
+class EpipolarPair:
+    """The epipolar geometry of a pair and all keypoints in the pixels it holds in.
+
+    Attributes:
+        fundamental: (3, 3), ``x2^T F x1 = 0``.
+        points1: (N1, 2) keypoints of image 1, px; without distortion where both cameras are
+            known.
+        points2: (N2, 2) keypoints of image 2.
+    """
+
+    fundamental: NDArray[np.float64]
+    points1: NDArray[np.float64]
+    points2: NDArray[np.float64]
+
+
+def epipolar_pair(
+    geometry: pycolmap.TwoViewGeometry,
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
+    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+) -> EpipolarPair | None:
+    """Return the epipolar geometry of a pair; None where it has none.
+
+    Args:
+        geometry: as COLMAP estimated it.
+        cameras: of image 1 and 2.
+        keypoints: (N1, 2 or more) and (N2, 2 or more) as in the database.
+    """
+    points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
+    essential, fundamental = geometry.E, geometry.F
+    if essential is not None and np.any(essential):
+        matrices = [camera.calibration_matrix() for camera in cameras]
+        fundamental = np.linalg.inv(matrices[1]).T @ essential @ np.linalg.inv(matrices[0])
+        points1 = undistorted(cameras[0], points1)
+        points2 = undistorted(cameras[1], points2)
+    if fundamental is None or not np.any(fundamental):
+        return None
+    return EpipolarPair(np.asarray(fundamental, np.float64), points1, points2)
+
+
+def undistorted(camera: pycolmap.Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N, 2) pixels as a camera without distortion would have them.
+
+    Points that the camera model cannot undistort become NaN.
+    """
+    if not len(points):
+        return points
+    matrix = np.asarray(camera.calibration_matrix(), np.float64)
+    rays = np.asarray(camera.cam_from_img(points), np.float64)
+    return np.asarray(rays @ matrix[:2, :2].T + matrix[:2, 2])
+
+
+def keypoint_shapes(keypoints: NDArray[np.floating]) -> NDArray[np.float64] | None:
+    """Return the (N, 2, 2) linear parts of a database's keypoints, up to a factor.
+
+    Of 6 columns (x, y, a11, a12, a21, a22) they are affine; of 4 (x, y, scale, orientation in
+    radians, as COLMAP's SIFT writes them) similarities; of 2 there are none: None.
+    """
+    keypoints = np.asarray(keypoints, np.float64)
+    if keypoints.shape[1] == 6:
+        return np.asarray(keypoints[:, 2:].reshape(-1, 2, 2), np.float64)
+    if keypoints.shape[1] == 4:
+        scales, angles = keypoints[:, 2], keypoints[:, 3]
+        cosines, sines = scales * np.cos(angles), scales * np.sin(angles)
+        return np.asarray(np.stack([cosines, -sines, sines, cosines], axis=1).reshape(-1, 2, 2))
+    return None
