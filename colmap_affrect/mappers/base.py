@@ -139,6 +139,7 @@ MAPPERS: Registry[Mapper] = Registry(
     kind="mapper",
     group="colmap_affrect.mappers",
     built_in={
+        "sparse": "colmap_affrect.mappers.sparse:SparseMapper",
         "incremental": "colmap_affrect.mappers.incremental:IncrementalMapper",
         "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
     },

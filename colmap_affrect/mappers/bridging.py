@@ -1,0 +1,286 @@
+"""Bridges: images and whole models that hang on a model by one verified pair.
+
+The pair gives rotation and direction of translation, but not the scale, since its features are
+not those whose depth the model knows. They lie beside them, though: the ratio of the model's depths
+to those of the pair at neighbouring places is the scale (:mod:`colmap_affrect.geometry.two_views`).
+What a bridge would do is judged by all other verified pairs of the images that it brings in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.poses import Pose
+from colmap_affrect.geometry.two_views import ScaleEstimate, scale_between
+from colmap_affrect.mappers.base import Bridge
+from colmap_affrect.mappers.pair_graph import (
+    MIN_SHARE,
+    CameraById,
+    PairGraph,
+    RelativePose,
+    VerifiedPair,
+    inverse,
+    poses_of,
+)
+
+RADIUS_FRAC = 0.03
+"""Places of known depth are neighbours up to this part of the longer side of the image."""
+
+MIN_AGREEING = 10
+MIN_AGREEING_SHARE = 0.5
+"""A scale needs so many places that agree, and this share of all: right pairs have 80 to 100 %, and
+chance a quarter."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A model as bridges see it.
+
+    Attributes:
+        model: the model.
+    """
+
+    model: pycolmap.Reconstruction
+
+    @cached_property
+    def poses(self) -> dict[int, Pose]:
+        """cam_from_world by image id."""
+        return poses_of(self.model)
+
+    @cached_property
+    def cameras(self) -> dict[int, pycolmap.Camera]:
+        """Camera by id of the image."""
+        images = self.model.images
+        return {i: self.model.cameras[images[i].camera_id] for i in self.poses}
+
+    def known_depths(
+        self, image_id: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (K, 2) px and (K,) depths of the points that an image sees."""
+        if image_id not in self._known:
+            rotation, translation = self.poses[image_id]
+            points = [p for p in self.model.images[image_id].points2D if p.has_point3D()]
+            places = np.array([p.xy for p in points]).reshape(-1, 2)
+            world = np.array([self.model.points3D[p.point3D_id].xyz for p in points])
+            depths = world.reshape(-1, 3) @ rotation[2] + translation[2]
+            in_front = depths > 0
+            self._known[image_id] = places[in_front], depths[in_front]
+        return self._known[image_id]
+
+    @cached_property
+    def _known(self) -> dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        return {}
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A bridge that could be built.
+
+    Attributes:
+        bridge: what would be reported.
+        poses: of the images that come in, by image id, in the frame of the model.
+        cameras: of these images.
+        share: of the inliers of all pairs between the model and these images, how many agree.
+        weight: of these pairs together.
+        other: index of the model that comes in; None for a single image.
+    """
+
+    bridge: Bridge
+    poses: Mapping[int, Pose]
+    cameras: CameraById
+    share: float
+    weight: float
+    other: int | None = None
+
+    @property
+    def rank(self) -> float:
+        """Higher for what more pairs agree with, and for scales that more places agree on."""
+        agreement = self.bridge.num_agreeing / self.bridge.num_ratios
+        return self.share * self.weight * agreement
+
+
+class Bridges:
+    """Finds bridges between models and images of one database."""
+
+    def __init__(self, graph: PairGraph, random_seed: int) -> None:
+        """Begin without any pose known."""
+        self.graph, self.random_seed = graph, random_seed
+        self._relative: dict[tuple[int, int, bytes], list[RelativePose]] = {}
+
+    def find(self, part: Part, others: Sequence[Part]) -> list[Hypothesis]:
+        """Return all bridges from a model to other models and to single images, best first."""
+        found = [*self._to_images(part)]
+        for index, other in enumerate(others):
+            found += self._to_model(part, other, index)
+        return sorted(found, key=lambda hypothesis: -hypothesis.rank)
+
+    def _to_images(self, part: Part) -> Iterator[Hypothesis]:
+        for pair in self.graph.pairs:
+            inside = [image_id in part.poses for image_id in pair.ids]
+            if sum(inside) != 1:
+                continue
+            side = inside.index(True)
+            near, far = pair.ids[side], pair.ids[1 - side]
+            cameras = {near: part.cameras[near], far: self._camera(part, far)}
+            for relative in self._poses(pair, cameras):
+                scale = self._scale(part, near, side, relative)
+                if scale is None:
+                    continue
+                pose = relative.pose if side == 0 else inverse(relative.pose)
+                rotation, translation = part.poses[near]
+                moved = pose[0] @ rotation, pose[0] @ translation + scale.scale * pose[1]
+                hypothesis = self._judged(
+                    part, (near, far), {far: moved}, {far: cameras[far]}, scale
+                )
+                if hypothesis is not None:
+                    yield hypothesis
+
+    def _to_model(self, part: Part, other: Part, index: int) -> Iterator[Hypothesis]:
+        """Yield bridges to a model: by a common image, and by pairs between both."""
+        for common in part.poses.keys() & other.poses.keys():
+            estimate = self._scale_of_common(part, other, common)
+            if estimate is not None:
+                yield from self._moved(part, other, index, (common, common), estimate, IDENTITY)
+        for pair in self.graph.pairs:
+            for side in (0, 1):
+                near, far = pair.ids[side], pair.ids[1 - side]
+                if near not in part.poses or far not in other.poses:
+                    continue
+                if near in other.poses or far in part.poses:
+                    continue
+                cameras = {near: part.cameras[near], far: other.cameras[far]}
+                for relative in self._poses(pair, cameras):
+                    scales = (
+                        self._scale(part, near, side, relative),
+                        self._scale(other, far, 1 - side, relative),
+                    )
+                    if scales[0] is None or scales[1] is None:
+                        continue
+                    pose = relative.pose if side == 0 else inverse(relative.pose)
+                    scaled = pose[0], pose[1] * scales[0].scale
+                    both = _quotient(scales[0], scales[1])
+                    yield from self._moved(part, other, index, (near, far), both, scaled)
+
+    def _moved(
+        self,
+        part: Part,
+        other: Part,
+        index: int,
+        ids: tuple[int, int],
+        scale: ScaleEstimate,
+        relative: Pose,
+    ) -> Iterator[Hypothesis]:
+        """Move a model so that ``relative`` leads from a near image to one of its images.
+
+        ``scale`` is the length of the part's unit in those of the other: lengths of the other
+        times it are lengths of the part.
+        """
+        near, far = ids
+        rotation, translation = part.poses[near]
+        target = relative[0] @ rotation, relative[0] @ translation + relative[1]
+        source = other.poses[far]
+        # x_far = R_s X_o + t_s (other's units) and scale * x_far = R_t X_p + t_t
+        turn = source[0].T @ target[0]
+        shift = source[0].T @ (target[1] - scale.scale * source[1])
+        poses = {}
+        for image_id, (own_rotation, own_translation) in other.poses.items():
+            if image_id not in part.poses:
+                moved = scale.scale * own_translation + own_rotation @ shift
+                poses[image_id] = own_rotation @ turn, moved
+        if not poses:
+            return
+        cameras = {i: part.cameras.get(i, self._camera(part, i, other.cameras[i])) for i in poses}
+        hypothesis = self._judged(part, ids, poses, cameras, scale, index)
+        if hypothesis is not None:
+            yield hypothesis
+
+    def _scale_of_common(self, part: Part, other: Part, image_id: int) -> ScaleEstimate | None:
+        camera = part.cameras[image_id]
+        radius = RADIUS_FRAC * max(camera.width, camera.height)
+        known, places = part.known_depths(image_id), other.known_depths(image_id)
+        return _trusted(scale_between(known, places, radius))
+
+    def _scale(
+        self, part: Part, image_id: int, side: int, relative: RelativePose
+    ) -> ScaleEstimate | None:
+        """Compare the depths of a pair in an image with those that a model knows there."""
+        camera = part.cameras[image_id]
+        radius = RADIUS_FRAC * max(camera.width, camera.height)
+        depths = relative.depths.first if side == 0 else relative.depths.second
+        in_front = relative.depths.in_front
+        places = self.graph.keypoints[image_id][relative.matches[in_front, side]]
+        known = part.known_depths(image_id)
+        return _trusted(scale_between(known, (places, depths[in_front]), radius))
+
+    def _judged(
+        self,
+        part: Part,
+        ids: tuple[int, int],
+        poses: Mapping[int, Pose],
+        cameras: CameraById,
+        scale: ScaleEstimate,
+        other: int | None = None,
+    ) -> Hypothesis | None:
+        """Ask all pairs between the model and what comes in; None where they disagree."""
+        all_poses, all_cameras = {**part.poses, **poses}, {**part.cameras, **cameras}
+        weight = agreeing = 0.0
+        for pair in self.graph.pairs:
+            if (pair.ids[0] in part.poses) + (pair.ids[1] in part.poses) == 1 and all(
+                image_id in all_poses for image_id in pair.ids
+            ):
+                weight += pair.weight
+                agreeing += pair.weight * self.graph.agreement(pair, all_poses, all_cameras)
+        if weight and agreeing < MIN_SHARE * weight:
+            return None
+        names = self.graph.names
+        bridge = Bridge(
+            (names[ids[0]], names[ids[1]]),
+            tuple(sorted(names[image_id] for image_id in poses)),
+            scale.num_agreeing,
+            scale.num_ratios,
+            scale.error_frac,
+        )
+        share = agreeing / weight if weight else 1.0
+        return Hypothesis(bridge, poses, cameras, share, weight, other)
+
+    def _poses(self, pair: VerifiedPair, cameras: CameraById) -> list[RelativePose]:
+        parameters = np.concatenate([cameras[image_id].params for image_id in pair.ids])
+        key = (*pair.ids, np.round(parameters, 3).tobytes())
+        if key not in self._relative:
+            self._relative[key] = self.graph.relative_poses(pair, cameras, self.random_seed)
+        return self._relative[key]
+
+    def _camera(
+        self, part: Part, image_id: int, default: pycolmap.Camera | None = None
+    ) -> pycolmap.Camera:
+        """Return the camera that an image has in a model, or would have there."""
+        shared = self.graph.cameras[image_id]
+        for known in part.cameras.values():
+            if known.camera_id == shared.camera_id:
+                return known
+        return default or shared
+
+
+IDENTITY: Pose = (np.eye(3), np.zeros(3))
+
+
+def _trusted(estimate: ScaleEstimate | None) -> ScaleEstimate | None:
+    """Return an estimate on which enough places agree."""
+    if estimate is None or estimate.num_agreeing < MIN_AGREEING:
+        return None
+    return estimate if estimate.share >= MIN_AGREEING_SHARE else None
+
+
+def _quotient(first: ScaleEstimate, second: ScaleEstimate) -> ScaleEstimate:
+    """Divide two scales; counts are those of the weaker one."""
+    weaker = min(first, second, key=lambda estimate: (estimate.share, estimate.num_agreeing))
+    error = float(np.hypot(first.error_frac, second.error_frac))
+    return ScaleEstimate(
+        first.scale / second.scale, weaker.num_agreeing, weaker.num_ratios, error
+    )

@@ -1,0 +1,233 @@
+"""The verified pairs of a database, and how well poses agree with them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.poses import Pose, relative_pose
+from colmap_affrect.geometry.epipolar import sampson_errors
+from colmap_affrect.geometry.two_views import (
+    Depths,
+    essential_matrix,
+    triangulated_depths,
+)
+
+PoseById = Mapping[int, Pose]
+CameraById = Mapping[int, pycolmap.Camera]
+"""Cameras by image id."""
+
+MAX_ERROR_PX = 4.0
+"""An inlier agrees with poses up to this Sampson error; COLMAP's limit for observations."""
+
+MIN_ANGLE_DEG = 1.0
+"""Rays closer to parallel say nothing about depth, nor which side of the camera a point is."""
+
+MIN_SHARE = 0.5
+"""A pair speaks for poses when at least this share of its inliers agrees."""
+
+
+@dataclass(frozen=True)
+class VerifiedPair:
+    """A verified pair of images.
+
+    Attributes:
+        ids: of the two images.
+        matches: (M, 2) features that are inliers.
+        homography: (3, 3) from image 1 to image 2, where COLMAP found one.
+    """
+
+    ids: tuple[int, int]
+    matches: NDArray[np.int64]
+    homography: NDArray[np.float64] | None
+
+    @property
+    def weight(self) -> float:
+        """What the pair counts beside others."""
+        return float(np.sqrt(len(self.matches)))
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """A relative pose of a pair that its inliers allow.
+
+    Attributes:
+        pose: cam2_from_cam1, with a translation of length 1.
+        matches: (M, 2) features that agree with it, with enough parallax to know their depth.
+        depths: of these.
+    """
+
+    pose: Pose
+    matches: NDArray[np.int64]
+    depths: Depths
+
+
+@dataclass(frozen=True)
+class PairGraph:
+    """All verified pairs of a database.
+
+    Attributes:
+        names: by image id.
+        cameras: by image id, as in the database.
+        keypoints: (N, 2) px by image id.
+        pairs: sorted by ids.
+    """
+
+    names: Mapping[int, str]
+    cameras: CameraById
+    keypoints: Mapping[int, NDArray[np.float64]]
+    pairs: tuple[VerifiedPair, ...]
+
+    @classmethod
+    def read(cls, path: Path, min_num_matches: int) -> PairGraph:
+        """Read the pairs with at least as many inliers."""
+        with open_database(path) as database:
+            images = {image.image_id: image for image in database.read_all_images()}
+            cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+            pair_ids, geometries = database.read_two_view_geometries()
+            pairs = [
+                _verified(pycolmap.pair_id_to_image_pair(pair_id), geometry)
+                for pair_id, geometry in zip(pair_ids, geometries, strict=True)
+                if len(geometry.inlier_matches) >= min_num_matches
+            ]
+            used = {image_id for pair in pairs for image_id in pair.ids}
+            keypoints = {
+                image_id: np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
+                for image_id in used
+            }
+        return cls(
+            {image_id: images[image_id].name for image_id in images},
+            {image_id: cameras[images[image_id].camera_id] for image_id in images},
+            keypoints,
+            tuple(sorted(pairs, key=lambda pair: pair.ids)),
+        )
+
+    @cached_property
+    def of_image(self) -> Mapping[int, tuple[VerifiedPair, ...]]:
+        """Pairs by image id."""
+        found: dict[int, list[VerifiedPair]] = {image_id: [] for image_id in self.names}
+        for pair in self.pairs:
+            for image_id in pair.ids:
+                found[image_id].append(pair)
+        return {image_id: tuple(pairs) for image_id, pairs in found.items()}
+
+    def points(self, pair: VerifiedPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the (M, 2) px of the inliers in both images."""
+        first, second = pair.ids
+        return self.keypoints[first][pair.matches[:, 0]], self.keypoints[second][pair.matches[:, 1]]
+
+    def agreement(self, pair: VerifiedPair, poses: PoseById, cameras: CameraById) -> float:
+        """Return the share of the inliers of a pair that agree with the poses of its images."""
+        camera1, camera2 = (cameras[image_id] for image_id in pair.ids)
+        pose = relative_pose(*(poses[image_id] for image_id in pair.ids))
+        return float(_agrees(pose, (camera1, camera2), self.points(pair))[0].mean())
+
+    def score(self, poses: PoseById, cameras: CameraById) -> float:
+        """Return how well poses agree with all pairs whose images have one.
+
+        Each pair counts by the root of its inliers; one whose inliers mostly disagree counts
+        against the poses. Images without a pose are not counted, so more right images are better.
+        """
+        return sum(
+            pair.weight * (2.0 * self.agreement(pair, poses, cameras) - 1.0)
+            for pair in self.pairs
+            if poses.keys() >= set(pair.ids)
+        )
+
+    def relative_poses(
+        self, pair: VerifiedPair, cameras: CameraById, random_seed: int
+    ) -> list[RelativePose]:
+        """Return the relative poses that explain a pair, the likeliest one first.
+
+        That of its essential matrix, and the ones into which its homography can be decomposed:
+        of a plane seen twice both solutions may have all points before both cameras, so that only
+        other pairs can tell which one is right.
+        """
+        camera1, camera2 = (cameras[image_id] for image_id in pair.ids)
+        points = self.points(pair)
+        options = pycolmap.TwoViewGeometryOptions(
+            compute_relative_pose=True,
+            min_num_inliers=5,
+            ransac=dict(max_error=MAX_ERROR_PX, random_seed=max(random_seed, 0)),
+        )
+        rows = np.arange(len(pair.matches), dtype=np.uint32)
+        geometry = pycolmap.estimate_calibrated_two_view_geometry(
+            camera1, points[0], camera2, points[1], np.stack([rows, rows], axis=1), options
+        )
+        candidates = []
+        if geometry.cam2_from_cam1 is not None:
+            matrix = geometry.cam2_from_cam1.matrix()
+            candidates.append((matrix[:, :3], matrix[:, 3]))
+        if pair.homography is not None:
+            candidates += _decomposed(pair.homography, camera1, camera2)
+        found = []
+        for pose in candidates:
+            if np.linalg.norm(pose[1]) < 1e-9:
+                continue
+            agrees, depths = _agrees(pose, (camera1, camera2), points)
+            known = agrees & (depths.angles_deg > MIN_ANGLE_DEG)
+            if agrees.mean() >= MIN_SHARE and known.any():
+                kept = Depths(depths.first[known], depths.second[known], depths.angles_deg[known])
+                found.append(RelativePose(pose, pair.matches[known], kept))
+        return found
+
+
+def poses_of(model: pycolmap.Reconstruction) -> dict[int, Pose]:
+    """Return cam_from_world of the registered images by image id."""
+    matrices = {i: model.image(i).cam_from_world().matrix() for i in model.reg_image_ids()}
+    return {image_id: (matrix[:, :3], matrix[:, 3]) for image_id, matrix in matrices.items()}
+
+
+def inverse(pose: Pose) -> Pose:
+    """Return cam1_from_cam2 of cam2_from_cam1."""
+    return pose[0].T, -pose[0].T @ pose[1]
+
+
+def _agrees(
+    pose: Pose,
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
+    points: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> tuple[NDArray[np.bool_], Depths]:
+    """Return which matches agree with a relative pose, and their depths."""
+    rays1, rays2 = (
+        np.asarray(camera.cam_from_img(part), np.float64)
+        for camera, part in zip(cameras, points, strict=True)
+    )
+    depths = triangulated_depths(*pose, rays1, rays2)
+    focal1, focal2 = (camera.mean_focal_length() for camera in cameras)
+    # Sampson errors are of px when rays are scaled by the focal lengths.
+    scale1, scale2 = (np.diag([1 / focal, 1 / focal, 1.0]) for focal in (focal1, focal2))
+    fundamental = scale2 @ essential_matrix(*pose) @ scale1
+    errors = sampson_errors(fundamental, focal1 * rays1, focal2 * rays2)
+    sides = depths.in_front | (depths.angles_deg < MIN_ANGLE_DEG)
+    return (errors <= MAX_ERROR_PX) & sides, depths
+
+
+def _decomposed(
+    homography: NDArray[np.float64], camera1: pycolmap.Camera, camera2: pycolmap.Camera
+) -> list[Pose]:
+    """Return the poses into which a homography of px can be decomposed."""
+    matrices = [np.asarray(c.calibration_matrix(), np.float64) for c in (camera1, camera2)]
+    normalized = np.linalg.inv(matrices[1]) @ homography @ matrices[0]
+    _, rotations, translations, _ = cv2.decomposeHomographyMat(normalized, np.eye(3))
+    lengths = [float(np.linalg.norm(translation)) for translation in translations]
+    return [
+        (np.asarray(rotation, np.float64), np.asarray(translation, np.float64).ravel() / length)
+        for rotation, translation, length in zip(rotations, translations, lengths, strict=True)
+        if length > 0
+    ]
+
+
+def _verified(ids: tuple[int, int], geometry: pycolmap.TwoViewGeometry) -> VerifiedPair:
+    homography = None if geometry.H is None else np.asarray(geometry.H, np.float64)
+    if homography is not None and not np.any(homography):
+        homography = None
+    return VerifiedPair(ids, np.asarray(geometry.inlier_matches, np.int64), homography)
