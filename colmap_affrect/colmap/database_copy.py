@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sqlite3
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
@@ -96,6 +96,14 @@ def copy_without_features(source: Path, target: Path) -> None:
         database.clear_two_view_geometries()
         _add_frames(database)
     partial.replace(target)
+
+
+def copy_without_pairs(source: Path, target: Path, pairs: Iterable[tuple[int, int]]) -> None:
+    """Copy a database and leave out the two-view geometries of some pairs of image ids."""
+    copy_database(source, target)
+    with closing(pycolmap.Database.open(target)) as database:
+        for image_id1, image_id2 in pairs:
+            database.delete_two_view_geometry(image_id1, image_id2)
 
 
 def _add_frames(database: pycolmap.Database) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from colmap_affrect.mappers.pair_graph import (
     PairGraph,
     RelativePose,
     VerifiedPair,
+    cameras_of,
     inverse,
     poses_of,
 )
@@ -36,6 +38,10 @@ MIN_AGREEING = 10
 MIN_AGREEING_SHARE = 0.5
 """A scale needs so many places that agree, and this share of all: right pairs have 80 to 100 %, and
 chance a quarter."""
+
+
+FOCAL_STEP = 0.02
+"""Relative poses are estimated again when a focal length has changed by about this part."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +62,9 @@ class Part:
     @cached_property
     def cameras(self) -> dict[int, pycolmap.Camera]:
         """Camera by id of the image."""
-        images = self.model.images
-        return {i: self.model.cameras[images[i].camera_id] for i in self.poses}
+        return cameras_of(self.model)
 
-    def known_depths(
-        self, image_id: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def known_depths(self, image_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return (K, 2) px and (K,) depths of the points that an image sees."""
         if image_id not in self._known:
             rotation, translation = self.poses[image_id]
@@ -111,7 +114,7 @@ class Bridges:
     def __init__(self, graph: PairGraph, random_seed: int) -> None:
         """Begin without any pose known."""
         self.graph, self.random_seed = graph, random_seed
-        self._relative: dict[tuple[int, int, bytes], list[RelativePose]] = {}
+        self._relative: dict[tuple[Any, ...], list[RelativePose]] = {}
 
     def find(self, part: Part, others: Sequence[Part]) -> list[Hypothesis]:
         """Return all bridges from a model to other models and to single images, best first."""
@@ -250,8 +253,8 @@ class Bridges:
         return Hypothesis(bridge, poses, cameras, share, weight, other)
 
     def _poses(self, pair: VerifiedPair, cameras: CameraById) -> list[RelativePose]:
-        parameters = np.concatenate([cameras[image_id].params for image_id in pair.ids])
-        key = (*pair.ids, np.round(parameters, 3).tobytes())
+        focals = [cameras[image_id].mean_focal_length() for image_id in pair.ids]
+        key = (pair.ids, *np.round(np.log(focals) / FOCAL_STEP).astype(int))
         if key not in self._relative:
             self._relative[key] = self.graph.relative_poses(pair, cameras, self.random_seed)
         return self._relative[key]
@@ -281,6 +284,4 @@ def _quotient(first: ScaleEstimate, second: ScaleEstimate) -> ScaleEstimate:
     """Divide two scales; counts are those of the weaker one."""
     weaker = min(first, second, key=lambda estimate: (estimate.share, estimate.num_agreeing))
     error = float(np.hypot(first.error_frac, second.error_frac))
-    return ScaleEstimate(
-        first.scale / second.scale, weaker.num_agreeing, weaker.num_ratios, error
-    )
+    return ScaleEstimate(first.scale / second.scale, weaker.num_agreeing, weaker.num_ratios, error)

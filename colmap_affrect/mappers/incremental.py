@@ -16,10 +16,9 @@ from colmap_affrect.options import within
 FLAG = "--mapper-options"
 
 
-class IncrementalOptions(MapperOptions):
-    """Incremental mapping."""
+class PipelineOptions(MapperOptions):
+    """Options of COLMAP's incremental pipeline."""
 
-    name: Literal["incremental"] = "incremental"
     init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0
     init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50
     abs_pose_min_num_inliers: Annotated[int, within(3, 1_000_000)] = 12
@@ -37,6 +36,12 @@ class IncrementalOptions(MapperOptions):
     }
 
 
+class IncrementalOptions(PipelineOptions):
+    """Incremental mapping."""
+
+    name: Literal["incremental"] = "incremental"
+
+
 class IncrementalMapper:
     """COLMAP's incremental mapper, in one thread.
 
@@ -46,7 +51,7 @@ class IncrementalMapper:
 
     Options = IncrementalOptions
 
-    def __init__(self, options: IncrementalOptions) -> None:
+    def __init__(self, options: PipelineOptions) -> None:
         """Check the options for pycolmap."""
         native = pycolmap.IncrementalPipelineOptions()
         resolved = resolve(native, options.mapper_options, FLAG)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -30,6 +29,9 @@ MAX_ERROR_PX = 4.0
 
 MIN_ANGLE_DEG = 1.0
 """Rays closer to parallel say nothing about depth, nor which side of the camera a point is."""
+
+MAX_MATCHES, MAX_TRIALS = 500, 1000
+"""What a relative pose is estimated from: inliers already, so that few are enough."""
 
 MIN_SHARE = 0.5
 """A pair speaks for poses when at least this share of its inliers agrees."""
@@ -70,17 +72,19 @@ class RelativePose:
     depths: Depths
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PairGraph:
     """All verified pairs of a database.
 
     Attributes:
+        cache: the same for pycolmap's mappers.
         names: by image id.
         cameras: by image id, as in the database.
         keypoints: (N, 2) px by image id.
         pairs: sorted by ids.
     """
 
+    cache: pycolmap.DatabaseCache
     names: Mapping[int, str]
     cameras: CameraById
     keypoints: Mapping[int, NDArray[np.float64]]
@@ -98,26 +102,24 @@ class PairGraph:
                 for pair_id, geometry in zip(pair_ids, geometries, strict=True)
                 if len(geometry.inlier_matches) >= min_num_matches
             ]
+            options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches)
+            cache = pycolmap.DatabaseCache.create(database, options)
             used = {image_id for pair in pairs for image_id in pair.ids}
             keypoints = {
                 image_id: np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
                 for image_id in used
             }
         return cls(
+            cache,
             {image_id: images[image_id].name for image_id in images},
             {image_id: cameras[images[image_id].camera_id] for image_id in images},
             keypoints,
             tuple(sorted(pairs, key=lambda pair: pair.ids)),
         )
 
-    @cached_property
-    def of_image(self) -> Mapping[int, tuple[VerifiedPair, ...]]:
-        """Pairs by image id."""
-        found: dict[int, list[VerifiedPair]] = {image_id: [] for image_id in self.names}
-        for pair in self.pairs:
-            for image_id in pair.ids:
-                found[image_id].append(pair)
-        return {image_id: tuple(pairs) for image_id, pairs in found.items()}
+    def without(self, ids: Collection[tuple[int, int]]) -> PairGraph:
+        """Leave out some pairs; the cache keeps them."""
+        return replace(self, pairs=tuple(pair for pair in self.pairs if pair.ids not in ids))
 
     def points(self, pair: VerifiedPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the (M, 2) px of the inliers in both images."""
@@ -142,6 +144,17 @@ class PairGraph:
             if poses.keys() >= set(pair.ids)
         )
 
+    def score_of(self, model: pycolmap.Reconstruction) -> float:
+        """Return the :meth:`score` of the images that a model has registered."""
+        return self.score(poses_of(model), cameras_of(model))
+
+    def is_explained_by(self, model: pycolmap.Reconstruction) -> bool:
+        """Tell whether a model has all images of all pairs, and no pair contradicts it."""
+        poses, cameras = poses_of(model), cameras_of(model)
+        return poses.keys() >= self.keypoints.keys() and all(
+            self.agreement(pair, poses, cameras) >= MIN_SHARE for pair in self.pairs
+        )
+
     def relative_poses(
         self, pair: VerifiedPair, cameras: CameraById, random_seed: int
     ) -> list[RelativePose]:
@@ -156,11 +169,14 @@ class PairGraph:
         options = pycolmap.TwoViewGeometryOptions(
             compute_relative_pose=True,
             min_num_inliers=5,
-            ransac=dict(max_error=MAX_ERROR_PX, random_seed=max(random_seed, 0)),
+            ransac=dict(
+                max_error=MAX_ERROR_PX, max_num_trials=MAX_TRIALS, random_seed=max(random_seed, 0)
+            ),
         )
-        rows = np.arange(len(pair.matches), dtype=np.uint32)
+        some = np.random.default_rng(0).permutation(len(pair.matches))[:MAX_MATCHES]
+        rows = np.stack([some, some], axis=1).astype(np.uint32)
         geometry = pycolmap.estimate_calibrated_two_view_geometry(
-            camera1, points[0], camera2, points[1], np.stack([rows, rows], axis=1), options
+            camera1, points[0], camera2, points[1], rows, options
         )
         candidates = []
         if geometry.cam2_from_cam1 is not None:
@@ -184,6 +200,11 @@ def poses_of(model: pycolmap.Reconstruction) -> dict[int, Pose]:
     """Return cam_from_world of the registered images by image id."""
     matrices = {i: model.image(i).cam_from_world().matrix() for i in model.reg_image_ids()}
     return {image_id: (matrix[:, :3], matrix[:, 3]) for image_id, matrix in matrices.items()}
+
+
+def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
+    """Return the cameras of the registered images by image id."""
+    return {i: model.cameras[model.images[i].camera_id] for i in model.reg_image_ids()}
 
 
 def inverse(pose: Pose) -> Pose:

@@ -3,49 +3,82 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
+
+import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database_copy import copy_without_pairs
+from colmap_affrect.colmap.native_options import Plain
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 from colmap_affrect.mappers.bridging import Bridges, Hypothesis, Part
-from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
-from colmap_affrect.mappers.pair_graph import PairGraph, poses_of
+from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
+from colmap_affrect.mappers.loops import check_loops
+from colmap_affrect.mappers.pair_graph import PairGraph
+
+MAX_TRIALS = 5
+"""Bridges from one model that are tried before nothing more is expected to join it."""
 
 
-class SparseOptions(IncrementalOptions):
+class SparseOptions(PipelineOptions):
     """Incremental mapping, then bridges by single pairs."""
 
-    name: Literal["sparse"] = "sparse"  # type: ignore[assignment]
+    name: Literal["sparse"] = "sparse"
 
 
-class SparseMapper(IncrementalMapper):
-    """Incremental mapping; what it leaves out, images and models, is joined by bridges."""
+class SparseMapper:
+    """Incremental mapping; what it leaves out, images and models, is joined by bridges.
+
+    Pairs that contradict the loops they stand in are left out when that explains the others
+    better.
+    """
 
     Options = SparseOptions
+
+    def __init__(self, options: SparseOptions) -> None:
+        """Check the options for pycolmap."""
+        self._incremental = IncrementalMapper(options)
+        self.options = self._incremental.options
 
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
-        models = super().map(task, output_path, random_seed, show)
-        native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
+        models = self._mapped(task, output_path / "all", random_seed, show)
+        native = self._incremental.native(random_seed, intrinsics_given=task.intrinsics_given)
         graph = PairGraph.read(task.database_path, native.min_num_matches)
-        missing = set(graph.keypoints)
-        for model in models:
-            if missing <= set(model.reconstruction.reg_image_ids()):
-                return models
-        with open_database(task.database_path) as database:
-            options = pycolmap.DatabaseCacheOptions(min_num_matches=native.min_num_matches)
-            cache = pycolmap.DatabaseCache.create(database, options)
-        joiner = Joiner(graph, cache, native, show)
-        joined = joiner.join([model.reconstruction for model in models])
+        if models and graph.is_explained_by(models[0]):
+            return [MappedModel(model) for model in models]
+        contradicting = check_loops(graph, native.random_seed).contradicting
+        trusted = graph.without(contradicting)
+        if contradicting:
+            reduced = output_path / "reduced.db"
+            copy_without_pairs(task.database_path, reduced, contradicting)
+            others = self._mapped(
+                replace(task, database_path=reduced), output_path / "reduced", random_seed, show
+            )
+            models = max(models, others, key=partial(best_score, trusted))
+        joiner = Joiner(trusted, native, show)
+        joined = joiner.join(models)
         for model in joined:
             if model.bridges and native.extract_colors:
                 model.reconstruction.extract_colors_for_all_images(task.image_path)
         return joined
+
+    def _mapped(
+        self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
+    ) -> list[pycolmap.Reconstruction]:
+        output_path.mkdir()
+        found = self._incremental.map(task, output_path, random_seed, show)
+        return [model.reconstruction for model in found]
+
+    def differences(self, *, intrinsics_given: bool) -> dict[str, Plain]:
+        """See :class:`colmap_affrect.mappers.base.Mapper`."""
+        return self._incremental.differences(intrinsics_given=intrinsics_given)
 
 
 class Joiner:
@@ -54,17 +87,16 @@ class Joiner:
     def __init__(
         self,
         graph: PairGraph,
-        cache: pycolmap.DatabaseCache,
         native: pycolmap.IncrementalPipelineOptions,
         show: Callable[[int], None],
     ) -> None:
         """Keep what all steps need."""
-        self.graph, self.cache, self.native, self.show = graph, cache, native, show
+        self.graph, self.native, self.show = graph, native, show
         self.bridges = Bridges(graph, native.random_seed)
 
     def join(self, models: Iterable[pycolmap.Reconstruction]) -> list[MappedModel]:
         """Let the best model grow, then the next one, with the models that are left."""
-        left = sorted(models, key=self.score, reverse=True)
+        left = sorted(models, key=self.graph.score_of, reverse=True)
         joined = []
         while left:
             model, bridges, left = self.grow(left[0], left[1:])
@@ -73,35 +105,25 @@ class Joiner:
             joined.append(MappedModel(model, tuple(bridges)))
         return joined
 
-    def score(self, model: pycolmap.Reconstruction) -> float:
-        """Return how well a model agrees with the verified pairs."""
-        part = Part(model)
-        return self.graph.score(part.poses, part.cameras)
-
     def grow(
         self, model: pycolmap.Reconstruction, others: list[pycolmap.Reconstruction]
     ) -> tuple[pycolmap.Reconstruction, list[Bridge], list[pycolmap.Reconstruction]]:
         """Bridge from a model until nothing joins; return it, its bridges and the other models."""
         built: list[Bridge] = []
-        failed: set[tuple[Any, ...]] = set()
-        score = self.score(model)
+        score = self.graph.score_of(model)
         while True:
             hypotheses = self.bridges.find(Part(model), [Part(other) for other in others])
-            untried = [h for h in hypotheses if (h.bridge.pair, h.bridge.names) not in failed]
-            if not untried:
+            for hypothesis in hypotheses[:MAX_TRIALS]:
+                grown = self.applied(hypothesis, model)
+                new_score = self.graph.score_of(grown)
+                if new_score > score and set(hypothesis.poses) & set(grown.reg_image_ids()):
+                    break
+            else:
                 return model, built, others
-            best = untried[0]
-            grown = self.applied(best, model)
-            new_score = self.score(grown)
-            came_in = set(best.poses) & set(grown.reg_image_ids())
-            if new_score <= score or not came_in:
-                failed.add((best.bridge.pair, best.bridge.names))
-                continue
             model, score = grown, new_score
-            built.append(best.bridge)
-            failed.clear()
-            if best.other is not None:
-                others = [other for i, other in enumerate(others) if i != best.other]
+            built.append(hypothesis.bridge)
+            if hypothesis.other is not None:
+                others = [other for i, other in enumerate(others) if i != hypothesis.other]
 
     def applied(
         self, hypothesis: Hypothesis, model: pycolmap.Reconstruction
@@ -109,29 +131,28 @@ class Joiner:
         """Return a copy of a model with the images of a bridge, grown and refined from there."""
         model = copy.deepcopy(model)
         known = {model.images[i].camera_id for i in model.reg_image_ids()}
-        model.load(self.cache)
+        model.load(self.graph.cache)
         for image_id, (rotation, translation) in hypothesis.poses.items():
             image = model.images[image_id]
-            if image.has_pose:
+            if image.has_pose or image.frame is None:
                 continue
             if image.camera_id not in known:
-                model.cameras[image.camera_id].params = hypothesis.cameras[image_id].params
-            matrix = _matrix(rotation, translation)
-            image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(matrix))
+                parameters = hypothesis.cameras[image_id].params.tolist()
+                model.cameras[image.camera_id].params = parameters
+            pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
+            image.frame.set_cam_from_world(image.camera_id, pose)
             model.register_frame(image.frame_id)
-        mapper = pycolmap.IncrementalMapper(self.cache)
+        mapper = pycolmap.IncrementalMapper(self.graph.cache)
         mapper.begin_reconstruction(model)
         for image_id in hypothesis.poses:
             mapper.triangulate_image(self.native.get_triangulation(), image_id)
         self._refine(mapper)
-        self._register_next(mapper, model)
+        self._register_next(mapper)
         mapper.end_reconstruction(False)
         self.show(model.num_reg_images())
         return model
 
-    def _register_next(
-        self, mapper: pycolmap.IncrementalMapper, model: pycolmap.Reconstruction
-    ) -> None:
+    def _register_next(self, mapper: pycolmap.IncrementalMapper) -> None:
         """Register images by their tracks as long as there are any, as COLMAP's pipeline does."""
         native = self.native
         options, triangulation = native.get_mapper(), native.get_triangulation()
@@ -166,7 +187,6 @@ class Joiner:
         )
 
 
-def _matrix(rotation: Any, translation: Any) -> Any:
-    import numpy as np
-
-    return np.column_stack([rotation, translation])
+def best_score(graph: PairGraph, models: Sequence[pycolmap.Reconstruction]) -> float:
+    """Return the best score of any of some models, 0 without any."""
+    return max(map(graph.score_of, models), default=0.0)

@@ -1,0 +1,129 @@
+"""Loops of verified pairs: rotations around a loop must multiply to the identity.
+
+Repeated structure gives wrong pairs that no test of two views finds, and a plane seen twice
+allows two relative poses. Both show in the loops that they stand in: rotations that are averaged
+robustly over the whole graph follow the majority, weighted by inliers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.mappers.pair_graph import PairGraph, RelativePose
+
+Ids = tuple[int, int]
+
+MAX_ERROR_DEG = 10.0
+"""A relative rotation farther from the averaged ones is wrong. Of right pairs with guessed focal
+lengths it is a few degrees, of repeated structure mostly more than 50."""
+
+MAX_ROUNDS = 3
+"""How often rotations are averaged again after other poses of pairs have been chosen."""
+
+
+@dataclass(frozen=True)
+class Loops:
+    """What loops say about the pairs of a graph.
+
+    Attributes:
+        poses: relative poses of each pair, the one that fits the loops best first.
+        contradicting: pairs none of whose poses fits, though their images are tied without them.
+    """
+
+    poses: Mapping[Ids, tuple[RelativePose, ...]]
+    contradicting: frozenset[Ids]
+
+
+@lru_cache(maxsize=1)
+def check_loops(graph: PairGraph, random_seed: int) -> Loops:
+    """Average the rotations of all pairs of a graph and compare each pair with the result."""
+    poses = {
+        pair.ids: graph.relative_poses(pair, graph.cameras, random_seed) for pair in graph.pairs
+    }
+    poses = {ids: found for ids, found in poses.items() if found}
+    weights = {pair.ids: len(pair.matches) for pair in graph.pairs}
+    errors: dict[Ids, float] = {}
+    for _ in range(MAX_ROUNDS):
+        rotations = _averaged(poses, weights, graph.cache, random_seed)
+        chosen = {ids: _by_error(ids, found, rotations) for ids, found in poses.items()}
+        errors = {ids: _error_deg(ids, found[0], rotations) for ids, found in chosen.items()}
+        changed = any(chosen[ids][0] is not poses[ids][0] for ids in poses)
+        poses = chosen
+        if not changed:
+            break
+    wrong = [ids for ids in errors if errors[ids] > MAX_ERROR_DEG]
+    return Loops(
+        {ids: tuple(found) for ids, found in poses.items()},
+        frozenset(_dispensable(sorted(wrong, key=lambda ids: -errors[ids]), weights)),
+    )
+
+
+def _averaged(
+    poses: Mapping[Ids, list[RelativePose]],
+    weights: Mapping[Ids, int],
+    cache: pycolmap.DatabaseCache,
+    random_seed: int,
+) -> dict[int, NDArray[np.float64]]:
+    """Return a rotation for each image, one connected part of the graph after the other."""
+    rotations: dict[int, NDArray[np.float64]] = {}
+    left = dict(poses)
+    options = pycolmap.RotationEstimatorOptions(random_seed=max(random_seed, 0))
+    while left:
+        model, edges = pycolmap.Reconstruction(), pycolmap.PoseGraph()
+        model.load(cache)
+        for ids, found in left.items():
+            edge = pycolmap.PoseGraphEdge(pycolmap.Rigid3d(np.column_stack(found[0].pose)))
+            edge.num_matches = weights[ids]
+            edges.add_edge(*ids, edge)
+        if not pycolmap.run_rotation_averaging(options, edges, model, []):
+            break
+        new = {i: model.images[i].cam_from_world().matrix()[:, :3] for i in model.reg_image_ids()}
+        rotations |= new
+        left = {ids: found for ids, found in left.items() if not new.keys() & set(ids)}
+        if not new:
+            break
+    return rotations
+
+
+def _by_error(
+    ids: Ids, found: list[RelativePose], rotations: Mapping[int, NDArray[np.float64]]
+) -> list[RelativePose]:
+    """Sort poses by their distance from the averaged rotations; the first one wins ties."""
+    return sorted(found, key=lambda relative: round(_error_deg(ids, relative, rotations)))
+
+
+def _error_deg(
+    ids: Ids, relative: RelativePose, rotations: Mapping[int, NDArray[np.float64]]
+) -> float:
+    if not rotations.keys() >= set(ids):
+        return 0.0
+    averaged = rotations[ids[1]] @ rotations[ids[0]].T
+    cosine = (np.trace(averaged @ relative.pose[0].T) - 1.0) / 2.0
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _dispensable(wrong: Iterable[Ids], pairs: Iterable[Ids]) -> list[Ids]:
+    """Return the wrong pairs without which their images are still tied to each other."""
+    kept, dropped = set(pairs), []
+    for ids in wrong:
+        kept.discard(ids)
+        if _tied(ids, kept):
+            dropped.append(ids)
+        else:
+            kept.add(ids)
+    return dropped
+
+
+def _tied(ids: Ids, pairs: set[Ids]) -> bool:
+    """Tell whether pairs lead from one image to the other."""
+    reached, size = {ids[0]}, 0
+    while len(reached) > size and ids[1] not in reached:
+        size = len(reached)
+        reached |= {image for pair in pairs if reached & set(pair) for image in pair}
+    return ids[1] in reached

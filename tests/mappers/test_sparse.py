@@ -1,0 +1,176 @@
+"""The sparse mapper on scenes whose truth is known: chains without tracks of three views, loops."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.poses import Poses, model_poses, pose_errors, relative_pose
+from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.loops import check_loops
+from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
+
+WIDTH, HEIGHT = 1000, 700
+MATRIX = np.array([[900.0, 0.0, 480.0], [0.0, 910.0, 360.0], [0.0, 0.0, 1.0]])
+NOISE_PX = 0.3
+MAX_SCALE_ERROR = 0.03
+
+
+def turned(about_x: float, about_y: float, about_z: float) -> NDArray[np.float64]:
+    angles = np.deg2rad([about_x, about_y, about_z])
+    return np.asarray(pycolmap.Rotation3d(angles).matrix())
+
+
+def views(count: int) -> Poses:
+    """Cameras that walk along a wall with unequal steps, up and down, and turn and roll."""
+    steps = np.cumsum([1.0, 1.3, 0.8, 1.5, 1.1, 0.9][:count])
+    found = {}
+    for i, along in enumerate(steps):
+        rotation = turned(3.0 * (-1) ** i, 9.0 - 4.0 * i, 5.0 * i)
+        center = np.array([along, 0.25 * (-1) ** i, -0.3 * i % 0.7])
+        found[f"{i}.jpg"] = rotation, -rotation @ center
+    return found
+
+
+def wall(random: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Points of two slanted planes that meet in an edge."""
+    x, y = random.uniform(-3, 9, count), random.uniform(-3, 3, count)
+    return np.stack([x, y, 7.0 + 0.35 * np.abs(x - 3.0) + 0.1 * y], axis=1)
+
+
+def write_scene(
+    path: Path, poses: Poses, pairs: Iterable[tuple[int, int]], num_points: int = 2000
+) -> None:
+    """Write a verified database in which each pair of images has features of its own."""
+    random = np.random.default_rng(5)
+    names = list(poses)
+    keypoints = {i: [np.zeros((0, 2))] for i in range(len(names))}
+    matches = {}
+    for first, second in pairs:
+        points = wall(random, num_points)
+        seen = [project(points, poses[names[i]]) for i in (first, second)]
+        inside = np.logical_and(*(is_inside(part) for part in seen))
+        starts = [sum(map(len, keypoints[i])) for i in (first, second)]
+        for i, part in zip((first, second), seen, strict=True):
+            keypoints[i].append(part[inside] + random.normal(0, NOISE_PX, (inside.sum(), 2)))
+        rows = np.arange(inside.sum())
+        matches[first, second] = np.stack([starts[0] + rows, starts[1] + rows], axis=1)
+    with closing(pycolmap.Database.open(path)) as database:
+        camera = pycolmap.Camera(
+            model="PINHOLE", width=WIDTH, height=HEIGHT, params=MATRIX[[0, 1, 0, 1], [0, 1, 2, 2]]
+        )
+        camera.camera_id = database.write_camera(camera)
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(camera.sensor_id)
+        rig_id = database.write_rig(rig)
+        for i, name in enumerate(names):
+            image = pycolmap.Image(name=name, camera_id=camera.camera_id, image_id=i + 1)
+            database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(rig_id=rig_id, frame_id=i + 1)
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_keypoints(i + 1, np.concatenate(keypoints[i]).astype(np.float32))
+        for (first, second), indices in matches.items():
+            database.write_matches(first + 1, second + 1, indices.astype(np.uint32))
+    verify(path, VerificationOptions())
+
+
+def project(points: NDArray[np.float64], pose: tuple[NDArray, NDArray]) -> NDArray[np.float64]:
+    seen = (points @ pose[0].T + pose[1]) @ MATRIX.T
+    return np.where(seen[:, 2:] > 0, seen[:, :2] / seen[:, 2:], np.nan)
+
+
+def is_inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((points > 0) & (points < (WIDTH, HEIGHT))).all(axis=1))
+
+
+def mapped(path: Path, output_path: Path) -> list[MappedModel]:
+    output_path.mkdir()
+    task = MappingTask(path, path.parent, intrinsics_given=True)
+    return SparseMapper(SparseOptions()).map(task, output_path, 0, lambda _: None)
+
+
+def centers(poses: Poses) -> NDArray[np.float64]:
+    return np.array([-poses[name][0].T @ poses[name][1] for name in sorted(poses)])
+
+
+def test_chain_in_which_no_feature_is_seen_three_times_is_bridged(tmp_path: Path) -> None:
+    truth = views(6)
+    path = tmp_path / "database.db"
+    write_scene(path, truth, [(i, i + 1) for i in range(5)])
+    (model, *others) = mapped(path, tmp_path / "models")
+    assert not others
+    found = model_poses(model.reconstruction)
+    assert sorted(found) == sorted(truth)
+    steps, true_steps = (
+        np.linalg.norm(np.diff(centers(poses), axis=0), axis=1) for poses in (found, truth)
+    )
+    ratios = (steps / true_steps) / (steps[0] / true_steps[0])
+    np.testing.assert_allclose(ratios, 1.0, atol=MAX_SCALE_ERROR)
+    for first, second in zip(sorted(truth), sorted(truth)[1:], strict=False):
+        errors = pose_errors(
+            relative_pose(found[first], found[second]), relative_pose(truth[first], truth[second])
+        )
+        assert max(errors) < 1.0
+    came_in = [name for bridge in model.bridges for name in bridge.names]
+    assert len(came_in) == len(set(came_in)) == 4
+    for bridge in model.bridges:
+        assert bridge.pair[0] not in bridge.names
+        assert bridge.pair[1] in bridge.names or bridge.pair[0] == bridge.pair[1]
+        assert bridge.num_agreeing > 0.8 * bridge.num_ratios
+        assert 0.0 < bridge.scale_error_frac < MAX_SCALE_ERROR
+
+
+def test_wrong_pair_in_a_loop_of_four_contradicts_it(tmp_path: Path) -> None:
+    truth = views(4)
+    path = tmp_path / "database.db"
+    write_scene(path, truth, [(0, 1), (1, 2), (2, 3), (0, 2), (1, 3)])
+    wrong = dict(truth)
+    wrong["3.jpg"] = turned(0, 25, 40) @ truth["3.jpg"][0], truth["3.jpg"][1] + (0.5, 0, 0)
+    other = tmp_path / "other.db"
+    write_scene(other, wrong, [(0, 3)])
+    right_graph = PairGraph.read(path, 15)
+    assert check_loops(right_graph, 0).contradicting == frozenset()
+    with (
+        closing(pycolmap.Database.open(path)) as database,
+        closing(pycolmap.Database.open(other)) as second,
+    ):
+        # The wrong pair's features come after those of the others.
+        indices = second.read_two_view_geometry(1, 4).inlier_matches.astype(np.int64)
+        for image_id, column in ((1, 0), (4, 1)):
+            own = database.read_keypoints(image_id)
+            both = np.concatenate([own, second.read_keypoints(image_id)])
+            database.update_keypoints(image_id, both)
+            indices[:, column] += len(own)
+        database.write_matches(1, 4, indices.astype(np.uint32))
+    verify(path, VerificationOptions())
+    graph = PairGraph.read(path, 15)
+    assert len(graph.pairs) == len(right_graph.pairs) + 1
+    assert check_loops(graph, 0).contradicting == {(1, 4)}
+    model, *_ = mapped(path, tmp_path / "models")
+    found = model_poses(model.reconstruction)
+    assert sorted(found) == sorted(truth)
+    for first, second_name in (("0.jpg", "3.jpg"), ("1.jpg", "2.jpg")):
+        errors = pose_errors(
+            relative_pose(found[first], found[second_name]),
+            relative_pose(truth[first], truth[second_name]),
+        )
+        assert max(errors) < 1.0
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_what_incremental_mapping_registers_is_left_as_it_is(tmp_path: Path, count: int) -> None:
+    path = tmp_path / "database.db"
+    write_scene(path, views(count), [(0, 1)])
+    (model,) = mapped(path, tmp_path / "models")
+    assert model.bridges == ()
+    assert model.reconstruction.num_reg_images() == 2
