@@ -91,6 +91,12 @@ TOLERANCE = 0.08
 NUM_NEIGHBORS = 5
 """Known places looked at beside each place of a pair."""
 
+NUM_ON_PLANE = 12
+"""Known places to which a plane is fitted."""
+
+MAX_PLANE_ERROR = 0.04
+"""Largest error of an inverse depth that a plane predicts, and spread of those it is fitted to."""
+
 
 def scale_between(
     known: tuple[Array, Array], places: tuple[Array, Array], radius_px: float
@@ -108,11 +114,48 @@ def scale_between(
     Returns:
         None without neighbours.
     """
-    rows, columns, distances = _nearest_known(known[0], places[0], radius_px)
-    if not len(rows):
-        return None
+    rows, columns, distances = _nearest_known(known[0], places[0], radius_px, NUM_NEIGHBORS)
     ratios = np.log(known[1][columns] / places[1][rows])
-    weights = np.exp(-((2 * distances / radius_px) ** 2))
+    return _densest(rows, ratios, np.exp(-((2 * distances / radius_px) ** 2)))
+
+
+def scale_by_planes(
+    known: tuple[Array, Array], places: tuple[Array, Array], radius_px: float
+) -> ScaleEstimate | None:
+    """Estimate the scale as :func:`scale_between`, where no known depth lies beside a place.
+
+    The inverse depth of a plane is affine in the image: it is fitted to the known depths around
+    each place and taken where they lie on a plane that is certain enough there.
+
+    Args:
+        known: (K, 2) px and (K,) depths that are known.
+        places: (N, 2) px and (N,) depths, all positive, whose scale is wanted.
+        radius_px: how far away known depths may be.
+    """
+    if not len(known[0]) or not len(places[0]):
+        return None
+    rows, columns, _ = _nearest_known(known[0], places[0], radius_px, NUM_ON_PLANE)
+    full = np.flatnonzero(np.bincount(rows, minlength=len(places[0])) == NUM_ON_PLANE)
+    columns = columns[np.isin(rows, full)].reshape(-1, NUM_ON_PLANE)
+    offsets = (known[0][columns] - places[0][full, None]) / radius_px
+    system = np.concatenate([np.ones((*columns.shape, 1)), offsets], axis=2)
+    inverse_depths = 1.0 / known[1][columns]
+    normal = system.transpose(0, 2, 1) @ system + 1e-9 * np.eye(3)
+    fitted = np.linalg.solve(normal, system.transpose(0, 2, 1) @ inverse_depths[..., None])
+    residuals = inverse_depths - (system @ fitted)[..., 0]
+    variances = (residuals**2).sum(axis=1) / (NUM_ON_PLANE - 3)
+    predicted = fitted[:, 0, 0]
+    errors = np.sqrt(variances * np.linalg.inv(normal)[:, 0, 0])
+    spreads = np.sqrt(variances)
+    certain = (predicted > 0) & (np.maximum(errors, spreads) < MAX_PLANE_ERROR * predicted)
+    ratios = -np.log(predicted[certain] * places[1][full[certain]])
+    return _densest(full[certain], ratios, np.ones(len(ratios)))
+
+
+def _densest(rows: NDArray[np.int64], ratios: Array, weights: Array) -> ScaleEstimate | None:
+    """Return the scale where most weight of the logarithms of ratios is; None without any."""
+    if not len(ratios):
+        return None
     order = np.argsort(ratios)
     summed = np.concatenate([[0.0], np.cumsum(weights[order])])
     first = np.searchsorted(ratios[order], ratios - TOLERANCE, side="left")
@@ -120,19 +163,18 @@ def scale_between(
     center = ratios[np.argmax(summed[last] - summed[first])]
     agreeing = np.abs(ratios - center) <= TOLERANCE
     num_agreeing = len(np.unique(rows[agreeing]))
-    spread = float(np.std(ratios[agreeing]))
     return ScaleEstimate(
         float(np.exp(np.average(ratios[agreeing], weights=weights[agreeing]))),
         num_agreeing,
         len(np.unique(rows)),
-        spread / np.sqrt(num_agreeing),
+        float(np.std(ratios[agreeing])) / np.sqrt(num_agreeing),
     )
 
 
 def _nearest_known(
-    known: Array, places: Array, radius_px: float
+    known: Array, places: Array, radius_px: float, count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Return (place, known point, distance) of the ``NUM_NEIGHBORS`` nearest of each place."""
+    """Return (place, known point, distance) of the ``count`` nearest of each place."""
     neighbors = neighbors_within(np.concatenate([places, known]), radius_px)
     rows, columns = neighbors.of(np.arange(len(places)))
     is_known = columns >= len(places)
@@ -141,5 +183,5 @@ def _nearest_known(
     order = np.lexsort((distances, rows))
     rows = rows[order]
     rank = np.arange(len(rows)) - np.searchsorted(rows, rows)
-    kept = order[rank < NUM_NEIGHBORS]
-    return rows[rank < NUM_NEIGHBORS], columns[kept], distances[kept]
+    kept = order[rank < count]
+    return rows[rank < count], columns[kept], distances[kept]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose
-from colmap_affrect.geometry.two_views import ScaleEstimate, scale_between
+from colmap_affrect.geometry.two_views import ScaleEstimate, scale_between, scale_by_planes
 from colmap_affrect.mappers.base import Bridge
 from colmap_affrect.mappers.pair_graph import (
     MIN_SHARE,
@@ -33,6 +33,9 @@ from colmap_affrect.mappers.pair_graph import (
 
 RADIUS_FRAC = 0.03
 """Places of known depth are neighbours up to this part of the longer side of the image."""
+
+PLANE_RADIUS = 4.0
+"""Known depths on a plane may be so many times farther away."""
 
 MIN_AGREEING = 10
 MIN_AGREEING_SHARE = 0.5
@@ -219,7 +222,10 @@ class Bridges:
         in_front = relative.depths.in_front
         places = self.graph.keypoints[image_id][relative.matches[in_front, side]]
         known = part.known_depths(image_id)
-        return _trusted(scale_between(known, (places, depths[in_front]), radius))
+        positive = depths[in_front]
+        return _trusted(scale_between(known, (places, positive), radius)) or _trusted(
+            scale_by_planes(known, (places, positive), PLANE_RADIUS * radius)
+        )
 
     def _judged(
         self,

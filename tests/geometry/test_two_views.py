@@ -1,0 +1,81 @@
+"""Depths of two views and scales between depths at neighbouring places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from colmap_affrect.geometry.epipolar import sampson_errors
+from colmap_affrect.geometry.two_views import (
+    essential_matrix,
+    scale_between,
+    scale_by_planes,
+    triangulated_depths,
+)
+
+ANGLE = np.deg2rad(20.0)
+ROTATION = np.array(
+    [[np.cos(ANGLE), 0, np.sin(ANGLE)], [0, 1, 0], [-np.sin(ANGLE), 0, np.cos(ANGLE)]]
+)
+TRANSLATION = np.array([-2.0, 0.3, 0.5])
+SCALE = 3.7
+
+
+def depth_at(points: np.ndarray) -> np.ndarray:
+    """A slanted plane: inverse depth is affine in the image."""
+    return np.asarray(1.0 / (0.1 + 4e-5 * points[:, 0] - 2e-5 * points[:, 1]))
+
+
+def test_depths_are_those_of_the_points_in_both_cameras() -> None:
+    points = np.random.default_rng(1).uniform((-2, -1, 4), (3, 1, 9), (50, 3))
+    moved = points @ ROTATION.T + TRANSLATION
+    rays1, rays2 = points[:, :2] / points[:, 2:], moved[:, :2] / moved[:, 2:]
+    depths = triangulated_depths(ROTATION, TRANSLATION, rays1, rays2)
+    np.testing.assert_allclose(depths.first, points[:, 2], rtol=1e-9)
+    np.testing.assert_allclose(depths.second, moved[:, 2], rtol=1e-9)
+    center = -ROTATION.T @ TRANSLATION
+    cosines = (points * (points - center)).sum(axis=1)
+    cosines /= np.linalg.norm(points, axis=1) * np.linalg.norm(points - center, axis=1)
+    np.testing.assert_allclose(depths.angles_deg, np.degrees(np.arccos(cosines)), atol=1e-6)
+    assert sampson_errors(essential_matrix(ROTATION, TRANSLATION), rays1, rays2).max() < 1e-9
+    turned = triangulated_depths(ROTATION, -TRANSLATION, rays1, rays2)
+    assert not turned.in_front.any()
+    assert depths.in_front.all()
+
+
+@pytest.mark.parametrize("share_wrong", [0.0, 0.4])
+def test_scale_is_found_between_features_that_lie_beside_each_other(share_wrong: float) -> None:
+    random = np.random.default_rng(2)
+    known, places = (random.uniform(0, 1000, (count, 2)) for count in (600, 200))
+    depths = depth_at(places) / SCALE
+    wrong = random.random(len(places)) < share_wrong
+    depths[wrong] *= np.exp(random.uniform(-2, 2, wrong.sum()))
+    found = scale_between((known, depth_at(known)), (places, depths), 30.0)
+    assert found is not None
+    assert found.scale == pytest.approx(SCALE, rel=0.01)
+    assert 100 < found.num_ratios <= 200
+    assert found.share == pytest.approx(1.0 - share_wrong, abs=0.12)
+    assert found.error_frac < 0.01
+
+
+def test_plane_carries_depths_to_where_nothing_is_known_and_only_a_plane_does() -> None:
+    random = np.random.default_rng(3)
+    known = random.uniform((0, 0), (400, 1000), (400, 2))
+    places = random.uniform((440, 100), (520, 900), (60, 2))
+    given = places, depth_at(places) / SCALE
+    assert scale_between((known, depth_at(known)), given, 30.0) is None
+    found = scale_by_planes((known, depth_at(known)), given, 160.0)
+    assert found is not None
+    assert found.scale == pytest.approx(SCALE, rel=1e-6)
+    assert found.num_agreeing == found.num_ratios > 30
+    rough = depth_at(known) * np.exp(random.normal(0, 0.3, len(known)))
+    assert scale_by_planes((known, rough), given, 160.0) is None
+
+
+@pytest.mark.parametrize("estimate", [scale_between, scale_by_planes])
+def test_without_known_depths_or_places_there_is_no_scale(estimate: object) -> None:
+    nothing = np.zeros((0, 2)), np.zeros(0)
+    something = np.zeros((20, 2)), np.ones(20)
+    assert callable(estimate)
+    for known, places in ((nothing, something), (something, nothing), (nothing, nothing)):
+        assert estimate(known, places, 10.0) is None
