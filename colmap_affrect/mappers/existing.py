@@ -76,7 +76,9 @@ class ExistingModel:
         if not self.refine:
             native.fix_existing_frames = True
             native.constant_cameras = {image.camera_id for image in self.images}
-            native.constant_rigs = {image.frame.rig_id for image in self.images}
+            native.constant_rigs = {
+                self.reconstruction.frame(image.frame_id).rig_id for image in self.images
+            }
 
     def restore(self, model: pycolmap.Reconstruction) -> None:
         """Give an extended model the poses that it had before, to the bit, and images it lost.
@@ -135,7 +137,7 @@ def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
     ids = {image.name: image_id for image_id, image in new.images.items()}
     names = _known_names(old, path, ids)
     images = [(image, new.image(ids[image.name])) for image in _registered(old)]
-    _take_cameras(images, new, path)
+    _take_cameras(images, old, new, path)
     _take_poses(images, new, path)
     same = {mine.image_id: now.image_id for mine, now in images if _same_keypoints(mine, now)}
     _take_points(old, new, same)
@@ -175,11 +177,13 @@ def _known_names(model: pycolmap.Reconstruction, path: Path, known: Collection[s
     return names
 
 
-def _take_cameras(images: ImagePairs, new: pycolmap.Reconstruction, path: Path) -> None:
+def _take_cameras(
+    images: ImagePairs, old: pycolmap.Reconstruction, new: pycolmap.Reconstruction, path: Path
+) -> None:
     """Replace the cameras of the database by those of the model."""
     taken: dict[int, tuple[str, pycolmap.Camera]] = {}
     for mine, now in images:
-        camera, mapped = mine.camera, new.camera(now.camera_id)
+        camera, mapped = old.camera(mine.camera_id), new.camera(now.camera_id)
         if (camera.width, camera.height) != (mapped.width, mapped.height):
             raise MappingError(
                 f"--extend {path}: {mine.name} is {camera.width} x {camera.height} px there and "
@@ -191,7 +195,7 @@ def _take_cameras(images: ImagePairs, new: pycolmap.Reconstruction, path: Path) 
                 f"--extend {path}: {name} and {mine.name} have different cameras there and share "
                 "one here; use the camera mode that the model was made with, or per-image"
             )
-        mapped.model, mapped.params = camera.model, camera.params
+        mapped.model, mapped.params = camera.model, list(camera.params)
         mapped.has_prior_focal_length = camera.has_prior_focal_length
 
 
@@ -203,9 +207,7 @@ def _take_poses(images: ImagePairs, new: pycolmap.Reconstruction, path: Path) ->
         rig = new.rig(frame.rig_id)
         reference = [i for i in frame.data_ids if rig.is_ref_sensor(i.sensor_id)]
         if not rig.is_ref_sensor(sensor) and reference and reference[0] in poses:
-            rig.set_sensor_from_rig(
-                sensor, poses[now.data_id] * poses[reference[0]].inverse()
-            )
+            rig.set_sensor_from_rig(sensor, poses[now.data_id] * poses[reference[0]].inverse())
     for image, now in images:
         frame = new.frame(now.frame_id)
         if not frame.has_pose():
@@ -213,7 +215,9 @@ def _take_poses(images: ImagePairs, new: pycolmap.Reconstruction, path: Path) ->
             new.register_frame(now.frame_id)
     for image, now in images:
         difference = image.cam_from_world().matrix() - now.cam_from_world().matrix()
-        if np.abs(difference).max() > SAME_POSE * (1 + np.abs(image.cam_from_world().translation).max()):
+        if np.abs(difference).max() > SAME_POSE * (
+            1 + np.abs(image.cam_from_world().translation).max()
+        ):
             raise MappingError(
                 f"--extend {path}: the pose of {image.name} does not fit the rig it has here"
             )
@@ -222,8 +226,8 @@ def _take_poses(images: ImagePairs, new: pycolmap.Reconstruction, path: Path) ->
 def _same_keypoints(one: pycolmap.Image, other: pycolmap.Image) -> bool:
     if one.num_points2D() != other.num_points2D():
         return False
-    positions = [np.array([point.xy for point in image.points2D]) for image in (one, other)]
-    return bool(np.allclose(*positions, rtol=0.0, atol=SAME_KEYPOINTS_PX))
+    mine, theirs = (np.array([point.xy for point in image.points2D]) for image in (one, other))
+    return bool(np.allclose(mine, theirs, rtol=0.0, atol=SAME_KEYPOINTS_PX))
 
 
 def _take_points(
@@ -244,7 +248,9 @@ def _move_onto(model: pycolmap.Reconstruction, images: list[pycolmap.Image]) -> 
     """Move a model by the similarity that brings its images onto their earlier poses."""
     registered = set(model.reg_image_ids())
     pairs = [(model.image(i.image_id), i) for i in images if i.image_id in registered]
-    centers = [np.array([image.projection_center() for image in side]) for side in zip(*pairs, strict=True)]
+    centers = [
+        np.array([image.projection_center() for image in side]) for side in zip(*pairs, strict=True)
+    ]
     product = sum(
         then.cam_from_world().rotation.matrix().T @ now.cam_from_world().rotation.matrix()
         for now, then in pairs

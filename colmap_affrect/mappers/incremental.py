@@ -142,7 +142,9 @@ class _Call:
         self._add(len(registered_names(snapshot)))
         models = self._map(token, snapshot)
         # After a model that is gone on with pycolmap begins no other.
-        found = {image.name for model in models for image in model.images.values() if image.has_pose}
+        found = {
+            image.name for model in models for image in model.images.values() if image.has_pose
+        }
         self.options.image_names = sorted(image_ids(task.database_path).keys() - found)
         return models + (self._map(token) if len(self.options.image_names) > 1 else [])
 

@@ -82,7 +82,11 @@ def drop_old_snapshots(folder: Path) -> None:
     folders = [path for path in folder.iterdir() if path.is_dir()]
     if len(folders) <= NUM_KEPT:
         return
-    sizes = {path: (path / "frames.bin").stat().st_size for path in folders if (path / "frames.bin").exists()}
+    sizes = {
+        path: (path / "frames.bin").stat().st_size
+        for path in folders
+        if (path / "frames.bin").exists()
+    }
     newest = max(folders, key=lambda path: path.name)  # may still be written
     complete = sorted((size, path.name, path) for path, size in sizes.items() if path != newest)
     for _, _, path in complete[: -(NUM_KEPT - 1)]:
