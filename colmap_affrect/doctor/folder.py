@@ -106,9 +106,7 @@ class _FolderExamination:
         try:
             record = workspace.recorded()
             done = [stage for stage in STAGES if stage in record.get("begun", [])]
-            wanted = (
-                [*COPY_STAGES] if "copy" in done else [name for name in STAGES if name != "copy"]
-            )
+            wanted = list(COPY_STAGES if "copy" in done else STAGES[1:])
             if "extract" in done:
                 Inputs.recorded(workspace)
                 if not recorded_extraction(workspace).escalation:

@@ -132,7 +132,7 @@ class _Call:
         task, snapshots = self.task, self.task.snapshot_path
         if task.extend:
             return self._extended(task.extend, token)
-        if not snapshots:
+        if not snapshots or self.options.snapshot_frames_freq:  # those of the user
             return self._map(token)
         self.options.snapshot_path = snapshots
         self.options.snapshot_frames_freq = SNAPSHOT_FRAMES
