@@ -8,10 +8,13 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 
+from colmap_affrect.colmap.database import num_matched_pairs
+from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
-from colmap_affrect.mappers.incremental import IncrementalOptions
+from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
+from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
@@ -20,9 +23,11 @@ from colmap_affrect.project.report import ReconstructionReport, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.stages.context import Context, Resources
+from colmap_affrect.stages.copy import copy_verified, is_copy
 from colmap_affrect.stages.escalate import escalate, pair_levels
 from colmap_affrect.stages.extract import Inputs, extract, write_descriptors
 from colmap_affrect.stages.map import (
+    image_names,
     intrinsics_given,
     map_images,
     num_verified_pairs,
@@ -57,7 +62,7 @@ class InputOptions:
     masks: MaskOptions = field(default_factory=MaskOptions)
     pairs: PairOptions = field(default_factory=PairOptions)
     verification: VerificationOptions = field(default_factory=VerificationOptions)
-    mapping: MapperOptions = field(default_factory=IncrementalOptions)
+    mapping: MapperOptions = field(default_factory=SparseOptions)
     image_list_path: Path | None = None
     from_database: Path | None = None
     resources: Resources = field(default_factory=Resources)
@@ -81,10 +86,12 @@ class RunOptions(InputOptions):
         recipe: options of extraction and matching.
         database_descriptors: also write descriptors into the database, as COLMAP's matchers
             need them.
+        extend: register the photographs into this model instead of beginning one.
     """
 
     recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
     database_descriptors: bool = False
+    extend: Extension | None = None
 
 
 def run(
@@ -118,7 +125,10 @@ def run(
     context = Context(Workspace(output_path), options.resources, executor, progress)
     mapper = MAPPERS.make(options.mapping)
     inputs = options.inputs(image_path)
-    inputs.names()  # refuses what cannot be read before anything is made
+    names = inputs.names()  # refuses what cannot be read before anything is made
+    if options.extend:
+        require_extends(mapper.options)
+        existing_names(options.extend.model_path, names)
     later = {"pairs": options.pairs, "verify": options.verification, "map": mapper.options}
     with context.workspace.locked():
         reports = [
@@ -131,30 +141,75 @@ def run(
             reports.append(escalate(context, options.recipe.escalate))
         if options.database_descriptors:
             write_descriptors(context)
-        return map_and_report(context, mapper, earlier=reports)
+        return map_and_report(context, mapper, options.extend, earlier=reports)
+
+
+def map_from_database(
+    database_path: Path,
+    output_path: Path,
+    *,
+    image_path: Path | None = None,
+    mapping: MapperOptions | None = None,
+    verification: VerificationOptions | None = None,
+    extend: Extension | None = None,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> ReconstructionReport:
+    """Map a database of any program; it is copied and stays as it is.
+
+    Args:
+        database_path: COLMAP database with matches; pairs without two-view geometry are verified.
+        output_path: folder for all results, made if missing.
+        image_path: folder of the photographs, for the colours of the points.
+        mapping: mapper and its options.
+        verification: of pairs that are not verified yet.
+        extend: register the images into this model instead of beginning one.
+        overwrite: discard results that are there.
+        progress: where to show progress.
+
+    Returns:
+        The report that is also written to ``report.json``.
+
+    Raises:
+        AffrectError: for anything that the caller can mend; what is done stays.
+    """
+    mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
+    schema_version(database_path)  # refuses what is no database before anything is made
+    context = Context(Workspace(output_path), progress=progress)
+    with context.workspace.locked():
+        report = copy_verified(
+            context,
+            database_path,
+            image_path,
+            verification or VerificationOptions(),
+            overwrite=overwrite,
+        )
+        return map_and_report(context, mapper, extend, earlier=[report])
 
 
 def map_and_report(
     context: Context,
     mapper: Mapper,
+    extend: Extension | None = None,
     *,
     earlier: Sequence[StageReport] = (),
     overwrite: bool = False,
 ) -> ReconstructionReport:
     """Map a verified workspace and write ``report.json``."""
     workspace, options = context.workspace, mapper.options
-    report, models = map_images(context, mapper, overwrite=overwrite)
-    names = Inputs.recorded(workspace).names()
+    before = existing_names(extend.model_path, image_names(workspace)) if extend else []
+    report, models = map_images(context, mapper, extend, overwrite=overwrite)
+    names, copied = image_names(workspace), is_copy(workspace)
     verification = recorded_verification(workspace)
     given = intrinsics_given(workspace)
     result = ReconstructionReport(
         images_total=len(names),
         unregistered=unregistered(context, names, models),
         models=tuple(models),
-        num_pairs=len(listed_pairs(context)),
+        num_pairs=num_matched_pairs(workspace.database) if copied else len(listed_pairs(context)),
         num_verified_pairs=num_verified_pairs(workspace),
         stages=(*earlier, report),
-        recipe=workspace.recipe(),
+        recipe="" if copied else workspace.recipe(),
         versions=installed_versions(),
         presets=(verification.preset_name, options.preset_name),
         verification=verification.to_mapping(),
@@ -163,7 +218,8 @@ def map_and_report(
             "verification": verification_differences(verification),
             "mapping": mapper.differences(intrinsics_given=given),
         },
-        pair_levels=pair_levels(context),
+        pair_levels={} if copied else pair_levels(context),
+        extended=tuple(before),
     )
     replace_text(workspace.report, result.to_json())
     return result

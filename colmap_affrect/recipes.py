@@ -155,19 +155,23 @@ class Recipe:
 
         Args:
             preset: ``sparse`` or ``colmap``.
-            name: of the mapper; that of the recipe by default.
+            name: of the mapper; by default that of the recipe, or of the preset.
             values: win over those of the recipe.
 
         Raises:
             OptionError: for an unknown mapper or option.
         """
         own = dict(self.mapping)
-        recipes_name = str(own.pop("name", MAPPERS.default))
+        recipes_name = str(own.pop("name", DEFAULT_MAPPERS.get(preset, MAPPERS.default)))
         name = name or recipes_name
         if name != recipes_name:
             own = {}
         options: MapperOptions = MAPPERS.part(name).Options.preset(preset, **{**own, **values})
         return options
+
+
+DEFAULT_MAPPERS = {"sparse": MAPPERS.default, "colmap": "incremental"}
+"""The mapper of each preset: ``colmap`` is what COLMAP does by default."""
 
 
 def recipe_folder() -> Path:

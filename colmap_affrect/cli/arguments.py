@@ -164,6 +164,20 @@ MAPPER = (
 )  # fmt: skip
 
 
+COPIED = (
+    _path("--from-database", "FILE",
+        "map this COLMAP database of any program, verified or matched; it is copied"),
+    _path("--image-path", "PATH",
+        "folder of its photographs, for the colours of the points (with --from-database)"),
+)  # fmt: skip
+EXTEND = (
+    _path("--extend", "MODEL",
+        "register new photographs into this COLMAP model, whose poses and cameras stay; it may be "
+        "of another program, and its photographs must be among those given"),
+    _flag("--refine-existing", "let the poses and cameras of --extend move"),
+)  # fmt: skip
+
+
 def seed(what: str = "of verification and mapping", default: int | None = None) -> Option:
     text = f"seed {what} (default: 0)"
     return _value("--random-seed", "N", text, type=int, default=default)

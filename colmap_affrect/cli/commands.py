@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from colmap_affrect.comparison.results import Comparison
     from colmap_affrect.images.photographs import CameraOptions, MaskOptions
     from colmap_affrect.mappers.base import MapperOptions
+    from colmap_affrect.mappers.existing import Extension
     from colmap_affrect.pairs.base import PairOptions
     from colmap_affrect.parallel.executor import Executor
     from colmap_affrect.recipes import Recipe
@@ -36,6 +37,7 @@ def run(options: argparse.Namespace) -> int:
     given = pipeline.RunOptions(
         recipe=recipe,
         database_descriptors=options.database_descriptors,
+        extend=_extension(options),
         **_inputs(options, recipe),
     )
     with _executor(options) as executor:
@@ -62,6 +64,16 @@ def _inputs(options: argparse.Namespace, recipe: Recipe | None = None) -> dict[s
         "from_database": options.from_database,
         "resources": _resources(options),
     }
+
+
+def _extension(options: argparse.Namespace) -> Extension | None:
+    from colmap_affrect.mappers.existing import Extension
+
+    if options.extend:
+        return Extension(options.extend, options.refine_existing)
+    if options.refine_existing:
+        raise OptionError("--refine-existing: only with --extend MODEL")
+    return None
 
 
 def _recipe(options: argparse.Namespace) -> Recipe:
@@ -266,11 +278,26 @@ def escalate(options: argparse.Namespace) -> int:
 
 def map(options: argparse.Namespace) -> int:
     from colmap_affrect.mappers.base import MAPPERS
-    from colmap_affrect.pipeline import map_and_report
+    from colmap_affrect.pipeline import map_and_report, map_from_database
 
+    extend = _extension(options)
+    if options.from_database:
+        report = map_from_database(
+            options.from_database,
+            options.output_path,
+            image_path=options.image_path,
+            mapping=_mapping(options),
+            verification=_verification(options),
+            extend=extend,
+            overwrite=options.overwrite,
+            progress=_progress(options),
+        )
+        return _print_reconstruction(report, options)
+    if options.image_path:
+        raise OptionError("--image-path: only with --from-database; else that of extract is used")
     with _context(options) as context:
         mapper = MAPPERS.make(_mapping(options, recorded=context.workspace.planned("map")))
-        report = map_and_report(context, mapper, overwrite=options.overwrite)
+        report = map_and_report(context, mapper, extend, overwrite=options.overwrite)
     return _print_reconstruction(report, options)
 
 

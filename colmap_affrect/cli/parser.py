@@ -24,6 +24,8 @@ examples:
   colmap-affrect match   --output-path out
   colmap-affrect verify  --output-path out
   colmap-affrect map     --output-path out
+  colmap-affrect map     --output-path out --from-database any.db --image-path photos
+  colmap-affrect run --image-path all-photos --output-path out --extend finished/sparse/0
   colmap-affrect run --image-path photos --output-path out --recipe on-demand
   colmap-affrect run --image-path photos --output-path out --recipe depth-planes-recommended \\
       --depth-path depth
@@ -85,7 +87,7 @@ COMMANDS: dict[str, Command] = {
     "run": (commands.run, "all stages: photographs in, COLMAP model out",
         (*args.RESULTS, *args.IMAGES, args.DESCRIPTORS, *args.recipe(), args.MATCHER,
         *args.RESOURCES, args.SCHEDULER, *args.DEPTH, *args.PAIRS, args.PRESET, *args.MAPPER,
-        args.seed(), args.json())),
+        *args.EXTEND, args.seed(), args.json())),
     "extract": (commands.extract, "features into features.h5 and database.db",
         (*args.RESULTS, *args.IMAGES, args.DESCRIPTORS, *args.recipe(), args.MATCHER,
         *args.RESOURCES, args.SCHEDULER, *args.DEPTH)),
@@ -100,7 +102,8 @@ COMMANDS: dict[str, Command] = {
         (*args.RESULTS, args.setting("escalate.min_num_tracks=10"), *args.RESOURCES,
             args.SCHEDULER)),
     "map": (commands.map, "COLMAP models into sparse/",
-        (*args.RESULTS, args.PRESET, *args.MAPPER, args.seed(), args.json())),
+        (*args.RESULTS, *args.COPIED, *args.EXTEND, args.PRESET, *args.MAPPER, args.seed(),
+        args.json())),
     "compare": (commands.compare,
         "how many photographs, and which, COLMAP's SIFT and recipes register; with pictures",
         (*args.RESULTS, *args.IMAGES, *args.COMPARISON, *args.RESOURCES, *args.DEPTH,

@@ -14,16 +14,20 @@ Result = TypeVar("Result")
 POLL_S = 0.2
 
 
-def run_cancellable(call: Callable[[pycolmap.CancellationToken], Result]) -> Result:
+def run_cancellable(
+    call: Callable[[pycolmap.CancellationToken], Result],
+    token: pycolmap.CancellationToken | None = None,
+) -> Result:
     """Run ``call`` in a thread; on Ctrl-C cancel it, wait until it has ended, and re-raise.
 
     First, memory that this process has freed goes back to the system.
 
     Args:
         call: takes the token that pycolmap's call must be given.
+        token: of the caller, who may cancel too; by default a new one.
     """
     return_freed_memory()
-    token = pycolmap.CancellationToken()
+    token = token or pycolmap.CancellationToken()
     outcome: list[Result] = []
     failure: list[BaseException] = []
     # Not Thread.join: interrupted in Python 3.11, it takes the running thread for ended, and

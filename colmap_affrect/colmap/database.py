@@ -195,6 +195,25 @@ def geometry_digest(path: Path) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
+def num_matched_pairs(path: Path) -> int:
+    """Return the number of pairs that have raw matches or a two-view geometry with inliers."""
+    with open_database(path) as database:
+        found = (database.read_num_matches(), database.read_two_view_geometry_num_inliers())
+    return len(
+        {pair for pairs, counts in found for pair, n in zip(pairs, counts, strict=True) if n}
+    )
+
+
+def keypoint_counts(path: Path) -> dict[str, int]:
+    """Return the number of keypoints of each image that has some on record, also none, by name."""
+    with open_database(path) as database:
+        return {
+            image.name: database.num_keypoints_for_image(image.image_id)
+            for image in database.read_all_images()
+            if database.exists_keypoints(image.image_id)
+        }
+
+
 def num_unverified_pairs(path: Path) -> int:
     """Return the number of pairs that have raw matches and no two-view geometry, good or bad."""
     with open_database(path) as database:

@@ -75,6 +75,20 @@ def copy_database(source: Path, target: Path) -> None:
     new.replace(target)
 
 
+def copy_with_frames(source: Path, target: Path) -> None:
+    """Copy a database with all its content; images without a frame get one.
+
+    Raises:
+        DatabaseError: as :func:`copy_database`.
+    """
+    partial = target.with_name(target.name + ".partial")
+    partial.unlink(missing_ok=True)
+    copy_database(source, partial)
+    with open_database(partial) as database:
+        _add_frames(database)
+    partial.replace(target)
+
+
 def copy_without_features(source: Path, target: Path) -> None:
     """Copy cameras, rigs, frames, images and pose priors of a database, and nothing else.
 

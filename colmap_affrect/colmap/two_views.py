@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.poses import Pose
 
 PLANAR = (
     pycolmap.TwoViewGeometryConfiguration.PLANAR,
@@ -18,6 +20,10 @@ PLANAR = (
     pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
 )
 """Pairs that a homography explains: their epipolar geometry is arbitrary."""
+
+
+MIN_TRANSLATION = 1e-9
+"""Of a decomposed homography, in units of the distance of its plane."""
 
 
 @dataclass(frozen=True)
@@ -86,3 +92,21 @@ def keypoint_shapes(keypoints: NDArray[np.floating]) -> NDArray[np.float64] | No
         cosines, sines = scales * np.cos(angles), scales * np.sin(angles)
         return np.asarray(np.stack([cosines, -sines, sines, cosines], axis=1).reshape(-1, 2, 2))
     return None
+
+
+def decomposed_homography(
+    homography: NDArray[np.float64], cameras: tuple[pycolmap.Camera, pycolmap.Camera]
+) -> list[Pose]:
+    """Return the relative poses into which a homography of px can be decomposed.
+
+    Translations have length 1; a homography of a pure rotation has none.
+    """
+    matrix1, matrix2 = (np.asarray(c.calibration_matrix(), np.float64) for c in cameras)
+    normalized = np.linalg.inv(matrix2) @ homography @ matrix1
+    _, rotations, translations, _ = cv2.decomposeHomographyMat(normalized, np.eye(3))
+    lengths = [float(np.linalg.norm(translation)) for translation in translations]
+    return [
+        (np.asarray(rotation, np.float64), np.asarray(translation, np.float64).ravel() / length)
+        for rotation, translation, length in zip(rotations, translations, lengths, strict=True)
+        if length > MIN_TRANSLATION
+    ]

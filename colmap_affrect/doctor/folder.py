@@ -15,7 +15,7 @@ from colmap_affrect.doctor.findings import OWN_ADVICE, SAME_RUN, Findings, witho
 from colmap_affrect.errors import AffrectError, WorkspaceError
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.stores import pair_key
-from colmap_affrect.project.workspace import STAGES, Workspace
+from colmap_affrect.project.workspace import COPY_STAGES, STAGES, Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
 from colmap_affrect.stages.map import INPUTS
@@ -106,7 +106,7 @@ class _FolderExamination:
         try:
             record = workspace.recorded()
             done = [stage for stage in STAGES if stage in record.get("begun", [])]
-            wanted = list(STAGES)
+            wanted = list(COPY_STAGES if "copy" in done else STAGES[1:])
             if "extract" in done:
                 Inputs.recorded(workspace)
                 if not recorded_extraction(workspace).escalation:
@@ -203,7 +203,7 @@ class _FolderExamination:
         except (OSError, UnicodeDecodeError):
             self._add("map-unfinished", sparse)
             return
-        if made_from != inputs:
+        if made_from.partition(" ")[0] != inputs:
             self._add("map-stale", sparse)
         folders = [path for path in sparse.iterdir() if path.name.isdigit()]
         sizes = []

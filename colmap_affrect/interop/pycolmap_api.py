@@ -1,7 +1,7 @@
 """Functions with the names and signatures of pycolmap's, for scripts that call those.
 
 ``pycolmap.`` becomes ``colmap_affrect.`` in ``extract_features``, ``match_exhaustive`` and
-``match_image_pairs``, and ``pycolmap.incremental_mapping`` follows unchanged. Arguments of
+``match_image_pairs``; ``incremental_mapping`` follows, pycolmap's or ours. Arguments of
 pycolmap that say how photographs, cameras and pairs are read mean the same; those that describe
 SIFT have no meaning here and are refused. What a database has no place for (descriptors, scores,
 the record of options) is kept in a folder beside it, ``x.affrect`` for ``x.db``: it makes the
@@ -10,17 +10,25 @@ functions go on where an earlier call stopped.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import refuse_wrong_matches
+from colmap_affrect.colmap.database import image_ids, open_database, refuse_wrong_matches
+from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.colmap.native_options import differences, flat_values
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.colmap.verification import verify as verify_database
 from colmap_affrect.errors import OptionError, PairListError
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+from colmap_affrect.mappers.attempts import map_database
+from colmap_affrect.mappers.base import MAPPERS, MapperOptions, MappingTask
+from colmap_affrect.mappers.existing import Extension, read_existing
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.options import CUSTOM, Options, flat, suggestion
 from colmap_affrect.pairs.base import Pair
@@ -151,6 +159,7 @@ def verify(
     database_path: PathLike,
     options: GivenVerification = None,
     *,
+    pairs_path: PathLike | None = None,
     random_seed: int | None = None,
 ) -> None:
     """Estimate the two-view geometries of the matched pairs of any database that lack one.
@@ -158,13 +167,157 @@ def verify(
     As ``pycolmap.geometric_verification``, with the preset for sparse sets; every match is
     checked first, because one that points at no keypoint ends the process inside COLMAP.
 
+    Args:
+        database_path: any COLMAP database.
+        options: ours, or those of pycolmap that have a counterpart.
+        pairs_path: verify these pairs only, two names per line.
+        random_seed: by default that of the options, which is 0.
+
     Raises:
         DatabaseError: when the database cannot be used, or has such matches.
     """
     path = Path(database_path)
     verification = _verification_options(options, random_seed)
     refuse_wrong_matches(path)
-    verify_database(path, verification)
+    if pairs_path is None:
+        verify_database(path, verification)
+    else:
+        _verify_pairs(path, read_pairs(Path(pairs_path), list(image_ids(path))), verification)
+
+
+def _verify_pairs(path: Path, pairs: Sequence[Pair], verification: VerificationOptions) -> None:
+    """Verify in a copy that has the matches of these pairs only, and take over what is found."""
+    ids = image_ids(path)
+    wanted = {(min(pair), max(pair)) for pair in ((ids[one], ids[two]) for one, two in pairs)}
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        copy = Path(folder) / "database.db"
+        copy_database(path, copy)
+        with open_database(copy) as database:
+            for pair_id in database.read_num_matches()[0]:
+                pair = pycolmap.pair_id_to_image_pair(pair_id)
+                if pair not in wanted:
+                    database.delete_matches(*pair)
+        verify_database(copy, verification)
+        with open_database(copy) as verified, open_database(path) as database:
+            for pair in sorted(wanted):
+                if database.exists_two_view_geometry(*pair):
+                    continue
+                if verified.exists_two_view_geometry(*pair):
+                    geometry = verified.read_two_view_geometry(*pair)
+                    database.write_two_view_geometry(*pair, geometry)
+
+
+def incremental_mapping(
+    database_path: PathLike,
+    image_path: PathLike,
+    output_path: PathLike,
+    options: pycolmap.IncrementalPipelineOptions | Mapping[str, Any] | None = None,
+    input_path: PathLike = "",
+    initial_image_pair_callback: Callable[[], None] | None = None,
+    next_image_callback: Callable[[], None] | None = None,
+    cancellation_token: pycolmap.CancellationToken | None = None,
+) -> dict[int, pycolmap.Reconstruction]:
+    """Map any verified database by our mapper and write the models as pycolmap does.
+
+    Args:
+        database_path: COLMAP database with two-view geometries.
+        image_path: folder of the photographs, for the colours of the points; empty for none.
+        output_path: models are written to 0, 1, ... in it, or, with ``input_path``, into it.
+        options: what differs from pycolmap's defaults wins over our preset for sparse sets.
+        input_path: a model to be extended. Its poses and cameras stay with
+            ``fix_existing_frames``.
+        initial_image_pair_callback: called when a first pair is registered.
+        next_image_callback: called for every further image.
+        cancellation_token: stops mapping when it is cancelled.
+
+    Returns:
+        The models by the number of their folder, largest first.
+
+    Raises:
+        AffrectError: for anything that the caller can mend.
+        InterruptedError: when mapping was cancelled, as by pycolmap.
+    """
+    native = _pipeline_options(options)
+    mapper = MAPPERS.make(_mapper_options(native))
+    database, output = Path(database_path), Path(output_path)
+    refuse_wrong_matches(database)
+    existing = None
+    if _given_path(input_path):
+        extension = Extension(Path(input_path), refine_existing=not native.fix_existing_frames)
+        existing = read_existing(extension, database)
+    task = MappingTask(
+        database,
+        Path(image_path) if str(image_path) else None,
+        extend=existing,
+        cancellation=cancellation_token,
+    )
+    callbacks = _Callbacks(initial_image_pair_callback, next_image_callback, existing is not None)
+    output.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=output) as folder:
+        found = Path(folder) / "sparse"
+        try:
+            map_database(mapper, task, found, callbacks.show)
+        except KeyboardInterrupt as error:
+            if cancellation_token and cancellation_token.is_cancelled:
+                raise InterruptedError("Operation cancelled") from error
+            raise
+        models = {int(path.name): pycolmap.Reconstruction(path) for path in found.iterdir()}
+        for index in models:
+            target = output if existing else output / str(index)
+            shutil.copytree(found / str(index), target, dirs_exist_ok=True)
+    return dict(sorted(models.items()))
+
+
+@dataclass
+class _Callbacks:
+    """pycolmap's callbacks, told of numbers of registered images."""
+
+    begun: Callable[[], None] | None
+    following: Callable[[], None] | None
+    extends: bool
+    count: int = 0
+
+    def show(self, number: int) -> None:
+        first = 0
+        if not self.count:
+            first = number if self.extends else min(number, 2)
+            if self.begun:
+                self.begun()
+        self.count += number
+        for _ in range(number - first):
+            if self.following:
+                self.following()
+
+
+def _pipeline_options(given: object) -> pycolmap.IncrementalPipelineOptions:
+    if isinstance(given, pycolmap.IncrementalPipelineOptions):
+        return given
+    if given is not None and not isinstance(given, Mapping):
+        raise OptionError(f"options: {type(given).__name__} does not apply here")
+    try:
+        return pycolmap.IncrementalPipelineOptions(dict(given or {}))
+    except (AttributeError, TypeError, ValueError, RuntimeError) as error:
+        raise OptionError(f"options: {' '.join(str(error).split())}") from error
+
+
+SET_OTHERWISE = ("random_seed", "image_path", "fix_existing_frames")
+"""Options of pycolmap's mapper, in any section, that reach ours by other ways."""
+
+
+def _mapper_options(native: pycolmap.IncrementalPipelineOptions) -> MapperOptions:
+    """Translate what differs from pycolmap's defaults into options of our mapper."""
+    usual = pycolmap.IncrementalPipelineOptions()
+    known = flat_values(usual)
+    for key, value in flat_values(native).items():
+        if isinstance(value, list | set) and value != known[key]:
+            raise OptionError(f"options: {key}={value} cannot be carried over")
+    values = differences(native, usual)
+    seed = {"random_seed": native.random_seed} if "random_seed" in values else {}
+    kept = {k: v for k, v in values.items() if k.rpartition(".")[2] not in SET_OTHERWISE}
+    options: MapperOptions = MAPPERS.options(
+        {"name": MAPPERS.default, **seed, "mapper_options": kept}, where="options"
+    )
+    return options
 
 
 @contextmanager

@@ -11,10 +11,17 @@ from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import registered_names, write_model
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
+from colmap_affrect.mappers.existing import require_extends
+from colmap_affrect.mappers.pair_graph import graph_of
+from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.project.report import ModelSummary
 
 ATTEMPT_SEED_STEP = 1_000_003
 """Distance of the seeds of repeated attempts, so that those of runs 0, 1, 2, ... differ."""
+
+MIN_NUM_MATCHES = 15
+"""Pairs with fewer inliers have no say in which attempt is the best; COLMAP's mappers leave them
+out."""
 
 LARGE_MODEL = 100
 """From this size on the first pair no longer matters, and another attempt takes long."""
@@ -26,8 +33,10 @@ def map_database(
     """Map a verified database and write the models to ``sparse_path``/0, /1, ..., largest first.
 
     While images are missing and the model is not large, it is tried again with another seed, as
-    often as the mapper's options allow, and the attempt with the largest model is kept.
-    ``sparse_path`` appears only once all models are written.
+    often as the mapper's options allow, and the attempt that agrees best with the verified pairs is
+    kept.
+    ``sparse_path`` appears only once all models are written. A model is extended once, and what
+    was in ``sparse_path``, perhaps this model, stays there until then.
 
     Args:
         mapper: with its options.
@@ -38,10 +47,13 @@ def map_database(
 
     Raises:
         MappingError: when COLMAP ends with an error.
-        KeyboardInterrupt: after mapping has been stopped and what it wrote removed.
+        KeyboardInterrupt: after mapping has been stopped and what it wrote, but snapshots, removed.
+        OptionError: when the mapper cannot extend a model.
     """
+    if task.extend:
+        require_extends(mapper.options)
     partial = sparse_path.with_name(sparse_path.name + ".partial")
-    for old in (partial, sparse_path):
+    for old in (partial,) if task.extend else (partial, sparse_path):
         shutil.rmtree(old, ignore_errors=True)
     num_images = len(image_ids(task.database_path))
     most_shown = 0
@@ -55,15 +67,17 @@ def map_database(
             next_image(news)
 
     try:
-        for attempt in range(mapper.options.max_num_attempts):
-            raw = partial / "raw"
-            raw.mkdir(parents=True)
-            seed = mapper.options.random_seed + attempt * ATTEMPT_SEED_STEP
-            models = mapper.map(task, raw, seed, show)
-            shutil.rmtree(raw)
-            best = max(best, sorted(models, key=_size, reverse=True), key=_size_of_largest)
-            if _size_of_largest(best)[0] >= min(num_images, LARGE_MODEL):
-                break
+        with with_snapshots(task, mapper.options, snapshots_of(sparse_path), num_images) as kept:
+            for attempt in range(1 if task.extend else mapper.options.max_num_attempts):
+                raw = partial / "raw"
+                raw.mkdir(parents=True)
+                seed = mapper.options.random_seed + attempt * ATTEMPT_SEED_STEP
+                models = mapper.map(kept, raw, seed, show)
+                shutil.rmtree(raw)
+                best = better(kept, best, sorted(models, key=_size, reverse=True))
+                if best and _size(best[0])[0] >= min(num_images, LARGE_MODEL):
+                    break
+        shutil.rmtree(sparse_path, ignore_errors=True)
         for index, model in enumerate(best):
             write_model(model.reconstruction, partial / str(index))
         partial.rename(sparse_path)
@@ -76,8 +90,14 @@ def _size(model: MappedModel) -> tuple[int, int]:
     return model.reconstruction.num_reg_images(), model.reconstruction.num_points3D()
 
 
-def _size_of_largest(models: list[MappedModel]) -> tuple[int, int]:
-    return _size(models[0]) if models else (0, 0)
+def better(
+    task: MappingTask, models: list[MappedModel], others: list[MappedModel]
+) -> list[MappedModel]:
+    """Return the models of two attempts with which the verified pairs agree best."""
+    if not models or not others:
+        return models or others
+    graph = graph_of(task, MIN_NUM_MATCHES)
+    return max(models, others, key=lambda found: graph.best_score(m.reconstruction for m in found))
 
 
 def read_models(sparse_path: Path) -> list[ModelSummary]:

@@ -25,6 +25,7 @@ from colmap_affrect.options import (
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap import pycolmap
+    from colmap_affrect.mappers.existing import ExistingModel
 
 
 class MapperOptions(PartOptions):
@@ -44,6 +45,9 @@ class MapperOptions(PartOptions):
     """Other options of pycolmap's pipeline, by dotted key (``mapper.init_max_error``); they win
     over those above."""
 
+    extends: ClassVar[bool] = False
+    """The mapper can register images into an existing model, ``MappingTask.extend``."""
+
     COLMAP: ClassVar[Mapping[str, Any]] = {}
     """The preset ``colmap``: COLMAP's own defaults."""
 
@@ -59,19 +63,30 @@ class MapperOptions(PartOptions):
         return next((name for name in PRESETS if self == self.preset(name, **free)), CUSTOM)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MappingTask:
     """What to map.
 
     Attributes:
         database_path: COLMAP database with two-view geometries.
-        image_path: folder of the photographs, for the colours of the points.
+        image_path: folder of the photographs, for the colours of the points; None for no colours.
         intrinsics_given: the user gave the camera parameters.
+        extend: register images into this model; only for mappers whose options say ``extends``.
+        snapshot_path: folder of snapshots, to be gone on from; mappers may leave it unused.
+        cancellation: a token by which mapping is stopped from outside.
     """
 
     database_path: Path
-    image_path: Path
+    image_path: Path | None
     intrinsics_given: bool = False
+    extend: ExistingModel | None = None
+    snapshot_path: Path | None = None
+    cancellation: pycolmap.CancellationToken | None = None
+
+    @property
+    def colors_path(self) -> Path:
+        """A folder that exists, as pycolmap needs one also where there are no photographs."""
+        return self.image_path or self.database_path.parent
 
 
 @dataclass(frozen=True)
@@ -143,5 +158,5 @@ MAPPERS: Registry[Mapper] = Registry(
         "incremental": "colmap_affrect.mappers.incremental:IncrementalMapper",
         "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
     },
-    default="incremental",
+    default="sparse",
 )

@@ -66,7 +66,7 @@ class GlobalMapper:
         """See :class:`colmap_affrect.mappers.base.Mapper`; all images register at once."""
         native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
         values = differences(native, pycolmap.GlobalPipelineOptions())
-        map_globally(task.database_path, task.image_path, output_path, values)
+        map_globally(task.database_path, task.colors_path, output_path, values)
         models = [MappedModel(read_model(path)) for path in sorted(output_path.iterdir())]
         show(max((model.reconstruction.num_reg_images() for model in models), default=0))
         return models

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
+from colmap_affrect.colmap.database import image_ids
+from colmap_affrect.colmap.model_files import registered_names
 from colmap_affrect.colmap.native_options import Plain, differences, resolve, set_values
 from colmap_affrect.errors import MappingError, OptionError
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
+from colmap_affrect.mappers.existing import ExistingModel
+from colmap_affrect.mappers.snapshots import (
+    SNAPSHOT_FRAMES,
+    drop_old_snapshots,
+    largest_snapshot,
+)
 from colmap_affrect.options import within
 
 FLAG = "--mapper-options"
@@ -19,6 +29,7 @@ FLAG = "--mapper-options"
 class PipelineOptions(MapperOptions):
     """Options of COLMAP's incremental pipeline."""
 
+    extends: ClassVar[bool] = True
     init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0
     init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50
     abs_pose_min_num_inliers: Annotated[int, within(3, 1_000_000)] = 12
@@ -64,30 +75,18 @@ class IncrementalMapper:
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
-        count = 0
-
-        def add(number: int) -> None:
-            nonlocal count
-            count += number
-            show(count)
-
         native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
+        if task.image_path is None:
+            native.extract_colors = False
+        call = _Call(task, native, output_path, show)
         try:
-            models = run_cancellable(
-                lambda token: pycolmap.incremental_mapping(
-                    task.database_path,
-                    task.image_path,
-                    output_path,
-                    options=native,
-                    initial_image_pair_callback=lambda: add(2),
-                    next_image_callback=lambda: add(1),
-                    cancellation_token=token,
-                )
-            )
+            models = run_cancellable(call.models, task.cancellation)
+        except InterruptedError as error:
+            raise KeyboardInterrupt from error
         except (RuntimeError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise MappingError(f"COLMAP's incremental mapper failed: {reason}") from error
-        return [MappedModel(model) for model in models.values()]
+        return [MappedModel(model) for model in models]
 
     def native(
         self, random_seed: int, *, intrinsics_given: bool
@@ -121,3 +120,77 @@ class IncrementalMapper:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
         native = self.native(self.options.random_seed, intrinsics_given=intrinsics_given)
         return differences(native, pycolmap.IncrementalPipelineOptions())
+
+
+@dataclass
+class _Call:
+    """Calls of pycolmap that make the models of one task, and how many images they registered."""
+
+    task: MappingTask
+    options: pycolmap.IncrementalPipelineOptions
+    output_path: Path
+    show: Callable[[int], None]
+    count: int = 0
+
+    def models(self, token: pycolmap.CancellationToken) -> list[pycolmap.Reconstruction]:
+        """Map from scratch, go on from a snapshot, or extend the model of the task."""
+        task, snapshots = self.task, self.task.snapshot_path
+        if task.extend:
+            return self._extended(task.extend, token)
+        if not snapshots or self.options.snapshot_frames_freq:  # those of the user
+            return self._map(token)
+        self.options.snapshot_path = snapshots
+        self.options.snapshot_frames_freq = SNAPSHOT_FRAMES
+        snapshot = largest_snapshot(snapshots)
+        if not snapshot:
+            return self._map(token)
+        self._add(len(registered_names(snapshot)))
+        models = self._map(token, snapshot)
+        # After a model that is gone on with pycolmap begins no other.
+        found = {
+            image.name for model in models for image in model.images.values() if image.has_pose
+        }
+        self.options.image_names = sorted(image_ids(task.database_path).keys() - found)
+        return models + (self._map(token) if len(self.options.image_names) > 1 else [])
+
+    def _extended(
+        self, existing: ExistingModel, token: pycolmap.CancellationToken
+    ) -> list[pycolmap.Reconstruction]:
+        start = existing.reconstruction
+        existing.constrain(self.options)
+        self._add(len(existing.names))
+        with tempfile.TemporaryDirectory(dir=self.output_path) as folder:
+            if existing.num_other_keypoints:
+                start = pycolmap.triangulate_points(
+                    start, self.task.database_path, self.task.colors_path, folder,
+                    clear_points=False, options=self.options, cancellation_token=token,
+                )  # fmt: skip
+            start.write(folder)
+            models = self._map(token, Path(folder)) or [start]
+        for model in models:
+            existing.restore(model)
+        return models
+
+    def _map(
+        self, token: pycolmap.CancellationToken, input_path: Path | None = None
+    ) -> list[pycolmap.Reconstruction]:
+        def begun() -> None:  # also called for a model that is gone on with
+            self._add(0 if input_path else 2)
+
+        models = pycolmap.incremental_mapping(
+            self.task.database_path,
+            self.task.colors_path,
+            self.output_path,
+            options=self.options,
+            input_path=input_path or "",
+            initial_image_pair_callback=begun,
+            next_image_callback=lambda: self._add(1),
+            cancellation_token=token,
+        )
+        return list(models.values())
+
+    def _add(self, number: int) -> None:
+        self.count += number
+        self.show(self.count)
+        if self.task.snapshot_path:
+            drop_old_snapshots(self.task.snapshot_path)

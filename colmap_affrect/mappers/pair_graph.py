@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.poses import Pose, relative_pose
+from colmap_affrect.colmap.two_views import decomposed_homography
 from colmap_affrect.geometry.epipolar import sampson_errors
 from colmap_affrect.geometry.two_views import (
     Depths,
     essential_matrix,
     triangulated_depths,
 )
+from colmap_affrect.mappers.base import MappingTask
 
 PoseById = Mapping[int, Pose]
 CameraById = Mapping[int, pycolmap.Camera]
@@ -148,6 +150,10 @@ class PairGraph:
         """Return the :meth:`score` of the images that a model has registered."""
         return self.score(poses_of(model), cameras_of(model))
 
+    def best_score(self, models: Iterable[pycolmap.Reconstruction]) -> float:
+        """Return the best :meth:`score_of` any of some models, 0 without any."""
+        return max(map(self.score_of, models), default=0.0)
+
     def is_explained_by(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether a model has all images of all pairs, and no pair contradicts it."""
         poses, cameras = poses_of(model), cameras_of(model)
@@ -183,7 +189,7 @@ class PairGraph:
             matrix = geometry.cam2_from_cam1.matrix()
             candidates.append((matrix[:, :3], matrix[:, 3]))
         if pair.homography is not None:
-            candidates += _decomposed(pair.homography, camera1, camera2)
+            candidates += decomposed_homography(pair.homography, (camera1, camera2))
         found = []
         for pose in candidates:
             if np.linalg.norm(pose[1]) < 1e-9:
@@ -194,6 +200,12 @@ class PairGraph:
                 kept = Depths(depths.first[known], depths.second[known], depths.angles_deg[known])
                 found.append(RelativePose(pose, pair.matches[known], kept))
         return found
+
+
+@lru_cache(maxsize=1)
+def graph_of(task: MappingTask, min_num_matches: int) -> PairGraph:
+    """Return the graph of what is to be mapped, read once for all attempts."""
+    return PairGraph.read(task.database_path, min_num_matches)
 
 
 def poses_of(model: pycolmap.Reconstruction) -> dict[int, Pose]:
@@ -230,21 +242,6 @@ def _agrees(
     errors = sampson_errors(fundamental, focal1 * rays1, focal2 * rays2)
     sides = depths.in_front | (depths.angles_deg < MIN_ANGLE_DEG)
     return (errors <= MAX_ERROR_PX) & sides, depths
-
-
-def _decomposed(
-    homography: NDArray[np.float64], camera1: pycolmap.Camera, camera2: pycolmap.Camera
-) -> list[Pose]:
-    """Return the poses into which a homography of px can be decomposed."""
-    matrices = [np.asarray(c.calibration_matrix(), np.float64) for c in (camera1, camera2)]
-    normalized = np.linalg.inv(matrices[1]) @ homography @ matrices[0]
-    _, rotations, translations, _ = cv2.decomposeHomographyMat(normalized, np.eye(3))
-    lengths = [float(np.linalg.norm(translation)) for translation in translations]
-    return [
-        (np.asarray(rotation, np.float64), np.asarray(translation, np.float64).ravel() / length)
-        for rotation, translation, length in zip(rotations, translations, lengths, strict=True)
-        if length > 0
-    ]
 
 
 def _verified(ids: tuple[int, int], geometry: pycolmap.TwoViewGeometry) -> VerifiedPair:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -18,7 +17,7 @@ from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 from colmap_affrect.mappers.bridging import Bridges, Hypothesis, Part
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.loops import check_loops
-from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.pair_graph import PairGraph, graph_of
 
 MAX_TRIALS = 5
 """Bridges from one model that are tried before nothing more is expected to join it."""
@@ -50,22 +49,24 @@ class SparseMapper:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
         models = self._mapped(task, output_path / "all", random_seed, show)
         native = self._incremental.native(random_seed, intrinsics_given=task.intrinsics_given)
-        graph = PairGraph.read(task.database_path, native.min_num_matches)
+        graph = graph_of(task, native.min_num_matches)
         if models and graph.is_explained_by(models[0]):
             return [MappedModel(model) for model in models]
-        contradicting = check_loops(graph, native.random_seed).contradicting
+        contradicting = check_loops(graph, random_seed).contradicting
         trusted = graph.without(contradicting)
         if contradicting:
             reduced = output_path / "reduced.db"
             copy_without_pairs(task.database_path, reduced, contradicting)
-            others = self._mapped(
-                replace(task, database_path=reduced), output_path / "reduced", random_seed, show
-            )
-            models = max(models, others, key=partial(best_score, trusted))
-        joiner = Joiner(trusted, native, show)
-        joined = joiner.join(models)
+            again = replace(task, database_path=reduced, snapshot_path=None)
+            others = self._mapped(again, output_path / "reduced", random_seed, show)
+            models = max(models, others, key=trusted.best_score)
+        if task.extend:
+            task.extend.constrain(native)
+        joined = Joiner(trusted, native, show).join(models)
         for model in joined:
-            if model.bridges and native.extract_colors:
+            if task.extend:
+                task.extend.restore(model.reconstruction)
+            if model.bridges and native.extract_colors and task.image_path:
                 model.reconstruction.extract_colors_for_all_images(task.image_path)
         return joined
 
@@ -131,7 +132,8 @@ class Joiner:
         """Return a copy of a model with the images of a bridge, grown and refined from there."""
         model = copy.deepcopy(model)
         known = {model.images[i].camera_id for i in model.reg_image_ids()}
-        model.load(self.graph.cache)
+        mapper = pycolmap.IncrementalMapper(self.graph.cache)
+        mapper.begin_reconstruction(model)
         for image_id, (rotation, translation) in hypothesis.poses.items():
             image = model.images[image_id]
             if image.has_pose or image.frame is None:
@@ -141,9 +143,7 @@ class Joiner:
                 model.cameras[image.camera_id].params = parameters
             pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
             image.frame.set_cam_from_world(image.camera_id, pose)
-            model.register_frame(image.frame_id)
-        mapper = pycolmap.IncrementalMapper(self.graph.cache)
-        mapper.begin_reconstruction(model)
+            mapper.observation_manager.register_frame(image.frame_id)
         for image_id in hypothesis.poses:
             mapper.triangulate_image(self.native.get_triangulation(), image_id)
         self._refine(mapper)
@@ -185,8 +185,3 @@ class Joiner:
             native.get_global_bundle_adjustment(),
             native.get_triangulation(),
         )
-
-
-def best_score(graph: PairGraph, models: Sequence[pycolmap.Reconstruction]) -> float:
-    """Return the best score of any of some models, 0 without any."""
-    return max(map(graph.score_of, models), default=0.0)

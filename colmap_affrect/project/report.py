@@ -83,6 +83,7 @@ class ReconstructionReport:
             COLMAP's default, by pycolmap's dotted keys.
         pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
             and ``none``; empty for other recipes.
+        extended: names of the images of the model that was extended; empty where none was.
     """
 
     images_total: int
@@ -98,6 +99,7 @@ class ReconstructionReport:
     mapping: dict[str, Any]
     differs_from_colmap: dict[str, dict[str, Any]]
     pair_levels: dict[str, int] = dataclasses.field(default_factory=dict)
+    extended: tuple[str, ...] = ()
 
     @property
     def status(self) -> str:
@@ -118,6 +120,12 @@ class ReconstructionReport:
     def registered_names(self) -> tuple[str, ...]:
         """Names of the images in the largest model."""
         return self.models[0].registered_names if self.models else ()
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """Names of the images that came into the model that was extended."""
+        before = set(self.extended)
+        return tuple(name for name in self.registered_names if before and name not in before)
 
     @property
     def failures(self) -> dict[str, str]:
@@ -147,6 +155,8 @@ class ReconstructionReport:
             "mean_track_length": largest.mean_track_length,
             "mean_reprojection_error_px": largest.mean_reprojection_error_px,
             "models": [list(model.registered_names) for model in self.models],
+            "extended": list(self.extended),
+            "added": list(self.added),
             "num_pairs": self.num_pairs,
             "num_verified_pairs": self.num_verified_pairs,
             "pair_levels": self.pair_levels,
@@ -170,6 +180,9 @@ class ReconstructionReport:
         """Return one screen of text."""
         registered = len(self.registered_names)
         lines = [f"registered  {registered} of {self.images_total} images"]
+        if self.extended:
+            lines += [f"extended    {len(self.extended)} were there, {len(self.added)} came in"]
+            lines += [f"            new {name}" for name in self.added]
         lines += [f"            not {name}: {why}" for name, why in self.unregistered.items()]
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
         if self.pair_levels:

@@ -24,7 +24,9 @@ logger = logging.getLogger(__name__)
 
 LOCAL = ("image_path", "image_list_path", "from_database", "cameras")
 """Options that :meth:`Workspace.options_digest` leaves out: where files are, and cameras."""
-STAGES = ("extract", "pairs", "match", "verify", "escalate", "map")
+STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "map")
+COPY_STAGES = ("copy", "verify", "map")
+"""Of a folder in which another program's database is mapped."""
 FORMAT_VERSION = 3
 """Of ``config.toml``: counts up when a stage records other options than before."""
 
@@ -38,6 +40,8 @@ class Workspace:
     stopped; with other options it refuses, and ``overwrite`` removes its results and those of the
     stages after it. A stage that has not begun takes the options on record unless it is given
     others.
+
+    A folder begins with ``extract``, or with ``copy`` of another program's database to be mapped.
 
     Attributes:
         path: the folder.
@@ -77,6 +81,11 @@ class Workspace:
     def sparse(self) -> Path:
         """Folder of the COLMAP models 0, 1, ..."""
         return self.path / "sparse"
+
+    @property
+    def snapshots(self) -> Path:
+        """Folder of what a mapping that was interrupted goes on from."""
+        return self.path / "sparse.snapshots"
 
     @property
     def report(self) -> Path:
@@ -174,7 +183,7 @@ class Workspace:
             StaleStoreError: when other options made the results that are there.
         """
         record = self.recorded()
-        self._refuse_foreign_results(record)
+        self._refuse_foreign_results(record, stage)
         begun = record.get("begun", [])
         if overwrite:
             self._discard(stage)
@@ -229,8 +238,15 @@ class Workspace:
         options: dict[str, Any] = record[stage]
         return options
 
-    def _refuse_foreign_results(self, record: Mapping[str, Any]) -> None:
-        if "extract" in record.get("begun", []):
+    def _refuse_foreign_results(self, record: Mapping[str, Any], stage: str) -> None:
+        begun = record.get("begun", [])
+        first = {"copy": "extract", "extract": "copy"}.get(stage)
+        if first in begun:
+            raise StaleStoreError(
+                f"{self.path}: the {first} stage was run there, which {stage} cannot go on from; "
+                "use another --output-path"
+            )
+        if {"copy", "extract"} & set(begun):
             return
         database = [] if self.users_database else [self.database]
         for path in (*database, self.sparse, self.features, self.matches):
@@ -243,14 +259,14 @@ class Workspace:
     def _discard(self, stage: str) -> None:
         """Remove what a stage and those after it made."""
         first = STAGES.index(stage)
-        outdated = [self.sparse, self.report]
+        outdated = [self.sparse, self.snapshots, self.report]
         if first <= STAGES.index("verify"):
             outdated.append(self.database)
         if first <= STAGES.index("match"):
             outdated.append(self.matches)
         if first <= STAGES.index("pairs"):
             outdated.append(self.pairs)
-        if first == 0:
+        if first <= STAGES.index("extract"):
             outdated.append(self.features)
         for path in outdated:
             logger.info("overwrite: removing %s", path)

@@ -8,59 +8,112 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import verified_pairs
+from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.mappers.attempts import map_database, read_models
 from colmap_affrect.mappers.base import Mapper, MappingTask
+from colmap_affrect.mappers.existing import Extension, read_existing, require_extends
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.copy import copied_image_path, is_copy
 from colmap_affrect.stages.extract import Inputs
 from colmap_affrect.stages.verify import recorded_verification
 
 INPUTS = "inputs.sha256"
-"""File in sparse/ that names the verified pairs the models were made from."""
+"""File in sparse/ that names the verified pairs, and the extended model, they were made from."""
 
 
 def map_images(
-    context: Context, mapper: Mapper, *, overwrite: bool = False
+    context: Context,
+    mapper: Mapper,
+    extend: Extension | None = None,
+    *,
+    overwrite: bool = False,
 ) -> tuple[StageReport, list[ModelSummary]]:
-    """Reconstruct; the models are mapped anew only when the verified pairs have changed.
+    """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
 
     Args:
         context: with verified pairs.
         mapper: with its options.
+        extend: the model that images are registered into; None begins anew.
         overwrite: discard the models that are there.
+
+    Raises:
+        MappingError: when the model cannot be extended with these images.
+        StaleStoreError: when the models that are there extend another one.
     """
     start = time.perf_counter()
     workspace = context.workspace
     workspace.require("verify")
+    existing = None
+    if extend:
+        require_extends(mapper.options)
+        existing = read_existing(extend, workspace.database)  # it may be discarded now
+    inputs = _inputs(workspace, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
-    inputs = colmap_database.geometry_digest(workspace.database)
     path = workspace.sparse / INPUTS
-    if path.exists() and path.read_text() == inputs:
+    known = path.read_text() if path.exists() else ""
+    if known == inputs:
         models = read_models(workspace.sparse)
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
+    if " " in known and not extend:
+        raise StaleStoreError(
+            f"{workspace.sparse}: its model extends another one; give --extend again, or "
+            "--overwrite to map from the beginning"
+        )
     task = MappingTask(
-        workspace.database,
-        Path(Inputs.recorded(workspace).image_path),
-        intrinsics_given(workspace),
+        workspace.database, _image_path(workspace), intrinsics_given(workspace), existing
     )
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
     replace_text(path, inputs)
-    return StageReport("map", time.perf_counter() - start, len(models)), models
+    warnings = {}
+    if extend and existing and existing.num_other_keypoints:
+        warnings[str(extend.model_path)] = (
+            f"keypoints of {existing.num_other_keypoints} of its {len(existing.names)} images are "
+            "not those of the database: poses and cameras kept, points triangulated anew"
+        )
+    wall_s = time.perf_counter() - start
+    return StageReport("map", wall_s, len(models), warnings=warnings), models
+
+
+def _inputs(workspace: Workspace, extend: Extension | None) -> str:
+    """Return the digests of verified pairs and, after a space, of the model that is extended."""
+    geometry = colmap_database.geometry_digest(workspace.database)
+    if not extend:
+        return geometry
+    own = extend.model_path.resolve().is_relative_to(workspace.sparse.resolve())
+    return f"{geometry} {'own' if own else extend.digest()}"
+
+
+def _image_path(workspace: Workspace) -> Path | None:
+    if is_copy(workspace):
+        return copied_image_path(workspace)
+    return Path(Inputs.recorded(workspace).image_path)
+
+
+def image_names(workspace: Workspace) -> list[str]:
+    """Return the names of the images of a run, or of the database that was copied."""
+    if is_copy(workspace):
+        return sorted(colmap_database.image_ids(workspace.database))
+    return Inputs.recorded(workspace).names()
 
 
 def intrinsics_given(workspace: Workspace) -> bool:
-    """Tell whether the user gave the camera parameters."""
-    return bool(Inputs.recorded(workspace).cameras.params)
+    """Tell whether the user gave the camera parameters; of a copied database it is not known."""
+    return not is_copy(workspace) and bool(Inputs.recorded(workspace).cameras.params)
 
 
 def num_verified_pairs(workspace: Workspace) -> int:
     """Return the number of pairs with a two-view geometry."""
-    min_num_inliers = recorded_verification(workspace).min_num_inliers
-    return len(verified_pairs(workspace.database, min_num_inliers))
+    return len(verified_pairs(workspace.database, _min_num_inliers(workspace)))
+
+
+def _min_num_inliers(workspace: Workspace) -> int:
+    """Return how many inliers a verified pair has; another program had its own threshold."""
+    return 1 if is_copy(workspace) else recorded_verification(workspace).min_num_inliers
 
 
 def unregistered(
@@ -68,10 +121,9 @@ def unregistered(
 ) -> dict[str, str]:
     """Tell for each image outside the largest model why it is not in it."""
     workspace = context.workspace
-    num_keypoints = context.features.num_keypoints()
+    num_keypoints = colmap_database.keypoint_counts(workspace.database)
     ids = colmap_database.image_ids(workspace.database)
-    min_num_inliers = recorded_verification(workspace).min_num_inliers
-    verified = verified_pairs(workspace.database, min_num_inliers)
+    verified = verified_pairs(workspace.database, _min_num_inliers(workspace))
     in_pairs = {image_id for pair in verified for image_id in pair}
     elsewhere = {
         name: f"in another model, sparse/{index}"

@@ -1,0 +1,263 @@
+"""A finished model that new photographs are to be registered into.
+
+It may be of another program, or of an earlier run with other ids: images are told by their names,
+and cameras, poses and points are moved into a reconstruction with the ids of the database.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.model_files import RECORDS, registered_names
+from colmap_affrect.errors import MappingError, OptionError
+from colmap_affrect.mappers.base import MAPPERS, MapperOptions
+
+SAME_KEYPOINTS_PX = 1e-3
+"""Keypoints of a model this near to those of the database are the same: a model holds the
+database's own, and text files round."""
+
+SAME_POSE = 1e-6
+"""Largest difference of the elements of two poses that are the same; quaternions round."""
+
+
+@dataclass(frozen=True)
+class Extension:
+    """What is to be extended, and how.
+
+    Attributes:
+        model_path: folder of a COLMAP model, text or binary.
+        refine_existing: its poses and cameras may move; else they stay as they are.
+    """
+
+    model_path: Path
+    refine_existing: bool = False
+
+    def digest(self) -> str:
+        """Return a sha256 of the files of the model and of how it is extended."""
+        found = hashlib.sha256(str(self.refine_existing).encode())
+        for path in sorted(self.model_path.glob("*.[bt][ix][nt]")):
+            found.update(path.read_bytes())
+        return found.hexdigest()
+
+
+@dataclass(frozen=True)
+class ExistingModel:
+    """A finished model with the ids of a database.
+
+    Attributes:
+        reconstruction: all images of the database, those of the model registered.
+        names: of the images of the model, sorted.
+        refine: its poses and cameras may move.
+        num_other_keypoints: images whose keypoints in the model are not those of the database;
+            only their poses and cameras are kept, their points are to be triangulated anew.
+    """
+
+    reconstruction: pycolmap.Reconstruction
+    names: tuple[str, ...]
+    refine: bool
+    num_other_keypoints: int
+
+    @property
+    def images(self) -> list[pycolmap.Image]:
+        """The images of the model."""
+        return [self.reconstruction.image(i) for i in self.reconstruction.reg_image_ids()]
+
+    def constrain(self, native: pycolmap.IncrementalPipelineOptions) -> None:
+        """Have pycolmap's mapper keep poses, cameras and rigs, unless they may move."""
+        native.load_all_images = True  # also those of the model that no match ties to others
+        if not self.refine:
+            native.fix_existing_frames = True
+            native.constant_cameras = {image.camera_id for image in self.images}
+            native.constant_rigs = {
+                self.reconstruction.frame(image.frame_id).rig_id for image in self.images
+            }
+
+    def restore(self, model: pycolmap.Reconstruction) -> None:
+        """Give an extended model the poses that it had before, to the bit, and images it lost.
+
+        Where poses may move, the model as a whole is moved back onto them.
+        """
+        if self.refine:
+            _move_onto(model, self.images)
+        for image in self.images:
+            frame = model.frame(image.frame_id)
+            if not (frame.has_pose() and self.refine):
+                frame.set_cam_from_world(image.camera_id, image.cam_from_world())
+            if image.frame_id not in model.reg_frame_ids():
+                model.register_frame(image.frame_id)
+
+
+def require_extends(options: MapperOptions) -> None:
+    """Refuse to extend a model with a mapper that cannot.
+
+    Raises:
+        OptionError: naming those that can.
+    """
+    if not options.extends:
+        able = [name for name in MAPPERS.names() if MAPPERS.options(name).extends]
+        raise OptionError(
+            f"--extend: the {options.name} mapper cannot register images into an existing model; "
+            f"use --mapper {' or '.join(able)}"
+        )
+
+
+def existing_names(model_path: Path, known: Collection[str]) -> list[str]:
+    """Return the sorted names of the images of a model that is to be extended.
+
+    Args:
+        model_path: folder of a COLMAP model.
+        known: names of the photographs; all of the model must be among them.
+
+    Raises:
+        MappingError: when it is no model, or has images that are not known.
+    """
+    return _known_names(_read(model_path), model_path, known)
+
+
+def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
+    """Read a model and give it the ids and keypoints of a database.
+
+    Raises:
+        MappingError: when it is no model, or does not fit the database.
+    """
+    old, path = _read(extension.model_path), extension.model_path
+    with open_database(database_path) as database:
+        options = pycolmap.DatabaseCacheOptions(load_all_images=True)
+        cache = pycolmap.DatabaseCache.create(database, options)
+    new = pycolmap.Reconstruction()
+    new.load(cache)
+    ids = {image.name: image_id for image_id, image in new.images.items()}
+    names = _known_names(old, path, ids)
+    images = [(image, new.image(ids[image.name])) for image in _registered(old)]
+    _take_cameras(images, old, new, path)
+    _take_poses(images, new, path)
+    same = {mine.image_id: now.image_id for mine, now in images if _same_keypoints(mine, now)}
+    _take_points(old, new, same)
+    return ExistingModel(new, tuple(names), extension.refine_existing, len(images) - len(same))
+
+
+ImagePairs = list[tuple[pycolmap.Image, pycolmap.Image]]
+"""Images of the old model and the same ones of the database."""
+
+
+def _read(path: Path) -> pycolmap.Reconstruction:
+    if all((path / name).exists() for name in RECORDS):
+        registered_names(path)  # pycolmap's reader may never end on a damaged file
+    try:
+        return pycolmap.Reconstruction(path)
+    except (RuntimeError, ValueError) as error:
+        raise MappingError(
+            f"--extend {path}: not a COLMAP model; give the folder that holds cameras, images and "
+            f"points3D as .bin or .txt ({' '.join(str(error).split())})"
+        ) from error
+
+
+def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return [model.image(image_id) for image_id in model.reg_image_ids()]
+
+
+def _known_names(model: pycolmap.Reconstruction, path: Path, known: Collection[str]) -> list[str]:
+    names = sorted(image.name for image in _registered(model))
+    missing = [name for name in names if name not in known]
+    if not names:
+        raise MappingError(f"--extend {path}: the model has no images with poses")
+    if missing:
+        raise MappingError(
+            f"--extend {path}: {len(missing)} of its {len(names)} images, such as {missing[0]}, "
+            "are not among the photographs; give the folder with old and new ones"
+        )
+    return names
+
+
+def _take_cameras(
+    images: ImagePairs, old: pycolmap.Reconstruction, new: pycolmap.Reconstruction, path: Path
+) -> None:
+    """Replace the cameras of the database by those of the model."""
+    taken: dict[int, tuple[str, pycolmap.Camera]] = {}
+    for mine, now in images:
+        camera, mapped = old.camera(mine.camera_id), new.camera(now.camera_id)
+        if (camera.width, camera.height) != (mapped.width, mapped.height):
+            raise MappingError(
+                f"--extend {path}: {mine.name} is {camera.width} x {camera.height} px there and "
+                f"{mapped.width} x {mapped.height} px here"
+            )
+        name, other = taken.setdefault(now.camera_id, (mine.name, camera))
+        if camera.model != other.model or not np.array_equal(camera.params, other.params):
+            raise MappingError(
+                f"--extend {path}: {name} and {mine.name} have different cameras there and share "
+                "one here; use the camera mode that the model was made with, or per-image"
+            )
+        mapped.model, mapped.params = camera.model, list(camera.params)
+        mapped.has_prior_focal_length = camera.has_prior_focal_length
+
+
+def _take_poses(images: ImagePairs, new: pycolmap.Reconstruction, path: Path) -> None:
+    """Set the poses of frames, and of the sensors of a rig relative to its reference."""
+    poses = {now.data_id: mine.cam_from_world() for mine, now in images}
+    for _, now in images:
+        frame, sensor = new.frame(now.frame_id), new.camera(now.camera_id).sensor_id
+        rig = new.rig(frame.rig_id)
+        reference = [i for i in frame.data_ids if rig.is_ref_sensor(i.sensor_id)]
+        if not rig.is_ref_sensor(sensor) and reference and reference[0] in poses:
+            rig.set_sensor_from_rig(sensor, poses[now.data_id] * poses[reference[0]].inverse())
+    for image, now in images:
+        frame = new.frame(now.frame_id)
+        if not frame.has_pose():
+            frame.set_cam_from_world(now.camera_id, image.cam_from_world())
+            new.register_frame(now.frame_id)
+    for image, now in images:
+        difference = image.cam_from_world().matrix() - now.cam_from_world().matrix()
+        if np.abs(difference).max() > SAME_POSE * (
+            1 + np.abs(image.cam_from_world().translation).max()
+        ):
+            raise MappingError(
+                f"--extend {path}: the pose of {image.name} does not fit the rig it has here"
+            )
+
+
+def _same_keypoints(one: pycolmap.Image, other: pycolmap.Image) -> bool:
+    if one.num_points2D() != other.num_points2D():
+        return False
+    mine, theirs = (np.array([point.xy for point in image.points2D]) for image in (one, other))
+    return bool(np.allclose(mine, theirs, rtol=0.0, atol=SAME_KEYPOINTS_PX))
+
+
+def _take_points(
+    old: pycolmap.Reconstruction, new: pycolmap.Reconstruction, image_ids: dict[int, int]
+) -> None:
+    """Add the points that are seen in two images whose keypoints are the same."""
+    for _, point in sorted(old.points3D.items()):
+        elements = [
+            pycolmap.TrackElement(image_ids[element.image_id], element.point2D_idx)
+            for element in point.track.elements
+            if element.image_id in image_ids
+        ]
+        if len(elements) > 1:
+            new.add_point3D(point.xyz, pycolmap.Track(elements), point.color)
+
+
+def _move_onto(model: pycolmap.Reconstruction, images: list[pycolmap.Image]) -> None:
+    """Move a model by the similarity that brings its images onto their earlier poses."""
+    registered = set(model.reg_image_ids())
+    pairs = [(model.image(i.image_id), i) for i in images if i.image_id in registered]
+    centers = [
+        np.array([image.projection_center() for image in side]) for side in zip(*pairs, strict=True)
+    ]
+    product = sum(
+        then.cam_from_world().rotation.matrix().T @ now.cam_from_world().rotation.matrix()
+        for now, then in pairs
+    )
+    left, _, right = np.linalg.svd(product)
+    rotation: NDArray[np.float64] = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    spreads = [np.linalg.norm(side - side.mean(axis=0)) for side in centers]
+    scale = spreads[1] / spreads[0] if min(spreads) > 0 else 1.0
+    translation = centers[1].mean(axis=0) - scale * rotation @ centers[0].mean(axis=0)
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation))

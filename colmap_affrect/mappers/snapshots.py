@@ -1,0 +1,93 @@
+"""Snapshots of a long mapping, from which it goes on after it has been killed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from colmap_affrect.colmap.database import geometry_digest
+from colmap_affrect.colmap.model_files import registered_names
+from colmap_affrect.errors import StoreError
+from colmap_affrect.mappers.base import MapperOptions, MappingTask
+from colmap_affrect.project.atomic_files import replace_text
+
+logger = logging.getLogger(__name__)
+
+SNAPSHOT_FRAMES = 100
+"""Images between two snapshots. A model of so many is not tried again with another seed, so that
+nothing but the attempt that made it can be gone on with."""
+
+NUM_KEPT = 2
+"""A snapshot may be half written when a run is killed; the one before it is complete."""
+
+INPUTS = "inputs.sha256"
+
+
+def snapshots_of(sparse_path: Path) -> Path:
+    """Return the folder of the snapshots of models that go to a folder."""
+    return sparse_path.with_name(sparse_path.name + ".snapshots")
+
+
+@contextmanager
+def with_snapshots(
+    task: MappingTask, options: MapperOptions, folder: Path, num_images: int
+) -> Iterator[MappingTask]:
+    """Give a task a folder for snapshots; it is removed when mapping has ended.
+
+    Those that an interrupted mapping of the same pairs with the same options has left are kept
+    until then. Small sets and models that are extended have none.
+    """
+    if num_images < SNAPSHOT_FRAMES or task.extend:
+        yield task
+        return
+    made_from = [geometry_digest(task.database_path), options.to_mapping(), task.intrinsics_given]
+    digest = hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()
+    record = folder / INPUTS
+    if not (record.exists() and record.read_text() == digest):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        replace_text(record, digest)
+    try:
+        yield replace(task, snapshot_path=folder)
+    except BaseException:
+        if not any(path.is_dir() for path in folder.iterdir()):
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def largest_snapshot(folder: Path | None) -> Path | None:
+    """Return the complete snapshot with most images, of several the newest."""
+    found: list[tuple[int, str, Path]] = []
+    for path in folder.iterdir() if folder else ():
+        try:
+            found.append((len(registered_names(path)), path.name, path))
+        except StoreError:
+            continue
+    if not found:
+        return None
+    num_images, _, path = max(found)
+    logger.info("mapping goes on from a snapshot of %d images", num_images)
+    return path
+
+
+def drop_old_snapshots(folder: Path) -> None:
+    """Remove all but the newest snapshots of the largest models."""
+    folders = [path for path in folder.iterdir() if path.is_dir()]
+    if len(folders) <= NUM_KEPT:
+        return
+    sizes = {
+        path: (path / "frames.bin").stat().st_size
+        for path in folders
+        if (path / "frames.bin").exists()
+    }
+    newest = max(folders, key=lambda path: path.name)  # may still be written
+    complete = sorted((size, path.name, path) for path, size in sizes.items() if path != newest)
+    for _, _, path in complete[: -(NUM_KEPT - 1)]:
+        shutil.rmtree(path, ignore_errors=True)

@@ -1,0 +1,84 @@
+"""Copy: another program's database into the output folder, verified where it is not yet."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+
+from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap.database_copy import copy_with_frames
+from colmap_affrect.colmap.verification import VerificationOptions
+from colmap_affrect.errors import DatabaseError
+from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.verify import verify_new
+
+logger = logging.getLogger(__name__)
+
+
+def copy_verified(
+    context: Context,
+    source: Path,
+    image_path: Path | None,
+    verification: VerificationOptions,
+    *,
+    overwrite: bool = False,
+) -> StageReport:
+    """Copy a database, and verify its matched pairs that have no two-view geometry.
+
+    The copy is made anew when the original has changed since.
+
+    Args:
+        context: of a folder without a run of its own.
+        source: any COLMAP database; it stays as it is.
+        image_path: folder of the photographs; None if they are not at hand.
+        verification: of the pairs that are not verified.
+        overwrite: discard what is in the folder first.
+
+    Raises:
+        DatabaseError: when it cannot be used, or has no matches.
+    """
+    start = time.perf_counter()
+    workspace = context.workspace
+    if image_path and not image_path.is_dir():
+        raise DatabaseError(f"--image-path {image_path}: no such folder")
+    given = {"database": str(source.resolve()), "image_path": _absolute(image_path)}
+    workspace.record_options("copy", given, overwrite=overwrite)
+    if _is_older(workspace.database, source):
+        workspace.database.unlink(missing_ok=True)
+        copy_with_frames(source, workspace.database)
+    colmap_database.refuse_wrong_matches(workspace.database)
+    workspace.record_options("verify", verification.to_mapping())
+    num_pairs = colmap_database.num_matched_pairs(workspace.database)
+    if not num_pairs:
+        raise DatabaseError(f"{source}: has no matches; match its images first")
+    todo = colmap_database.num_unverified_pairs(workspace.database)
+    if todo:
+        logger.warning("%s: %d pairs have matches only; they are verified now", source, todo)
+    with context.progress.stage("verify", todo, "pairs") as advance:
+        verify_new(workspace)
+        advance(todo)
+    return StageReport("verify", time.perf_counter() - start, todo, num_pairs - todo)
+
+
+def is_copy(workspace: Workspace) -> bool:
+    """Tell whether a folder holds the copy of another program's database."""
+    return "copy" in workspace.recorded().get("begun", [])
+
+
+def copied_image_path(workspace: Workspace) -> Path | None:
+    """Return the folder of the photographs of a copied database, None if it was not given."""
+    path = workspace.require("copy")["image_path"]
+    return Path(path) if path else None
+
+
+def _absolute(path: Path | None) -> str:
+    return str(path.resolve()) if path else ""
+
+
+def _is_older(copy: Path, source: Path) -> bool:
+    files = (source, source.with_name(source.name + "-wal"))
+    newest = max((file.stat().st_mtime for file in files if file.exists()), default=0.0)
+    return not copy.exists() or copy.stat().st_mtime < newest
