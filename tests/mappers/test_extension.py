@@ -217,7 +217,7 @@ def test_mapper_that_cannot_extend_says_so(
 ) -> None:
     existing = read_existing(Extension(written(old, tmp_path / "old")), database)
     task = MappingTask(database, None, extend=existing)
-    with pytest.raises(OptionError, match=r"the global mapper cannot .* use --mapper incremental"):
+    with pytest.raises(OptionError, match=r"the global mapper cannot .* use --mapper sparse"):
         map_database(mapper_of("global"), task, tmp_path / "sparse", lambda _: None)
 
 
