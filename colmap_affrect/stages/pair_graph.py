@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import networkx
 
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.recipes import EscalateOptions
+
+T = TypeVar("T", int, str)
 
 
 def insecure_images(
@@ -35,6 +38,14 @@ def insecure_images(
     )
 
 
+def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> list[set[T]]:
+    """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
+    graph: networkx.Graph[T] = networkx.Graph()
+    graph.add_nodes_from(images)
+    graph.add_edges_from(pairs)
+    return sorted(networkx.connected_components(graph), key=lambda part: (-len(part), min(part)))
+
+
 @dataclass(frozen=True)
 class PairGraph:
     """The pairs of a set as they are now.
@@ -52,11 +63,8 @@ class PairGraph:
     @cached_property
     def components(self) -> dict[str, int]:
         """The part of the graph of verified pairs that each image is in; 0 is the largest."""
-        graph = networkx.Graph(pair for pair, count in self.num_inliers.items() if count)
-        graph.add_nodes_from(name for pair in self.num_inliers for name in pair)
-        parts = sorted(
-            networkx.connected_components(graph), key=lambda part: (-len(part), min(part))
-        )
+        verified = (pair for pair, count in self.num_inliers.items() if count)
+        parts = connected_parts(verified, (name for pair in self.num_inliers for name in pair))
         return {name: number for number, part in enumerate(parts) for name in part}
 
     def worth(self, pair: Pair) -> tuple[int, int]:
