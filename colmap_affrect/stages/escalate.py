@@ -86,6 +86,8 @@ def escalate(
     escalation = Escalation(context, options)
     if overwrite:
         escalation.undo()
+    if colmap_database.num_unverified_pairs(context.workspace.database):
+        escalation.write()  # it was killed there
     climbed: set[Pair] = set()
     total = escalation.num_steps_ahead()
     with context.progress.stage("escalate", total, "steps") as advance:
