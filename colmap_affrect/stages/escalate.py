@@ -214,7 +214,9 @@ class Escalation:
             return {
                 pair
                 for pair, found in stored
-                if not np.array_equal(database.read_matches(*map(ids.get, pair)), found.indices)
+                if not np.array_equal(
+                    database.read_matches(ids[pair[0]], ids[pair[1]]), found.indices
+                )
             }
 
     @cached_property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
@@ -58,7 +58,7 @@ class PairGraph:
 
     num_inliers: Mapping[Pair, int]
     num_consistent: Mapping[Pair, int]
-    insecure: Collection[str]
+    insecure: Set[str]
 
     @cached_property
     def components(self) -> dict[str, int]:
