@@ -73,14 +73,20 @@ class ExtractionOptions(Options):
 
 
 class EscalateOptions(Options):
-    """Which pairs climb to the rectifiers of ``escalation``, beside those that are not verified."""
+    """Which pairs climb to the rectifiers of ``escalation``: those of images that hang loosely."""
 
     strong_num_inliers: Annotated[int, within(0, 1_000_000)] = 100
-    """A pair with fewer inliers climbs too while one of its images has no pair with as many:
-    an image that hangs on weak pairs alone is verified but rarely registered."""
+    """The pairs of an image climb while none of them has as many: an image that hangs on weak
+    pairs alone is verified but rarely registered."""
     min_num_tracks: Annotated[int, within(0, 1_000_000)] = 30
-    """All pairs of an image climb when fewer of its features are in tracks through three images or
+    """The pairs of an image climb when fewer of its features are in tracks through three images or
     more: mapping registers images by such features, and COLMAP wants 30 of them."""
+    min_num_consistent: Annotated[int, within(0, 1_000_000)] = 2
+    """A pair that is not verified climbs only when so many of its matches are confirmed by the
+    matches beside them: without it hardly any pair verifies at a higher level; 0 lets all climb."""
+    num_best_pairs: Annotated[int, within(0, 1_000_000)] = 2
+    """So many pairs of an image that no verified pairs connect to the others, those with the most
+    such matches, climb all the same."""
 
 
 AnyMatcher = Annotated[SerializeAsAny[MatcherOptions], BeforeValidator(MATCHERS.options)]

@@ -27,8 +27,8 @@ from colmap_affrect.evaluation.recipe_features import RecipeFeatures
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
 from colmap_affrect.recipes import Recipe
-from colmap_affrect.stages.escalate import open_pairs
 from colmap_affrect.stages.one_pair import CachedMatcher
+from colmap_affrect.stages.pair_graph import insecure_images
 
 VERIFICATION_SEED = 0
 
@@ -156,7 +156,7 @@ class PairMatcher:
             if pair.name in best:
                 found = best[pair.name].better(found)
             inliers = {(name1, name2): found.verified_inliers}
-            is_open = bool(open_pairs(inliers, self.recipe.escalate.strong_num_inliers))
+            is_open = bool(insecure_images(inliers, self.recipe.escalate.strong_num_inliers))
             climbs = is_open and level < len(extraction.escalation)
             return found, None if climbs else finish(found)
 

@@ -1,30 +1,44 @@
 """Escalation on demand: more warps for the pairs of images that need them, and only those.
 
-Level by level (the recipe's ``escalation``; Mishkin, Matas, Perdoch, MODS, 2015) the images of
-the pairs that are still open get the features that the level adds, and these pairs are matched
-again, by these features and those of the images themselves. New matches take the place of the
-old ones only when their two-view geometry has more inliers, so that no pair loses. Two
-additions make it serve mapping and not single pairs alone:
+Level by level (the recipe's ``escalation``; Mishkin, Matas, Perdoch, MODS, 2015) images get the
+features that the level adds, and pairs are matched again, by these features and those of the
+images themselves. New matches take the place of the old ones only when their two-view geometry has
+more inliers, so that no pair loses; or, where neither is verified, when more of them confirm each
+other. Which pairs climb is decided anew after every step, by what the database holds then, and the
+lowest level that has something to do comes first, so that a killed run goes on in the same way:
 
-- A pair that is verified counts as open while one of its images has no strong pair, or few
-  features in tracks through three images.
-- Verified pairs of images that gained are matched again at the same level. Their new features
-  would otherwise be seen in two images only, and the mapper could not tie them to the rest.
+- First pairs between images that no verified pairs connect, then those of an image that is not
+  secure: without a strong pair, or with few features in tracks through three images. Images that
+  are tied well keep no pair climbing.
+- Of pairs that are not verified only those whose matches hint at a common surface
+  (:mod:`colmap_affrect.geometry.consistency`), and the best few of an image that is left outside.
+- Then the verified pairs of the images that gained, while one of the two is not secure. Their new
+  features would otherwise be seen in two images only, and the mapper could not tie them to the
+  rest.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.verification import PairVerifier, inlier_matches, verified_pairs
+from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.colmap.verification import (
+    PairVerifier,
+    inlier_matches,
+    verified_pairs,
+    verify,
+)
 from colmap_affrect.errors import ImageError
+from colmap_affrect.geometry.consistency import num_consistent_matches
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
@@ -41,6 +55,7 @@ from colmap_affrect.stages.extract import (
 from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, recorded_matching
 from colmap_affrect.stages.one_image import ImageExtractor
 from colmap_affrect.stages.one_pair import iterate_matches
+from colmap_affrect.stages.pair_graph import PairGraph, insecure_images
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import recorded_verification, verify_new
 
@@ -71,17 +86,37 @@ def escalate(
     escalation = Escalation(context, options)
     if overwrite:
         escalation.undo()
+    if colmap_database.num_unverified_pairs(context.workspace.database):
+        escalation.write()  # it was killed there
     climbed: set[Pair] = set()
-    levels = escalation.extraction.escalation
-    for level, rectifier in enumerate(levels, 1):
-        title = f"{rectifier.name} ({level} of {len(levels)})"
-        for choose in (escalation.open_pairs, lambda level=level: escalation.links(level)):
-            todo = escalation.untried(choose(), level)
-            num_steps = escalation.num_steps(todo, level)
-            with context.progress.stage(title, num_steps, "steps") as advance:
-                escalation.climb(todo, level, advance)
+    total = escalation.num_steps_ahead()
+    with context.progress.stage("escalate", total, "steps") as advance:
+        forecast = _Forecast(total, advance)
+        while work := escalation.next_work():
+            level, todo = work
+            escalation.climb(todo, level, forecast.step)
             climbed |= set(todo)
+            forecast.lower(escalation.num_steps_ahead())
+        escalation.write()
     return StageReport("escalate", time.perf_counter() - start, len(climbed))
+
+
+class _Forecast:
+    """A progress bar of steps of which most may turn out needless: it ends full all the same."""
+
+    def __init__(self, total: int, advance: Callable[[int], None]) -> None:
+        self._ahead, self._advance = total, advance
+
+    def step(self, count: int) -> None:
+        """Some steps are done."""
+        self.lower(self._ahead - count)
+
+    def lower(self, ahead: int) -> None:
+        """At most so many are left; more than were expected do not move the bar back."""
+        news = self._ahead - max(ahead, 0)
+        if news > 0:
+            self._ahead -= news
+            self._advance(news)
 
 
 def pair_levels(context: Context) -> dict[str, int]:
@@ -101,21 +136,24 @@ def pair_levels(context: Context) -> dict[str, int]:
     return counts
 
 
-def open_pairs(
-    num_inliers: Mapping[Pair, int], strong_num_inliers: int, weakly_connected: Collection[str] = ()
-) -> list[Pair]:
-    """Return the pairs that are not verified, and those of an image that mapping may well lose.
+@contextmanager
+def first_level_database(context: Context) -> Iterator[Path | None]:
+    """Give a copy of the database in which the pairs that climbed are as they were before.
 
-    Args:
-        num_inliers: of each pair, 0 where it is not verified.
-        strong_num_inliers: an image needs a pair with as many.
-        weakly_connected: images that have little in common with two others; see
-            :func:`weakly_connected_images`.
+    It is what a recipe without escalation would have made. None when no pair of the database has
+    climbed with success.
     """
-    secure = {
-        name for pair, count in num_inliers.items() if count >= strong_num_inliers for name in pair
-    }.difference(weakly_connected)
-    return [pair for pair, count in num_inliers.items() if not count or not secure.issuperset(pair)]
+    escalation = Escalation(context, EscalateOptions())
+    levels = context.matches.levels(escalation.pairs)
+    climbed = [pair for pair, count in escalation.num_inliers().items() if count and levels[pair]]
+    if not climbed:
+        yield None
+        return
+    with TemporaryDirectory(dir=context.workspace.path) as folder:
+        path = Path(folder) / "database.db"
+        copy_database(context.workspace.database, path)
+        escalation.match_first_level(climbed, path)
+        yield path
 
 
 def weakly_connected_images(
@@ -161,6 +199,25 @@ class Escalation:
         self.pairs = listed_pairs(context)
         self.features, self.matches = context.features, context.matches
         self.path = context.workspace.database
+        self.levels = range(1, len(self.extraction.rectifiers))
+        self._consistent: dict[Pair, tuple[bytes, int]] = {}
+
+    @cached_property
+    def _unwritten(self) -> set[Pair]:
+        """Pairs whose matches a killed run has stored and not put into the database."""
+        pairs = list(self.num_inliers())
+        if not pairs:
+            return set()
+        ids = colmap_database.image_ids(self.path)
+        stored = zip(pairs, self.matches.read(pairs), strict=True)
+        with colmap_database.open_database(self.path) as database:
+            return {
+                pair
+                for pair, found in stored
+                if not np.array_equal(
+                    database.read_matches(ids[pair[0]], ids[pair[1]]), found.indices
+                )
+            }
 
     @cached_property
     def extractor(self) -> ImageExtractor:
@@ -178,15 +235,60 @@ class Escalation:
                 counts[first, second] = verified.get((low, high), 0)
         return counts
 
-    def open_pairs(self) -> list[Pair]:
-        """See :func:`open_pairs`; tracks count only where there are more than two images."""
+    def graph(self) -> PairGraph:
+        """Return the pairs as the database has them; tracks count where there are three images."""
         num_inliers = self.num_inliers()
         weakly_connected: set[str] = set()
         if len({name for pair in num_inliers for name in pair}) > 2:
             weakly_connected = weakly_connected_images(
                 self.inlier_matches(), self.options.min_num_tracks
             )
-        return open_pairs(num_inliers, self.options.strong_num_inliers, weakly_connected)
+        insecure = insecure_images(num_inliers, self.options.strong_num_inliers, weakly_connected)
+        failed = [pair for pair, count in num_inliers.items() if not count]
+        return PairGraph(num_inliers, self._num_consistent(failed), insecure)
+
+    def _num_consistent(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
+        ids = colmap_database.image_ids(self.path)
+        with colmap_database.open_database(self.path) as database:
+            matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in pairs}
+        known = self._consistent
+        for pair, indices in matches.items():
+            key = indices.tobytes()
+            if known.get(pair, (b"", 0))[0] != key:
+                known[pair] = key, num_consistent_matches(*self._frames(pair, indices))
+        return {pair: known[pair][1] for pair in pairs}
+
+    def _frames(
+        self, pair: Pair, indices: NDArray[np.integer]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        first, second = (self.features.read_frames(name) for name in pair)
+        return first[indices[:, 0]], second[indices[:, 1]]
+
+    def next_work(self) -> tuple[int, list[Pair]] | None:
+        """Return the lowest level with something to do, and the pairs to match at it now.
+
+        There are none when all have been matched before a kill and only the database lacks it.
+        """
+        graph, levels = self.graph(), self.matches.levels(self.pairs)
+        tried = self.matches.tried_levels(self.pairs)
+        joining, hanging = graph.joining(self.options), graph.hanging(self.options)
+        for level in self.levels:
+            unwritten = {pair for pair in self._unwritten if tried[pair] == level}
+            for pairs in (joining, hanging, graph.links(levels, level)):
+                todo = [pair for pair in pairs if tried[pair] < level]
+                if todo or unwritten.intersection(pairs):
+                    return level, todo
+        return None
+
+    def num_steps_ahead(self) -> int:
+        """Return how many steps are left if no pair succeeds."""
+        graph, tried = self.graph(), self.matches.tried_levels(self.pairs)
+        pairs = {*graph.joining(self.options), *graph.hanging(self.options)}
+        steps = 0
+        for level in self.levels:
+            todo = [pair for pair in pairs if tried[pair] < level]
+            steps += len(self._images_to_extend(todo, level)) + len(todo)
+        return steps
 
     def inlier_matches(self) -> dict[Pair, NDArray[np.int64]]:
         """Return the (M, 2) features of each verified pair that are inliers."""
@@ -195,30 +297,19 @@ class Escalation:
         verified = inlier_matches(self.path, self.verification.min_num_inliers)
         return {(names[one], names[two]): indices for (one, two), indices in verified.items()}
 
-    def links(self, level: int) -> list[Pair]:
-        """Return the verified pairs of images that gained matches at a level."""
-        levels = self.matches.levels(self.pairs)
-        gained = {name for pair in self.pairs if levels[pair] == level for name in pair}
-        counts = self.num_inliers()
-        return [pair for pair, count in counts.items() if count and gained.intersection(pair)]
-
-    def untried(self, pairs: Sequence[Pair], level: int) -> list[Pair]:
-        """Return those of the pairs that were not matched at a level yet."""
-        tried = self.matches.tried_levels(pairs)
-        return [pair for pair in pairs if tried[pair] < level]
-
-    def num_steps(self, pairs: Sequence[Pair], level: int) -> int:
-        """Return how often :meth:`climb` will call ``advance``."""
-        return len(self._images_to_extend(pairs, level)) + len(pairs)
-
     def climb(self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]) -> None:
         """Match pairs with the features of a level and keep what has more inliers."""
         self._extend(self._images_to_extend(pairs, level), level, advance)
         if pairs:
             self._match_again(pairs, level, advance)
+        self.write()
+
+    def write(self) -> None:
+        """Bring the database up to what is stored."""
         write_images_and_keypoints(self.context)
         self._replace_matches()
         verify_new(self.context.workspace)
+        self._unwritten = set()
 
     def undo(self) -> None:
         """Bring all pairs back to level 0."""
@@ -227,8 +318,31 @@ class Escalation:
         with self.context.progress.stage("match", len(higher), "pairs") as advance:
             match_pairs(self.context, higher, self.matching, advance)
         self.matches.mark_tried(self.pairs, 0)
-        self._replace_matches()
-        verify_new(self.context.workspace)
+        self.write()
+
+    def match_first_level(self, pairs: Sequence[Pair], path: Path) -> None:
+        """Give pairs of a copy of the database the matches that they had before they climbed."""
+        ids = colmap_database.image_ids(path)
+        with closing(self._iterate_matches(pairs, 0)) as found_pairs:
+            found_matches = list(found_pairs)
+        with colmap_database.open_database(path) as database:
+            for found in found_matches:
+                first, second = (ids[name] for name in found.names)
+                colmap_database.replace_matches(database, first, second, found.indices)
+        verify(path, self.verification)
+
+    def _iterate_matches(
+        self, pairs: Sequence[Pair], level: int
+    ) -> Generator[PairMatches, None, None]:
+        return iterate_matches(
+            pairs,
+            self.features,
+            self.matching,
+            level,
+            self.context.resources,
+            self.context.executor,
+            self.extraction.features.name,
+        )
 
     def _images_to_extend(self, pairs: Sequence[Pair], level: int) -> list[str]:
         names = sorted({name for pair in pairs for name in pair})
@@ -256,8 +370,7 @@ class Escalation:
     def _match_again(
         self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]
     ) -> None:
-        verifier = PairVerifier(self.path, self.verification)
-        num_inliers = self.num_inliers()
+        verifier, graph = PairVerifier(self.path, self.verification), self.graph()
         tried: list[Pair] = []
         better: list[PairMatches] = []
 
@@ -267,23 +380,11 @@ class Escalation:
             tried.clear()
             better.clear()
 
-        matches = iterate_matches(
-            pairs,
-            self.features,
-            self.matching,
-            level,
-            self.context.resources,
-            self.context.executor,
-            self.extraction.features.name,
-        )
         try:
-            with closing(matches) as found_pairs:
+            with closing(self._iterate_matches(pairs, level)) as found_pairs:
                 for found in found_pairs:
-                    names = found.names
-                    first, second = (self.features.read_frames(name)[:, :, 2] for name in names)
-                    count = verifier.num_inliers(names, (first, second), found.indices)
-                    tried.append(names)
-                    if count > num_inliers[names]:
+                    tried.append(found.names)
+                    if self._worth(found, verifier) > graph.worth(found.names):
                         better.append(found)
                     advance(1)
                     if len(tried) == PAIRS_PER_WRITE:
@@ -291,6 +392,16 @@ class Escalation:
         finally:
             if tried:
                 record()
+
+    def _worth(self, found: PairMatches, verifier: PairVerifier) -> tuple[int, int]:
+        """Return the inliers of matches; where there are none, how many confirm each other."""
+        first, second = (self.features.read_frames(name) for name in found.names)
+        keypoints = first[:, :, 2], second[:, :, 2]
+        count = verifier.num_inliers(found.names, keypoints, found.indices)
+        if count:
+            return count, 0
+        rows, columns = found.indices.T
+        return 0, num_consistent_matches(first[rows], second[columns])
 
     def _replace_matches(self) -> None:
         """Put matches into the database where they differ from the ones there."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from shutil import rmtree
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.errors import StaleStoreError
-from colmap_affrect.mappers.attempts import map_database, read_models
+from colmap_affrect.mappers.attempts import LARGE_MODEL, map_database, read_models
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing, require_extends
 from colmap_affrect.project.atomic_files import replace_text
@@ -17,8 +20,12 @@ from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copied_image_path, is_copy
+from colmap_affrect.stages.escalate import first_level_database
 from colmap_affrect.stages.extract import Inputs
+from colmap_affrect.stages.pair_graph import connected_parts
 from colmap_affrect.stages.verify import recorded_verification
+
+logger = logging.getLogger(__name__)
 
 INPUTS = "inputs.sha256"
 """File in sparse/ that names the verified pairs, and the extended model, they were made from."""
@@ -68,6 +75,8 @@ def map_images(
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
+    if _num_registered(models) < min(num_images, LARGE_MODEL):
+        models = _or_first_level(context, mapper, task, models)
     replace_text(path, inputs)
     warnings = {}
     if extend and existing and existing.num_other_keypoints:
@@ -99,6 +108,36 @@ def image_names(workspace: Workspace) -> list[str]:
     if is_copy(workspace):
         return sorted(colmap_database.image_ids(workspace.database))
     return Inputs.recorded(workspace).names()
+
+
+def _or_first_level(
+    context: Context, mapper: Mapper, task: MappingTask, models: list[ModelSummary]
+) -> list[ModelSummary]:
+    """Keep the models of the pairs as they were before they climbed, where those have more images.
+
+    So escalation never loses an image.
+    """
+    min_num_inliers = recorded_verification(context.workspace).min_num_inliers
+    with first_level_database(context) as path:
+        parts = connected_parts(verified_pairs(path, min_num_inliers)) if path else []
+        if path is None or max(map(len, parts), default=0) <= _num_registered(models):
+            return models
+        sparse = path.with_name("sparse")
+        firsts = map_database(mapper, replace(task, database_path=path), sparse, _ignore)
+        if _num_registered(firsts) <= _num_registered(models):
+            return models
+        logger.info("the model of the pairs before they climbed has more images and is kept")
+        rmtree(context.workspace.sparse)
+        sparse.rename(context.workspace.sparse)
+    return firsts
+
+
+def _num_registered(models: Sequence[ModelSummary]) -> int:
+    return len(models[0].registered_names) if models else 0
+
+
+def _ignore(_: int) -> None:
+    pass
 
 
 def intrinsics_given(workspace: Workspace) -> bool:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,11 +16,15 @@ from results import database_content
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.project.report import StageReport
+from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.mappers.incremental import IncrementalOptions
+from colmap_affrect.progress import Progress
+from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import escalate as escalation
+from colmap_affrect.stages import map as map_stage
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, recorded_escalation
 from colmap_affrect.stages.extract import Inputs, extract
@@ -174,25 +180,6 @@ def test_trial_of_a_pair_is_what_the_database_then_holds(
         assert count == len(geometry(workspace, pair))
 
 
-@pytest.mark.parametrize(
-    ("counts", "expected"),
-    [
-        ({("a", "b"): 200, ("a", "c"): 150, ("b", "c"): 30}, []),
-        ({("a", "b"): 200, ("a", "c"): 30, ("b", "c"): 0}, [("a", "c"), ("b", "c")]),
-        ({("a", "b"): 200, ("a", "c"): 100, ("b", "c"): 0}, [("b", "c")]),
-        ({("a", "b"): 99}, [("a", "b")]),
-        ({}, []),
-    ],
-)
-def test_pairs_that_fail_and_the_only_pairs_of_an_image_are_open(counts, expected) -> None:
-    assert escalation.open_pairs(counts, 100) == expected
-
-
-def test_pairs_of_a_weakly_connected_image_are_open_however_strong() -> None:
-    counts = {("a", "b"): 200, ("a", "c"): 150, ("b", "c"): 100}
-    assert escalation.open_pairs(counts, 100, {"c"}) == [("a", "c"), ("b", "c")]
-
-
 def numbered(*rows: tuple[int, int]) -> np.ndarray:
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
@@ -235,9 +222,64 @@ def test_strong_pairs_without_a_track_of_three_climb(
     apart = {**matches, (NAMES[1], NAMES[2]): np.arange(1, 81).reshape(40, 2)}
     monkeypatch.setattr(climb, "num_inliers", lambda: chain)
     monkeypatch.setattr(climb, "inlier_matches", lambda: apart)
-    assert climb.open_pairs() == []
+    assert climb.next_work() is None
     monkeypatch.setattr(climb, "inlier_matches", lambda: matches)
-    assert climb.open_pairs() == list(chain)
+    assert climb.next_work() == (1, list(chain))
+
+
+def test_the_bar_covers_the_whole_climb_and_ends_full(before: Workspace, tmp_path: Path) -> None:
+    workspace, shown = copy(before, tmp_path), io.StringIO()
+    with workspace.locked():
+        escalation.escalate(Context(workspace, progress=Progress(shown)))
+    lines = [line for line in shown.getvalue().splitlines() if line.startswith("escalate: ")]
+    done, total = zip(*(map(int, line.split()[1].split("/")) for line in lines), strict=True)
+    assert len(set(total)) == 1
+    assert list(done) == sorted(set(done))
+    assert done[-1] == total[-1] > 1
+
+
+def test_pairs_that_climbed_can_be_had_as_they_were(
+    climbed: tuple[Workspace, StageReport], before: Workspace, tmp_path: Path
+) -> None:
+    workspace = copy(climbed[0], tmp_path)
+    assert len(geometry(workspace, HARD)) > len(geometry(before, HARD))
+    content = database_content(workspace.database)
+    with escalation.first_level_database(Context(workspace)) as path:
+        assert path is not None
+        first = SimpleNamespace(database=path)
+        for pair in (EASY, HARD):
+            assert_array_equal(geometry(first, pair), geometry(before, pair))
+    assert not path.parent.exists()
+    assert database_content(workspace.database) == content
+    with escalation.first_level_database(Context(before)) as path:
+        assert path is None
+
+
+@pytest.mark.parametrize("loses", [True, False])
+def test_the_model_before_the_climb_is_kept_where_it_has_more_images(
+    climbed: tuple[Workspace, StageReport],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    loses: bool,
+) -> None:
+    workspace, mapped = copy(climbed[0], tmp_path), []
+
+    def map_database(_, task, sparse, __):
+        is_first_level = task.database_path != workspace.database
+        mapped.append(is_first_level)
+        (sparse / "0").mkdir(parents=True)
+        (sparse / "0" / "which").write_text("first" if is_first_level else "escalated")
+        names = NAMES[:2] if is_first_level or not loses else ()
+        return [ModelSummary(tuple(names), 10, 2.0, 0.5)]
+
+    monkeypatch.setattr(map_stage, "map_database", map_database)
+    with workspace.locked():
+        mapper = MAPPERS.make(IncrementalOptions())
+        _, models = map_stage.map_images(Context(workspace), mapper)
+    assert mapped == ([False, True] if loses else [False])
+    assert len(models[0].registered_names) == 2
+    assert (workspace.sparse / "0" / "which").read_text() == ("first" if loses else "escalated")
+    assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == ["sparse"]
 
 
 def test_no_pair_that_verifies_unrectified_loses_inliers(

@@ -1,0 +1,107 @@
+"""Which pairs of a set may climb: those that would tie an image that mapping may well lose."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Collection, Iterable, Mapping, Set
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import networkx
+
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.recipes import EscalateOptions
+
+T = TypeVar("T", int, str)
+
+
+def insecure_images(
+    num_inliers: Mapping[Pair, int], strong_num_inliers: int, weakly_connected: Collection[str] = ()
+) -> set[str]:
+    """Return the images that mapping may well lose.
+
+    Args:
+        num_inliers: of each pair, 0 where it is not verified.
+        strong_num_inliers: an image needs a pair with as many.
+        weakly_connected: images that have little in common with two others; see
+            :func:`colmap_affrect.stages.escalate.weakly_connected_images`.
+    """
+    strong = {
+        name
+        for pair, count in num_inliers.items()
+        if count >= max(1, strong_num_inliers)
+        for name in pair
+    }
+    return {name for pair in num_inliers for name in pair if name not in strong}.union(
+        weakly_connected
+    )
+
+
+def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> list[set[T]]:
+    """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
+    graph: networkx.Graph[T] = networkx.Graph()
+    graph.add_nodes_from(images)
+    graph.add_edges_from(pairs)
+    return sorted(networkx.connected_components(graph), key=lambda part: (-len(part), min(part)))
+
+
+@dataclass(frozen=True)
+class PairGraph:
+    """The pairs of a set as they are now.
+
+    Attributes:
+        num_inliers: of each pair, 0 where it is not verified.
+        num_consistent: matches that confirm each other, of each pair that is not verified.
+        insecure: images that mapping may well lose.
+    """
+
+    num_inliers: Mapping[Pair, int]
+    num_consistent: Mapping[Pair, int]
+    insecure: Set[str]
+
+    @cached_property
+    def components(self) -> dict[str, int]:
+        """The part of the graph of verified pairs that each image is in; 0 is the largest."""
+        verified = (pair for pair, count in self.num_inliers.items() if count)
+        parts = connected_parts(verified, (name for pair in self.num_inliers for name in pair))
+        return {name: number for number, part in enumerate(parts) for name in part}
+
+    def worth(self, pair: Pair) -> tuple[int, int]:
+        """Return the inliers of a pair; where there are none, how many matches are consistent."""
+        return self.num_inliers[pair], self.num_consistent.get(pair, 0)
+
+    def joining(self, options: EscalateOptions) -> list[Pair]:
+        """Return the promising pairs between images that no verified pairs connect."""
+        parts = self.components
+        between = [pair for pair in self.num_inliers if parts[pair[0]] != parts[pair[1]]]
+        best: set[Pair] = set()
+        for name in (name for name, part in parts.items() if part):
+            own = [pair for pair in between if name in pair]
+            best |= set(
+                heapq.nlargest(options.num_best_pairs, own, self.num_consistent.__getitem__)
+            )
+        return [pair for pair in between if pair in best or self._is_promising(pair, options)]
+
+    def hanging(self, options: EscalateOptions) -> list[Pair]:
+        """Return the verified and the promising pairs of images that are not secure."""
+        return [
+            pair
+            for pair, count in self.num_inliers.items()
+            if not self.insecure.isdisjoint(pair) and (count or self._is_promising(pair, options))
+        ]
+
+    def _is_promising(self, pair: Pair, options: EscalateOptions) -> bool:
+        return self.num_consistent[pair] >= options.min_num_consistent
+
+    def links(self, levels: Mapping[Pair, int], level: int) -> list[Pair]:
+        """Return the verified pairs of images that gained matches at a level and need more."""
+        gained = {
+            name
+            for pair, reached in levels.items()
+            if reached == level
+            and self.num_inliers.get(pair)
+            and not self.insecure.isdisjoint(pair)
+            for name in pair
+        }
+        return [pair for pair, n in self.num_inliers.items() if n and not gained.isdisjoint(pair)]
