@@ -41,6 +41,18 @@ class Extension:
     model_path: Path
     refine_existing: bool = False
 
+    def refuse_discarding(self, output_path: Path) -> None:
+        """Refuse a model in a folder whose results are to be discarded first.
+
+        Raises:
+            OptionError: naming it.
+        """
+        if self.model_path.resolve().is_relative_to(output_path.resolve()):
+            raise OptionError(
+                f"--extend {self.model_path}: --overwrite would discard it; leave that out, or use "
+                "another --output-path"
+            )
+
     def digest(self) -> str:
         """Return a sha256 of the files of the model and of how it is extended."""
         found = hashlib.sha256(str(self.refine_existing).encode())
