@@ -127,6 +127,8 @@ def run(
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
     if options.extend:
+        if overwrite:
+            options.extend.refuse_discarding(output_path)
         require_extends(mapper.options)
         existing_names(options.extend.model_path, names)
     later = {"pairs": options.pairs, "verify": options.verification, "map": mapper.options}
@@ -175,6 +177,8 @@ def map_from_database(
     """
     mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
     schema_version(database_path)  # refuses what is no database before anything is made
+    if extend and overwrite:
+        extend.refuse_discarding(output_path)
     context = Context(Workspace(output_path), progress=progress)
     with context.workspace.locked():
         report = copy_verified(
@@ -197,6 +201,8 @@ def map_and_report(
 ) -> ReconstructionReport:
     """Map a verified workspace and write ``report.json``."""
     workspace, options = context.workspace, mapper.options
+    if extend and overwrite:
+        extend.refuse_discarding(workspace.path)
     before = existing_names(extend.model_path, image_names(workspace)) if extend else []
     report, models = map_images(context, mapper, extend, overwrite=overwrite)
     names, copied = image_names(workspace), is_copy(workspace)

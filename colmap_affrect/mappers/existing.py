@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.model_files import RECORDS, registered_names
 from colmap_affrect.errors import MappingError, OptionError
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
@@ -40,6 +41,18 @@ class Extension:
     model_path: Path
     refine_existing: bool = False
 
+    def refuse_discarding(self, output_path: Path) -> None:
+        """Refuse a model in a folder whose results are to be discarded first.
+
+        Raises:
+            OptionError: naming it.
+        """
+        if self.model_path.resolve().is_relative_to(output_path.resolve()):
+            raise OptionError(
+                f"--extend {self.model_path}: --overwrite would discard it; leave that out, or use "
+                "another --output-path"
+            )
+
     def digest(self) -> str:
         """Return a sha256 of the files of the model and of how it is extended."""
         found = hashlib.sha256(str(self.refine_existing).encode())
@@ -58,12 +71,14 @@ class ExistingModel:
         refine: its poses and cameras may move.
         num_other_keypoints: images whose keypoints in the model are not those of the database;
             only their poses and cameras are kept, their points are to be triangulated anew.
+        other_camera_models: cameras have another model than in the database.
     """
 
     reconstruction: pycolmap.Reconstruction
     names: tuple[str, ...]
     refine: bool
     num_other_keypoints: int
+    other_camera_models: bool
 
     @property
     def images(self) -> list[pycolmap.Image]:
@@ -79,6 +94,22 @@ class ExistingModel:
             native.constant_rigs = {
                 self.reconstruction.frame(image.frame_id).rig_id for image in self.images
             }
+
+    def database(self, path: Path, folder: Path) -> Path:
+        """Return a database whose cameras have the model's camera models, as COLMAP demands.
+
+        Args:
+            path: the database that the model was read for.
+            folder: where a copy is made if it is needed.
+        """
+        if not self.other_camera_models:
+            return path
+        copy = folder / "database.db"
+        copy_database(path, copy)
+        with open_database(copy) as database:
+            for camera_id in {image.camera_id for image in self.images}:
+                database.update_camera(self.reconstruction.camera(camera_id))
+        return copy
 
     def restore(self, model: pycolmap.Reconstruction) -> None:
         """Give an extended model the poses that it had before, to the bit, and images it lost.
@@ -137,11 +168,15 @@ def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
     ids = {image.name: image_id for image_id, image in new.images.items()}
     names = _known_names(old, path, ids)
     images = [(image, new.image(ids[image.name])) for image in _registered(old)]
+    models = {camera_id: camera.model for camera_id, camera in new.cameras.items()}
     _take_cameras(images, old, new, path)
+    other_models = any(camera.model != models[i] for i, camera in new.cameras.items())
     _take_poses(images, new, path)
     same = {mine.image_id: now.image_id for mine, now in images if _same_keypoints(mine, now)}
     _take_points(old, new, same)
-    return ExistingModel(new, tuple(names), extension.refine_existing, len(images) - len(same))
+    return ExistingModel(
+        new, tuple(names), extension.refine_existing, len(images) - len(same), other_models
+    )
 
 
 ImagePairs = list[tuple[pycolmap.Image, pycolmap.Image]]

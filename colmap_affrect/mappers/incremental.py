@@ -132,6 +132,9 @@ class _Call:
     show: Callable[[int], None]
     count: int = 0
 
+    def __post_init__(self) -> None:
+        self.database_path = self.task.database_path
+
     def models(self, token: pycolmap.CancellationToken) -> list[pycolmap.Reconstruction]:
         """Map from scratch, go on from a snapshot, or extend the model of the task."""
         task, snapshots = self.task, self.task.snapshot_path
@@ -159,14 +162,16 @@ class _Call:
         start = existing.reconstruction
         existing.constrain(self.options)
         self._add(len(existing.names))
-        with tempfile.TemporaryDirectory(dir=self.output_path) as folder:
+        with tempfile.TemporaryDirectory(dir=self.output_path) as name:
+            folder = Path(name)
+            self.database_path = existing.database(self.database_path, folder)
             if existing.num_other_keypoints:
                 start = pycolmap.triangulate_points(
-                    start, self.task.database_path, self.task.colors_path, folder,
+                    start, self.database_path, self.task.colors_path, folder,
                     clear_points=False, options=self.options, cancellation_token=token,
                 )  # fmt: skip
             start.write(folder)
-            models = self._map(token, Path(folder)) or [start]
+            models = self._map(token, folder) or [start]
         for model in models:
             existing.restore(model)
         return models
@@ -178,7 +183,7 @@ class _Call:
             self._add(0 if input_path else 2)
 
         models = pycolmap.incremental_mapping(
-            self.task.database_path,
+            self.database_path,
             self.task.colors_path,
             self.output_path,
             options=self.options,

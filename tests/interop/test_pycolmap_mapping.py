@@ -197,6 +197,13 @@ def test_map_from_database_extends(tmp_path: Path) -> None:
     assert report.added == tuple(sorted(set(names) - set(report.extended)))
     assert "extended    4 were there, 2 came in" in report.summary()
     assert report.to_mapping()["added"] == list(report.added)
+    own = colmap_affrect.Extension(tmp_path / "e" / "sparse" / "0")
+    with pytest.raises(OptionError, match="--overwrite would discard it"):
+        colmap_affrect.map_from_database(
+            tmp_path / "any.db", tmp_path / "e", extend=own, overwrite=True
+        )
+    again = colmap_affrect.map_from_database(tmp_path / "any.db", tmp_path / "e", extend=own)
+    assert (len(again.extended), again.added) == (len(names), ())
 
 
 def test_databases_that_cannot_be_mapped_are_one_clear_line(tmp_path: Path) -> None:

@@ -174,6 +174,27 @@ def test_rigs_get_the_poses_of_their_cameras(tmp_path: Path) -> None:
     assert existing.reconstruction.num_reg_frames() == 5
 
 
+def database_cameras(path: Path) -> list[str]:
+    with open_database(path) as database:
+        return [str(camera.todict()) for camera in database.read_all_cameras()]
+
+
+def test_cameras_may_have_another_model_than_in_the_database(
+    database: Path, old: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    other = with_other_ids(old, 0.3)
+    for camera in other.cameras.values():
+        f, cx, cy, k = camera.params
+        camera.model, camera.params = pycolmap.CameraModelId.RADIAL, [f, cx, cy, k, 0.0]
+    before = database_cameras(database)
+    existing = read_existing(Extension(written(other, tmp_path / "old")), database)
+    model, _ = extended(database, existing, tmp_path)
+    for name, pose in poses(old).items():
+        assert poses(model)[name].tobytes() == pose.tobytes()
+        assert cameras(model)[name] == cameras(other)[name]
+    assert database_cameras(database) == before
+
+
 def broken(old: pycolmap.Reconstruction, kind: str, folder: Path) -> Path:
     model = with_other_ids(old)
     first = model.image(model.reg_image_ids()[0])

@@ -53,6 +53,8 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "mean_track_length": 2.25,
         "mean_reprojection_error_px": 0.512,
         "models": [["a.png", "č d.png"], ["e.png", "f.png"]],
+        "extended": [],
+        "added": [],
         "num_pairs": 10,
         "num_verified_pairs": 3,
         "pair_levels": {"identity": 2, "asift": 1, "none": 7},

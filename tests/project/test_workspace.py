@@ -10,7 +10,10 @@ from pathlib import Path
 import pytest
 
 from colmap_affrect.errors import StaleStoreError, WorkspaceError
-from colmap_affrect.project.workspace import STAGES, Workspace
+from colmap_affrect.project.workspace import COPY_STAGES, Workspace
+from colmap_affrect.project.workspace import STAGES as ALL_STAGES
+
+STAGES = tuple(stage for stage in ALL_STAGES if stage != "copy")
 
 OPTIONS = {"image_path": "photos", "camera": {"mode": "auto"}, "sigmas": (8.0, 16.0), "size": 3}
 
@@ -118,6 +121,24 @@ def test_record_options_with_overwrite_discards_this_stage_and_later_ones(
         **{name: {"by": name} for name in (*earlier, *later)},
         stage: {"by": "somebody else"},
     }
+
+
+def test_run_and_copy_of_a_database_keep_out_of_each_others_folder(
+    finished: Workspace, tmp_path: Path
+) -> None:
+    with pytest.raises(StaleStoreError, match="the extract stage was run there, which copy cannot"):
+        finished.record_options("copy", {}, overwrite=True)
+    copied = Workspace(tmp_path / "copy")
+    copied.path.mkdir()
+    for stage in COPY_STAGES:
+        copied.record_options(stage, {"by": stage})
+    copied.database.write_bytes(b"copy")
+    assert copied.recorded()["begun"] == list(COPY_STAGES)
+    with pytest.raises(StaleStoreError, match="the copy stage was run there, which extract cannot"):
+        copied.record_options("extract", {})
+    copied.snapshots.mkdir()
+    copied.record_options("copy", {"by": "another"}, overwrite=True)
+    assert sorted(path.name for path in copied.path.iterdir()) == ["config.toml"]
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
