@@ -23,6 +23,7 @@ from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.escalate import escalate, pair_levels
 from colmap_affrect.stages.extract import Inputs, extract, write_descriptors
 from colmap_affrect.stages.map import (
+    advice,
     intrinsics_given,
     map_images,
     num_verified_pairs,
@@ -147,9 +148,10 @@ def map_and_report(
     names = Inputs.recorded(workspace).names()
     verification = recorded_verification(workspace)
     given = intrinsics_given(workspace)
+    missing = unregistered(context, names, models)
     result = ReconstructionReport(
         images_total=len(names),
-        unregistered=unregistered(context, names, models),
+        unregistered=missing,
         models=tuple(models),
         num_pairs=len(listed_pairs(context)),
         num_verified_pairs=num_verified_pairs(workspace),
@@ -164,6 +166,7 @@ def map_and_report(
             "mapping": mapper.differences(intrinsics_given=given),
         },
         pair_levels=pair_levels(context),
+        advice=advice(context, missing, models),
     )
     replace_text(workspace.report, result.to_json())
     return result

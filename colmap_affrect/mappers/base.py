@@ -7,10 +7,12 @@ A mapper of another package becomes known by an entry point of the group
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from colmap_affrect.options import (
@@ -67,11 +69,13 @@ class MappingTask:
         database_path: COLMAP database with two-view geometries.
         image_path: folder of the photographs, for the colours of the points.
         intrinsics_given: the user gave the camera parameters.
+        guided: (M, 2) features of pairs of image ids that only guided matching has matched.
     """
 
     database_path: Path
     image_path: Path
     intrinsics_given: bool = False
+    guided: Mapping[tuple[int, int], NDArray[np.integer]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -100,10 +104,12 @@ class MappedModel:
     Attributes:
         reconstruction: the model.
         bridges: in the order in which they were made.
+        taken_out: images that were certainly wrong and had to leave, with the reason.
     """
 
     reconstruction: pycolmap.Reconstruction
     bridges: tuple[Bridge, ...] = ()
+    taken_out: Mapping[str, str] = field(default_factory=dict)
 
 
 class Mapper(Protocol):
