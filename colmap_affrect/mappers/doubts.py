@@ -5,10 +5,10 @@ Doubts have two degrees: what is certainly wrong leaves the model, the rest is t
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.two_views import undistorted
 from colmap_affrect.colmap.verification import REJECTED
 from colmap_affrect.geometry.epipolar import sampson_errors
-from colmap_affrect.geometry.parallax import mirrored_share, rotation_share
+from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
 from colmap_affrect.mappers.arrivals import MIN_THREE_VIEW_POINTS
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 
@@ -55,7 +55,7 @@ MIN_WIDE_ANGLE_DEG, MIN_SHARE_WIDE = 3.0, 0.1
 """Points under smaller angles only have no depth to speak of (COLMAP drops those below 1.5)."""
 
 MAX_ANGLE_DEG = 90.0
-"""Surfaces seen by two images are then tilted by 45 degrees in both at least. Single matches
+"""To the next image. Surfaces are then tilted by 45 degrees in one of both at least: single matches
 survive that, not most of an image; repeated and symmetric structures look so."""
 
 MAX_PAIRS_OF_IMAGE, MAX_PAIRS_FOR_PARALLAX, MAX_POINTS_FOR_ANGLES = 10, 100, 2000
@@ -160,7 +160,7 @@ def _num_agreeing(model: pycolmap.Reconstruction, ids: Ids, points: tuple[Points
     relative = poses[1] * poses[0].inverse()
     x, y, z = relative.translation
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative.rotation.matrix()
-    cameras = [image.camera for image in images]
+    cameras = [_camera(image) for image in images]
     try:
         inverses = [np.linalg.inv(camera.calibration_matrix()) for camera in cameras]
     except np.linalg.LinAlgError:  # a focal length of 0
@@ -169,6 +169,16 @@ def _num_agreeing(model: pycolmap.Reconstruction, ids: Ids, points: tuple[Points
     with np.errstate(all="ignore"):  # of cameras that are impossible
         errors = sampson_errors(inverses[1].T @ essential @ inverses[0], *ideal)
         return int((errors <= MAX_ERROR * max(map(_side, cameras))).sum())
+
+
+def _camera(image: pycolmap.Image) -> pycolmap.Camera:
+    """Return the camera, which registered images always have."""
+    return cast("pycolmap.Camera", image.camera)
+
+
+def _size(image: pycolmap.Image) -> Size:
+    camera = _camera(image)
+    return camera.width, camera.height
 
 
 def _side(camera: pycolmap.Camera) -> int:
@@ -193,10 +203,10 @@ def _image_doubts(model: MappedModel, pairs: Mapping[Ids, _Pair], task: MappingT
         agreeing, total = totals[image_id]
         agreement = float(agreeing / total) if total else 1.0
         found = [
-            *([] if task.intrinsics_given else _camera_doubts(image.camera)),
+            *([] if task.intrinsics_given else _camera_doubts(_camera(image))),
             *_observation_doubts(image.num_points3D),
             *_agreement_doubts(agreement),
-            *_angle_doubts(angles[image_id]),
+            *_angle_doubts([near for near, _ in angles[image_id]]),
             *_bridge_doubts(bridges.get(image.name)),
         ]
         if found:
@@ -254,13 +264,10 @@ def _model_doubts(
     num_images, num_given = reconstruction.num_reg_images(), len(image_ids(task.database_path))
     if num_images < 3 <= num_given:
         yield f"only {num_images} of {num_given} photographs, which no third one confirms"
-    angles = list(itertools.chain.from_iterable(_angles_deg(reconstruction).values()))
+    angles = [wide for of_image in _angles_deg(reconstruction).values() for _, wide in of_image]
     some = list(pairs.items())[:: max(1, len(pairs) // MAX_PAIRS_FOR_PARALLAX)]
-    shown = {ids: (reconstruction.images[ids[0]], reconstruction.images[ids[1]]) for ids, _ in some}
-    sizes = {
-        ids: tuple((image.camera.width, image.camera.height) for image in images)
-        for ids, images in shown.items()
-    }
+    shown = {ids: tuple(reconstruction.images[i] for i in ids) for ids, _ in some}
+    sizes = {ids: (_size(first), _size(second)) for ids, (first, second) in shown.items()}
     still = [
         rotation_share(*pair.points, sizes[ids], MAX_ERROR * max(*sizes[ids][0], *sizes[ids][1]))
         >= MIN_SHARE_STILL
@@ -285,16 +292,19 @@ def _model_doubts(
             yield f"only {num_ties} points are seen by three photographs"
 
 
-def _angles_deg(model: pycolmap.Reconstruction) -> dict[int, list[float]]:
-    """Return, of some points of each image, the widest angle to a ray of another image."""
+def _angles_deg(model: pycolmap.Reconstruction) -> dict[int, list[tuple[float, float]]]:
+    """Return, of some points of each image, the angles to the next and to the farthest ray."""
     ids = sorted(model.point3D_ids())
-    found: dict[int, list[float]] = {image_id: [] for image_id in model.reg_image_ids()}
+    found: dict[int, list[tuple[float, float]]] = {i: [] for i in model.reg_image_ids()}
     for point_id in ids[:: max(1, len(ids) // MAX_POINTS_FOR_ANGLES)]:
         point = model.point3D(point_id)
         seen_by = sorted({element.image_id for element in point.track.elements})
         rays = np.array([model.images[i].projection_center() - point.xyz for i in seen_by])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        angles = np.rad2deg(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0))).max(axis=1)
-        for image_id, angle in zip(seen_by, angles, strict=True):
-            found[image_id].append(float(angle))
+        angles = np.rad2deg(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)))
+        np.fill_diagonal(angles, 0.0)
+        farthest = angles.max(axis=1)
+        np.fill_diagonal(angles, 180.0)
+        for image_id, *both in zip(seen_by, angles.min(axis=1), farthest, strict=True):
+            found[image_id].append((float(both[0]), float(both[1])))
     return found
