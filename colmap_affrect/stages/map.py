@@ -119,14 +119,14 @@ def _verified_by_name(database_path: Path, min_num_inliers: int) -> dict[str, di
 def advice(
     context: Context, missing: Collection[str], models: Sequence[ModelSummary]
 ) -> tuple[str, ...]:
-    """Say what may help when images are missing or nothing can be trusted, best first.
+    """Say what may help when images are missing, best first.
 
     Args:
         context: of a run that has been mapped.
         missing: images that are not in the largest model.
         models: all models, largest first.
     """
-    if models and models[0].is_trustworthy and not missing:
+    if not missing:
         return ()
     workspace = context.workspace
     min_num_inliers = recorded_verification(workspace).min_num_inliers
@@ -139,14 +139,12 @@ def advice(
     others = [name for name in STRONGER_RECIPES if name != workspace.recipe()]
     texts.append(f"another method, --recipe {' or '.join(others)}; compare tries several")
     between = [
-        f"{name} and {max(partners, key=lambda other: partners[other])}"
+        f"{name} and {max(inside, key=lambda other: partners[other])}"
         for name, partners in verified.items()
-        if name in missing
+        if name in missing and (inside := partners.keys() - set(missing))
     ][:NUM_BEST_PAIRS]
-    if between:
-        texts.append(f"more photographs between {', between '.join(between)}")
-    elif missing:
-        texts.append("more photographs between the missing ones and the others")
+    places = f"between {', between '.join(between)}" if between else "that show the missing places"
+    texts.append(f"more photographs {places}")
     if models and models[0].doubtful and not (inputs.masks.path or inputs.masks.camera_path):
         texts.append("--mask-path, where something moves, repeats or is written over photographs")
     return tuple(texts)

@@ -395,12 +395,12 @@ def test_missing_weights_are_one_error_with_the_way_out(tmp_path: Path) -> None:
 
 
 def test_model_that_nobody_can_trust_ends_with_3(
-    verified: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    verified: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     doubts = Doubts(model=("no parallax",))
     monkeypatch.setattr(attempts, "find_doubts", lambda *_: doubts)
     assert main(["map", "--output-path", str(verified), "--overwrite", "--quiet"]) == 3
-    printed = capsys.readouterr()
+    printed = capfd.readouterr()
     assert "doubtful    the whole model: no parallax\n" in printed.out
     assert printed.err.splitlines()[-1].startswith("error: nothing in the model can be trusted;")
     assert json.loads((verified / "report.json").read_text())["status"] == "doubtful"
