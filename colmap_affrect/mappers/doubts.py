@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import islice
+from math import ceil
 from typing import cast
 
 import numpy as np
@@ -268,18 +270,20 @@ def _model_doubts(
     some = list(pairs.items())[:: max(1, len(pairs) // MAX_PAIRS_FOR_PARALLAX)]
     shown = {ids: tuple(reconstruction.images[i] for i in ids) for ids, _ in some}
     sizes = {ids: (_size(first), _size(second)) for ids, (first, second) in shown.items()}
-    still = [
-        rotation_share(*pair.points, sizes[ids], MAX_ERROR * max(*sizes[ids][0], *sizes[ids][1]))
-        >= MIN_SHARE_STILL
+    moving = (
+        ids
         for ids, pair in some
-    ]
-    if still and np.mean(still) >= MIN_SHARE_OF_STILL_PAIRS:
+        if rotation_share(*pair.points, sizes[ids], MAX_ERROR * max(map(max, sizes[ids])))
+        < MIN_SHARE_STILL
+    )
+    max_num_moving = len(some) - ceil(MIN_SHARE_OF_STILL_PAIRS * len(some))
+    if some and next(islice(moving, max_num_moving, None), None) is None:
         yield (
             "no parallax: the camera only turned or zoomed, or the photographs are copies or "
             "crops of one another"
         )
     elif np.mean(np.array(angles or [0.0]) >= MIN_WIDE_ANGLE_DEG) < MIN_SHARE_WIDE:
-        yield f"hardly any parallax: rays to its points are {MIN_WIDE_ANGLE_DEG:g} degrees apart"
+        yield f"hardly any parallax: rays are less than {MIN_WIDE_ANGLE_DEG:g} degrees apart"
     for ids, pair in some:
         same = sizes[ids][0] == sizes[ids][1]
         if same and mirrored_share(*pair.keypoints, sizes[ids][0]) >= MIN_SHARE_MIRRORED:
