@@ -27,6 +27,7 @@ from colmap_affrect.stages.copy import copy_verified, is_copy
 from colmap_affrect.stages.escalate import escalate, pair_levels
 from colmap_affrect.stages.extract import Inputs, extract, write_descriptors
 from colmap_affrect.stages.map import (
+    advice,
     image_names,
     intrinsics_given,
     map_images,
@@ -208,9 +209,10 @@ def map_and_report(
     names, copied = image_names(workspace), is_copy(workspace)
     verification = recorded_verification(workspace)
     given = intrinsics_given(workspace)
+    missing = unregistered(context, names, models)
     result = ReconstructionReport(
         images_total=len(names),
-        unregistered=unregistered(context, names, models),
+        unregistered=missing,
         models=tuple(models),
         num_pairs=num_matched_pairs(workspace.database) if copied else len(listed_pairs(context)),
         num_verified_pairs=num_verified_pairs(workspace),
@@ -226,6 +228,7 @@ def map_and_report(
         },
         pair_levels={} if copied else pair_levels(context),
         extended=tuple(before),
+        advice=advice(context, missing, models),
     )
     replace_text(workspace.report, result.to_json())
     return result

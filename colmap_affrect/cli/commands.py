@@ -426,6 +426,10 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
         why = "one image cannot make a model" if report.images_total == 1 else "no model was found"
         print(f"error: {why}; see {options.output_path / 'report.json'}", file=sys.stderr)
         return EXIT_NO_MODEL
+    if not report.models[0].is_trustworthy:
+        where = options.output_path / "report.json"
+        print(f"error: nothing in the model can be trusted; see {where}", file=sys.stderr)
+        return EXIT_NO_MODEL
     return _exit_code(report.failures, options)
 
 

@@ -69,6 +69,8 @@ class SeedResult:
         pair_inliers: verified pairs and their numbers of inliers.
         scores: against ground truth; None where there is none.
         wall_s: seconds of ``verify`` and ``map``.
+        doubtful: images of the largest model that cannot be trusted, with the reason.
+        doubts: reasons to doubt the largest model as a whole.
     """
 
     seed: int
@@ -82,6 +84,8 @@ class SeedResult:
     pair_inliers: PairCounts
     scores: Scores
     wall_s: Mapping[str, float]
+    doubtful: Mapping[str, str] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
 
     @property
     def registered_names(self) -> tuple[str, ...]:
@@ -106,6 +110,7 @@ class SeedResult:
 
 MEASURES: dict[str, Callable[[SeedResult], float]] = {
     "registered": lambda seed: len(seed.registered_names),
+    "num_doubtful": lambda seed: len(seed.registered_names if seed.doubts else seed.doubtful),
     "num_models": lambda seed: len(seed.model_names),
     "verified_pairs": lambda seed: len(seed.pair_inliers),
     "inliers": lambda seed: sum(seed.pair_inliers.values()),
@@ -177,7 +182,7 @@ class MethodResult:
     @property
     def usually_registered(self) -> frozenset[str]:
         """Images that more than half of the seeds register."""
-        return _in_most([seed.registered_names for seed in self.seeds])
+        return in_most([seed.registered_names for seed in self.seeds])
 
     @property
     def usually_correct(self) -> frozenset[str]:
@@ -185,7 +190,7 @@ class MethodResult:
 
         Without ground truth, register.
         """
-        return _in_most([seed.correct_names for seed in self.seeds])
+        return in_most([seed.correct_names for seed in self.seeds])
 
     @property
     def stage_seconds(self) -> dict[str, float]:
@@ -237,8 +242,8 @@ def _plain(result: SeedResult | MethodResult) -> dict[str, Any]:
     return values
 
 
-def _in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
-    """Return the names that more than half of the seeds have."""
+def in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
+    """Return what more than half of the seeds name."""
     counts = Counter(name for names in names_of_seeds for name in names)
     return frozenset(name for name, count in counts.items() if 2 * count > len(names_of_seeds))
 

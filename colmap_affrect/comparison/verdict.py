@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from colmap_affrect.comparison.results import Comparison, MethodResult, Span
+from colmap_affrect.comparison.results import Comparison, MethodResult, Span, in_most
 
 REFERENCES = ("sift", "sift-affine-dsp")
 """What gains are measured against: the first of these that was run."""
@@ -16,12 +16,6 @@ REFERENCES = ("sift", "sift-affine-dsp")
 MIN_MEAN_GAIN = 0.5
 """More photographs on average over the seeds than this is a gain, though no single photograph is
 registered in most seeds that was not before."""
-
-MIN_OBSERVATIONS = 40
-"""A pose that hangs on fewer points may be chance: COLMAP asks for 30 to register an image."""
-
-MIN_TRACK_LENGTH = 2.2
-"""Below, most points are seen by two images only, which do not tie a third to them."""
 
 MIN_IMAGES = 3
 """Fewer are a pair, not a reconstruction."""
@@ -34,7 +28,7 @@ def verdict(comparison: Comparison) -> tuple[str, ...]:
     """Return the paragraphs, the most important one first."""
     rules = (
         headline, changes, seeds_disagree, wrong_poses, registered_by_none, failures,
-        few_observations, short_tracks, unstable_poses, contradictions,
+        doubts, unstable_poses, contradictions,
     )  # fmt: skip
     return tuple(text for rule in rules for text in rule(comparison))
 
@@ -206,32 +200,18 @@ def failures(comparison: Comparison) -> list[str]:
             if method.failed]  # fmt: skip
 
 
-def few_observations(comparison: Comparison) -> list[str]:
-    """Doubt gained photographs that hang on few points."""
+def doubts(comparison: Comparison) -> list[str]:
+    """Name what cannot be trusted in the models of most seeds, whatever ground truth says."""
     texts = []
-    for method, change in _gains(comparison):
-        most = {
-            name: max(seed.num_observations.get(name, 0) for seed in method.seeds)
-            for name in change.gained
-        }
-        weak = [
-            f"{name} ({num} points)" for name, num in most.items() if 0 < num < MIN_OBSERVATIONS
-        ]
-        if weak:
-            texts.append(f"Doubtful: in {method.name} few points hold {_listed(weak)}.")
+    for method in comparison.finished:
+        reasons = {name: why for seed in method.seeds for name, why in seed.doubtful.items()}
+        usual = in_most([list(seed.doubtful) for seed in method.seeds])
+        if usual:
+            some = [f"{name} ({reasons[name]})" for name in sorted(usual)]
+            texts.append(f"Doubtful: in {method.name} {_listed(some)}.")
+        for why in sorted(in_most([seed.doubts for seed in method.seeds])):
+            texts.append(f"Doubtful: the model of {method.name}, {why}.")
     return texts
-
-
-def short_tracks(comparison: Comparison) -> list[str]:
-    """Doubt gains of models in which hardly any point is seen by three images."""
-    return [
-        f"Doubtful: the mean track length of {method.name} is "
-        f"{method.span('mean_track_length').mean:.2f}; hardly any point is seen by three "
-        "photographs."
-        for method, _ in _gains(comparison)
-        if method.registered.mean >= MIN_IMAGES
-        and method.span("mean_track_length").mean < MIN_TRACK_LENGTH
-    ]
 
 
 def unstable_poses(comparison: Comparison) -> list[str]:
@@ -266,16 +246,6 @@ def contradictions(comparison: Comparison) -> list[str]:
         )
         names = {pair: images for pair, images in names.items() if worst not in pair}
     return texts
-
-
-def _gains(comparison: Comparison) -> Iterable[tuple[MethodResult, Change]]:
-    """Return the methods whose gain on the reference no ground truth confirms."""
-    reference = reference_of(comparison)
-    for method in comparison.finished:
-        if reference and method is not reference and not comparison.has_ground_truth:
-            change = Change.between(method, reference)
-            if change.is_gain:
-                yield method, change
 
 
 def _count(method: MethodResult) -> Span:

@@ -216,6 +216,8 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
             model.images[image_id].name: model.images[image_id].num_points3D
             for image_id in sorted(model.reg_image_ids())
         },
+        doubtful=largest.doubtful,
+        doubts=largest.doubts,
     )
     replace_text(result_path, json.dumps(result.to_mapping(), ensure_ascii=False))
     return result

@@ -10,7 +10,9 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import registered_names, write_model
 from colmap_affrect.errors import StoreError
+from colmap_affrect.mappers.arrivals import arrivals, read_arrivals, write_arrivals
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
+from colmap_affrect.mappers.doubts import find_doubts, without_impossible
 from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
@@ -34,9 +36,10 @@ def map_database(
 
     While images are missing and the model is not large, it is tried again with another seed, as
     often as the mapper's options allow, and the attempt that agrees best with the verified pairs is
-    kept.
-    ``sparse_path`` appears only once all models are written. A model is extended once, and what
-    was in ``sparse_path``, perhaps this model, stays there until then.
+    kept. Images that are certainly wrong are taken out first
+    (:mod:`colmap_affrect.mappers.doubts`). ``sparse_path`` appears only once all models are
+    written. A model is extended once, and what was in ``sparse_path``, perhaps this model, stays
+    there until then.
 
     Args:
         mapper: with its options.
@@ -72,18 +75,21 @@ def map_database(
                 raw = partial / "raw"
                 raw.mkdir(parents=True)
                 seed = mapper.options.random_seed + attempt * ATTEMPT_SEED_STEP
-                models = mapper.map(kept, raw, seed, show)
+                found = mapper.map(kept, raw, seed, show)
                 shutil.rmtree(raw)
-                best = better(kept, best, sorted(models, key=_size, reverse=True))
+                if not task.extend:  # whose images stay, whatever they are
+                    found = [m for m in (without_impossible(model, kept) for model in found) if m]
+                best = better(kept, best, sorted(found, key=_size, reverse=True))
                 if best and _size(best[0])[0] >= min(num_images, LARGE_MODEL):
                     break
         shutil.rmtree(sparse_path, ignore_errors=True)
         for index, model in enumerate(best):
             write_model(model.reconstruction, partial / str(index))
+            write_arrivals(model, partial / str(index))
         partial.rename(sparse_path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return [summarize(model.reconstruction) for model in best]
+    return [summarize(model, task) for model in best]
 
 
 def _size(model: MappedModel) -> tuple[int, int]:
@@ -100,8 +106,8 @@ def better(
     return max(models, others, key=lambda found: graph.best_score(m.reconstruction for m in found))
 
 
-def read_models(sparse_path: Path) -> list[ModelSummary]:
-    """Summarize the models that :func:`map_database` wrote."""
+def read_models(sparse_path: Path, task: MappingTask) -> list[ModelSummary]:
+    """Summarize the models that :func:`map_database` wrote for a task."""
     folders = sorted(
         (p for p in sparse_path.iterdir() if p.name.isdigit()), key=lambda p: int(p.name)
     )
@@ -110,11 +116,13 @@ def read_models(sparse_path: Path) -> list[ModelSummary]:
             registered_names(folder)
         except StoreError as error:
             raise StoreError(f"{error}; run map again with --overwrite") from error
-    return [summarize(pycolmap.Reconstruction(folder)) for folder in folders]
+    models = (read_arrivals(pycolmap.Reconstruction(folder), folder) for folder in folders)
+    return [summarize(model, task) for model in models]
 
 
-def summarize(model: pycolmap.Reconstruction) -> ModelSummary:
-    """Count what a reconstruction holds."""
+def summarize(mapped: MappedModel, task: MappingTask) -> ModelSummary:
+    """Count what a model holds, and judge it."""
+    model, doubts = mapped.reconstruction, find_doubts(mapped, task)
     return ModelSummary(
         registered_names=tuple(
             sorted(model.images[image_id].name for image_id in model.reg_image_ids())
@@ -122,4 +130,8 @@ def summarize(model: pycolmap.Reconstruction) -> ModelSummary:
         num_points3D=model.num_points3D(),
         mean_track_length=float(model.compute_mean_track_length()),
         mean_reprojection_error_px=float(model.compute_mean_reprojection_error()),
+        doubtful=dict(doubts.images),
+        doubts=doubts.model,
+        arrivals=arrivals(mapped, task),
+        taken_out=dict(mapped.taken_out),
     )

@@ -7,10 +7,12 @@ A mapper of another package becomes known by an entry point of the group
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from colmap_affrect.options import (
@@ -74,6 +76,7 @@ class MappingTask:
         extend: register images into this model; only for mappers whose options say ``extends``.
         snapshot_path: folder of snapshots, to be gone on from; mappers may leave it unused.
         cancellation: a token by which mapping is stopped from outside.
+        guided: (M, 2) features of pairs of image ids that only guided matching has matched.
     """
 
     database_path: Path
@@ -82,6 +85,7 @@ class MappingTask:
     extend: ExistingModel | None = None
     snapshot_path: Path | None = None
     cancellation: pycolmap.CancellationToken | None = None
+    guided: Mapping[tuple[int, int], NDArray[np.integer]] = field(default_factory=dict)
 
     @property
     def colors_path(self) -> Path:
@@ -115,10 +119,12 @@ class MappedModel:
     Attributes:
         reconstruction: the model.
         bridges: in the order in which they were made.
+        taken_out: images that were certainly wrong and had to leave, with the reason.
     """
 
     reconstruction: pycolmap.Reconstruction
     bridges: tuple[Bridge, ...] = ()
+    taken_out: Mapping[str, str] = field(default_factory=dict)
 
 
 class Mapper(Protocol):

@@ -48,7 +48,7 @@ class SparseMapper:
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
         models = self._mapped(task, output_path / "all", random_seed, show)
-        native = self._incremental.native(random_seed, intrinsics_given=task.intrinsics_given)
+        native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
         graph = graph_of(task, native.min_num_matches)
         if models and graph.is_explained_by(models[0]):
             return [MappedModel(model) for model in models]
@@ -76,6 +76,12 @@ class SparseMapper:
         output_path.mkdir()
         found = self._incremental.map(task, output_path, random_seed, show)
         return [model.reconstruction for model in found]
+
+    def native(
+        self, random_seed: int, *, intrinsics_given: bool
+    ) -> pycolmap.IncrementalPipelineOptions:
+        """Translate the options into pycolmap's."""
+        return self._incremental.native(random_seed, intrinsics_given=intrinsics_given)
 
     def differences(self, *, intrinsics_given: bool) -> dict[str, Plain]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""

@@ -6,11 +6,24 @@ import csv
 import dataclasses
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
+
+
+MAX_LINES, MAX_ADVICE = 12, 4
+"""Of each list in a summary; report.json has all."""
+
+
+def _some(lines: Iterable[str]) -> list[str]:
+    """Return the first few lines of a list, and how many there are more."""
+    shown = list(lines)
+    more = len(shown) - MAX_LINES
+    return (
+        [*shown[:MAX_LINES], f"            and {more} more, see report.json"] if more > 1 else shown
+    )
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -58,13 +71,60 @@ class StageReport:
 
 
 @dataclass(frozen=True)
+class Arrival:
+    """How an image came into a model.
+
+    Attributes:
+        how: by ``tracks`` through three images, by tracks that ``guided`` matching made, or
+            ``bridged``: by one verified pair whose scale comes from neighbouring depths.
+        by: of a bridge, the image that had been there; other fields are of bridges too.
+        num_agreeing: depths that agree on the scale.
+        num_ratios: depths compared.
+        scale_error_frac: standard error of the scale.
+    """
+
+    how: str
+    by: str = ""
+    num_agreeing: int = 0
+    num_ratios: int = 0
+    scale_error_frac: float = 0.0
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return what ``report.json`` holds."""
+        return dataclasses.asdict(self) if self.by else {"how": self.how}
+
+    def text(self) -> str:
+        """Return a few words."""
+        if not self.by:
+            return f"by {self.how} matches"
+        agreeing = f"{self.num_agreeing} of {self.num_ratios} depths agree"
+        return f"bridged by {self.by}, {agreeing}, scale +-{self.scale_error_frac:.1%}"
+
+
+@dataclass(frozen=True)
 class ModelSummary:
-    """One COLMAP model; the error is the mean over observations in px."""
+    """One COLMAP model; the error is the mean over observations in px.
+
+    Attributes:
+        doubtful: images whose pose or camera is doubtful, with the reason.
+        doubts: reasons to doubt the model as a whole.
+        arrivals: how each image came in.
+        taken_out: images that were certainly wrong, with the reason.
+    """
 
     registered_names: tuple[str, ...]
     num_points3D: int
     mean_track_length: float
     mean_reprojection_error_px: float
+    doubtful: dict[str, str] = dataclasses.field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
+    arrivals: dict[str, Arrival] = dataclasses.field(default_factory=dict)
+    taken_out: dict[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def is_trustworthy(self) -> bool:
+        """Whether two images or more are left that nothing speaks against."""
+        return not self.doubts and len(self.registered_names) - len(self.doubtful) > 1
 
 
 @dataclass(frozen=True)
@@ -72,9 +132,10 @@ class ReconstructionReport:
     """A whole run; numbers of points and tracks are those of the largest model.
 
     Attributes:
-        status: ``ok`` (all images in one model), ``partial``, or ``no_model``.
+        status: ``ok`` (all images in one model), ``partial``, ``doubtful`` (nothing that can
+            be trusted), or ``no_model``.
         unregistered: image name to reason: unreadable, no features, no verified pair, not
-            registered, or in another model.
+            registered (with its best pairs), taken out, or in another model.
         models: all models, largest first, as written to sparse/0, sparse/1, ...
         presets: of verification and of mapping: ``sparse``, ``colmap`` or ``custom``.
         verification: options of two-view geometry.
@@ -84,6 +145,7 @@ class ReconstructionReport:
         pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
             and ``none``; empty for other recipes.
         extended: names of the images of the model that was extended; empty where none was.
+        advice: what to try for the images that are missing.
     """
 
     images_total: int
@@ -100,12 +162,15 @@ class ReconstructionReport:
     differs_from_colmap: dict[str, dict[str, Any]]
     pair_levels: dict[str, int] = dataclasses.field(default_factory=dict)
     extended: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
 
     @property
     def status(self) -> str:
         """See the class docstring."""
         if not self.models:
             return "no_model"
+        if not self.models[0].is_trustworthy:
+            return "doubtful"
         return "partial" if self.unregistered else "ok"
 
     @property
@@ -150,6 +215,10 @@ class ReconstructionReport:
             "images_registered": len(largest.registered_names),
             "registered_names": list(largest.registered_names),
             "unregistered": self.unregistered,
+            "doubtful": largest.doubtful,
+            "doubts": list(largest.doubts),
+            "arrivals": {name: item.to_mapping() for name, item in largest.arrivals.items()},
+            "advice": list(self.advice),
             "num_models": len(self.models),
             "points3D": largest.num_points3D,
             "mean_track_length": largest.mean_track_length,
@@ -183,13 +252,21 @@ class ReconstructionReport:
         if self.extended:
             lines += [f"extended    {len(self.extended)} were there, {len(self.added)} came in"]
             lines += [f"            new {name}" for name in self.added]
-        lines += [f"            not {name}: {why}" for name, why in self.unregistered.items()]
+        lines += _some(f"            not {name}: {why}" for name, why in self.unregistered.items())
+        lines += [f"try         {text}" for text in self.advice[:MAX_ADVICE]]
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
         if self.pair_levels:
             counts = ", ".join(f"{count} by {name}" for name, count in self.pair_levels.items())
             lines += [f"decided     {counts}"]
         if self.models:
             model = self.models[0]
+            lines += _some(
+                f"came in     {name} {item.text()}"
+                for name, item in model.arrivals.items()
+                if item.how != "tracks"
+            )
+            lines += _some(f"doubtful    {name}: {why}" for name, why in model.doubtful.items())
+            lines += [f"doubtful    the whole model: {why}" for why in model.doubts]
             lines += [
                 f"points      {model.num_points3D}",
                 f"track       {model.mean_track_length:.2f} images on average",

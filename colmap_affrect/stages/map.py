@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
@@ -29,6 +30,12 @@ logger = logging.getLogger(__name__)
 
 INPUTS = "inputs.sha256"
 """File in sparse/ that names the verified pairs, and the extended model, they were made from."""
+
+NUM_BEST_PAIRS = 3
+"""Pairs that are named for each image that was not registered."""
+
+STRONGER_RECIPES = ("on-demand", "affnet-shapes")
+"""Advised where photographs are missing; the second needs weights."""
 
 
 def map_images(
@@ -61,10 +68,7 @@ def map_images(
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
     path = workspace.sparse / INPUTS
     known = path.read_text() if path.exists() else ""
-    if known == inputs:
-        models = read_models(workspace.sparse)
-        return StageReport("map", time.perf_counter() - start, 0, len(models)), models
-    if " " in known and not extend:
+    if known != inputs and " " in known and not extend:
         raise StaleStoreError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
             "--overwrite to map from the beginning"
@@ -72,6 +76,9 @@ def map_images(
     task = MappingTask(
         workspace.database, _image_path(workspace), intrinsics_given(workspace), existing
     )
+    if known == inputs:
+        models = read_models(workspace.sparse, task)
+        return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
@@ -162,14 +169,14 @@ def unregistered(
     workspace = context.workspace
     num_keypoints = colmap_database.keypoint_counts(workspace.database)
     ids = colmap_database.image_ids(workspace.database)
-    verified = verified_pairs(workspace.database, _min_num_inliers(workspace))
-    in_pairs = {image_id for pair in verified for image_id in pair}
+    verified = _verified_by_name(workspace.database, _min_num_inliers(workspace))
     elsewhere = {
         name: f"in another model, sparse/{index}"
         for index, model in reversed(list(enumerate(models)))
         for name in model.registered_names
     }
     registered = set(models[0].registered_names) if models else set()
+    taken_out = models[0].taken_out if models else {}
     reasons = {}
     for name in names:
         if name in registered:
@@ -180,8 +187,55 @@ def unregistered(
             reasons[name] = "unreadable"
         elif not num_keypoints[name]:
             reasons[name] = "no features"
-        elif ids[name] not in in_pairs:
+        elif name not in verified:
             reasons[name] = "no verified pair"
         else:
-            reasons[name] = "not registered"
+            best = sorted(verified[name].items(), key=lambda item: -item[1])[:NUM_BEST_PAIRS]
+            pairs = ", ".join(f"{other} ({count} inliers)" for other, count in best)
+            why = f"taken out, {taken_out[name]}" if name in taken_out else "not registered"
+            reasons[name] = f"{why}; verified with {pairs}"
     return reasons
+
+
+def _verified_by_name(database_path: Path, min_num_inliers: int) -> dict[str, dict[str, int]]:
+    """Return for each image of a verified pair its partners, and how many inliers they share."""
+    names = {image_id: name for name, image_id in colmap_database.image_ids(database_path).items()}
+    found: defaultdict[str, dict[str, int]] = defaultdict(dict)
+    for pair, count in verified_pairs(database_path, min_num_inliers).items():
+        first, second = (names[image_id] for image_id in pair)
+        found[first][second] = found[second][first] = count
+    return dict(found)
+
+
+def advice(
+    context: Context, missing: Collection[str], models: Sequence[ModelSummary]
+) -> tuple[str, ...]:
+    """Say what may help when images are missing, best first.
+
+    Args:
+        context: of a run that has been mapped.
+        missing: images that are not in the largest model.
+        models: all models, largest first.
+    """
+    if not missing:
+        return ()
+    workspace = context.workspace
+    min_num_inliers = recorded_verification(workspace).min_num_inliers
+    verified = _verified_by_name(workspace.database, min_num_inliers)
+    texts = []
+    cameras, inputs = colmap_database.all_cameras(workspace.database), Inputs.recorded(workspace)
+    same_size = len({(camera.width, camera.height) for camera in cameras}) == 1
+    if len(cameras) > 1 and same_size and not any(c.has_prior_focal_length for c in cameras):
+        texts.append("--camera-mode single, if one camera took them: all have the same size")
+    others = [name for name in STRONGER_RECIPES if name != workspace.recipe()]
+    texts.append(f"another method, --recipe {' or '.join(others)}; compare tries several")
+    between = [
+        f"{name} and {max(inside, key=lambda other: partners[other])}"
+        for name, partners in verified.items()
+        if name in missing and (inside := partners.keys() - set(missing))
+    ][:NUM_BEST_PAIRS]
+    places = f"between {', between '.join(between)}" if between else "that show the missing places"
+    texts.append(f"more photographs {places}")
+    if models and models[0].doubtful and not (inputs.masks.path or inputs.masks.camera_path):
+        texts.append("--mask-path, where something moves, repeats or is written over photographs")
+    return tuple(texts)

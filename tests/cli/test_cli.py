@@ -17,6 +17,9 @@ import pytest
 from small_scene import INTRINSICS, write_photographs
 
 from colmap_affrect import __version__
+from colmap_affrect.cli import main
+from colmap_affrect.mappers import attempts
+from colmap_affrect.mappers.doubts import Doubts
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 
@@ -419,3 +422,15 @@ def test_finished_model_is_extended_and_another_database_mapped(
     wrong = run_command("run", *run_arguments(photos, tmp_path / "no"), "--extend", photos, "-q")
     assert "not a COLMAP model" in wrong.stderr
     assert not (tmp_path / "no" / "features.h5").exists()
+
+
+def test_model_that_nobody_can_trust_ends_with_3(
+    verified: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    doubts = Doubts(model=("no parallax",))
+    monkeypatch.setattr(attempts, "find_doubts", lambda *_: doubts)
+    assert main(["map", "--output-path", str(verified), "--overwrite", "--quiet"]) == 3
+    printed = capfd.readouterr()
+    assert "doubtful    the whole model: no parallax\n" in printed.out
+    assert printed.err.splitlines()[-1].startswith("error: nothing in the model can be trusted;")
+    assert json.loads((verified / "report.json").read_text())["status"] == "doubtful"

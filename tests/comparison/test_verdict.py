@@ -141,21 +141,18 @@ def test_seeds_that_disagree_are_named():
     assert rules.seeds_disagree(comparison(SIFT)) == []
 
 
-@pytest.mark.parametrize(("points", "doubtful"), [(39, True), (40, False)])
-def test_gained_photograph_on_few_points_is_doubtful(points, doubtful):
-    texts = rules.few_observations(comparison(SIFT, default("abcd", points=points)))
-    assert texts == ["Doubtful: in default few points hold d (39 points)."] * doubtful
-    confirmed = default("abcd", points=points, correct="abcd")
-    assert rules.few_observations(comparison(SIFT, confirmed)) == []
-    assert rules.few_observations(comparison(SIFT, default("abc", points=points))) == []
-
-
-@pytest.mark.parametrize(("track", "doubtful"), [(2.19, True), (2.2, False)])
-def test_gain_of_short_tracks_is_doubtful(track, doubtful):
-    texts = rules.short_tracks(comparison(SIFT, default("abcd", track=track)))
-    start = "Doubtful: the mean track length of default is 2.19"
-    assert [text[: len(start)] for text in texts] == [start] * doubtful
-    assert rules.short_tracks(comparison(SIFT, method("x", "abc", track=track))) == []
+def test_doubts_of_most_seeds_are_told():
+    few = {"doubtful": {"d": "only 9 points hold it"}, "doubts": ("no parallax",)}
+    seeds = [replace(seed_result("abcd", seed), **few) for seed in (0, 1)]
+    doubtful = replace(default("abcd"), seeds=(*seeds, seed_result("abcd", 2)))
+    texts = rules.doubts(comparison(SIFT, doubtful))
+    assert texts == [
+        "Doubtful: in default d (only 9 points hold it).",
+        "Doubtful: the model of default, no parallax.",
+    ]
+    assert doubtful.span("num_doubtful").max == 4
+    seldom = replace(default("abcd"), seeds=(seeds[0], seed_result("abcd", 2)))
+    assert rules.doubts(comparison(SIFT, seldom)) == []
 
 
 def test_poses_that_change_with_the_seed_are_doubtful():

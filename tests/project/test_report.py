@@ -7,9 +7,15 @@ from dataclasses import replace
 
 import pytest
 
-from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
+from colmap_affrect.project.report import Arrival, ModelSummary, ReconstructionReport, StageReport
 
-LARGE = ModelSummary(("a.png", "č d.png"), 120, 2.25, 0.512)
+LARGE = ModelSummary(
+    ("a.png", "č d.png"),
+    120,
+    2.25,
+    0.512,
+    arrivals={"a.png": Arrival("tracks"), "č d.png": Arrival("bridged", "a.png", 32, 36, 0.031)},
+)
 SMALL = ModelSummary(("e.png", "f.png"), 50, 2.0, 0.25)
 
 REPORT = ReconstructionReport(
@@ -34,8 +40,11 @@ REPORT = ReconstructionReport(
     },
     differs_from_colmap={"verification": {"min_num_inliers": 20}, "mapping": {}},
     pair_levels={"identity": 2, "asift": 1, "none": 7},
+    advice=("--recipe on-demand",),
 )
 
+SHAKY = replace(LARGE, doubtful={"a.png": "only 9 points hold it"})
+TURNED = replace(LARGE, doubts=("no parallax",))
 EMPTY = replace(REPORT, models=(), unregistered={"a.png": "no verified pair"}, images_total=1)
 
 
@@ -48,6 +57,19 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "images_registered": 2,
         "registered_names": ["a.png", "č d.png"],
         "unregistered": REPORT.unregistered,
+        "doubtful": {},
+        "doubts": [],
+        "arrivals": {
+            "a.png": {"how": "tracks"},
+            "č d.png": {
+                "how": "bridged",
+                "by": "a.png",
+                "num_agreeing": 32,
+                "num_ratios": 36,
+                "scale_error_frac": 0.031,
+            },
+        },
+        "advice": ["--recipe on-demand"],
         "num_models": 2,
         "points3D": 120,
         "mean_track_length": 2.25,
@@ -80,6 +102,8 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
     [
         (REPORT, "partial"),
         (replace(REPORT, unregistered={}), "ok"),
+        (replace(REPORT, models=(SHAKY, SMALL)), "doubtful"),
+        (replace(REPORT, models=(TURNED,)), "doubtful"),
         (EMPTY, "no_model"),
         (replace(EMPTY, unregistered={}), "no_model"),
     ],
@@ -106,6 +130,8 @@ def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
         "registered  2 of 5 images",
         "not broken.png: unreadable",
         "not e.png: not registered",
+        "try         --recipe on-demand",
+        "came in     č d.png bridged by a.png, 32 of 36 depths agree, scale +-3.1%",
         "3 of 10 verified",
         "points      120",
         "2.25 images",
@@ -115,6 +141,18 @@ def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
         "extract 1.2  map 0.5",
     ):
         assert part in text
+
+
+def test_summary_says_what_cannot_be_trusted() -> None:
+    text = replace(REPORT, models=(replace(SHAKY, doubts=TURNED.doubts),)).summary()
+    assert "doubtful    a.png: only 9 points hold it\n" in text
+    assert "doubtful    the whole model: no parallax\n" in text
+
+
+def test_long_lists_end_where_the_screen_does() -> None:
+    report = replace(REPORT, unregistered={f"{i}.png": "no features" for i in range(100)})
+    assert "and 88 more, see report.json" in report.summary()
+    assert len(report.to_mapping()["unregistered"]) == 100
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,101 @@
+"""What matches of two images say about parallax: none between turned, cropped or copied views.
+
+All points are (N, 2) px with the corner of the image at (0, 0); sizes are (width, height) px.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Size = tuple[int, int]
+
+FOCAL_LENGTHS = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.5, 5.0, 10.0)
+"""Tried for a turned camera, in longer sides: fine where a rotation bends lines most. From ten on a
+rotation is a shift, as between two crops of one photograph."""
+
+MAX_NUM_POINTS = 500
+"""Enough to measure a share to two per cent."""
+
+MIN_DEPTH = 1e-3
+"""Of a turned ray of length 1; what is behind the camera lands far outside of the image."""
+
+MAX_ITERATIONS = 3
+"""Least squares are repeated without outliers; a verified pair has few of them."""
+
+
+def rotation_share(points1: Array, points2: Array, sizes: tuple[Size, Size], error: float) -> float:
+    """Return the share of matches that one turned, and zoomed, camera explains.
+
+    Args:
+        points1: in image 1.
+        points2: their matches in image 2.
+        sizes: of both images.
+        error: explained are matches at most so far off in image 2, px.
+    """
+    points1, points2 = _some(points1), _some(points2)
+    spreads = [_spread(points) for points in (points1, points2)]
+    zooms = {1.0, spreads[1] / spreads[0]} if min(spreads) else {1.0}
+    centers = [np.array(size) / 2 for size in sizes]
+    shares = (
+        _share_of(points1 - centers[0], points2 - centers[1], focal * max(sizes[0]), zoom, error)
+        for focal in FOCAL_LENGTHS
+        for zoom in zooms
+    )
+    return max(shares)
+
+
+def _share_of(points1: Array, points2: Array, focal: float, zoom: float, error: float) -> float:
+    """Return the share of matches within ``error`` px of the best rotation."""
+    rays1, rays2 = _rays(points1 / focal), _rays(points2 / (focal * zoom))
+    kept, errors = np.ones(len(rays1), bool), np.zeros(len(rays1))
+    for _ in range(MAX_ITERATIONS):
+        left, _, right = np.linalg.svd(rays2[kept].T @ rays1[kept])
+        rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        turned = rays1 @ rotation.T
+        depths = np.maximum(turned[:, 2:], MIN_DEPTH)
+        errors = np.linalg.norm(turned[:, :2] / depths * focal * zoom - points2, axis=1)
+        kept = errors <= max(error, float(np.median(errors)))
+    return float((errors <= error).mean())
+
+
+def _spread(points: Array) -> float:
+    """Return the median distance from the median point, which outliers do not change."""
+    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+
+
+def _rays(points: Array) -> Array:
+    rays = np.hstack([points, np.ones((len(points), 1))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def _some(points: Array) -> Array:
+    """Return at most ``MAX_NUM_POINTS``, evenly spaced in their order."""
+    return points[:: -(-len(points) // MAX_NUM_POINTS)] if len(points) else points
+
+
+def mirrored_share(points1: Array, points2: Array, size: Size) -> float:
+    """Return the share of all keypoints of image 1 that a mirrored copy of it has too.
+
+    Args:
+        points1: all keypoints of image 1.
+        points2: all keypoints of image 2, of the same size.
+        size: of both images.
+    """
+    row = size[0] + 4
+    taken = np.unique(_cells(points2, row))
+    neighbors = np.array([y * row + x for y in (-1, 0, 1) for x in (-1, 0, 1)])
+    shares = [0.0]
+    for axis in (0, 1) if len(points1) else ():
+        mirrored = _some(points1).copy()
+        mirrored[:, axis] = size[axis] - mirrored[:, axis]
+        found = np.isin(_cells(mirrored, row)[:, None] + neighbors, taken).any(axis=1)
+        shares.append(float(found.mean()))
+    return max(shares)
+
+
+def _cells(points: Array, row: int) -> NDArray[np.int64]:
+    """Number the pixels that points lie in."""
+    columns, rows = np.floor(points).astype(np.int64).T
+    return np.asarray(rows * row + columns)

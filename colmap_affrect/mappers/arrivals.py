@@ -1,0 +1,110 @@
+"""How the images of a model came in, and the file beside a model that keeps it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.verification import inlier_matches
+from colmap_affrect.errors import StoreError
+from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
+from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.report import Arrival
+
+FILE_NAME = "arrivals.json"
+"""Beside cameras.bin: what a COLMAP model cannot hold; other programs ignore it."""
+
+MIN_THREE_VIEW_POINTS = 12
+"""So many points tie an image to two others, as the sparse preset asks for."""
+
+
+def write_arrivals(model: MappedModel, folder: Path) -> None:
+    """Keep what :func:`read_arrivals` needs; nothing where COLMAP's model says it all."""
+    if model.bridges or model.taken_out:
+        bridges = [dataclasses.asdict(bridge) for bridge in model.bridges]
+        values = {"bridges": bridges, "taken_out": dict(model.taken_out)}
+        replace_text(folder / FILE_NAME, json.dumps(values, indent=2, ensure_ascii=False) + "\n")
+
+
+def read_arrivals(reconstruction: pycolmap.Reconstruction, folder: Path) -> MappedModel:
+    """Return a model that was read, with what was kept beside it.
+
+    Raises:
+        StoreError: when the file is damaged.
+    """
+    path = folder / FILE_NAME
+    if not path.exists():
+        return MappedModel(reconstruction)
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        bridges = TypeAdapter(tuple[Bridge, ...]).validate_python(values["bridges"])
+        taken_out = TypeAdapter(dict[str, str]).validate_python(values["taken_out"])
+    except (OSError, ValueError, KeyError, TypeError, ValidationError) as error:
+        raise StoreError(f"{path}: damaged") from error
+    return MappedModel(reconstruction, bridges, taken_out)
+
+
+def arrivals(model: MappedModel, task: MappingTask) -> dict[str, Arrival]:
+    """Tell for each registered image how it came in."""
+    reconstruction = model.reconstruction
+    bridged = {
+        name: Arrival(
+            "bridged",
+            bridge.pair[0],
+            bridge.num_agreeing,
+            bridge.num_ratios,
+            bridge.scale_error_frac,
+        )
+        for bridge in model.bridges
+        for name in bridge.names
+    }
+    guided = _tied_by_guided_matches(reconstruction, task) if task.guided else set()
+    names = {i: reconstruction.images[i].name for i in reconstruction.reg_image_ids()}
+    return {
+        name: bridged.get(name, Arrival("guided" if image_id in guided else "tracks"))
+        for image_id, name in sorted(names.items(), key=lambda item: item[1])
+    }
+
+
+def _tied_by_guided_matches(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:
+    """Return the images that too few three-view tracks would tie without guided matches."""
+    points = {
+        i: np.array([point.point3D_id for point in model.images[i].points2D], np.uint64)
+        for i in model.reg_image_ids()
+    }
+    links: defaultdict[tuple[int, int], list[tuple[int, int]]] = defaultdict(list)
+    for ids, matches in inlier_matches(task.database_path, 1).items():
+        if not points.keys() >= set(ids):
+            continue
+        both = [points[i][matches[:, side]] for side, i in enumerate(ids)]
+        known = (both[0] == both[1]) & (both[0] != pycolmap.INVALID_POINT3D_ID)
+        guided = set(map(tuple, np.asarray(task.guided.get(ids, ())).tolist()))
+        for first, second in matches[known].tolist():
+            if (first, second) not in guided:
+                links[ids[0], first].append((ids[1], second))
+                links[ids[1], second].append((ids[0], first))
+    tied = Counter(
+        feature[0]
+        for feature, others in links.items()
+        if len(others) > 1 or len(links[others[0]]) > 1
+    )
+    return {
+        image_id
+        for image_id in points
+        if tied[image_id] < MIN_THREE_VIEW_POINTS <= _num_three_view(model, image_id)
+    }
+
+
+def _num_three_view(model: pycolmap.Reconstruction, image_id: int) -> int:
+    """Count the points of an image that two others see as well."""
+    return sum(
+        model.point3D(point.point3D_id).track.length() > 2
+        for point in model.images[image_id].points2D
+        if point.has_point3D()
+    )

@@ -1,0 +1,314 @@
+"""What in a finished model cannot be trusted, as data.
+
+Doubts have two degrees: what is certainly wrong leaves the model, the rest is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from itertools import islice
+from math import ceil
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.two_views import undistorted
+from colmap_affrect.colmap.verification import REJECTED
+from colmap_affrect.geometry.epipolar import sampson_errors
+from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
+from colmap_affrect.mappers.arrivals import MIN_THREE_VIEW_POINTS
+from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
+
+FOCAL_LENGTHS = (0.3, 10.0)
+"""Longer sides: 120 and 6 degrees, beyond all lenses of photographs that anybody reconstructs."""
+IMPOSSIBLE_FOCAL_LENGTHS = (0.1, 30.0)
+"""Where it is no lens at all, but an adjustment that ran away."""
+
+MAX_DISTORTION, IMPOSSIBLE_DISTORTION = 1.0, 10.0
+"""Size of distortion coefficients; COLMAP's mappers have the first limit."""
+
+MIN_OBSERVATIONS, TOO_FEW_OBSERVATIONS = 30, 8
+"""COLMAP's own defaults ask for 30 to register an image; a pose of six unknowns and a focal length
+goes through hardly more than the four points that chance brings."""
+
+MIN_AGREEMENT, NO_AGREEMENT = 0.5, 0.25
+"""Share of the inliers of an image's verified pairs. Of right images of sparse sets at least three
+quarters agree."""
+
+MAX_ERROR = 0.003
+"""Of a match, in longer sides: 3 px of 1000, the threshold of verification."""
+
+MAX_SCALE_ERROR_FRAC = 0.1
+"""Of a bridged image: beyond, its distance is a guess."""
+
+MIN_SHARE_STILL, MIN_SHARE_OF_STILL_PAIRS = 0.8, 0.9
+"""A rotation explains nearly all matches of views from one place, and at most two thirds of those
+of flat ground from a kite. Some steps of a walk look still; not nearly all pairs do."""
+
+MIN_SHARE_MIRRORED = 0.5
+"""Mirrored copies have nearly all keypoints in common, other images a tenth by chance."""
+
+MIN_WIDE_ANGLE_DEG, MIN_SHARE_WIDE = 3.0, 0.1
+"""Points under smaller angles only have no depth to speak of (COLMAP drops those below 1.5)."""
+
+MAX_ANGLE_DEG = 90.0
+"""To the next image. Surfaces are then tilted by 45 degrees in one of both at least: single matches
+survive that, not most of an image; repeated and symmetric structures look so."""
+
+MAX_PAIRS_OF_IMAGE, MAX_PAIRS_FOR_PARALLAX, MAX_POINTS_FOR_ANGLES = 10, 100, 2000
+"""Strongest pairs of each image, pairs and points looked at; more change no share."""
+
+Points = NDArray[np.float64]
+Ids = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """What cannot be trusted.
+
+    Attributes:
+        images: name to reason.
+        model: reasons to doubt the model as a whole.
+        impossible: of the images those that are certainly wrong, the worst one first.
+    """
+
+    images: Mapping[str, str] = field(default_factory=dict)
+    model: tuple[str, ...] = ()
+    impossible: tuple[str, ...] = ()
+
+
+def find_doubts(model: MappedModel, task: MappingTask) -> Doubts:
+    """Look for everything that is wrong with a model or may be.
+
+    Args:
+        model: with all its images, also of bridges.
+        task: what it was made from.
+    """
+    pairs = _verified_pairs(model.reconstruction, task)
+    images = _image_doubts(model, pairs, task)
+    return replace(images, model=tuple(_model_doubts(model, pairs, task)))
+
+
+def without_impossible(model: MappedModel, task: MappingTask) -> MappedModel | None:
+    """Take out the images that are certainly wrong, the worst one first; None if two are not left.
+
+    The reconstruction itself is changed.
+    """
+    reconstruction = model.reconstruction
+    pairs = _verified_pairs(reconstruction, task)
+    taken: dict[str, str] = {}
+    while reconstruction.num_reg_images():
+        doubts = _image_doubts(model, pairs, task)
+        if not doubts.impossible:
+            break
+        name = doubts.impossible[0]
+        taken[name] = doubts.images[name]
+        reconstruction.deregister_frame(reconstruction.find_image_with_name(name).frame_id)
+    if reconstruction.num_reg_images() < 2:
+        return None
+    return replace(model, taken_out={**model.taken_out, **taken})
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A verified pair of registered images: both sides of its inliers, and how many agree."""
+
+    points: tuple[Points, Points]
+    keypoints: tuple[Points, Points]
+    num_agreeing: int
+
+    @property
+    def num_inliers(self) -> int:
+        return len(self.points[0])
+
+
+def _verified_pairs(model: pycolmap.Reconstruction, task: MappingTask) -> dict[Ids, _Pair]:
+    """Return the strongest pairs of each image, the strongest of all first."""
+    registered = set(model.reg_image_ids())
+    with open_database(task.database_path) as database:
+        inliers = {
+            pycolmap.pair_id_to_image_pair(pair_id): np.asarray(geometry.inlier_matches, np.int64)
+            for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True)
+            if geometry.config not in REJECTED and len(geometry.inlier_matches)
+        }
+
+        @lru_cache(maxsize=256)
+        def keypoints(image_id: int) -> Points:
+            return np.asarray(database.read_keypoints(image_id)[:, :2], np.float64)
+
+        counts = dict.fromkeys(registered, 0)
+        found = {}
+        for ids, matches in sorted(inliers.items(), key=lambda item: -len(item[1])):
+            wanted = registered.issuperset(ids) and min(counts[i] for i in ids) < MAX_PAIRS_OF_IMAGE
+            if not wanted:
+                continue
+            both = (keypoints(ids[0]), keypoints(ids[1]))
+            points = (both[0][matches[:, 0]], both[1][matches[:, 1]])
+            found[ids] = _Pair(points, both, _num_agreeing(model, ids, points))
+            for image_id in ids:
+                counts[image_id] += 1
+    return found
+
+
+def _num_agreeing(model: pycolmap.Reconstruction, ids: Ids, points: tuple[Points, Points]) -> int:
+    """Count the matches that lie on the epipolar lines of the model."""
+    images = [model.images[image_id] for image_id in ids]
+    poses = [image.cam_from_world() for image in images]
+    relative = poses[1] * poses[0].inverse()
+    x, y, z = relative.translation
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative.rotation.matrix()
+    cameras = [_camera(image) for image in images]
+    try:
+        inverses = [np.linalg.inv(camera.calibration_matrix()) for camera in cameras]
+    except np.linalg.LinAlgError:  # a focal length of 0
+        return 0
+    ideal = [undistorted(camera, side) for camera, side in zip(cameras, points, strict=True)]
+    with np.errstate(all="ignore"):  # of cameras that are impossible
+        errors = sampson_errors(inverses[1].T @ essential @ inverses[0], *ideal)
+        return int((errors <= MAX_ERROR * max(map(_side, cameras))).sum())
+
+
+def _camera(image: pycolmap.Image) -> pycolmap.Camera:
+    """Return the camera, which registered images always have."""
+    return cast("pycolmap.Camera", image.camera)
+
+
+def _size(image: pycolmap.Image) -> Size:
+    camera = _camera(image)
+    return camera.width, camera.height
+
+
+def _side(camera: pycolmap.Camera) -> int:
+    return max(camera.width, camera.height)
+
+
+def _image_doubts(model: MappedModel, pairs: Mapping[Ids, _Pair], task: MappingTask) -> Doubts:
+    """Judge the images one by one."""
+    reconstruction = model.reconstruction
+    registered = set(reconstruction.reg_image_ids())
+    bridges = {name: bridge for bridge in model.bridges for name in bridge.names}
+    inside = [(ids, pair) for ids, pair in pairs.items() if registered.issuperset(ids)]
+    totals = dict.fromkeys(registered, np.zeros(2, np.int64))
+    for ids, pair in inside:
+        for image_id in ids:
+            totals[image_id] = totals[image_id] + (pair.num_agreeing, pair.num_inliers)
+    reasons: dict[str, str] = {}
+    angles = _angles_deg(reconstruction)
+    impossible: list[tuple[float, int, str]] = []
+    for image_id in registered:
+        image = reconstruction.images[image_id]
+        agreeing, total = totals[image_id]
+        agreement = float(agreeing / total) if total else 1.0
+        found = [
+            *([] if task.intrinsics_given else _camera_doubts(_camera(image))),
+            *_observation_doubts(image.num_points3D),
+            *_agreement_doubts(agreement),
+            *_angle_doubts([near for near, _ in angles[image_id]]),
+            *_bridge_doubts(bridges.get(image.name)),
+        ]
+        if found:
+            reasons[image.name] = "; ".join(text for text, _ in found)
+        if any(wrong for _, wrong in found):
+            impossible.append((agreement, image.num_points3D, image.name))
+    worst = tuple(name for _, _, name in sorted(impossible))
+    return Doubts(dict(sorted(reasons.items())), impossible=worst)
+
+
+def _camera_doubts(camera: pycolmap.Camera) -> Iterator[tuple[str, bool]]:
+    """Doubt cameras that no lens has; each reason comes with whether it is certain."""
+    focal = camera.mean_focal_length() / _side(camera)
+    if not FOCAL_LENGTHS[0] <= focal <= FOCAL_LENGTHS[1]:
+        low, high = IMPOSSIBLE_FOCAL_LENGTHS
+        yield f"its focal length is {focal:.3g} longer sides", not low <= focal <= high
+    elif camera.has_bogus_params(*IMPOSSIBLE_FOCAL_LENGTHS, MAX_DISTORTION):
+        wrong = camera.has_bogus_params(*IMPOSSIBLE_FOCAL_LENGTHS, IMPOSSIBLE_DISTORTION)
+        yield "the distortion of its lens is extreme", wrong
+
+
+def _observation_doubts(num: int) -> Iterator[tuple[str, bool]]:
+    if num < MIN_OBSERVATIONS:
+        yield f"only {num} points hold it", num < TOO_FEW_OBSERVATIONS
+
+
+def _agreement_doubts(share: float) -> Iterator[tuple[str, bool]]:
+    if share < MIN_AGREEMENT:
+        text = f"only {share:.0%} of the matches of its verified pairs agree with its pose"
+        yield text, share < NO_AGREEMENT
+
+
+def _angle_doubts(angles: Sequence[float]) -> Iterator[tuple[str, bool]]:
+    if len(angles) >= TOO_FEW_OBSERVATIONS and np.median(angles) > MAX_ANGLE_DEG:
+        yield (
+            f"most of its points are seen from directions {np.median(angles):.0f} degrees apart",
+            False,
+        )
+
+
+def _bridge_doubts(bridge: Bridge | None) -> Iterator[tuple[str, bool]]:
+    if bridge and not bridge.scale_error_frac <= MAX_SCALE_ERROR_FRAC:
+        error = f"{bridge.scale_error_frac:.0%}"
+        yield f"bridged by {bridge.pair[0]} at a distance known to +-{error} only", False
+    elif bridge and 2 * bridge.num_agreeing < bridge.num_ratios:
+        some = f"{bridge.num_agreeing} of {bridge.num_ratios}"
+        yield f"bridged by {bridge.pair[0]}, where only {some} depths agree on the scale", False
+
+
+def _model_doubts(
+    model: MappedModel, pairs: Mapping[Ids, _Pair], task: MappingTask
+) -> Iterator[str]:
+    """Judge the model as a whole."""
+    reconstruction = model.reconstruction
+    num_images, num_given = reconstruction.num_reg_images(), len(image_ids(task.database_path))
+    if num_images < 3 <= num_given:
+        yield f"only {num_images} of {num_given} photographs, which no third one confirms"
+    angles = [wide for of_image in _angles_deg(reconstruction).values() for _, wide in of_image]
+    some = list(pairs.items())[:: max(1, len(pairs) // MAX_PAIRS_FOR_PARALLAX)]
+    shown = {ids: tuple(reconstruction.images[i] for i in ids) for ids, _ in some}
+    sizes = {ids: (_size(first), _size(second)) for ids, (first, second) in shown.items()}
+    moving = (
+        ids
+        for ids, pair in some
+        if rotation_share(*pair.points, sizes[ids], MAX_ERROR * max(map(max, sizes[ids])))
+        < MIN_SHARE_STILL
+    )
+    max_num_moving = len(some) - ceil(MIN_SHARE_OF_STILL_PAIRS * len(some))
+    if some and next(islice(moving, max_num_moving, None), None) is None:
+        yield (
+            "no parallax: the camera only turned or zoomed, or the photographs are copies or "
+            "crops of one another"
+        )
+    elif np.mean(np.array(angles or [0.0]) >= MIN_WIDE_ANGLE_DEG) < MIN_SHARE_WIDE:
+        yield f"hardly any parallax: rays are less than {MIN_WIDE_ANGLE_DEG:g} degrees apart"
+    for ids, pair in some:
+        same = sizes[ids][0] == sizes[ids][1]
+        if same and mirrored_share(*pair.keypoints, sizes[ids][0]) >= MIN_SHARE_MIRRORED:
+            first, second = sorted(image.name for image in shown[ids])
+            yield f"{first} and {second} are mirrored copies of one photograph"
+            break
+    if num_images > 2 and not model.bridges:
+        num_ties = sum(p.track.length() > 2 for p in reconstruction.points3D.values())
+        if num_ties < MIN_THREE_VIEW_POINTS:
+            yield f"only {num_ties} points are seen by three photographs"
+
+
+def _angles_deg(model: pycolmap.Reconstruction) -> dict[int, list[tuple[float, float]]]:
+    """Return, of some points of each image, the angles to the next and to the farthest ray."""
+    ids = sorted(model.point3D_ids())
+    found: dict[int, list[tuple[float, float]]] = {i: [] for i in model.reg_image_ids()}
+    for point_id in ids[:: max(1, len(ids) // MAX_POINTS_FOR_ANGLES)]:
+        point = model.point3D(point_id)
+        seen_by = sorted({element.image_id for element in point.track.elements})
+        rays = np.array([model.images[i].projection_center() - point.xyz for i in seen_by])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles = np.rad2deg(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)))
+        np.fill_diagonal(angles, 0.0)
+        farthest = angles.max(axis=1)
+        np.fill_diagonal(angles, 180.0)
+        for image_id, *both in zip(seen_by, angles.min(axis=1), farthest, strict=True):
+            found[image_id].append((float(both[0]), float(both[1])))
+    return found

@@ -1,0 +1,233 @@
+"""What cannot be trusted in a model: right ones are not doubted, and each doubt has its cause."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.verification import inlier_matches
+from colmap_affrect.errors import StoreError
+from colmap_affrect.mappers.arrivals import FILE_NAME, arrivals, read_arrivals, write_arrivals
+from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
+from colmap_affrect.mappers.doubts import find_doubts, without_impossible
+from colmap_affrect.project.report import Arrival
+
+
+def scene(tmp_path: Path, num_images: int = 4) -> tuple[MappedModel, MappingTask]:
+    """A right model of images with a camera each, and its database."""
+    pycolmap.set_random_seed(5)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=num_images, num_frames_per_rig=1, num_points3D=150
+    )
+    path = tmp_path / "database.db"
+    with open_database(path) as database:
+        model = pycolmap.synthesize_dataset(options, database)
+    return MappedModel(model), MappingTask(path, tmp_path)
+
+
+def last(model: MappedModel) -> pycolmap.Image:
+    return model.reconstruction.images[max(model.reconstruction.reg_image_ids())]
+
+
+def keep_observations(model: MappedModel, image: pycolmap.Image, number: int) -> None:
+    seen = [i for i, point in enumerate(image.points2D) if point.has_point3D()]
+    for index in seen[number:]:
+        model.reconstruction.delete_observation(image.image_id, index)
+
+
+@pytest.mark.parametrize("num_images", [2, 3, 5])
+def test_right_models_are_not_doubted(tmp_path: Path, num_images: int) -> None:
+    model, task = scene(tmp_path, num_images)
+    doubts = find_doubts(model, task)
+    assert (doubts.images, doubts.model, doubts.impossible) == ({}, (), ())
+    kept = without_impossible(model, task)
+    assert kept is not None
+    assert (kept.reconstruction.num_reg_images(), kept.taken_out) == (num_images, {})
+
+
+@pytest.mark.parametrize(
+    ("focal", "distortion", "text", "impossible"),
+    [
+        (12.0, 0.0, "focal length is 12 longer", False),
+        (500.0, 0.0, "focal length is 500 longer", True),
+        (0.2, 0.0, "focal length is 0.2 longer", False),
+        (1.2, 1.5, "distortion", False),
+        (1.2, -15.0, "distortion", True),
+    ],
+)
+def test_cameras_that_no_lens_has(
+    tmp_path: Path, focal: float, distortion: float, text: str, *, impossible: bool
+) -> None:
+    model, task = scene(tmp_path)
+    image = last(model)
+    camera = image.camera
+    camera.focal_length = focal * max(camera.width, camera.height)
+    camera.params = np.array([*camera.params[:3], distortion])
+    doubts = find_doubts(model, task)
+    assert text in doubts.images[image.name]
+    assert (image.name in doubts.impossible) >= impossible
+    given = MappingTask(task.database_path, tmp_path, intrinsics_given=True)
+    assert text not in find_doubts(model, given).images.get(image.name, "")
+
+
+@pytest.mark.parametrize(
+    ("number", "doubtful", "impossible"), [(30, 0, 0), (29, 1, 0), (8, 1, 0), (7, 1, 1)]
+)
+def test_images_that_few_points_hold(
+    tmp_path: Path, number: int, doubtful: int, impossible: int
+) -> None:
+    model, task = scene(tmp_path)
+    image = last(model)
+    keep_observations(model, image, number)
+    doubts = find_doubts(model, task)
+    told = {image.name: f"only {number} points hold it"}
+    assert doubts.images == (told if doubtful else {})
+    assert len(doubts.impossible) == impossible
+
+
+def test_image_that_contradicts_its_pairs_leaves_and_the_others_stay(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    image = last(model)
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.1, 0.2, 0.05])), np.array([1.0, 2, 3]))
+    image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
+    kept = without_impossible(model, task)
+    assert kept is not None
+    assert list(kept.taken_out) == [image.name]
+    assert "of the matches of its verified pairs agree" in kept.taken_out[image.name]
+    assert kept.reconstruction.num_reg_images() == 3
+    assert find_doubts(kept, task).images == {}
+
+
+def test_nothing_is_left_of_a_pair_that_loses_an_image(tmp_path: Path) -> None:
+    model, task = scene(tmp_path, 2)
+    keep_observations(model, last(model), 3)
+    assert without_impossible(model, task) is None
+
+
+def test_two_of_more_photographs_are_no_model(tmp_path: Path) -> None:
+    model, task = scene(tmp_path, 3)
+    model.reconstruction.deregister_frame(last(model).frame_id)
+    assert find_doubts(model, task).model == (
+        "only 2 of 3 photographs, which no third one confirms",
+    )
+
+
+def write_keypoints(model: MappedModel, task: MappingTask, points_of: object) -> None:
+    """Give each image other keypoints, of the same number."""
+    with open_database(task.database_path) as database:
+        for image_id in sorted(model.reconstruction.reg_image_ids()):
+            points = points_of(model.reconstruction.images[image_id])
+            database.update_keypoints(image_id, points.astype(np.float32))
+
+
+def test_camera_that_only_turned(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    first = model.reconstruction.images[min(model.reconstruction.reg_image_ids())]
+    pose, rng = first.cam_from_world(), np.random.default_rng(3)
+
+    def turned(image: pycolmap.Image) -> np.ndarray:
+        matrix = pycolmap.Rotation3d(rng.uniform(-0.15, 0.15, 3)).matrix()
+        size = np.array([image.camera.width, image.camera.height])
+        points = np.array([point.xy for point in image.points2D], np.float64)
+        for index, point in enumerate(image.points2D):
+            if point.has_point3D():
+                ray = matrix @ (pose * model.reconstruction.point3D(point.point3D_id).xyz)
+                points[index] = 0.9 * size.max() * ray[:2] / ray[2] + size / 2
+        return points
+
+    write_keypoints(model, task, turned)
+    (doubt,) = find_doubts(model, task).model
+    assert doubt.startswith("no parallax: the camera only turned")
+
+
+def test_mirrored_copies(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    image = last(model)
+    with open_database(task.database_path) as database:
+        database_pairs = inlier_matches(task.database_path, 1)
+        other = next(ids[0] for ids in database_pairs if ids[1] == image.image_id)
+        points = database.read_keypoints(image.image_id)
+        points[:, 0] = image.camera.width - points[:, 0]
+        old = database.read_keypoints(other)
+        database.update_keypoints(other, np.vstack([points, old])[: max(len(points), len(old))])
+    assert any("mirrored copies" in text for text in find_doubts(model, task).model)
+
+
+def test_views_from_nearly_one_place(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    for image_id in model.reconstruction.reg_image_ids():
+        image = model.reconstruction.images[image_id]
+        pose, center = image.cam_from_world(), image.projection_center()
+        far = np.array([40.0, -30, 20]) + 0.01 * center
+        rotation = pose.rotation
+        image.frame.set_cam_from_world(
+            image.camera_id, pycolmap.Rigid3d(rotation, -(rotation.matrix() @ far))
+        )
+    assert any(text.startswith("hardly any parallax") for text in find_doubts(model, task).model)
+
+
+def test_tracks_of_two_views_tie_nothing_unless_images_are_bridged(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    for point_id in sorted(model.reconstruction.point3D_ids()):
+        for element in list(model.reconstruction.point3D(point_id).track.elements)[2:]:
+            model.reconstruction.delete_observation(element.image_id, element.point2D_idx)
+    text = "only 0 points are seen by three photographs"
+    assert text in find_doubts(model, task).model
+    assert text not in find_doubts(MappedModel(model.reconstruction, BRIDGES), task).model
+
+
+BRIDGES = (Bridge(("camera000001_frame000001.png", "b"), ("b",), 32, 36, 0.031),)
+
+
+@pytest.mark.parametrize(
+    ("bridge", "text"),
+    [
+        ((32, 36, 0.03), None),
+        ((32, 36, 0.11), "distance known to +-11% only"),
+        ((32, 36, float("nan")), "distance known to"),
+        ((11, 39, 0.03), "only 11 of 39 depths agree"),
+    ],
+)
+def test_bridges_of_uncertain_scale(
+    tmp_path: Path, bridge: tuple[int, int, float], text: str | None
+) -> None:
+    model, task = scene(tmp_path)
+    name = last(model).name
+    bridged = MappedModel(model.reconstruction, (Bridge(("a", name), (name,), *bridge),))
+    doubts = find_doubts(bridged, task)
+    assert list(doubts.images) == ([name] if text else [])
+    assert text is None or text in doubts.images[name]
+    assert doubts.impossible == ()
+
+
+def test_how_images_came_in_is_kept_beside_the_model(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    name = last(model).name
+    bridge = Bridge(("a.jpg", name), (name,), 32, 36, 0.031)
+    mapped = MappedModel(model.reconstruction, (bridge,), {"č.jpg": "only 3 points hold it"})
+    write_arrivals(mapped, tmp_path)
+    read = read_arrivals(model.reconstruction, tmp_path)
+    assert (read.bridges, read.taken_out) == (mapped.bridges, mapped.taken_out)
+    found = arrivals(read, task)
+    assert found.pop(name) == Arrival("bridged", "a.jpg", 32, 36, 0.031)
+    assert set(found.values()) == {Arrival("tracks")}
+    assert Arrival("tracks").to_mapping() == {"how": "tracks"}
+    (tmp_path / FILE_NAME).write_text('{"bridges": [1]}')
+    with pytest.raises(StoreError, match="damaged"):
+        read_arrivals(model.reconstruction, tmp_path)
+
+
+def test_image_tied_by_guided_matches_only(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    image = last(model)
+    pairs = inlier_matches(task.database_path, 1)
+    guided = {ids: matches for ids, matches in pairs.items() if image.image_id in ids}
+    found = arrivals(model, MappingTask(task.database_path, tmp_path, guided=guided))
+    assert [name for name, item in found.items() if item.how == "guided"] == [image.name]
+    few = {ids: matches[:5] for ids, matches in guided.items()}
+    found = arrivals(model, MappingTask(task.database_path, tmp_path, guided=few))
+    assert {item.how for item in found.values()} == {"tracks"}
