@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -16,13 +18,21 @@ from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.report import ReconstructionReport, StageReport
+from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.escalate import escalate, pair_levels
 from colmap_affrect.stages.extract import Inputs, extract, write_descriptors
+from colmap_affrect.stages.guide import (
+    current,
+    guide,
+    guided_counts,
+    recorded_guiding,
+    restore_exact,
+)
 from colmap_affrect.stages.map import (
+    images_in_need,
     intrinsics_given,
     map_images,
     num_verified_pairs,
@@ -129,6 +139,7 @@ def run(
         ]
         if options.recipe.extraction.escalation:
             reports.append(escalate(context, options.recipe.escalate))
+        reports.append(guide(context, options.recipe.guided))
         if options.database_descriptors:
             write_descriptors(context)
         return map_and_report(context, mapper, earlier=reports)
@@ -143,7 +154,7 @@ def map_and_report(
 ) -> ReconstructionReport:
     """Map a verified workspace and write ``report.json``."""
     workspace, options = context.workspace, mapper.options
-    report, models = map_images(context, mapper, overwrite=overwrite)
+    reports, models = map_guided(context, mapper, overwrite=overwrite)
     names = Inputs.recorded(workspace).names()
     verification = recorded_verification(workspace)
     given = intrinsics_given(workspace)
@@ -153,7 +164,7 @@ def map_and_report(
         models=tuple(models),
         num_pairs=len(listed_pairs(context)),
         num_verified_pairs=num_verified_pairs(workspace),
-        stages=(*earlier, report),
+        stages=(*earlier, *reports),
         recipe=workspace.recipe(),
         versions=installed_versions(),
         presets=(verification.preset_name, options.preset_name),
@@ -164,9 +175,57 @@ def map_and_report(
             "mapping": mapper.differences(intrinsics_given=given),
         },
         pair_levels=pair_levels(context),
+        guided=guided_counts(context),
     )
     replace_text(workspace.report, result.to_json())
     return result
+
+
+def map_guided(
+    context: Context, mapper: Mapper, *, overwrite: bool = False
+) -> tuple[list[StageReport], list[ModelSummary]]:
+    """Map; where images are missing or hang on few tracks, guide their pairs and map again."""
+    report, models = map_images(context, mapper, overwrite=overwrite)
+    before = {pair.names for pair in current(context)}
+    images = images_in_need(context, recorded_guiding(context.workspace).min_num_tracks)
+    guided = guide(context, images=images) if images else None
+    if guided is None or not guided.num_done:
+        return [report], models
+    with set_aside(context.workspace.sparse) as restore_models:
+        again, models_again = map_images(context, mapper)
+        reports = [report, guided, again]
+        if better(models_again, models):
+            return reports, models_again
+        restore_exact(context, {pair.names for pair in current(context)} - before)
+        restore_models()
+    return reports, models
+
+
+def better(models: Sequence[ModelSummary], others: Sequence[ModelSummary]) -> bool:
+    """Tell whether the largest of some models is better than the largest of others."""
+    first, second = (
+        max(((len(m.registered_names), m.num_points3D) for m in found), default=(0, 0))
+        for found in (models, others)
+    )
+    return first > second
+
+
+@contextmanager
+def set_aside(folder: Path) -> Iterator[Callable[[], None]]:
+    """Move a folder away while another one is made in its place.
+
+    What is given can be called to have it back instead of the other one; else it is removed.
+    """
+    aside = folder.with_name(folder.name + ".aside")
+    shutil.rmtree(aside, ignore_errors=True)
+    folder.rename(aside)
+
+    def restore() -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        aside.rename(folder)
+
+    yield restore
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 def installed_versions() -> dict[str, str]:

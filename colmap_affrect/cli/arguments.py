@@ -112,6 +112,9 @@ def setting(example: str) -> Option:
 
 MATCHER = _value("--matcher", "NAME",
     "nearest, or one of another package (default: that of the recipe)")  # fmt: skip
+GUIDED = _choice("--guided", ["auto", "always", "never"],
+    "match verified pairs again, guided by their geometry: those of images that are missing or "
+    "hang on few tracks, all, or none (default: auto)")  # fmt: skip
 DEVICE = _value("--device", "DEVICE",
     "for networks and matching: auto, cpu, cuda, cuda:1, mps (default: auto)",
     default="auto")  # fmt: skip

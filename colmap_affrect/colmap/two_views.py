@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.geometry.affine import project
 
 PLANAR = (
     pycolmap.TwoViewGeometryConfiguration.PLANAR,
@@ -85,4 +86,33 @@ def keypoint_shapes(keypoints: NDArray[np.floating]) -> NDArray[np.float64] | No
         scales, angles = keypoints[:, 2], keypoints[:, 3]
         cosines, sines = scales * np.cos(angles), scales * np.sin(angles)
         return np.asarray(np.stack([cosines, -sines, sines, cosines], axis=1).reshape(-1, 2, 2))
+    return None
+
+
+def homography_of(
+    geometry: pycolmap.TwoViewGeometry,
+    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+    tolerance_px: float,
+    min_off_plane: int,
+) -> NDArray[np.float64] | None:
+    """Return the homography of a pair whose epipolar geometry is arbitrary or hardly determined.
+
+    That is one of :data:`PLANAR`, or whose homography explains all but fewer than
+    ``min_off_plane`` of its inliers: epipolar lines hold on the plane, but turn freely off it.
+
+    Args:
+        geometry: as COLMAP estimated it.
+        keypoints: (N1, 2 or more) and (N2, 2 or more) as in the database.
+        tolerance_px: how near to the place in image 2 is explained.
+        min_off_plane: so many inliers off the plane determine the geometry.
+    """
+    homography = geometry.H
+    if homography is None or not np.any(homography):
+        return None
+    homography = np.asarray(homography, np.float64)
+    first, second = np.asarray(geometry.inlier_matches, np.int64).T
+    places = project(homography, np.asarray(keypoints[0][first, :2], np.float64))
+    errors = np.linalg.norm(places - keypoints[1][second, :2], axis=1)
+    if geometry.config in PLANAR or (errors > tolerance_px).sum() < min_off_plane:
+        return homography
     return None

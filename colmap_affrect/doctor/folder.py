@@ -106,7 +106,7 @@ class _FolderExamination:
         try:
             record = workspace.recorded()
             done = [stage for stage in STAGES if stage in record.get("begun", [])]
-            wanted = list(STAGES)
+            wanted = [stage for stage in STAGES if stage != "guide"]  # map does that when needed
             if "extract" in done:
                 Inputs.recorded(workspace)
                 if not recorded_extraction(workspace).escalation:

@@ -34,7 +34,7 @@ class StageReport:
     """One stage of a run.
 
     Attributes:
-        name: extract, pairs, match, verify, escalate or map.
+        name: extract, pairs, match, verify, escalate, guide or map.
         wall_s: seconds.
         num_done: images, pairs or models made now.
         num_kept: those found done already.
@@ -83,6 +83,8 @@ class ReconstructionReport:
             COLMAP's default, by pycolmap's dotted keys.
         pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
             and ``none``; empty for other recipes.
+        guided: ``pairs`` that guided matching gave more inliers, and these inliers
+            ``matches_before`` and ``matches_after``; empty where no pair needed it.
     """
 
     images_total: int
@@ -98,6 +100,7 @@ class ReconstructionReport:
     mapping: dict[str, Any]
     differs_from_colmap: dict[str, dict[str, Any]]
     pair_levels: dict[str, int] = dataclasses.field(default_factory=dict)
+    guided: dict[str, int] = dataclasses.field(default_factory=dict)
 
     @property
     def status(self) -> str:
@@ -150,6 +153,7 @@ class ReconstructionReport:
             "num_pairs": self.num_pairs,
             "num_verified_pairs": self.num_verified_pairs,
             "pair_levels": self.pair_levels,
+            "guided": self.guided,
             "stages": [dataclasses.asdict(stage) for stage in self.stages],
             "recipe": self.recipe,
             "preset": self.preset,
@@ -175,6 +179,9 @@ class ReconstructionReport:
         if self.pair_levels:
             counts = ", ".join(f"{count} by {name}" for name, count in self.pair_levels.items())
             lines += [f"decided     {counts}"]
+        if self.guided:
+            before, after = self.guided["matches_before"], self.guided["matches_after"]
+            lines += [f"guided      {self.guided['pairs']} pairs, {before} to {after} inliers"]
         if self.models:
             model = self.models[0]
             lines += [

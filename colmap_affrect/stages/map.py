@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.mappers.attempts import map_database, read_models
 from colmap_affrect.mappers.base import Mapper, MappingTask
@@ -94,3 +95,19 @@ def unregistered(
         else:
             reasons[name] = "not registered"
     return reasons
+
+
+def images_in_need(context: Context, min_num_tracks: int) -> set[str]:
+    """Return the images that are not in the largest model, or there see few of its points.
+
+    Args:
+        context: after mapping.
+        min_num_tracks: an image that sees fewer points of three images or more is in need.
+    """
+    workspace = context.workspace
+    names = set(colmap_database.image_ids(workspace.database))
+    path = workspace.sparse / "0"
+    if not path.exists() or len(names) < 3:
+        return names if len(names) > 2 else set()
+    counts = num_long_tracks(path)
+    return {name for name in names if counts.get(name, 0) < min_num_tracks}
