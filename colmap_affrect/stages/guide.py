@@ -104,16 +104,19 @@ def restore_exact(context: Context, pairs: Collection[Pair] | None = None) -> No
     context.guided.write([replace(pair, num_inliers=0) for pair in guided])
 
 
-def exact_inliers(context: Context) -> dict[Pair, Matches]:
-    """Return the inliers of each verified pair without guided matches."""
+def verified_inliers(context: Context) -> dict[Pair, Matches]:
+    """Return the inliers of each verified pair."""
     workspace = context.workspace
     names = {number: name for name, number in colmap_database.image_ids(workspace.database).items()}
     min_num_inliers = recorded_verification(workspace).min_num_inliers
     found = inlier_matches(workspace.database, min_num_inliers)
-    exact = {(names[one], names[two]): indices for (one, two), indices in found.items()}
-    if workspace.guided.exists():
-        exact |= {pair.names: pair.exact for pair in current(context) if pair.num_inliers}
-    return exact
+    return {(names[one], names[two]): indices for (one, two), indices in found.items()}
+
+
+def exact_inliers(context: Context) -> dict[Pair, Matches]:
+    """Return the inliers of each verified pair without guided matches."""
+    guided = {pair.names: pair.exact for pair in current(context) if pair.num_inliers}
+    return {**verified_inliers(context), **guided}
 
 
 def current(context: Context) -> list[GuidedPair]:

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.model_files import num_long_tracks
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import num_long_tracks, write_model
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.mappers.attempts import map_database, read_models
 from colmap_affrect.mappers.base import Mapper, MappingTask
+from colmap_affrect.mappers.exact import exact_only
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs
+from colmap_affrect.stages.guide import exact_inliers, guided_counts, verified_inliers
 from colmap_affrect.stages.verify import recorded_verification
 
 INPUTS = "inputs.sha256"
@@ -49,8 +53,23 @@ def map_images(
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
+    if guided_counts(context):
+        adjust_exactly(context, mapper)
+        models = read_models(workspace.sparse)
     replace_text(path, inputs)
     return StageReport("map", time.perf_counter() - start, len(models)), models
+
+
+def adjust_exactly(context: Context, mapper: Mapper) -> None:
+    """Adjust models by exact matches where these suffice; see :mod:`..mappers.exact`."""
+    workspace = context.workspace
+    exact, verified = exact_inliers(context), verified_inliers(context)
+    refine = not (intrinsics_given(workspace) and mapper.options.keep_given_intrinsics)
+    for folder in (path for path in workspace.sparse.iterdir() if path.name.isdigit()):
+        model = pycolmap.Reconstruction(folder)
+        if exact_only(model, exact, verified, refine_intrinsics=refine):
+            shutil.rmtree(folder)
+            write_model(model, folder)
 
 
 def intrinsics_given(workspace: Workspace) -> bool:
