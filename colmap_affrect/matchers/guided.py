@@ -348,8 +348,8 @@ def nearest_allowed(
         others[_within(points2[best[alike]], points2, options.min_contrast_distance_px)] = -1.0
         ratios = _ratios(value[alike], others.max(axis=1))
         accepted[rows[alike]] = ratios < options.max_ratio
-    mutual = accepted & (backward[forward] == np.arange(count1)) & (forward >= 0)
-    kept = np.flatnonzero(mutual)
+    kept = np.flatnonzero(accepted)
+    kept = kept[backward[forward[kept]] == kept]
     return np.stack([kept, forward[kept]], axis=1)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import PairVerifier, inlier_matches, verified_pairs
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.pairs.base import Pair
@@ -237,7 +238,9 @@ class Guiding:
         self.context.guided.write(
             replace(pair, num_inliers=counts.get(pair.names, 0)) for pair in found
         )
+        self._write_geometries(geometries)
+
+    def _write_geometries(self, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]) -> None:
         with colmap_database.open_database(self.path) as database:
-            for names, geometry in geometries.items():
-                first_id, second_id = (self.ids[name] for name in names)
-                database.update_two_view_geometry(first_id, second_id, geometry)
+            for (first, second), geometry in geometries.items():
+                database.update_two_view_geometry(self.ids[first], self.ids[second], geometry)
