@@ -267,14 +267,20 @@ def escalate(options: argparse.Namespace) -> int:
 
 
 def guide(options: argparse.Namespace) -> int:
+    from colmap_affrect.colmap.model_files import read_model
     from colmap_affrect.matchers.guided import GuidedOptions
     from colmap_affrect.stages.guide import guide, guided_counts
+    from colmap_affrect.stages.guide_by_model import guide_by_model
 
     with _context(options) as context:
         values = _changed("guided", context.workspace.planned("guide"), options.set)
         values |= {"enabled": options.guided} if options.guided else {}
         chosen = GuidedOptions.from_mapping(values, "guided")
-        report = guide(context, chosen, overwrite=options.overwrite)
+        report = guide(
+            context, chosen, () if options.model_path else None, overwrite=options.overwrite
+        )
+        if options.model_path:
+            report = guide_by_model(context, read_model(options.model_path))
         counts = guided_counts(context)
     print(report.summary())
     if counts:

@@ -114,7 +114,7 @@ class EpipolarGuide:
         """Bring both images to unit size, which keeps angles around far epipoles apart."""
         self._fundamental, self._points = fundamental, (points1, points2)
         finite = [points[np.isfinite(points).all(axis=1)] for points in (points1, points2)]
-        size = max(1.0, *(float(np.ptp(p, axis=0).max(initial=0.0)) for p in finite if len(p)))
+        size = max([1.0, *(float(np.ptp(p, axis=0).max()) for p in finite if len(p))])
         to_pixels, unit = [], []
         for points, usable in zip((points1, points2), finite, strict=True):
             center = usable.mean(axis=0) if len(usable) else np.zeros(2)
@@ -306,11 +306,14 @@ def guided_matches(
 
     Returns:
         (K, 2), by rising features of image 1; the inliers alone where their frames do not agree
-        with the geometry (:data:`MIN_AGREEING`). Frames are not asked where an image has none that
-        could tell (:attr:`GuidableImage.has_directions`).
+        with the geometry (:data:`MIN_AGREEING`); without inliers those of the guided matches must.
+        Frames are not asked where an image has none that could tell
+        (:attr:`GuidableImage.has_directions`); there nothing is found without inliers.
     """
     found = nearest_allowed(first, second, guide, options)
-    if first.has_directions and second.has_directions:
+    if not (first.has_directions and second.has_directions):
+        found = found[: len(found) if len(inliers) else 0]
+    else:
         shapes1, shapes2 = np.asarray(first.shapes), np.asarray(second.shapes)
         trusted = inliers if len(inliers) else found
         agreeing = guide.angles_deg(shapes1, shapes2, trusted, trusted) <= options.max_angle_deg

@@ -165,6 +165,9 @@ class Guiding:
         self.context, self.options = context, options
         self.path = context.workspace.database
         self.ids = colmap_database.image_ids(self.path)
+        max_size_px = recorded_extraction(context.workspace).max_image_size_px
+        sizes = context.features.image_sizes()
+        self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()}
         self.verifier = PairVerifier(self.path, recorded_verification(context.workspace))
 
     def todo(self, images: Collection[str] | None) -> tuple[list[Pair], int]:
@@ -179,10 +182,22 @@ class Guiding:
         done = {pair.names for pair in current(self.context)}
         return [pair for pair in chosen if pair not in done], sum(p in done for p in chosen)
 
-    def guide(self, pairs: Sequence[Pair], advance: Callable[[int], None]) -> None:
-        """Match pairs again, batch by batch, and keep what has more inliers."""
+    def guide(
+        self,
+        pairs: Sequence[Pair],
+        advance: Callable[[int], None],
+        tasks: Callable[[Sequence[Pair]], list[GuidedTask]] | None = None,
+    ) -> None:
+        """Match pairs again, batch by batch, and keep what has more inliers.
+
+        Args:
+            pairs: of images, the one with the lower id first.
+            advance: is told of each.
+            tasks: makes the tasks of a batch; by default from the geometries of verified pairs.
+        """
         if not pairs:
             return
+        tasks = tasks or self._tasks
         features = self.context.features
         executor = self.context.executor
         if executor is None or not executor.sees([features.path]):
@@ -192,18 +207,13 @@ class Guiding:
         for begin in range(0, len(ordered), PAIRS_PER_WRITE):
             batch = ordered[begin : begin + PAIRS_PER_WRITE]
             found = []
-            for pair in executor.map(matcher, self._tasks(batch), [features.path]):
+            for pair in executor.map(matcher, tasks(batch), [features.path]):
                 found.append(pair)
                 advance(1)
             self._keep(found)
 
     def _tasks(self, pairs: Sequence[Pair]) -> list[GuidedTask]:
         """Return what can be guided."""
-        max_size_px = recorded_extraction(self.context.workspace).max_image_size_px
-        scales = {
-            name: max(1.0, max(size) / max_size_px)
-            for name, size in self.context.features.image_sizes().items()
-        }
         tasks = []
         with colmap_database.open_database(self.path) as database:
             cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
@@ -217,7 +227,7 @@ class Guiding:
                         database.read_keypoints(first.image_id),
                         database.read_keypoints(second.image_id),
                     ),
-                    (scales[names[0]], scales[names[1]]),
+                    (self.scales[names[0]], self.scales[names[1]]),
                 )
                 geometry = database.read_two_view_geometry(first.image_id, second.image_id)
                 tasks.append(view.task(geometry, self.options.band_px))
@@ -242,5 +252,9 @@ class Guiding:
 
     def _write_geometries(self, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]) -> None:
         with colmap_database.open_database(self.path) as database:
-            for (first, second), geometry in geometries.items():
-                database.update_two_view_geometry(self.ids[first], self.ids[second], geometry)
+            for pair, geometry in geometries.items():
+                first, second = (self.ids[name] for name in pair)
+                if database.exists_two_view_geometry(first, second):
+                    database.update_two_view_geometry(first, second, geometry)
+                else:
+                    database.write_two_view_geometry(first, second, geometry)

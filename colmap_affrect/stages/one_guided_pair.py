@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,13 @@ class GuidedTask:
     def __str__(self) -> str:
         return " and ".join(self.names)
 
+    def scaled(self, scales: tuple[float, float]) -> GuidedTask:
+        """Return the same in pixels of images that are smaller by these factors."""
+        first, second = (np.diag([scale, scale, 1.0]) for scale in scales)
+        other = np.linalg.inv(second) if self.is_homography else second
+        points = (self.points[0] / scales[0], self.points[1] / scales[1])
+        return replace(self, matrix=other @ self.matrix @ first, points=points)
+
     def guide(self, band_px: float) -> Guide:
         """Return the geometry as what guides matches."""
         make = HomographyGuide if self.is_homography else EpipolarGuide
@@ -78,18 +85,16 @@ class PairView:
         inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
         tolerance_px = BANDS_OF_HOMOGRAPHY * band_px * max(self.scales)
         homography = homography_of(geometry, self.keypoints, tolerance_px, MIN_OFF_PLANE)
-        scales = [np.diag([scale, scale, 1.0]) for scale in self.scales]
         if homography is not None:
             first, second = (np.asarray(p[:, :2], np.float64) for p in self.keypoints)
-            matrix = np.linalg.inv(scales[1]) @ homography @ scales[0]
+            task = GuidedTask(self.names, homography, True, (first, second), inliers)
         else:
             pair = epipolar_pair(geometry, self.cameras, self.keypoints)
             if pair is None:
                 return None
-            first, second = pair.points1, pair.points2
-            matrix = scales[1] @ pair.fundamental @ scales[0]
-        points = (first / self.scales[0], second / self.scales[1])
-        return GuidedTask(self.names, matrix, homography is not None, points, inliers)
+            points = (pair.points1, pair.points2)
+            task = GuidedTask(self.names, pair.fundamental, False, points, inliers)
+        return task.scaled(self.scales)
 
 
 @dataclass(frozen=True)

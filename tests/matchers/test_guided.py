@@ -203,7 +203,10 @@ def test_circles_have_no_directions() -> None:
     circles = np.random.default_rng(2).uniform(1, 9, 200)[:, None, None] * np.eye(2)
     first, second = (replace(image, shapes=circles) for image in (first, second))
     assert not first.has_directions
-    assert len(guided_matches(first, second, guides[0], OPTIONS, np.zeros((0, 2), int))) == 200
+    nothing = np.zeros((0, 2), int)
+    assert not len(guided_matches(first, second, guides[0], OPTIONS, nothing))
+    some = nearest_allowed(first, second, guides[0], OPTIONS)[:1]
+    assert len(guided_matches(first, second, guides[0], OPTIONS, some)) == 200
 
 
 def test_inliers_stay_and_matches_are_one_to_one() -> None:

@@ -34,6 +34,7 @@ from colmap_affrect.stages.guide import (
     restore_exact,
     verified_inliers,
 )
+from colmap_affrect.stages.guide_by_model import guide_by_model
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
@@ -76,9 +77,15 @@ def test_pairs_gain_and_what_was_there_stays_on_record(before: Workspace, contex
         assert_array_equal(exact_inliers(context)[pair], indices)
         for side in (0, 1):
             assert len(np.unique(verified[pair][:, side])) == len(verified[pair])
-    raw = [database_content(item.database)["matches"] for item in (before, context.workspace)]
+    raw = [raw_matches(item.database) for item in (before, context.workspace)]
     assert raw[0] == raw[1]
     assert geometry_digest(before.database) != geometry_digest(context.workspace.database)
+
+
+def raw_matches(path: Path) -> list[tuple[int, bytes]]:
+    with open_database(path) as database:
+        pair_ids, matches = database.read_all_matches()
+    return [(pair, found.tobytes()) for pair, found in zip(pair_ids, matches, strict=True)]
 
 
 def test_guided_matches_are_right(context: Context) -> None:
@@ -185,8 +192,8 @@ def test_command(context: Context, call: Call) -> None:
     out = ["--output-path", context.workspace.path]
     ended = call("guide", *out, "--guided", "always", "--set", "guided.band_px=2")
     assert ended.code == 0
-    assert "guide: 6 done" in ended.output
-    assert "inliers" in ended.output
+    assert "guide: 6 done" in ended.stdout
+    assert "inliers" in ended.stdout
     refused = call("guide", *out, "--guided", "auto")
     assert "was run there with band_px=2.0" in refused.errors[0] or "enabled" in refused.errors[0]
     wrong = call("guide", *out, "--set", "matching.max_ratio=0.8")
@@ -261,6 +268,38 @@ def test_more_images_are_better_then_more_points() -> None:
     assert better([small, large], [small])
     assert not better([small], [small])
     assert not better([], [small])
+
+
+def test_pairs_that_never_matched_are_guided_by_a_model(context: Context) -> None:
+    pairs = sorted(verified_inliers(context))
+    map_images(context, mapper())
+    model = pycolmap.Reconstruction(context.workspace.sparse / "0")
+    lost, ids = pairs[2], image_ids(context.workspace.database)
+    true = verified_inliers(context)[lost]
+    with open_database(context.workspace.database) as database:
+        database.delete_two_view_geometry(*(ids[name] for name in lost))
+        database.delete_matches(*(ids[name] for name in lost))
+    assert lost not in verified_inliers(context)
+    assert guide_by_model(context, model).num_done == 1
+    found = verified_inliers(context)[lost]
+    assert len({*map(tuple, true)} & {*map(tuple, found)}) > 0.8 * len(true)
+    assert guide_by_model(context, model).num_done == 0
+    restore_exact(context)
+    assert lost not in verified_inliers(context)
+
+
+def test_a_wrong_model_gives_nothing(context: Context) -> None:
+    map_images(context, mapper())
+    model = pycolmap.Reconstruction(context.workspace.sparse / "0")
+    pair, ids = sorted(verified_inliers(context))[2], image_ids(context.workspace.database)
+    wrong = next(image for image in model.images.values() if image.name == pair[0])
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d([0, 0, 0.3, 0.954]), [0.4, 0, 0])
+    wrong.frame.set_cam_from_world(wrong.camera_id, turn * wrong.cam_from_world())
+    with open_database(context.workspace.database) as database:
+        database.delete_two_view_geometry(*(ids[name] for name in pair))
+        database.delete_matches(*(ids[name] for name in pair))
+    assert guide_by_model(context, model).num_done == 1
+    assert pair not in verified_inliers(context)
 
 
 def test_ids_of_a_pair_are_in_order(context: Context) -> None:
