@@ -35,11 +35,11 @@ def exact_only(
     *,
     refine_intrinsics: bool,
 ) -> int:
-    """Take guided observations out of a model where exact ones suffice, and adjust it.
+    """Take guided observations out of a model that exact ones hold, and adjust it.
 
-    These are the observations that only guided matches tie to their tracks, in the largest part
-    of the model whose images hang together by exact tracks through three images. Others stay, and
-    so do those that tie other images to this part: two-view tracks leave their scale open.
+    These are the observations that only guided matches tie to their tracks. Where exact matches do
+    not hold all images nothing is taken out: guided tracks then fix what exact ones leave open, the
+    scale of one part against another for one, and half of them would serve neither part.
 
     Args:
         model: changed in place.
@@ -56,12 +56,8 @@ def exact_only(
         if image.has_pose
     }
     ties = _ties(points, exact)
-    held = exactly_held(ties)
-    others = _ties(points, verified)
-    is_inside = np.isin(others >> 32, list(held)).all(axis=1)
-    needed = np.concatenate([ties.ravel(), others[~is_inside].ravel()])
-    dropped = np.setdiff1d(others[is_inside], needed)
-    if not len(dropped):
+    dropped = np.setdiff1d(_ties(points, verified), ties)
+    if not len(dropped) or len(exactly_held(ties)) < len(points):
         return 0
     for image_id, index in zip(dropped >> 32, dropped & 0xFFFFFFFF, strict=True):
         if model.images[image_id].points2D[index].has_point3D():
