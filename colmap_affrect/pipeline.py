@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
@@ -19,16 +20,25 @@ from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.report import ReconstructionReport, StageReport
+from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.copy import copy_verified, is_copy
 from colmap_affrect.stages.escalate import escalate, pair_levels
 from colmap_affrect.stages.extract import Inputs, extract, write_descriptors
+from colmap_affrect.stages.guide import (
+    current,
+    guide,
+    guided_counts,
+    recorded_guiding,
+    restore_exact,
+)
 from colmap_affrect.stages.map import (
     advice,
+    agreement,
     image_names,
+    images_in_need,
     intrinsics_given,
     map_images,
     num_verified_pairs,
@@ -142,6 +152,7 @@ def run(
         ]
         if options.recipe.extraction.escalation:
             reports.append(escalate(context, options.recipe.escalate))
+        reports.append(guide(context, options.recipe.guided))
         if options.database_descriptors:
             write_descriptors(context)
         return map_and_report(context, mapper, options.extend, earlier=reports)
@@ -205,7 +216,7 @@ def map_and_report(
     if extend and overwrite:
         extend.refuse_discarding(workspace.path)
     before = existing_names(extend.model_path, image_names(workspace)) if extend else []
-    report, models = map_images(context, mapper, extend, overwrite=overwrite)
+    reports, models = map_guided(context, mapper, extend, overwrite=overwrite)
     names, copied = image_names(workspace), is_copy(workspace)
     verification = recorded_verification(workspace)
     given = intrinsics_given(workspace)
@@ -216,7 +227,7 @@ def map_and_report(
         models=tuple(models),
         num_pairs=num_matched_pairs(workspace.database) if copied else len(listed_pairs(context)),
         num_verified_pairs=num_verified_pairs(workspace),
-        stages=(*earlier, report),
+        stages=(*earlier, *reports),
         recipe="" if copied else workspace.recipe(),
         versions=installed_versions(),
         presets=(verification.preset_name, options.preset_name),
@@ -227,11 +238,39 @@ def map_and_report(
             "mapping": mapper.differences(intrinsics_given=given),
         },
         pair_levels={} if copied else pair_levels(context),
+        guided=guided_counts(context),
         extended=tuple(before),
         advice=advice(context, missing, models),
     )
     replace_text(workspace.report, result.to_json())
     return result
+
+
+def map_guided(
+    context: Context, mapper: Mapper, extend: Extension | None = None, *, overwrite: bool = False
+) -> tuple[list[StageReport], list[ModelSummary]]:
+    """Map; where images are missing or hang on few tracks, guide their pairs and map again."""
+    report, models = map_images(context, mapper, extend, overwrite=overwrite)
+    if extend or is_copy(context.workspace):
+        return [report], models
+    before = {pair.names for pair in current(context)}
+    images = images_in_need(context, recorded_guiding(context.workspace).min_num_tracks)
+    guided = guide(context, images=images) if images else None
+    if guided is None or not guided.num_done:
+        return [report], models
+    sparse = context.workspace.sparse
+    aside = sparse.with_name(sparse.name + ".aside")
+    shutil.rmtree(aside, ignore_errors=True)
+    sparse.rename(aside)
+    again, models_again = map_images(context, mapper)
+    reports = [report, guided, again]
+    if agreement(context, sparse) > agreement(context, aside):
+        shutil.rmtree(aside)
+        return reports, models_again
+    restore_exact(context, {pair.names for pair in current(context)} - before)
+    shutil.rmtree(sparse)
+    aside.rename(sparse)
+    return reports, models
 
 
 def installed_versions() -> dict[str, str]:

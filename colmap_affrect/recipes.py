@@ -21,6 +21,7 @@ from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.images.depth import DEPTH_SOURCES, DepthFilesOptions, DepthOptions
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
+from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.options import Options, Registry, within
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOptions
@@ -98,6 +99,7 @@ class RecipeOptions(ExtractionOptions):
     summary: str = ""
     matching: AnyMatcher = NearestOptions()
     escalate: EscalateOptions = EscalateOptions()
+    guided: GuidedOptions = GuidedOptions()
     mapping: dict[str, Any] = Field(default_factory=dict)
     """``name`` of the mapper and options that differ from the preset."""
 
@@ -112,6 +114,7 @@ class Recipe:
         extraction: everything that decides the features of an image.
         matching: the matcher.
         escalate: which pairs climb.
+        guided: guided matching.
         mapping: the mapper's ``name`` and options that differ from the preset.
     """
 
@@ -120,6 +123,7 @@ class Recipe:
     extraction: ExtractionOptions = field(default_factory=ExtractionOptions)
     matching: MatcherOptions = field(default_factory=NearestOptions)
     escalate: EscalateOptions = field(default_factory=EscalateOptions)
+    guided: GuidedOptions = field(default_factory=GuidedOptions)
     mapping: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -138,6 +142,7 @@ class Recipe:
             ExtractionOptions(**fields),
             options.matching,
             options.escalate,
+            options.guided,
             options.mapping,
         )
         if recipe.mapping:
@@ -153,6 +158,7 @@ class Recipe:
             **self.extraction.to_mapping(),
             "matching": self.matching.to_mapping(),
             "escalate": self.escalate.to_mapping(),
+            "guided": self.guided.to_mapping(),
             "mapping": dict(self.mapping),
         }
 

@@ -17,6 +17,7 @@ from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.global_mapper import GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalOptions
+from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.options import Options
 from colmap_affrect.pairs.base import PairOptions
@@ -26,8 +27,8 @@ from colmap_affrect.rectifiers.whole_image import AsiftOptions
 
 ALL_OPTIONS = [
     CameraOptions, EscalateOptions, ExtractionOptions, GlobalOptions, IncrementalOptions,
-    NearestOptions, PairOptions, SecondMomentOptions, SiftOptions, VerificationOptions,
-    AffNetHardNetOptions, AsiftOptions,
+    GuidedOptions, NearestOptions, PairOptions, SecondMomentOptions, SiftOptions,
+    VerificationOptions, AffNetHardNetOptions, AsiftOptions,
 ]  # fmt: skip
 
 

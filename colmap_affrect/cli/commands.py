@@ -81,6 +81,8 @@ def _recipe(options: argparse.Namespace) -> Recipe:
 
     matcher = getattr(options, "matcher", None)
     settings = [f"matching.name={json.dumps(matcher)}"] if matcher else []
+    guided = getattr(options, "guided", None)
+    settings += [f"guided.enabled={json.dumps(guided)}"] if guided else []
     return load_recipe(options.recipe, [*settings, *options.set, *_depth_settings(options)])
 
 
@@ -273,6 +275,28 @@ def escalate(options: argparse.Namespace) -> int:
         levels = pair_levels(context)
     print(report.summary())
     print(", ".join(f"{count} pairs by {name}" for name, count in levels.items()))
+    return EXIT_OK
+
+
+def guide(options: argparse.Namespace) -> int:
+    from colmap_affrect.colmap.model_files import read_model
+    from colmap_affrect.matchers.guided import GuidedOptions
+    from colmap_affrect.stages.guide import guide, guided_counts
+    from colmap_affrect.stages.guide_by_model import guide_by_model
+
+    with _context(options) as context:
+        values = _changed("guided", context.workspace.planned("guide"), options.set)
+        values |= {"enabled": options.guided} if options.guided else {}
+        chosen = GuidedOptions.from_mapping(values, "guided")
+        report = guide(
+            context, chosen, () if options.model_path else None, overwrite=options.overwrite
+        )
+        if options.model_path:
+            report = guide_by_model(context, read_model(options.model_path))
+        counts = guided_counts(context)
+    print(report.summary())
+    if counts:
+        print("{pairs} pairs, {matches_before} to {matches_after} inliers".format(**counts))
     return EXIT_OK
 
 

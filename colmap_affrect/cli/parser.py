@@ -85,7 +85,7 @@ Command = tuple[Callable[[argparse.Namespace], int], str, tuple[args.Option | ar
 
 COMMANDS: dict[str, Command] = {
     "run": (commands.run, "all stages: photographs in, COLMAP model out",
-        (*args.RESULTS, *args.IMAGES, args.DESCRIPTORS, *args.recipe(), args.MATCHER,
+        (*args.RESULTS, *args.IMAGES, args.DESCRIPTORS, *args.recipe(), args.MATCHER, args.GUIDED,
         *args.RESOURCES, args.SCHEDULER, *args.DEPTH, *args.PAIRS, args.PRESET, *args.MAPPER,
         *args.EXTEND, args.seed(), args.json())),
     "extract": (commands.extract, "features into features.h5 and database.db",
@@ -100,6 +100,10 @@ COMMANDS: dict[str, Command] = {
     "escalate": (commands.escalate,
         "match pairs that failed again, with more warps (recipes that escalate, as on-demand)",
         (*args.RESULTS, args.setting("escalate.min_num_tracks=10"), *args.RESOURCES,
+            args.SCHEDULER)),
+    "guide": (commands.guide,
+        "match verified pairs again, guided by their geometry",
+        (*args.RESULTS, args.GUIDED, args.BY_MODEL, args.setting("guided.band_px=2"),
             args.SCHEDULER)),
     "map": (commands.map, "COLMAP models into sparse/",
         (*args.RESULTS, *args.COPIED, *args.EXTEND, args.PRESET, *args.MAPPER, args.seed(),

@@ -7,6 +7,7 @@ followed to the end of its file, which damage seldom leaves in its place.
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -148,3 +149,13 @@ RECORDS: dict[str, Callable[[_Reader], str | None]] = {
     "points3D.bin": _walk_point,
 }
 """The files of a model, and what steps over one record of each."""
+
+
+def num_long_tracks(folder: Path) -> dict[str, int]:
+    """Return how many points that three images or more see each image of a model sees."""
+    model = pycolmap.Reconstruction(folder)
+    counts: Counter[int] = Counter()
+    for point in model.points3D.values():
+        if point.track.length() > 2:
+            counts.update({element.image_id for element in point.track.elements})
+    return {image.name: counts[image_id] for image_id, image in model.images.items()}

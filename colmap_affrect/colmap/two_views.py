@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose
+from colmap_affrect.geometry.affine import project
 
 PLANAR = (
     pycolmap.TwoViewGeometryConfiguration.PLANAR,
@@ -110,3 +111,32 @@ def decomposed_homography(
         for rotation, translation, length in zip(rotations, translations, lengths, strict=True)
         if length > MIN_TRANSLATION
     ]
+
+
+def homography_of(
+    geometry: pycolmap.TwoViewGeometry,
+    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+    tolerance_px: float,
+    min_off_plane: int,
+) -> NDArray[np.float64] | None:
+    """Return the homography of a pair whose epipolar geometry is arbitrary or hardly determined.
+
+    That is one of :data:`PLANAR`, or whose homography explains all but fewer than
+    ``min_off_plane`` of its inliers: epipolar lines hold on the plane, but turn freely off it.
+
+    Args:
+        geometry: as COLMAP estimated it.
+        keypoints: (N1, 2 or more) and (N2, 2 or more) as in the database.
+        tolerance_px: how near to the place in image 2 is explained.
+        min_off_plane: so many inliers off the plane determine the geometry.
+    """
+    homography = geometry.H
+    if homography is None or not np.any(homography):
+        return None
+    homography = np.asarray(homography, np.float64)
+    first, second = np.asarray(geometry.inlier_matches, np.int64).T
+    places = project(homography, np.asarray(keypoints[0][first, :2], np.float64))
+    errors = np.linalg.norm(places - keypoints[1][second, :2], axis=1)
+    if geometry.config in PLANAR or (errors > tolerance_px).sum() < min_off_plane:
+        return homography
+    return None

@@ -123,13 +123,26 @@ class PairVerifier:
             keypoints: (N1, 2) and (N2, 2) in pixel-centre px.
             indices: (M, 2) matches.
         """
+        geometry = self.geometry(names, keypoints, indices)
+        return len(geometry.inlier_matches) if geometry else 0
+
+    def geometry(
+        self,
+        names: tuple[str, str],
+        keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+        indices: NDArray[np.integer],
+    ) -> pycolmap.TwoViewGeometry | None:
+        """Return the two-view geometry, from the image with the lower id to the other one.
+
+        Arguments are those of :meth:`num_inliers`; None if there is none.
+        """
         sides = [
             (*self._images[name], points) for name, points in zip(names, keypoints, strict=True)
         ]
         if sides[0][0] > sides[1][0]:
             sides, indices = sides[::-1], indices[:, ::-1]
         _, cameras, points = zip(*sides, strict=True)
-        return num_two_view_inliers(cameras, points, indices, self.options)
+        return two_view_geometry(cameras, points, indices, self.options)
 
 
 def num_two_view_inliers(
@@ -138,7 +151,18 @@ def num_two_view_inliers(
     indices: NDArray[np.integer],
     options: pycolmap.TwoViewGeometryOptions,
 ) -> int:
-    """Return the number of inliers of (M, 2) matches of two images, 0 without a geometry.
+    """Return the number of inliers of :func:`two_view_geometry`, 0 without one."""
+    geometry = two_view_geometry(cameras, keypoints, indices, options)
+    return len(geometry.inlier_matches) if geometry else 0
+
+
+def two_view_geometry(
+    cameras: Sequence[pycolmap.Camera],
+    keypoints: Sequence[NDArray[np.floating]],
+    indices: NDArray[np.integer],
+    options: pycolmap.TwoViewGeometryOptions,
+) -> pycolmap.TwoViewGeometry | None:
+    """Estimate the geometry of (M, 2) matches of two images; None where there is none.
 
     Keypoints are (N1, 2) and (N2, 2) in pixel-centre px.
     """
@@ -147,7 +171,7 @@ def num_two_view_inliers(
         cameras[0], stored1, cameras[1], stored2, indices.astype(np.uint32), options
     )
     # Of a geometry that it rejects the estimator returns the inliers all the same.
-    return 0 if geometry.config in REJECTED else len(geometry.inlier_matches)
+    return None if geometry.config in REJECTED else geometry
 
 
 def stored_keypoints(points: NDArray[np.floating]) -> NDArray[np.float64]:

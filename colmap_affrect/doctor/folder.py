@@ -107,6 +107,7 @@ class _FolderExamination:
             record = workspace.recorded()
             done = [stage for stage in STAGES if stage in record.get("begun", [])]
             wanted = list(COPY_STAGES if "copy" in done else STAGES[1:])
+            wanted = [stage for stage in wanted if stage != "guide"]  # map does that when needed
             if "extract" in done:
                 Inputs.recorded(workspace)
                 if not recorded_extraction(workspace).escalation:

@@ -85,7 +85,7 @@ class MappingTask:
     extend: ExistingModel | None = None
     snapshot_path: Path | None = None
     cancellation: pycolmap.CancellationToken | None = None
-    guided: Mapping[tuple[int, int], NDArray[np.integer]] = field(default_factory=dict)
+    guided: Mapping[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
 
     @property
     def colors_path(self) -> Path:

@@ -47,7 +47,7 @@ class StageReport:
     """One stage of a run.
 
     Attributes:
-        name: extract, pairs, match, verify, escalate or map.
+        name: extract, pairs, match, verify, escalate, guide or map.
         wall_s: seconds.
         num_done: images, pairs or models made now.
         num_kept: those found done already.
@@ -146,6 +146,8 @@ class ReconstructionReport:
             and ``none``; empty for other recipes.
         extended: names of the images of the model that was extended; empty where none was.
         advice: what to try for the images that are missing.
+        guided: ``pairs`` that guided matching gave more inliers, and these inliers
+            ``matches_before`` and ``matches_after``; empty where no pair needed it.
     """
 
     images_total: int
@@ -163,6 +165,7 @@ class ReconstructionReport:
     pair_levels: dict[str, int] = dataclasses.field(default_factory=dict)
     extended: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
+    guided: dict[str, int] = dataclasses.field(default_factory=dict)
 
     @property
     def status(self) -> str:
@@ -229,6 +232,7 @@ class ReconstructionReport:
             "num_pairs": self.num_pairs,
             "num_verified_pairs": self.num_verified_pairs,
             "pair_levels": self.pair_levels,
+            "guided": self.guided,
             "stages": [dataclasses.asdict(stage) for stage in self.stages],
             "recipe": self.recipe,
             "preset": self.preset,
@@ -258,6 +262,9 @@ class ReconstructionReport:
         if self.pair_levels:
             counts = ", ".join(f"{count} by {name}" for name, count in self.pair_levels.items())
             lines += [f"decided     {counts}"]
+        if self.guided:
+            before, after = self.guided["matches_before"], self.guided["matches_after"]
+            lines += [f"guided      {self.guided['pairs']} pairs, {before} to {after} inliers"]
         if self.models:
             model = self.models[0]
             lines += _some(

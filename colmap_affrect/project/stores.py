@@ -6,7 +6,8 @@
 escalation follow those of level k - 1 and end at ``level_ends[k]``. ``matches.h5``: a group
 per pair with ``matches0`` (N0,), -1 where unmatched, ``matching_scores0`` (N0,) and the
 attributes ``level``, whose features were matched together with those of level 0, and
-``tried_level``, the highest that was tried. Coordinates have their origin at the centre of the
+``tried_level``, the highest that was tried. ``guided.h5``: a group per pair that was matched again
+by its geometry. Coordinates have their origin at the centre of the
 first pixel. Files are opened for one image or one batch of pairs and closed again; what is
 written in between appears as a whole (:mod:`colmap_affrect.project.atomic_files`). A group without
 the attribute ``complete``, of another program, does not count.
@@ -173,7 +174,7 @@ def _complete_groups(group: h5py.Group, path: str = "") -> Iterator[str]:
 
 DATASETS = {
     "descriptors", "image_size", "keypoints", "lafs", "level_ends", "matches0",
-    "matching_scores0", "rectification_ids", "scores",
+    "matching_scores0", "rectification_ids", "scores", "exact", "candidates",
 }  # fmt: skip
 """What complete groups hold; groups too, where a file has become a folder."""
 
@@ -364,3 +365,50 @@ class MatchStore(_Store):
                     len(matches0),
                     int(file[key].attrs["level"]),
                 )
+
+
+@dataclass(frozen=True)
+class GuidedPair:
+    """What guided matching found for a pair.
+
+    Attributes:
+        names: of the two images, in the order of the columns.
+        exact: (M, 2) inliers before; what adjusts models most accurately.
+        candidates: (K, 2) the same and guided matches, to verify.
+        num_inliers: of the geometry that was estimated from the candidates and took the place of
+            the one before; 0 where that stayed.
+    """
+
+    names: tuple[str, str]
+    exact: NDArray[np.int64]
+    candidates: NDArray[np.int64]
+    num_inliers: int
+
+
+class GuidedStore(_Store):
+    """Which pairs were matched again by their geometry."""
+
+    kind = "guided matches"
+
+    def write(self, pairs: Iterable[GuidedPair]) -> None:
+        """Write a batch of pairs, in the place of what is there of them."""
+        with self._open("a") as file:
+            for pair in pairs:
+                datasets = {"exact": pair.exact, "candidates": pair.candidates}
+                names = np.asarray(pair.names, dtype=h5py.string_dtype())
+                key = pair_key(*pair.names)
+                self._write(file, key, datasets, names=names, num_inliers=pair.num_inliers)
+
+    def read(self) -> list[GuidedPair]:
+        """Read all pairs."""
+        keys = self.names()
+        if not keys:
+            return []
+        found = []
+        with self._open("r") as file:
+            for group in (file[key] for key in keys):
+                first, second = (str(name) for name in group.attrs["names"])
+                exact, candidates = group["exact"][()], group["candidates"][()]
+                count = int(group.attrs["num_inliers"])
+                found.append(GuidedPair((first, second), exact, candidates, count))
+        return found

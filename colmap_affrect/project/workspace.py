@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 LOCAL = ("image_path", "image_list_path", "from_database", "cameras")
 """Options that :meth:`Workspace.options_digest` leaves out: where files are, and cameras."""
-STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "map")
+STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
 COPY_STAGES = ("copy", "verify", "map")
 """Of a folder in which another program's database is mapped."""
 FORMAT_VERSION = 3
@@ -71,6 +71,11 @@ class Workspace:
     def matches(self) -> Path:
         """Raw matches by pair (HDF5)."""
         return self.path / "matches.h5"
+
+    @property
+    def guided(self) -> Path:
+        """What guided matching found, by pair (HDF5)."""
+        return self.path / "guided.h5"
 
     @property
     def database(self) -> Path:
@@ -249,7 +254,7 @@ class Workspace:
         if {"copy", "extract"} & set(begun):
             return
         database = [] if self.users_database else [self.database]
-        for path in (*database, self.sparse, self.features, self.matches):
+        for path in (*database, self.sparse, self.features, self.matches, self.guided):
             if path.exists():
                 raise StaleStoreError(
                     f"{path}: exists and was not made here; it is left as it is, use "
@@ -260,6 +265,8 @@ class Workspace:
         """Remove what a stage and those after it made."""
         first = STAGES.index(stage)
         outdated = [self.sparse, self.snapshots, self.report]
+        if first <= STAGES.index("guide"):
+            outdated.append(self.guided)
         if first <= STAGES.index("verify"):
             outdated.append(self.database)
         if first <= STAGES.index("match"):

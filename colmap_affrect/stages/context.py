@@ -7,7 +7,7 @@ from pathlib import Path
 
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.stores import FeatureStore, MatchStore
+from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 
 
@@ -64,3 +64,9 @@ class Context:
         """The raw matches; refused like features."""
         digest = self.workspace.options_digest("extract", "match")
         return MatchStore(self.workspace.matches, digest)
+
+    @property
+    def guided(self) -> GuidedStore:
+        """The guided matches; refused like features."""
+        digest = self.workspace.options_digest("extract", "match", "verify", "guide")
+        return GuidedStore(self.workspace.guided, digest)

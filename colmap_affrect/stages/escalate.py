@@ -20,7 +20,7 @@ lowest level that has something to do comes first, so that a killed run goes on 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -40,6 +40,7 @@ from colmap_affrect.colmap.verification import (
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.consistency import num_consistent_matches
 from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.connectivity import weakly_connected_images
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace
@@ -52,6 +53,7 @@ from colmap_affrect.stages.extract import (
     recorded_extraction,
     write_images_and_keypoints,
 )
+from colmap_affrect.stages.guide import restore_exact
 from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, recorded_matching
 from colmap_affrect.stages.one_image import ImageExtractor
 from colmap_affrect.stages.one_pair import iterate_matches
@@ -82,6 +84,8 @@ def escalate(
     context.resources.require_device()
     context.workspace.require("verify")
     options = options or recorded_escalation(context.workspace)
+    if overwrite:
+        restore_exact(context)
     context.workspace.record_options("escalate", options.to_mapping(), overwrite=overwrite)
     escalation = Escalation(context, options)
     if overwrite:
@@ -154,37 +158,6 @@ def first_level_database(context: Context) -> Iterator[Path | None]:
         copy_database(context.workspace.database, path)
         escalation.match_first_level(climbed, path)
         yield path
-
-
-def weakly_connected_images(
-    matches: Mapping[Pair, NDArray[np.int64]], min_num_features: int
-) -> set[str]:
-    """Return the images with too few features in tracks through three images or more.
-
-    A mapper registers an image by features whose matches it has triangulated already. That takes
-    two other images, so a strong pair alone ties an image to nothing.
-
-    Args:
-        matches: (M, 2) features of the first and the second image, of each verified pair.
-        min_num_features: fewer are too few.
-    """
-    names = sorted({name for pair in matches for name in pair})
-    number = {name: index for index, name in enumerate(names)}
-    ends = [
-        (number[pair[side]] << 32) + indices[:, side]
-        for side in (0, 1)
-        for pair, indices in matches.items()
-    ]
-    features, index, num_matches = np.unique(
-        np.concatenate([np.zeros(0, np.int64), *ends]), return_inverse=True, return_counts=True
-    )
-    first, second = index.reshape(2, -1)
-    is_shared = num_matches > 1
-    in_track = is_shared.copy()
-    in_track[first[is_shared[second]]] = True
-    in_track[second[is_shared[first]]] = True
-    counts = np.bincount(features[in_track] >> 32, minlength=len(names))
-    return {name for name, count in zip(names, counts, strict=True) if count < min_num_features}
 
 
 class Escalation:

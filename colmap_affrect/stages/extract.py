@@ -212,7 +212,7 @@ def _record(
 ) -> None:
     """Put the options of this stage and those known of later ones on record."""
     weights = {path.name: file_sha256(path) for path in extractor.weights.values()}
-    planned: dict[str, Options] = {"match": recipe.matching}
+    planned: dict[str, Options] = {"match": recipe.matching, "guide": recipe.guided}
     if recipe.extraction.escalation:
         planned["escalate"] = recipe.escalate
     if recipe.mapping:

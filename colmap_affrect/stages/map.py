@@ -11,11 +11,19 @@ from pathlib import Path
 from shutil import rmtree
 
 from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.errors import StaleStoreError
-from colmap_affrect.mappers.attempts import LARGE_MODEL, map_database, read_models
+from colmap_affrect.mappers.attempts import (
+    LARGE_MODEL,
+    MIN_NUM_MATCHES,
+    map_database,
+    read_models,
+)
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing, require_extends
+from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
@@ -23,6 +31,7 @@ from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copied_image_path, is_copy
 from colmap_affrect.stages.escalate import first_level_database
 from colmap_affrect.stages.extract import Inputs
+from colmap_affrect.stages.guide import guided_matches
 from colmap_affrect.stages.pair_graph import connected_parts
 from colmap_affrect.stages.verify import recorded_verification
 
@@ -74,7 +83,11 @@ def map_images(
             "--overwrite to map from the beginning"
         )
     task = MappingTask(
-        workspace.database, _image_path(workspace), intrinsics_given(workspace), existing
+        workspace.database,
+        _image_path(workspace),
+        intrinsics_given(workspace),
+        existing,
+        guided={} if is_copy(workspace) else guided_matches(context),
     )
     if known == inputs:
         models = read_models(workspace.sparse, task)
@@ -239,3 +252,26 @@ def advice(
     if models and models[0].doubtful and not (inputs.masks.path or inputs.masks.camera_path):
         texts.append("--mask-path, where something moves, repeats or is written over photographs")
     return tuple(texts)
+
+
+def agreement(context: Context, sparse_path: Path) -> float:
+    """Return how well the best of some models agrees with the verified pairs."""
+    graph = PairGraph.read(context.workspace.database, MIN_NUM_MATCHES)
+    folders = [path for path in sparse_path.iterdir() if path.name.isdigit()]
+    return graph.best_score(pycolmap.Reconstruction(folder) for folder in folders)
+
+
+def images_in_need(context: Context, min_num_tracks: int) -> set[str]:
+    """Return the images that are not in the largest model, or there see few of its points.
+
+    Args:
+        context: after mapping.
+        min_num_tracks: an image that sees fewer points of three images or more is in need.
+    """
+    workspace = context.workspace
+    names = set(colmap_database.image_ids(workspace.database))
+    path = workspace.sparse / "0"
+    if not path.exists() or len(names) < 3:
+        return names if len(names) > 2 else set()
+    counts = num_long_tracks(path)
+    return {name for name in names if counts.get(name, 0) < min_num_tracks}

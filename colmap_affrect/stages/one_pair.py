@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,11 +145,52 @@ class PreparedImage:
     keypoints: NDArray[np.floating]
     indices: NDArray[np.int64]
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of what the matcher made."""
+        return int(self.content.nbytes)
+
+
+class HasBytes(Protocol):
+    """What says how much memory it takes."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all arrays."""
+
+
+Content = TypeVar("Content", bound=HasBytes)
+
+
+class ImageCache(Generic[Content]):
+    """Keeps what is made of images, as many as ``CACHE_BYTES`` hold.
+
+    Those not used for longest are dropped first.
+    """
+
+    def __init__(self, make: Callable[[str], Content]) -> None:
+        """Say how to make what is missing, of the name of an image."""
+        self._make, self._lock = make, threading.Lock()
+        self._images: OrderedDict[str, Content] = OrderedDict()
+
+    def get(self, name: str) -> Content:
+        """Return what there is of an image; made one at a time."""
+        with self._lock:
+            if name not in self._images:
+                self._images[name] = self._make(name)
+            self._images.move_to_end(name)
+            while self._nbytes() > CACHE_BYTES and len(self._images) > 1:
+                self._images.popitem(last=False)
+            return self._images[name]
+
+    def _nbytes(self) -> int:
+        return sum(image.nbytes for image in self._images.values())
+
 
 class CachedMatcher:
-    """Matches pairs, and keeps the images that it has prepared, as many as ``CACHE_BYTES`` hold.
+    """Matches pairs, and keeps the images that it has prepared (:class:`ImageCache`).
 
-    Those not used for longest are dropped first. A copy in another process starts with none.
+    A copy in another process starts with none.
     """
 
     def __init__(
@@ -182,8 +223,7 @@ class CachedMatcher:
         weights = resolve(options.weights, resources.weights_path)
         context = MatcherContext(weights, resources.device, num_similarities)
         self._matcher = MATCHERS.make(options, context)
-        self._images: OrderedDict[str, PreparedImage] = OrderedDict()
-        self._lock = threading.Lock()
+        self._images = ImageCache(lambda name: self._prepare(self.read(name)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         given = {
@@ -229,16 +269,7 @@ class CachedMatcher:
 
     def prepared(self, name: str) -> PreparedImage:
         """Return an image ready for matching."""
-        with self._lock:
-            if name not in self._images:
-                self._images[name] = self._prepare(self.read(name))
-            self._images.move_to_end(name)
-            while self._nbytes() > CACHE_BYTES and len(self._images) > 1:
-                self._images.popitem(last=False)
-            return self._images[name]
-
-    def _nbytes(self) -> int:
-        return sum(image.content.nbytes for image in self._images.values())
+        return self._images.get(name)
 
 
 def _rebuilt(store: FeatureStore, options: MatcherOptions, given: dict[str, Any]) -> CachedMatcher:

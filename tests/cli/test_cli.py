@@ -24,7 +24,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
 
 COMMANDS = [
-    "run", "extract", "pairs", "match", "verify", "escalate", "map",
+    "run", "extract", "pairs", "match", "verify", "escalate", "guide", "map",
     "compare", "evaluate", "inspect", "recipes", "weights", "doctor",
 ]  # fmt: skip
 TIMEOUT_S = 60

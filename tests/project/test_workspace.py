@@ -28,7 +28,8 @@ def finished(workspace: Workspace) -> Workspace:
     """A workspace with all stages on record and something in each of their files."""
     for stage in STAGES:
         workspace.record_options(stage, {"by": stage}, recipe="default")
-    for path in (workspace.features, workspace.pairs, workspace.matches, workspace.database):
+    files = (workspace.features, workspace.pairs, workspace.matches, workspace.guided)
+    for path in (*files, workspace.database):
         path.write_bytes(path.name.encode())
     (workspace.sparse / "0").mkdir(parents=True)
     (workspace.sparse / "0" / "images.bin").write_bytes(b"model")
@@ -100,7 +101,8 @@ KEPT = {
     "match": ["features.h5", "pairs.txt"],
     "verify": ["features.h5", "matches.h5", "pairs.txt"],
     "escalate": ["database.db", "features.h5", "matches.h5", "pairs.txt"],
-    "map": ["database.db", "features.h5", "matches.h5", "pairs.txt"],
+    "guide": ["database.db", "features.h5", "matches.h5", "pairs.txt"],
+    "map": ["database.db", "features.h5", "guided.h5", "matches.h5", "pairs.txt"],
 }
 
 

@@ -18,6 +18,7 @@ from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.incremental import IncrementalOptions
+from colmap_affrect.pairs.connectivity import weakly_connected_images
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import FeatureStore, MatchStore
@@ -210,7 +211,7 @@ def numbered(*rows: tuple[int, int]) -> np.ndarray:
 def test_images_with_few_features_in_tracks_of_three_are_weakly_connected(matches, tracks) -> None:
     for limit in range(4):
         expected = {name for name, count in tracks.items() if count < limit}
-        assert escalation.weakly_connected_images(matches, limit) == expected
+        assert weakly_connected_images(matches, limit) == expected
 
 
 def test_strong_pairs_without_a_track_of_three_climb(

@@ -1,0 +1,124 @@
+"""The last adjustment of a model by exact matches, where guided ones have brought images together.
+
+Guided matches are less exact than others. They register images and tie them together, but where
+exact matches suffice to hold images these alone say where they stand.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping
+from itertools import combinations
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+
+Matches = Mapping[tuple[int, int], NDArray[np.int64]]
+Observations = NDArray[np.int64]
+"""An image id in the upper 32 bits, and the number of a keypoint."""
+
+MIN_NUM_TRACKS = 30
+"""Exact tracks through three images or more that hold an image, as many as COLMAP asks for when it
+registers one."""
+
+MIN_SHARED_TRACKS = 10
+"""Of these tracks so many hold two images together."""
+
+
+def exact_only(
+    model: pycolmap.Reconstruction,
+    verified: Matches,
+    guided: Matches,
+    *,
+    refine_intrinsics: bool,
+) -> int:
+    """Take guided observations out of a model that exact ones hold, and adjust it.
+
+    These are the observations that only guided matches tie to their tracks. Where exact matches do
+    not hold all images nothing is taken out: guided tracks then fix what exact ones leave open, the
+    scale of one part against another for one, and half of them would serve neither part.
+
+    Args:
+        model: changed in place.
+        verified: (M, 2) inliers of each pair of image ids, as they made the model.
+        guided: those of them that only guided matching has found.
+        refine_intrinsics: whether focal lengths and distortion are adjusted as well.
+
+    Returns:
+        How many observations were taken out; the model is left alone if there are none.
+    """
+    points = {i: _points(model.images[i]) for i in model.reg_image_ids()}
+    all_ties, guided_ties = _ties(points, verified), _ties(points, guided)
+    ties = all_ties[~np.isin(_keys(all_ties), _keys(guided_ties))]
+    dropped = np.setdiff1d(all_ties, ties)
+    if not len(dropped) or len(exactly_held(ties)) < len(points):
+        return 0
+    for image_id, index in zip(dropped >> 32, dropped & 0xFFFFFFFF, strict=True):
+        if model.images[image_id].points2D[index].has_point3D():
+            model.delete_observation(image_id, index)
+    _adjust(model, refine_intrinsics=refine_intrinsics)
+    return len(dropped)
+
+
+def _keys(ties: Observations) -> NDArray[np.complex128]:
+    """Return one number for each (E, 2) tie."""
+    return ties[:, 0] + 1j * ties[:, 1]
+
+
+def _points(image: pycolmap.Image) -> NDArray[np.int64]:
+    """Return the number of the point that each keypoint sees, -1 for none."""
+    seen = np.full(image.num_points2D(), -1, np.int64)
+    for index in image.get_observation_point2D_idxs():
+        seen[index] = image.points2D[index].point3D_id
+    return seen
+
+
+def _ties(points: Mapping[int, NDArray[np.int64]], matches: Matches) -> Observations:
+    """Return the (E, 2) observations of matches that see the same point."""
+    found = [np.zeros((0, 2), np.int64)]
+    for (first, second), indices in matches.items():
+        if first in points and second in points:
+            seen = points[first][indices[:, 0]]
+            same = indices[(seen >= 0) & (seen == points[second][indices[:, 1]])]
+            found.append(same + np.array([first << 32, second << 32]))
+    return np.concatenate(found)
+
+
+def exactly_held(ties: Observations) -> set[int]:
+    """Return the ids of the largest part of the images that hang together by long exact tracks.
+
+    Args:
+        ties: (E, 2) observations that exact matches tie together.
+    """
+    tracks = nx.Graph()
+    tracks.add_edges_from(ties.tolist())
+    num_tracks: Counter[int] = Counter()
+    shared: dict[tuple[int, int], int] = defaultdict(int)
+    for track in nx.connected_components(tracks):
+        images = sorted({observation >> 32 for observation in track})
+        if len(images) > 2:
+            num_tracks.update(images)
+            for pair in combinations(images, 2):
+                shared[pair] += 1
+    parts = nx.Graph()
+    parts.add_nodes_from(image for image, count in num_tracks.items() if count >= MIN_NUM_TRACKS)
+    parts.add_edges_from(
+        pair
+        for pair, count in shared.items()
+        if count >= MIN_SHARED_TRACKS and all(image in parts for image in pair)
+    )
+    return set(max(nx.connected_components(parts), key=len, default=()))
+
+
+def _adjust(model: pycolmap.Reconstruction, *, refine_intrinsics: bool) -> None:
+    options = pycolmap.BundleAdjustmentOptions(
+        refine_focal_length=refine_intrinsics,
+        refine_extra_params=refine_intrinsics,
+        print_summary=False,
+    )
+    options.ceres.solver_options.num_threads = 1
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()

@@ -1,0 +1,276 @@
+"""Guide: matches of verified pairs once more, where their geometry allows them.
+
+For the pairs of images that hang on few tracks through three images, or that the caller names:
+those that mapping lost. Guided matches are less exact than others, and where they outweigh these a
+model becomes less accurate; so images that register well are left alone, and what was there before
+stays on record (``guided.h5``) for the last adjustment. The raw matches stay as they are, as with
+COLMAP's own guided matching.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.verification import PairVerifier, inlier_matches, verified_pairs
+from colmap_affrect.matchers.guided import GuidedOptions
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.connectivity import weakly_connected_images
+from colmap_affrect.pairs.lists import ordered_for_reuse
+from colmap_affrect.parallel.executor import Threads, available_cores
+from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stores import GuidedPair
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.extract import recorded_extraction
+from colmap_affrect.stages.match import PAIRS_PER_WRITE
+from colmap_affrect.stages.one_guided_pair import (
+    GuidedMatcher,
+    GuidedTask,
+    PairView,
+)
+from colmap_affrect.stages.verify import recorded_verification, verify_new
+
+Matches = NDArray[np.int64]
+
+IMAGES_IN_MEMORY = 40
+"""Of 13,000 features; pairs come in an order that reads these seldom."""
+
+
+def recorded_guiding(workspace: Workspace) -> GuidedOptions:
+    """Return the options on record of guided matching, done or still to be done."""
+    return GuidedOptions.from_mapping(workspace.planned("guide") or {}, str(workspace.config))
+
+
+def guide(
+    context: Context,
+    options: GuidedOptions | None = None,
+    images: Collection[str] | None = None,
+    *,
+    overwrite: bool = False,
+) -> StageReport:
+    """Match the verified pairs of some images again, guided by their geometry.
+
+    A pair gets the geometry of its inliers and guided matches when that has more inliers than the
+    one before. Pairs that were guided are not guided again.
+
+    Args:
+        context: with verified pairs.
+        options: by default those on record.
+        images: whose pairs are guided; by default those of images with few features in tracks
+            through three images.
+        overwrite: undo what guided matching has done first.
+
+    Returns:
+        ``num_done`` counts the pairs that were matched again now.
+    """
+    start = time.perf_counter()
+    workspace = context.workspace
+    workspace.require("verify")
+    options = options or recorded_guiding(workspace)
+    if overwrite:
+        restore_exact(context)
+    workspace.record_options("guide", options.to_mapping(), overwrite=overwrite)
+    guiding = Guiding(context, options)
+    todo, num_done = guiding.todo(images)
+    with context.progress.stage("guide", len(todo), "pairs") as advance:
+        guiding.guide(todo, advance)
+    return StageReport("guide", time.perf_counter() - start, len(todo), num_done)
+
+
+def restore_exact(context: Context, pairs: Collection[Pair] | None = None) -> None:
+    """Give guided pairs, by default all, their geometry without guided matches again.
+
+    They stay on record as tried, so that :func:`guide` leaves them alone.
+    """
+    workspace = context.workspace
+    guided = [
+        pair
+        for pair in current(context)
+        if pair.num_inliers and (pairs is None or pair.names in pairs)
+    ]
+    if not guided:
+        return
+    ids = colmap_database.image_ids(workspace.database)
+    with colmap_database.open_database(workspace.database) as database:
+        for pair in guided:
+            database.delete_two_view_geometry(*(ids[name] for name in pair.names))
+    verify_new(workspace)
+    context.guided.write([replace(pair, num_inliers=0) for pair in guided])
+
+
+def verified_inliers(context: Context) -> dict[Pair, Matches]:
+    """Return the inliers of each verified pair."""
+    workspace = context.workspace
+    names = {number: name for name, number in colmap_database.image_ids(workspace.database).items()}
+    min_num_inliers = recorded_verification(workspace).min_num_inliers
+    found = inlier_matches(workspace.database, min_num_inliers)
+    return {(names[one], names[two]): indices for (one, two), indices in found.items()}
+
+
+def exact_inliers(context: Context) -> dict[Pair, Matches]:
+    """Return the inliers of each verified pair without guided matches."""
+    guided = {pair.names: pair.exact for pair in current(context) if pair.num_inliers}
+    return {**verified_inliers(context), **guided}
+
+
+def guided_matches(context: Context) -> dict[tuple[int, int], Matches]:
+    """Return the inliers, by image ids, that only guided matching has found."""
+    guided = [pair for pair in current(context) if pair.num_inliers]
+    if not guided:
+        return {}
+    verified = verified_inliers(context)
+    ids = colmap_database.image_ids(context.workspace.database)
+    found = {}
+    for pair in guided:
+        exact = set(map(tuple, pair.exact.tolist()))
+        new = [row for row in verified[pair.names].tolist() if tuple(row) not in exact]
+        first, second = pair.names
+        found[ids[first], ids[second]] = np.array(new, np.int64).reshape(-1, 2)
+    return found
+
+
+def current(context: Context) -> list[GuidedPair]:
+    """Return the guided pairs whose geometry is still the one on record.
+
+    It is not where a run was killed just before it was written, and where the pair has got other
+    raw matches since.
+    """
+    path = context.workspace.database
+    if not (context.workspace.guided.exists() and path.exists()):
+        return []
+    ids = colmap_database.image_ids(path)
+    counts = verified_pairs(path, 0)
+    return [
+        pair
+        for pair in context.guided.read()
+        if pair.num_inliers in (0, counts.get((ids[pair.names[0]], ids[pair.names[1]])))
+    ]
+
+
+def weak_images(exact: Mapping[Pair, Matches], min_num_tracks: int) -> set[str]:
+    """Return the images with few features in tracks through three images, where there are three."""
+    if len({name for pair in exact for name in pair}) < 3:
+        return set()
+    return weakly_connected_images(exact, min_num_tracks)
+
+
+def guided_counts(context: Context) -> dict[str, int]:
+    """Return what the report says: pairs with more inliers, and these before and after."""
+    gained = [pair for pair in current(context) if pair.num_inliers]
+    if not gained:
+        return {}
+    return {
+        "pairs": len(gained),
+        "matches_before": sum(len(pair.exact) for pair in gained),
+        "matches_after": sum(pair.num_inliers for pair in gained),
+    }
+
+
+class Guiding:
+    """Guides the pairs of a workspace, with the options on record."""
+
+    def __init__(self, context: Context, options: GuidedOptions) -> None:
+        """Read what is on record."""
+        self.context, self.options = context, options
+        self.path = context.workspace.database
+        self.ids = colmap_database.image_ids(self.path)
+        max_size_px = recorded_extraction(context.workspace).max_image_size_px
+        sizes = context.features.image_sizes()
+        self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()}
+        self.verifier = PairVerifier(self.path, recorded_verification(context.workspace))
+
+    def todo(self, images: Collection[str] | None) -> tuple[list[Pair], int]:
+        """Return the pairs to guide, and how many are done."""
+        exact = exact_inliers(self.context)
+        if images is None:
+            is_auto = self.options.enabled == "auto"
+            images = weak_images(exact, self.options.min_num_tracks) if is_auto else self.ids
+        if self.options.enabled == "never":
+            images = ()
+        chosen = [pair for pair in exact if not set(pair).isdisjoint(images)]
+        done = {pair.names for pair in current(self.context)}
+        return [pair for pair in chosen if pair not in done], sum(p in done for p in chosen)
+
+    def guide(
+        self,
+        pairs: Sequence[Pair],
+        advance: Callable[[int], None],
+        tasks: Callable[[Sequence[Pair]], list[GuidedTask]] | None = None,
+    ) -> None:
+        """Match pairs again, batch by batch, and keep what has more inliers.
+
+        Args:
+            pairs: of images, the one with the lower id first.
+            advance: is told of each.
+            tasks: makes the tasks of a batch; by default from the geometries of verified pairs.
+        """
+        if not pairs:
+            return
+        tasks = tasks or self._tasks
+        features = self.context.features
+        executor = self.context.executor
+        if executor is None or not executor.sees([features.path]):
+            executor = Threads(available_cores())
+        matcher = GuidedMatcher(features, self.options)
+        ordered = ordered_for_reuse(pairs, IMAGES_IN_MEMORY)
+        for begin in range(0, len(ordered), PAIRS_PER_WRITE):
+            batch = ordered[begin : begin + PAIRS_PER_WRITE]
+            found = []
+            for pair in executor.map(matcher, tasks(batch), [features.path]):
+                found.append(pair)
+                advance(1)
+            self._keep(found)
+
+    def _tasks(self, pairs: Sequence[Pair]) -> list[GuidedTask]:
+        """Return what can be guided."""
+        tasks = []
+        with colmap_database.open_database(self.path) as database:
+            cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+            images = {image.name: image for image in database.read_all_images()}
+            for names in pairs:
+                first, second = (images[name] for name in names)
+                view = PairView(
+                    names,
+                    (cameras[first.camera_id], cameras[second.camera_id]),
+                    (
+                        database.read_keypoints(first.image_id),
+                        database.read_keypoints(second.image_id),
+                    ),
+                    (self.scales[names[0]], self.scales[names[1]]),
+                )
+                geometry = database.read_two_view_geometry(first.image_id, second.image_id)
+                tasks.append(view.task(geometry, self.options.band_px))
+        return [task for task in tasks if task]
+
+    def _keep(self, found: Sequence[GuidedPair]) -> None:
+        """Put better geometries into the database, and all pairs on record before that."""
+        geometries = {}
+        for pair in found:
+            if len(pair.candidates) > len(pair.exact):
+                first, second = (
+                    self.context.features.read_frames(name)[:, :, 2] for name in pair.names
+                )
+                geometry = self.verifier.geometry(pair.names, (first, second), pair.candidates)
+                if geometry and len(geometry.inlier_matches) > len(pair.exact):
+                    geometries[pair.names] = geometry
+        counts = {names: len(geometry.inlier_matches) for names, geometry in geometries.items()}
+        self.context.guided.write(
+            replace(pair, num_inliers=counts.get(pair.names, 0)) for pair in found
+        )
+        self._write_geometries(geometries)
+
+    def _write_geometries(self, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]) -> None:
+        with colmap_database.open_database(self.path) as database:
+            for pair, geometry in geometries.items():
+                first, second = (self.ids[name] for name in pair)
+                if database.exists_two_view_geometry(first, second):
+                    database.update_two_view_geometry(first, second, geometry)
+                else:
+                    database.write_two_view_geometry(first, second, geometry)

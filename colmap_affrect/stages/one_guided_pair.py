@@ -1,0 +1,133 @@
+"""What guided matching does for one pair, in a thread of this process or on a worker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.two_views import epipolar_pair, homography_of
+from colmap_affrect.matchers.guided import (
+    BANDS_OF_HOMOGRAPHY,
+    EpipolarGuide,
+    GuidableImage,
+    Guide,
+    GuidedOptions,
+    HomographyGuide,
+    guided_matches,
+)
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.project.stores import FeatureStore, GuidedPair
+from colmap_affrect.stages.one_pair import ImageCache
+
+MIN_OFF_PLANE = 20
+"""Fewer inliers off a plane may be accidental, as many as verification asks of a pair."""
+
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GuidedTask:
+    """One pair to match again.
+
+    Attributes:
+        names: of the two images.
+        matrix: (3, 3) fundamental matrix, or a homography of image 2 from image 1.
+        is_homography: which of both.
+        points: of each image the (N, 2) keypoints in the pixels that the matrix holds in.
+        inliers: (M, 2) of the geometry.
+    """
+
+    names: Pair
+    matrix: NDArray[np.float64]
+    is_homography: bool
+    points: tuple[Points, Points]
+    inliers: NDArray[np.int64]
+
+    def __str__(self) -> str:
+        return " and ".join(self.names)
+
+    def scaled(self, scales: tuple[float, float]) -> GuidedTask:
+        """Return the same in pixels of images that are smaller by these factors."""
+        first, second = (np.diag([scale, scale, 1.0]) for scale in scales)
+        other = np.linalg.inv(second) if self.is_homography else second
+        points = (self.points[0] / scales[0], self.points[1] / scales[1])
+        return replace(self, matrix=other @ self.matrix @ first, points=points)
+
+    def guide(self, band_px: float) -> Guide:
+        """Return the geometry as what guides matches."""
+        make = HomographyGuide if self.is_homography else EpipolarGuide
+        return make(self.matrix, *self.points, band_px)
+
+
+@dataclass(frozen=True)
+class PairView:
+    """One pair in a database.
+
+    Attributes:
+        names: of the image with the lower id and the other one.
+        cameras: of both.
+        keypoints: (N, 2 or more) of both, as in the database.
+        scales: the longer side of each image over that at which features were extracted: bands
+            are as wide as features are exact.
+    """
+
+    names: Pair
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera]
+    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]]
+    scales: tuple[float, float]
+
+    def task(self, geometry: pycolmap.TwoViewGeometry, band_px: float) -> GuidedTask | None:
+        """Return what is to be done where a geometry can guide, else None."""
+        inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+        tolerance_px = BANDS_OF_HOMOGRAPHY * band_px * max(self.scales)
+        homography = homography_of(geometry, self.keypoints, tolerance_px, MIN_OFF_PLANE)
+        if homography is not None:
+            first, second = (np.asarray(p[:, :2], np.float64) for p in self.keypoints)
+            task = GuidedTask(self.names, homography, True, (first, second), inliers)
+        else:
+            pair = epipolar_pair(geometry, self.cameras, self.keypoints)
+            if pair is None:
+                return None
+            points = (pair.points1, pair.points2)
+            task = GuidedTask(self.names, pair.fundamental, False, points, inliers)
+        return task.scaled(self.scales)
+
+
+@dataclass(frozen=True)
+class _Descriptors:
+    descriptors: NDArray[np.float32]
+    shapes: NDArray[np.float64]
+
+    @property
+    def nbytes(self) -> int:
+        return self.descriptors.nbytes + self.shapes.nbytes
+
+
+class GuidedMatcher:
+    """Matches pairs again, with the features that it keeps of some images."""
+
+    def __init__(self, store: FeatureStore, options: GuidedOptions) -> None:
+        """Name the features."""
+        self._store, self._options = store, options
+        self._images = ImageCache(self._read)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return GuidedMatcher, (self._store, self._options)
+
+    def __call__(self, task: GuidedTask) -> GuidedPair:
+        """Return the inliers of a pair and its guided matches."""
+        first, second = (
+            GuidableImage(image.descriptors, points, image.shapes)
+            for image, points in zip(map(self._images.get, task.names), task.points, strict=True)
+        )
+        guide = task.guide(self._options.band_px)
+        both = guided_matches(first, second, guide, self._options, task.inliers)
+        return GuidedPair(task.names, task.inliers, both, 0)
+
+    def _read(self, name: str) -> _Descriptors:
+        features = self._store.read(name)
+        return _Descriptors(features.descriptors, features.lafs[:, :, :2])

@@ -1,0 +1,310 @@
+"""Guided matching as a stage: who is guided, what stays on record, again, killed and undone."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import Call
+from numpy.testing import assert_array_equal
+from results import database_content
+from small_scene import INTRINSICS, NAMES, write_photographs
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import geometry_digest, image_ids, open_database
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.mappers.exact import exact_only, exactly_held
+from colmap_affrect.mappers.incremental import IncrementalOptions
+from colmap_affrect.matchers.guided import GuidedOptions
+from colmap_affrect.pipeline import better, map_guided
+from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.stages import guide as stage
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.guide import (
+    exact_inliers,
+    guide,
+    guided_counts,
+    restore_exact,
+    verified_inliers,
+)
+from colmap_affrect.stages.guide_by_model import guide_by_model
+from colmap_affrect.stages.map import map_images
+from colmap_affrect.stages.match import match
+from colmap_affrect.stages.pairs import choose_pairs
+from colmap_affrect.stages.verify import verify_matches
+
+ALWAYS = GuidedOptions(enabled="always")
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    photos = tmp_path_factory.mktemp("photos")
+    write_photographs(photos)
+    workspace = Workspace(tmp_path_factory.mktemp("before"))
+    cameras = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
+    with workspace.locked():
+        context = Context(workspace)
+        extract(context, Inputs.of(photos, cameras=cameras), load_recipe("unrectified-rootsift"))
+        choose_pairs(context)
+        match(context)
+        verify_matches(context)
+    return workspace
+
+
+@pytest.fixture
+def context(before: Workspace, tmp_path: Path) -> Context:
+    folder = tmp_path / "out"
+    shutil.copytree(before.path, folder)
+    return Context(Workspace(folder))
+
+
+def test_pairs_gain_and_what_was_there_stays_on_record(before: Workspace, context: Context) -> None:
+    exact = verified_inliers(Context(before))
+    assert guide(context, ALWAYS).num_done == len(exact) == 6
+    verified = verified_inliers(context)
+    counts = guided_counts(context)
+    assert counts["pairs"] > 3
+    assert counts["matches_after"] > 1.05 * counts["matches_before"]
+    for pair, indices in exact.items():
+        assert len(verified[pair]) >= len(indices)
+        assert_array_equal(exact_inliers(context)[pair], indices)
+        for side in (0, 1):
+            assert len(np.unique(verified[pair][:, side])) == len(verified[pair])
+    raw = [raw_matches(item.database) for item in (before, context.workspace)]
+    assert raw[0] == raw[1]
+    assert geometry_digest(before.database) != geometry_digest(context.workspace.database)
+
+
+def raw_matches(path: Path) -> list[tuple[int, bytes]]:
+    with open_database(path) as database:
+        pair_ids, matches = database.read_all_matches()
+    return [(pair, found.tobytes()) for pair, found in zip(pair_ids, matches, strict=True)]
+
+
+def test_guided_matches_are_right(context: Context) -> None:
+    """A geometry of the first inliers explains nearly all that came later."""
+    guide(context, ALWAYS)
+    exact, verified = exact_inliers(context), verified_inliers(context)
+    frames = {name: context.features.read(name).keypoints for name in NAMES}
+    for pair, indices in verified.items():
+        known = {*map(tuple, exact[pair])}
+        new = np.array([row for row in indices.tolist() if tuple(row) not in known])
+        if not len(new):
+            continue
+        points = [np.concatenate([frames[n][i] for i in (exact[pair][:, s], new[:, s])])
+                  for s, n in enumerate(pair)]  # fmt: skip
+        found = pycolmap.estimate_fundamental_matrix(*points, {"max_error": 3.0})
+        assert found is not None
+        assert found["inlier_mask"][len(exact[pair]) :].mean() > 0.9
+
+
+def test_sets_that_hang_together_are_left_alone(before: Workspace, context: Context) -> None:
+    digest = geometry_digest(before.database)
+    assert guide(context).num_done == 0
+    assert not context.workspace.guided.exists()
+    assert geometry_digest(context.workspace.database) == digest
+
+
+def test_only_images_in_need(context: Context) -> None:
+    every = set(verified_inliers(context))
+    assert guide(context, images=[NAMES[1]]).num_done == 3
+    assert {pair.names for pair in context.guided.read()} == {p for p in every if NAMES[1] in p}
+    report = guide(context, images=NAMES[:2])
+    assert (report.num_done, report.num_kept) == (2, 3)
+
+
+def test_never(context: Context) -> None:
+    assert guide(context, GuidedOptions(enabled="never"), images=NAMES).num_done == 0
+
+
+def test_again_nothing_happens(context: Context) -> None:
+    guide(context, ALWAYS)
+    content = database_content(context.workspace.database)
+    report = guide(context)
+    assert (report.num_done, report.num_kept) == (0, 6)
+    assert database_content(context.workspace.database) == content
+
+
+def test_killed_before_the_geometries_are_written_it_goes_on(
+    context: Context, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(context.workspace.path, other)
+    guide(context, ALWAYS)
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    again = Context(Workspace(other))
+    monkeypatch.setattr(stage, "PAIRS_PER_WRITE", 4)
+    monkeypatch.setattr(stage.Guiding, "_write_geometries", killed)
+    with pytest.raises(KeyboardInterrupt):
+        guide(again, ALWAYS)
+    monkeypatch.undo()
+    assert guided_counts(again) == {}
+    guide(again, ALWAYS)
+    same_inliers(context, again)
+
+
+def same_inliers(first: Context, second: Context) -> None:
+    one, other = verified_inliers(first), verified_inliers(second)
+    assert one.keys() == other.keys()
+    for pair, indices in one.items():
+        assert_array_equal(indices, other[pair])
+
+
+def test_what_is_undone_is_as_before(before: Workspace, context: Context) -> None:
+    guide(context, ALWAYS)
+    restore_exact(context, {min(verified_inliers(context))})
+    assert 0 < guided_counts(context)["pairs"] < 6
+    restore_exact(context)
+    assert guided_counts(context) == {}
+    same_inliers(Context(before), context)
+    assert guide(context).num_done == 0  # they were tried
+
+
+def test_overwrite_undoes_and_guides_again(context: Context) -> None:
+    guide(context, ALWAYS)
+    counts = guided_counts(context)
+    assert guide(context, ALWAYS, overwrite=True).num_done == 6
+    assert guided_counts(context) == counts
+    assert guide(context, GuidedOptions(enabled="never"), overwrite=True).num_done == 0
+    assert guided_counts(context) == {}
+
+
+def test_verification_over_again_forgets_guided_matches(
+    before: Workspace, context: Context
+) -> None:
+    guide(context, ALWAYS)
+    verify_matches(context, overwrite=True)
+    assert guided_counts(context) == {}
+    same_inliers(Context(before), context)
+
+
+def test_command(context: Context, call: Call) -> None:
+    out = ["--output-path", context.workspace.path]
+    ended = call("guide", *out, "--guided", "always", "--set", "guided.band_px=2")
+    assert ended.code == 0
+    assert "guide: 6 done" in ended.stdout
+    assert "inliers" in ended.stdout
+    refused = call("guide", *out, "--guided", "auto")
+    assert "was run there with band_px=2.0" in refused.errors[0] or "enabled" in refused.errors[0]
+    wrong = call("guide", *out, "--set", "matching.max_ratio=0.8")
+    assert wrong.errors == ["error: --set: only options of guided can be changed here"]
+
+
+def mapper() -> object:
+    return MAPPERS.make(IncrementalOptions(max_num_attempts=1))
+
+
+def test_models_of_guided_pairs_are_adjusted_by_exact_matches(context: Context) -> None:
+    guide(context, ALWAYS)
+    map_images(context, mapper())
+    model = pycolmap.Reconstruction(context.workspace.sparse / "0")
+    assert model.num_reg_images() == 4
+    exact, verified = exact_inliers(context), verified_inliers(context)
+    seen = {image.name: [p.point3D_id if p.has_point3D() else -1 for p in image.points2D]
+            for image in model.images.values()}  # fmt: skip
+    tied = {(name, row[side]) for pair, rows in exact.items() for row in rows.tolist()
+            if seen[pair[0]][row[0]] == seen[pair[1]][row[1]] != -1
+            for side, name in enumerate(pair)}  # fmt: skip
+    guided_only = {(name, row[side]) for pair, rows in verified.items() for row in rows.tolist()
+                   if seen[pair[0]][row[0]] == seen[pair[1]][row[1]] != -1
+                   for side, name in enumerate(pair)} - tied  # fmt: skip
+    assert tied
+    assert not guided_only
+    assert exact_only(model, exact, verified, refine_intrinsics=False) == 0
+
+
+def track(point: int, *images: int) -> list[list[int]]:
+    keys = [(image << 32) + point for image in images]
+    return [[keys[0], key] for key in keys[1:]]
+
+
+def test_images_are_held_by_exact_tracks_through_three() -> None:
+    ties = [tie for point in range(40) for tie in track(point, 1, 2, 3)]
+    ties += [tie for point in range(40, 75) for tie in track(point, 3, 5, 4, 2)]
+    ties += [tie for point in range(100, 200) for tie in track(point, 5, 6)]  # two views only
+    ties += [tie for point in range(200, 220) for tie in track(point, 7, 1, 2)]  # too few
+    ties += [tie for point in range(300, 340) for tie in track(point, 8, 9, 10)]  # elsewhere
+    assert exactly_held(np.array(ties)) == {1, 2, 3, 4, 5}
+    assert exactly_held(np.zeros((0, 2), np.int64)) == set()
+
+
+def test_images_that_are_missing_are_guided_and_the_better_model_stays(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here nothing is missing; one image is said to be, and either model to be better."""
+    from colmap_affrect import pipeline
+
+    guide(context)
+    reports, models = map_guided(context, mapper())
+    assert [report.name for report in reports] == ["map"]
+    digest = geometry_digest(context.workspace.database)
+    monkeypatch.setattr(pipeline, "images_in_need", lambda *_: {NAMES[2]})
+    choice: Callable[[object, object], bool] = lambda *_: False  # noqa: E731
+    monkeypatch.setattr(pipeline, "better", choice)
+    reports, kept = map_guided(context, mapper())
+    assert [report.name for report in reports] == ["map", "guide", "map"]
+    assert kept == models
+    assert geometry_digest(context.workspace.database) == digest
+    assert map_images(context, mapper())[0].num_done == 0  # sparse/ belongs to the database
+    reports, _ = map_guided(context, mapper())
+    assert [report.name for report in reports] == ["map"]  # tried already
+    assert not list(context.workspace.path.glob("sparse.*"))
+
+
+def test_more_images_are_better_then_more_points() -> None:
+    small, large = (ModelSummary(tuple("abc"), points, 2.0, 0.5) for points in (10, 30))
+    most = ModelSummary(tuple("abcd"), 5, 2.0, 0.5)
+    assert better([most], [large])
+    assert better([small, large], [small])
+    assert not better([small], [small])
+    assert not better([], [small])
+
+
+def test_pairs_that_never_matched_are_guided_by_a_model(context: Context) -> None:
+    pairs = sorted(verified_inliers(context))
+    map_images(context, mapper())
+    model = pycolmap.Reconstruction(context.workspace.sparse / "0")
+    lost, ids = pairs[2], image_ids(context.workspace.database)
+    true = verified_inliers(context)[lost]
+    with open_database(context.workspace.database) as database:
+        database.delete_two_view_geometry(*(ids[name] for name in lost))
+        database.delete_matches(*(ids[name] for name in lost))
+    assert lost not in verified_inliers(context)
+    assert guide_by_model(context, model).num_done == 1
+    found = verified_inliers(context)[lost]
+    assert len({*map(tuple, true)} & {*map(tuple, found)}) > 0.8 * len(true)
+    assert guide_by_model(context, model).num_done == 0
+    restore_exact(context)
+    assert lost not in verified_inliers(context)
+
+
+def test_a_wrong_model_gives_nothing(context: Context) -> None:
+    map_images(context, mapper())
+    model = pycolmap.Reconstruction(context.workspace.sparse / "0")
+    pair, ids = sorted(verified_inliers(context))[2], image_ids(context.workspace.database)
+    wrong = next(image for image in model.images.values() if image.name == pair[0])
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d([0, 0, 0.3, 0.954]), [0.4, 0, 0])
+    wrong.frame.set_cam_from_world(wrong.camera_id, turn * wrong.cam_from_world())
+    with open_database(context.workspace.database) as database:
+        database.delete_two_view_geometry(*(ids[name] for name in pair))
+        database.delete_matches(*(ids[name] for name in pair))
+    assert guide_by_model(context, model).num_done == 1
+    assert pair not in verified_inliers(context)
+
+
+def test_ids_of_a_pair_are_in_order(context: Context) -> None:
+    ids = image_ids(context.workspace.database)
+    assert all(ids[first] < ids[second] for first, second in verified_inliers(context))
+    guide(context, ALWAYS)
+    with open_database(context.workspace.database) as database:
+        assert len(database.read_two_view_geometries()[0]) == 6
