@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 LOCAL = ("image_path", "image_list_path", "from_database", "cameras")
 """Options that :meth:`Workspace.options_digest` leaves out: where files are, and cameras."""
 STAGES = ("extract", "pairs", "match", "verify", "escalate", "map")
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Of ``config.toml``: counts up when a stage records other options than before."""
 
 

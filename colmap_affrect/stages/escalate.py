@@ -256,7 +256,8 @@ class Escalation:
     def _match_again(
         self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]
     ) -> None:
-        verifier = PairVerifier(self.path, self.verification)
+        size_px = self.extraction.max_image_size_px
+        verifier = PairVerifier(self.path, self.verification, size_px)
         num_inliers = self.num_inliers()
         tried: list[Pair] = []
         better: list[PairMatches] = []
@@ -280,7 +281,7 @@ class Escalation:
             with closing(matches) as found_pairs:
                 for found in found_pairs:
                     names = found.names
-                    first, second = (self.features.read_frames(name)[:, :, 2] for name in names)
+                    first, second = (self.features.read_frames(name) for name in names)
                     count = verifier.num_inliers(names, (first, second), found.indices)
                     tried.append(names)
                     if count > num_inliers[names]:
