@@ -30,6 +30,8 @@ CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0
 """Of frames that are turned at random."""
 MAX_CHANCE = 0.99
 """Frames that agree by chance nearly always, upright ones for one, say nothing."""
+MIN_VARIETY = 0.05
+"""Elements of shapes of area one that differ by less are all alike: they have no direction."""
 
 Points = NDArray[np.float64]
 Rows = NDArray[np.integer]
@@ -107,16 +109,25 @@ def significance(
         model = _model(geometry, cameras, keypoints)
         if model is None:
             return math.inf
-        inliers = np.asarray(geometry.inlier_matches, np.int64)
-        inliers = inliers[model.errors(inliers[:, 0], inliers[:, 1]) <= max_error_px]
-        num_matches = len(keypoints[0])
-        hits = model.errors(*shuffled(num_matches)) <= max_error_px
+        rows = np.arange(len(keypoints[0]))
+        inliers = rows[model.errors(rows, rows) <= max_error_px]
+        hits = model.errors(*shuffled(len(rows))) <= max_error_px
         chance = max(float(hits.mean()), 1.0 / len(hits))
-        alarms = log10_false_alarms(num_matches, len(inliers), model.sample_size, chance)
-        shapes = tuple(map(keypoint_shapes, keypoints))
+        alarms = log10_false_alarms(len(rows), len(inliers), model.sample_size, chance)
+        shapes = (telling_shapes(keypoints[0]), telling_shapes(keypoints[1]))
         if math.isinf(alarms) or shapes[0] is None or shapes[1] is None:
             return -alarms
         return _frame_evidence(model, inliers, (shapes[0], shapes[1])) - alarms
+
+
+def telling_shapes(keypoints: NDArray[np.floating]) -> Points | None:
+    """Return the shapes of keypoints; None without any, or if they all are circles, or alike."""
+    shapes = keypoint_shapes(keypoints)
+    if shapes is None or not len(shapes):
+        return None
+    areas = np.maximum(np.abs(determinants(shapes)), np.finfo(float).tiny)
+    alike = np.ptp(shapes / np.sqrt(areas)[:, None, None], axis=0).max() < MIN_VARIETY
+    return None if alike else shapes
 
 
 def _model(
@@ -124,23 +135,24 @@ def _model(
     cameras: tuple[pycolmap.Camera, pycolmap.Camera],
     keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
 ) -> _Epipolar | _Homography | None:
+    configs = pycolmap.TwoViewGeometryConfiguration
     if geometry.config in PLANAR and geometry.H is not None:
         points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
         return _Homography(np.asarray(geometry.H, np.float64), (points1, points2))
     pair = epipolar_pair(geometry, cameras, keypoints)
-    if pair is None or geometry.config == pycolmap.TwoViewGeometryConfiguration.WATERMARK:
+    if pair is None or geometry.config == configs.WATERMARK:
         return None
-    is_calibrated = geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-    return _Epipolar(pair.fundamental, (pair.points1, pair.points2), 5 if is_calibrated else 7)
+    sample_size = 5 if geometry.config == configs.CALIBRATED else 7
+    return _Epipolar(pair.fundamental, (pair.points1, pair.points2), sample_size)
 
 
 def _frame_evidence(
     model: _Epipolar | _Homography, inliers: Rows, shapes: tuple[Points, Points]
 ) -> float:
     """Return the Bayes factor of the agreement of frames, as a decimal logarithm."""
-    cosines = model.cosines(inliers[:, 0], inliers[:, 1], shapes)
+    cosines = model.cosines(inliers, inliers, shapes)
     first, second = shuffled(len(inliers))
-    by_chance = model.cosines(inliers[first, 0], inliers[second, 1], shapes)
+    by_chance = model.cosines(inliers[first], inliers[second], shapes)
     limit = math.cos(math.radians(MAX_FRAME_ANGLE_DEG))
     signs = (1.0, -1.0) if model.has_sign else (1.0,)
     chance = max(float((by_chance * sign >= limit).mean()) for sign in signs)

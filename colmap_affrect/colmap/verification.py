@@ -21,8 +21,7 @@ from colmap_affrect.colmap.database import (
     unverified_pairs,
 )
 from colmap_affrect.colmap.native_options import Plain, differences
-from colmap_affrect.colmap.pair_significance import significance
-from colmap_affrect.colmap.two_views import keypoint_shapes
+from colmap_affrect.colmap.pair_significance import significance, telling_shapes
 from colmap_affrect.options import CUSTOM, MAX_SEED, PRESETS, Options, preset_values, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
@@ -231,8 +230,8 @@ class _PairReader:
         return _Task(ids, sides, self._database.read_matches(*ids))
 
     def warn_of_missing_shapes(self, pairs: Sequence[tuple[int, int]], path: Path) -> None:
-        """Say it when keypoints of the first pair are positions only."""
-        if pairs and any(keypoint_shapes(self._side(i).keypoints) is None for i in pairs[0]):
+        """Say it when keypoints of the first pair have none, or all the same."""
+        if pairs and any(telling_shapes(self._side(i).keypoints) is None for i in pairs[0]):
             logger.warning(
                 "%s: keypoints have no shapes; pairs need more inliers to count as verified", path
             )
