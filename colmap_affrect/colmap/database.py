@@ -220,15 +220,15 @@ def keypoint_counts(path: Path) -> dict[str, int]:
         }
 
 
-def num_unverified_pairs(path: Path) -> int:
-    """Return the number of pairs that have raw matches and no two-view geometry, good or bad."""
+def unverified_pairs(path: Path) -> list[tuple[int, int]]:
+    """Return the pairs of image ids with raw matches and no two-view geometry, good or bad."""
     with open_database(path) as database:
-        pair_ids, counts = database.read_num_matches()
-        return sum(
-            count > 0
-            and not database.exists_two_view_geometry(*pycolmap.pair_id_to_image_pair(pair_id))
-            for pair_id, count in zip(pair_ids, counts, strict=True)
-        )
+        pairs = [
+            pycolmap.pair_id_to_image_pair(pair_id)
+            for pair_id, count in zip(*database.read_num_matches(), strict=True)
+            if count > 0
+        ]
+        return [pair for pair in pairs if not database.exists_two_view_geometry(*pair)]
 
 
 def colmap_keypoints(lafs: NDArray[np.floating]) -> NDArray[np.float32]:

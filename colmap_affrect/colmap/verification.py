@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -10,33 +13,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.database import (
-    num_unverified_pairs,
+    colmap_keypoints,
+    image_ids,
     open_database,
     require_database_space,
+    unverified_pairs,
 )
 from colmap_affrect.colmap.native_options import Plain, differences
-from colmap_affrect.conventions import colmap_from_pixel
+from colmap_affrect.colmap.pair_significance import significance, telling_shapes
 from colmap_affrect.options import CUSTOM, MAX_SEED, PRESETS, Options, preset_values, within
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+
+logger = logging.getLogger(__name__)
+
+PAIRS_PER_WRITE = 200
+"""A killed run loses at most as many."""
+NUM_CACHED_IMAGES = 256
+"""As COLMAP keeps: 80 MB of 13,000 keypoints each."""
 
 
 class VerificationOptions(Options):
     """Two-view geometry, by default the sparse preset (names as in pycolmap)."""
 
     max_error_px: Annotated[float, within(0.01, 1000.0)] = 3.0
-    min_num_inliers: Annotated[int, within(5, 1_000_000)] = 20
-    """COLMAP's 15 is what 100 random matches reach."""
-    min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.20
-    """COLMAP's 0 accepts random matches once there are many of them."""
+    scale_max_error: bool = True
+    """Whether ``max_error_px`` counts pixels of photographs as they were when features were
+    extracted, shrunk to ``max_image_size_px`` of the recipe; else those of the files."""
+    min_num_inliers: Annotated[int, within(5, 1_000_000)] = 15
+    min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.0
+    """Share of the raw matches; those that are wrong say little about the others."""
+    min_significance: Annotated[float, within(0.0, 1e9)] = 5.0
+    """Beside enough inliers, a pair must look so good that chance would need 10 to the power of
+    this many pairs to have one like it: by the number of its inliers among so many raw matches,
+    and by the share of them whose local affine frames agree with the geometry. With 5, all pairs of
+    450 unrelated photographs have about one. 0 accepts what COLMAP accepts."""
     max_num_trials: Annotated[int, within(1, 100_000_000)] = 10000
     ransac_min_inlier_ratio: Annotated[float, within(0.0, 1.0)] = 0.10
     random_seed: Annotated[int, within(-1, MAX_SEED)] = 0
 
     COLMAP: ClassVar[Mapping[str, Any]] = {
         "max_error_px": 4.0,
+        "scale_max_error": False,
         "min_num_inliers": 15,
         "min_inlier_ratio": 0.0,
+        "min_significance": 0.0,
         "max_num_trials": 10000,
         "ransac_min_inlier_ratio": 0.25,
     }
@@ -79,20 +100,147 @@ def verification_differences(options: VerificationOptions) -> dict[str, Plain]:
     return differences(two_view_options(options), pycolmap.TwoViewGeometryOptions())
 
 
-def verify(path: Path, options: VerificationOptions) -> None:
+@dataclass(frozen=True)
+class Side:
+    """One image of a pair: its camera and (N, 2, 4 or 6) keypoints as in the database."""
+
+    camera: pycolmap.Camera
+    keypoints: NDArray[np.float32]
+
+
+def estimate_geometry(
+    sides: tuple[Side, Side],
+    matches: NDArray[np.integer],
+    options: VerificationOptions,
+    extracted_px: int | None = None,
+) -> pycolmap.TwoViewGeometry:
+    """Return the two-view geometry of (M, 2) matches; an empty one if it is rejected.
+
+    Args:
+        sides: the image of the smaller id first, as COLMAP has them.
+        matches: raw ones.
+        options: thresholds.
+        extracted_px: longest side that photographs were shrunk to before extraction, if any.
+    """
+    cameras = (sides[0].camera, sides[1].camera)
+    matched = (sides[0].keypoints[matches[:, 0]], sides[1].keypoints[matches[:, 1]])
+    rows = np.stack([np.arange(len(matches), dtype=np.uint32)] * 2, axis=1)
+    chosen = options.changed(max_error_px=max_error_px(cameras, options, extracted_px))
+    points1, points2 = (keypoints[:, :2].astype(np.float64) for keypoints in matched)
+    geometry = pycolmap.estimate_two_view_geometry(
+        cameras[0], points1, cameras[1], points2, rows, two_view_options(chosen)
+    )
+    # Of a geometry that it rejects the estimator returns the inliers all the same.
+    is_rejected = (
+        geometry.config in REJECTED or len(geometry.inlier_matches) < options.min_num_inliers
+    )
+    if not is_rejected and options.min_significance:
+        found = significance(geometry, cameras, matched, chosen.max_error_px)
+        is_rejected = found < options.min_significance
+    if is_rejected:
+        return pycolmap.TwoViewGeometry()
+    geometry.inlier_matches = matches.astype(np.uint32)[np.asarray(geometry.inlier_matches)[:, 0]]
+    return geometry
+
+
+def max_error_px(
+    cameras: Sequence[pycolmap.Camera], options: VerificationOptions, extracted_px: int | None
+) -> float:
+    """Return the threshold of a pair in px of the stored images, the mean of its two."""
+    if not (options.scale_max_error and extracted_px):
+        return options.max_error_px
+    sides = [max(camera.width, camera.height) / extracted_px for camera in cameras]
+    return options.max_error_px * float(np.mean(np.maximum(sides, 1.0)))
+
+
+def verify(
+    path: Path,
+    options: VerificationOptions,
+    extracted_px: int | None = None,
+    advance: Callable[[int], None] | None = None,
+) -> None:
     """Estimate the two-view geometry of every matched pair that has none yet.
 
-    By ``pycolmap.geometric_verification``, which keeps the raw matches;
-    ``pycolmap.verify_matches`` would match again and delete.
+    As ``pycolmap.geometric_verification``, but a geometry is written when it has been judged:
+    whatever ends this, no pair is left that counts as verified and was not.
+
+    Args:
+        path: of the database.
+        options: thresholds.
+        extracted_px: longest side that photographs were shrunk to before extraction, if any.
+        advance: called with the number of pairs that are done.
     """
-    require_database_space(path, num_unverified_pairs(path))
-    run_cancellable(
-        lambda token: pycolmap.geometric_verification(
-            path,
-            two_view_geometry_options=two_view_options(options),
-            cancellation_token=token,
-        )
-    )
+    todo = unverified_pairs(path)
+    require_database_space(path, len(todo))
+    with open_database(path) as database:
+        reader = _PairReader(database)
+        if options.min_significance:
+            reader.warn_of_missing_shapes(todo, path)
+
+        def estimate(task: _Task) -> tuple[tuple[int, int], pycolmap.TwoViewGeometry]:
+            return task.ids, estimate_geometry(task.sides, task.matches, options, extracted_px)
+
+        done: list[tuple[tuple[int, int], pycolmap.TwoViewGeometry]] = []
+        tasks = map(reader.task, todo)
+        try:
+            for item in map_ordered(estimate, tasks, available_cores()):
+                done.append(item)
+                if len(done) == PAIRS_PER_WRITE:
+                    _write(database, done, advance)
+        finally:
+            _write(database, done, advance)
+
+
+def _write(
+    database: pycolmap.Database,
+    done: list[tuple[tuple[int, int], pycolmap.TwoViewGeometry]],
+    advance: Callable[[int], None] | None,
+) -> None:
+    """Write geometries and forget them."""
+    with pycolmap.DatabaseTransaction(database):
+        for ids, geometry in done:
+            database.write_two_view_geometry(*ids, geometry)
+    if advance:
+        advance(len(done))
+    done.clear()
+
+
+@dataclass(frozen=True)
+class _Task:
+    ids: tuple[int, int]
+    sides: tuple[Side, Side]
+    matches: NDArray[np.integer]
+
+
+class _PairReader:
+    """Reads what the verification of pairs needs; the images used last are kept."""
+
+    def __init__(self, database: pycolmap.Database) -> None:
+        self._database = database
+        self._cameras = read_image_cameras(database)
+        self._side = lru_cache(NUM_CACHED_IMAGES)(self._read_side)
+
+    def _read_side(self, image_id: int) -> Side:
+        keypoints = np.asarray(self._database.read_keypoints(image_id), np.float32)
+        return Side(self._cameras[image_id], keypoints)
+
+    def task(self, ids: tuple[int, int]) -> _Task:
+        """Read a pair."""
+        sides = (self._side(ids[0]), self._side(ids[1]))
+        return _Task(ids, sides, self._database.read_matches(*ids))
+
+    def warn_of_missing_shapes(self, pairs: Sequence[tuple[int, int]], path: Path) -> None:
+        """Say it when keypoints of the first pair have none, or all the same."""
+        if pairs and any(telling_shapes(self._side(i).keypoints) is None for i in pairs[0]):
+            logger.warning(
+                "%s: keypoints have no shapes; pairs need more inliers to count as verified", path
+            )
+
+
+def read_image_cameras(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:
+    """Return the camera of each image by image id."""
+    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    return {image.image_id: cameras[image.camera_id] for image in database.read_all_images()}
 
 
 class PairVerifier:
@@ -102,81 +250,48 @@ class PairVerifier:
     (pinned by a test).
     """
 
-    def __init__(self, path: Path, options: VerificationOptions) -> None:
+    def __init__(
+        self, path: Path, options: VerificationOptions, extracted_px: int | None = None
+    ) -> None:
         """Read cameras and image ids of a database."""
-        self.options = two_view_options(options)
+        self._options, self._extracted_px = options, extracted_px
+        self._ids = image_ids(path)
         with open_database(path) as database:
-            cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-            images = database.read_all_images()
-        self._images = {image.name: (image.image_id, cameras[image.camera_id]) for image in images}
+            self._cameras = read_image_cameras(database)
 
     def num_inliers(
         self,
         names: tuple[str, str],
-        keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+        frames: tuple[NDArray[np.floating], NDArray[np.floating]],
         indices: NDArray[np.integer],
     ) -> int:
-        """Return the number of inliers of a two-view geometry, 0 if there is none.
+        """Return the number of inliers of a two-view geometry, 0 if it is rejected.
 
         Args:
             names: of the two images.
-            keypoints: (N1, 2) and (N2, 2) in pixel-centre px.
+            frames: (N1, 2, 3) and (N2, 2, 3) local affine frames in pixel-centre px.
             indices: (M, 2) matches.
         """
-        geometry = self.geometry(names, keypoints, indices)
-        return len(geometry.inlier_matches) if geometry else 0
+        return len(self.geometry(names, frames, indices).inlier_matches)
 
     def geometry(
         self,
         names: tuple[str, str],
-        keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+        frames: tuple[NDArray[np.floating], NDArray[np.floating]],
         indices: NDArray[np.integer],
-    ) -> pycolmap.TwoViewGeometry | None:
+    ) -> pycolmap.TwoViewGeometry:
         """Return the two-view geometry, from the image with the lower id to the other one.
 
-        Arguments are those of :meth:`num_inliers`; None if there is none.
+        Arguments are those of :meth:`num_inliers`; without inliers where there is none.
         """
-        sides = [
-            (*self._images[name], points) for name, points in zip(names, keypoints, strict=True)
-        ]
-        if sides[0][0] > sides[1][0]:
-            sides, indices = sides[::-1], indices[:, ::-1]
-        _, cameras, points = zip(*sides, strict=True)
-        return two_view_geometry(cameras, points, indices, self.options)
-
-
-def num_two_view_inliers(
-    cameras: Sequence[pycolmap.Camera],
-    keypoints: Sequence[NDArray[np.floating]],
-    indices: NDArray[np.integer],
-    options: pycolmap.TwoViewGeometryOptions,
-) -> int:
-    """Return the number of inliers of :func:`two_view_geometry`, 0 without one."""
-    geometry = two_view_geometry(cameras, keypoints, indices, options)
-    return len(geometry.inlier_matches) if geometry else 0
-
-
-def two_view_geometry(
-    cameras: Sequence[pycolmap.Camera],
-    keypoints: Sequence[NDArray[np.floating]],
-    indices: NDArray[np.integer],
-    options: pycolmap.TwoViewGeometryOptions,
-) -> pycolmap.TwoViewGeometry | None:
-    """Estimate the geometry of (M, 2) matches of two images; None where there is none.
-
-    Keypoints are (N1, 2) and (N2, 2) in pixel-centre px.
-    """
-    stored1, stored2 = map(stored_keypoints, keypoints)
-    geometry = pycolmap.estimate_two_view_geometry(
-        cameras[0], stored1, cameras[1], stored2, indices.astype(np.uint32), options
-    )
-    # Of a geometry that it rejects the estimator returns the inliers all the same.
-    return None if geometry.config in REJECTED else geometry
-
-
-def stored_keypoints(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return (N, 2) pixel-centre points as COLMAP reads them from a database: through float32."""
-    return colmap_from_pixel(points.astype(np.float32)).astype(np.float64)
+        ids = [self._ids[name] for name in names]
+        first, second = (
+            Side(self._cameras[image_id], colmap_keypoints(lafs))
+            for image_id, lafs in zip(ids, frames, strict=True)
+        )
+        if ids[0] > ids[1]:
+            first, second, indices = second, first, indices[:, ::-1]
+        return estimate_geometry((first, second), indices, self._options, self._extracted_px)
 
 
 def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], int]:

@@ -191,8 +191,10 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
     watch = Stopwatch()
     title = f"verify, seed {seed}"
     with watch.step("verify"), progress.stage(title, num_pairs, "pairs") as advance:
-        verify(database_path, request.verification.changed(random_seed=seed))
-        advance(num_pairs)
+        recipe = request.method.recipe
+        extracted_px = recipe.extraction.max_image_size_px if recipe else None
+        options = request.verification.changed(random_seed=seed)
+        verify(database_path, options, extracted_px, advance)
     with watch.step("map"), progress.stage(f"map, seed {seed}", len(names), "images") as advance:
         mapper = MAPPERS.make(request.mapping.changed(random_seed=seed))
         task = MappingTask(database_path, request.image_path, request.intrinsics_given)

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import colmap_keypoints
 from colmap_affrect.colmap.verification import (
+    Side,
     VerificationOptions,
-    num_two_view_inliers,
-    two_view_options,
+    estimate_geometry,
 )
 from colmap_affrect.conventions import DEFAULT_FOCAL_RATIO
 from colmap_affrect.evaluation.protocol import EvaluationPair
@@ -139,15 +140,16 @@ class PairMatcher:
             image1, image2 = prepared.prepared(name1), prepared.prepared(name2)
             start = time.perf_counter()
             rows1, rows2 = prepared.match(image1, image2).indices.T
-            points1, points2 = image1.keypoints[rows1], image2.keypoints[rows2]
+            frames = (image1.frames[rows1], image2.frames[rows2])
             count, decided = 0, ""
             if extraction.escalation:
-                count = verified_inliers(points1, points2, sizes[name1], sizes[name2])
+                limit = extraction.max_image_size_px
+                count = verified_inliers(frames, (sizes[name1], sizes[name2]), limit)
                 decided = extraction.rectifiers[level].name if count else "none"
             found = MatchedPair(
                 pair,
-                (points1.astype(np.float64), points2.astype(np.float64)),
-                (len(image1.keypoints), len(image2.keypoints)),
+                (frames[0][:, :, 2], frames[1][:, :, 2]),
+                (len(image1.frames), len(image2.frames)),
                 decided,
                 level + 1,
                 count,
@@ -164,28 +166,29 @@ class PairMatcher:
 
 
 def verified_inliers(
-    points1: NDArray[np.floating],
-    points2: NDArray[np.floating],
-    size1: tuple[int, int],
-    size2: tuple[int, int],
+    frames: tuple[NDArray[np.floating], NDArray[np.floating]],
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+    extracted_px: int | None = None,
 ) -> int:
     """Return the inliers of COLMAP's two-view geometry; 0 if a run would not take it.
 
     Args:
-        points1: (M, 2) pixel-centre px of image 1.
-        points2: (M, 2) those of image 2 that match them.
-        size1: (width, height) of image 1 in px.
-        size2: (width, height) of image 2 in px.
+        frames: (M, 2, 3) local affine frames of image 1, in pixel-centre px, and those of image 2
+            that match them.
+        sizes: (width, height) of both images in px.
+        extracted_px: longest side that photographs were shrunk to before extraction.
     """
     options = VerificationOptions(random_seed=VERIFICATION_SEED)
-    cameras = [
-        # What COLMAP assumes of an image without EXIF: a camera of its own, of unknown focus. The
-        # id matters: two images of one camera are verified in another way.
-        pycolmap.Camera.create_from_model_name(
-            camera_id, "SIMPLE_RADIAL", DEFAULT_FOCAL_RATIO * max(size), *size
+    first, second = (
+        Side(
+            # What COLMAP assumes of an image without EXIF: a camera of its own, of unknown focus.
+            # The id matters: two images of one camera are verified in another way.
+            pycolmap.Camera.create_from_model_name(
+                camera_id, "SIMPLE_RADIAL", DEFAULT_FOCAL_RATIO * max(size), *size
+            ),
+            colmap_keypoints(lafs),
         )
-        for camera_id, size in enumerate((size1, size2), 1)
-    ]
-    rows = np.stack([np.arange(len(points1))] * 2, axis=1)
-    count = num_two_view_inliers(cameras, (points1, points2), rows, two_view_options(options))
-    return count if count >= options.min_num_inliers else 0
+        for camera_id, (size, lafs) in enumerate(zip(sizes, frames, strict=True), 1)
+    )
+    rows = np.stack([np.arange(len(frames[0]))] * 2, axis=1)
+    return len(estimate_geometry((first, second), rows, options, extracted_px).inlier_matches)

@@ -147,8 +147,7 @@ def import_h5(
         num_verified = None
         if not skip_verification:
             with progress.stage("verify", len(files.pairs), "pairs") as advance:
-                verify(new, verification)
-                advance(len(files.pairs))
+                verify(new, verification, advance=advance)
             num_verified = len(verified_pairs(new, verification.min_num_inliers))
         new.replace(database_path)
     notes = list(files.notes)

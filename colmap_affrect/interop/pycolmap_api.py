@@ -378,7 +378,7 @@ def _not_ours(given: object, argument: str, name: str) -> OptionError:
 
 
 def _verification_options(given: object, random_seed: int | None) -> VerificationOptions:
-    seed = {} if random_seed is None else {"random_seed": random_seed}
+    seed: dict[str, Any] = {} if random_seed is None else {"random_seed": random_seed}
     if given is None:
         return VerificationOptions(**seed)
     if not isinstance(given, pycolmap.TwoViewGeometryOptions):
@@ -388,7 +388,7 @@ def _verification_options(given: object, random_seed: int | None) -> Verificatio
         if key not in VERIFICATION_NAMES and value != usual[key]:
             raise OptionError(f"verification_options: {key}={value} cannot be carried over")
     ours = {name: values[key] for key, name in VERIFICATION_NAMES.items()}
-    return VerificationOptions(**ours, **seed)
+    return VerificationOptions.preset("colmap", **{**ours, **seed})
 
 
 VERIFICATION_NAMES = {

@@ -8,12 +8,11 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.database_copy import copy_with_frames
-from colmap_affrect.colmap.verification import VerificationOptions
+from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.verify import verify_new
 
 logger = logging.getLogger(__name__)
 
@@ -54,12 +53,11 @@ def copy_verified(
     num_pairs = colmap_database.num_matched_pairs(workspace.database)
     if not num_pairs:
         raise DatabaseError(f"{source}: has no matches; match its images first")
-    todo = colmap_database.num_unverified_pairs(workspace.database)
+    todo = len(colmap_database.unverified_pairs(workspace.database))
     if todo:
         logger.warning("%s: %d pairs have matches only; they are verified now", source, todo)
     with context.progress.stage("verify", todo, "pairs") as advance:
-        verify_new(workspace)
-        advance(todo)
+        verify(workspace.database, verification, advance=advance)
     return StageReport("verify", time.perf_counter() - start, todo, num_pairs - todo)
 
 

@@ -90,7 +90,7 @@ def escalate(
     escalation = Escalation(context, options)
     if overwrite:
         escalation.undo()
-    if colmap_database.num_unverified_pairs(context.workspace.database):
+    if colmap_database.unverified_pairs(context.workspace.database):
         escalation.write()  # it was killed there
     climbed: set[Pair] = set()
     total = escalation.num_steps_ahead()
@@ -302,7 +302,7 @@ class Escalation:
             for found in found_matches:
                 first, second = (ids[name] for name in found.names)
                 colmap_database.replace_matches(database, first, second, found.indices)
-        verify(path, self.verification)
+        verify(path, self.verification, self.extraction.max_image_size_px)
 
     def _iterate_matches(
         self, pairs: Sequence[Pair], level: int
@@ -343,7 +343,8 @@ class Escalation:
     def _match_again(
         self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]
     ) -> None:
-        verifier, graph = PairVerifier(self.path, self.verification), self.graph()
+        size_px = self.extraction.max_image_size_px
+        verifier, graph = PairVerifier(self.path, self.verification, size_px), self.graph()
         tried: list[Pair] = []
         better: list[PairMatches] = []
 

@@ -184,7 +184,9 @@ class Guiding:
         max_size_px = recorded_extraction(context.workspace).max_image_size_px
         sizes = context.features.image_sizes()
         self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()}
-        self.verifier = PairVerifier(self.path, recorded_verification(context.workspace))
+        self.verifier = PairVerifier(
+            self.path, recorded_verification(context.workspace), max_size_px
+        )
 
     def todo(self, images: Collection[str] | None) -> tuple[list[Pair], int]:
         """Return the pairs to guide, and how many are done."""
@@ -254,11 +256,9 @@ class Guiding:
         geometries = {}
         for pair in found:
             if len(pair.candidates) > len(pair.exact):
-                first, second = (
-                    self.context.features.read_frames(name)[:, :, 2] for name in pair.names
-                )
+                first, second = (self.context.features.read_frames(name) for name in pair.names)
                 geometry = self.verifier.geometry(pair.names, (first, second), pair.candidates)
-                if geometry and len(geometry.inlier_matches) > len(pair.exact):
+                if len(geometry.inlier_matches) > len(pair.exact):
                     geometries[pair.names] = geometry
         counts = {names: len(geometry.inlier_matches) for names, geometry in geometries.items()}
         self.context.guided.write(

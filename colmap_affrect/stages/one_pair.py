@@ -137,12 +137,12 @@ class PreparedImage:
 
     Attributes:
         content: what the matcher made of it.
-        keypoints: (N, 2) pixel-centre px.
+        frames: (N, 2, 3) local affine frames in pixel-centre px.
         indices: (N,) int64 that its features have in the store.
     """
 
     content: Any
-    keypoints: NDArray[np.floating]
+    frames: NDArray[np.floating]
     indices: NDArray[np.int64]
 
     @property
@@ -265,7 +265,7 @@ class CachedMatcher:
 
     def _prepare(self, stored: StoredFeatures) -> PreparedImage:
         content = self._matcher.prepare(stored.image)
-        return PreparedImage(content, stored.image.features.keypoints, stored.indices)
+        return PreparedImage(content, stored.image.features.lafs, stored.indices)
 
     def prepared(self, name: str) -> PreparedImage:
         """Return an image ready for matching."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.extract import recorded_extraction
 from colmap_affrect.stages.match import write_matches
 from colmap_affrect.stages.pairs import listed_pairs
 
@@ -37,14 +39,13 @@ def verify_matches(
     options = options or recorded_verification(workspace)
     workspace.record_options("verify", options.to_mapping(), overwrite=overwrite)
     write_matches(context, pairs)
-    todo = colmap_database.num_unverified_pairs(workspace.database)
+    todo = len(colmap_database.unverified_pairs(workspace.database))
     with context.progress.stage("verify", todo, "pairs") as advance:
-        verify_new(workspace)
-        advance(todo)
+        verify_new(workspace, advance)
     return StageReport("verify", time.perf_counter() - start, todo, len(pairs) - todo)
 
 
-def verify_new(workspace: Workspace) -> None:
+def verify_new(workspace: Workspace, advance: Callable[[int], None] | None = None) -> None:
     """Verify the pairs of the database that have matches and no two-view geometry, good or bad."""
-    if colmap_database.num_unverified_pairs(workspace.database):
-        verify(workspace.database, recorded_verification(workspace))
+    extracted_px = recorded_extraction(workspace).max_image_size_px
+    verify(workspace.database, recorded_verification(workspace), extracted_px, advance)

@@ -272,8 +272,6 @@ def test_pipeline_options_leave_given_intrinsics_alone_if_asked_to(
 
 
 SPARSE_VERIFICATION = {
-    "min_num_inliers": 20,
-    "min_inlier_ratio": 0.2,
     "ransac.max_error": 3.0,
     "ransac.min_inlier_ratio": 0.1,
 }

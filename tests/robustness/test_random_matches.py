@@ -16,6 +16,7 @@ from colmap_affrect.colmap.verification import (
     verify,
 )
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.geometry.affine import rotation
 
 SIZE = (1600, 1200)
 
@@ -25,12 +26,13 @@ def random_pairs(path: Path, count: int, num_pairs: int, *, prior: bool) -> None
     rng = np.random.default_rng([count, prior])
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.2 * SIZE[0], *SIZE)
     camera.has_prior_focal_length = prior
-    lafs = np.tile(MEASUREMENT_SIGMAS * np.eye(2, 3), (count, 1, 1))
+    lafs = np.zeros((count, 2, 3))
     with open_database(path) as database:
         database.write_camera(camera, use_camera_id=True)
         for image_id in range(1, 2 * num_pairs + 1):
             image = pycolmap.Image(name=f"{image_id}.png", image_id=image_id, camera_id=1)
             database.write_image(image, use_image_id=True)
+            lafs[:, :, :2] = rotation(rng.uniform(0, 2 * np.pi, count)) * rng.uniform(6, 30, 2)
             lafs[:, :, 2] = rng.uniform(0, np.subtract(SIZE, 1), (count, 2))
             write_keypoints(database, image_id, lafs)
             if image_id % 2 == 0:
@@ -68,7 +70,10 @@ def test_random_matches_are_accepted_by_colmaps_default(tmp_path: Path) -> None:
 def test_random_matches_are_no_inliers_for_escalation(tmp_path: Path) -> None:
     random_pairs(tmp_path / "database.db", 1000, 1, prior=False)
     with open_database(tmp_path / "database.db") as database:
-        points = [database.read_keypoints(i)[:, :2] - np.float32(0.5) for i in (1, 2)]
+        keypoints = [database.read_keypoints(i) for i in (1, 2)]
         indices = database.read_matches(1, 2)
     verifier = PairVerifier(tmp_path / "database.db", VerificationOptions())
-    assert verifier.num_inliers(("1.png", "2.png"), tuple(points), indices) == 0
+    frames = [np.tile(MEASUREMENT_SIGMAS * np.eye(2, 3), (1000, 1, 1)) for _ in keypoints]
+    for lafs, points in zip(frames, keypoints, strict=True):
+        lafs[:, :, 2] = points[:, :2] - 0.5
+    assert verifier.num_inliers(("1.png", "2.png"), (frames[0], frames[1]), indices) == 0

@@ -28,7 +28,7 @@ from colmap_affrect.stages import escalate as escalation
 from colmap_affrect.stages import map as map_stage
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, recorded_escalation
-from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.extract import Inputs, extract, recorded_extraction
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verify_matches
@@ -172,12 +172,13 @@ def test_trial_of_a_pair_is_what_the_database_then_holds(
     climbed: tuple[Workspace, StageReport],
 ) -> None:
     workspace = climbed[0]
-    verifier = PairVerifier(workspace.database, VerificationOptions())
+    size_px = recorded_extraction(workspace).max_image_size_px
+    verifier = PairVerifier(workspace.database, VerificationOptions(), size_px)
     store = FeatureStore(workspace.features)
     for pair in (EASY, HARD, HARD[::-1]):
-        keypoints = [store.read_frames(name)[:, :, 2] for name in pair]
+        frames = [store.read_frames(name) for name in pair]
         indices = matches(workspace, pair).astype(np.int64)
-        count = verifier.num_inliers(pair, tuple(keypoints), indices)
+        count = verifier.num_inliers(pair, tuple(frames), indices)
         assert count == len(geometry(workspace, pair))
 
 

@@ -1,0 +1,163 @@
+"""The significance of a two-view geometry: of its inliers, and of what their frames say.
+
+A match of two local affine frames is a local map from image 1 to image 2. It must carry the
+epipolar direction of image 1 to that of image 2. The epipolar geometry of a plane is arbitrary;
+there the map must turn as the homography does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.two_views import PLANAR, epipolar_pair, keypoint_shapes
+from colmap_affrect.geometry.affine import determinants, project, transform_frames
+from colmap_affrect.geometry.epipolar import common_sign, direction_cosines, sampson_errors
+from colmap_affrect.geometry.significance import (
+    log10_bayes_factor,
+    log10_false_alarms,
+    shuffled,
+)
+
+MAX_FRAME_ANGLE_DEG = 20.0
+"""Frames agree up to here: those of right matches are off by 5 to 10 degrees."""
+CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0
+"""Of frames that are turned at random."""
+MAX_CHANCE = 0.99
+"""Frames that agree by chance nearly always, upright ones for one, say nothing."""
+MIN_VARIETY = 0.05
+"""Elements of shapes of area one that differ by less are all alike: they have no direction."""
+
+Points = NDArray[np.float64]
+Rows = NDArray[np.integer]
+
+
+@dataclass(frozen=True)
+class _Epipolar:
+    """What an epipolar geometry says of matches of features ``rows1`` with features ``rows2``."""
+
+    has_sign: ClassVar[bool] = True
+    """All cosines may have the other sign."""
+    fundamental: Points
+    points: tuple[Points, Points]
+    sample_size: int
+
+    def errors(self, rows1: Rows, rows2: Rows) -> Points:
+        """Return (M,) px."""
+        return sampson_errors(self.fundamental, self.points[0][rows1], self.points[1][rows2])
+
+    def cosines(self, rows1: Rows, rows2: Rows, shapes: tuple[Points, Points]) -> Points:
+        """Return (M,) cosines between what frames carry over and what the geometry does."""
+        points = self.points[0][rows1], self.points[1][rows2]
+        return direction_cosines(self.fundamental, *points, shapes[0][rows1], shapes[1][rows2])
+
+
+@dataclass(frozen=True)
+class _Homography:
+    """As :class:`_Epipolar`, of a homography."""
+
+    has_sign: ClassVar[bool] = False
+    sample_size: ClassVar[int] = 4
+    matrix: Points
+    points: tuple[Points, Points]
+
+    def errors(self, rows1: Rows, rows2: Rows) -> Points:
+        """Return (M,) px."""
+        offsets = project(self.matrix, self.points[0][rows1]) - self.points[1][rows2]
+        return np.asarray(np.linalg.norm(offsets, axis=1))
+
+    def cosines(self, rows1: Rows, rows2: Rows, shapes: tuple[Points, Points]) -> Points:
+        """Return (M,) cosines between what frames carry over and what the geometry does."""
+        frames = np.concatenate([shapes[0][rows1], self.points[0][rows1, :, None]], axis=2)
+        return turn_cosines(transform_frames(self.matrix, frames)[:, :, :2], shapes[1][rows2])
+
+
+def turn_cosines(shapes1: Points, shapes2: Points) -> Points:
+    """Return (N,) cosines of the angles by which frames are turned against others; -1 mirrored."""
+    a, b, c, d = (shapes1[:, i, j] for i in (0, 1) for j in (0, 1))
+    inverses = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)  # up to the determinants
+    turns = shapes2 @ inverses * np.sign(determinants(shapes1))[:, None, None]
+    along, across = turns[:, 0, 0] + turns[:, 1, 1], turns[:, 1, 0] - turns[:, 0, 1]
+    cosines = along / np.maximum(np.hypot(along, across), np.finfo(float).tiny)
+    return np.where(determinants(turns) > 0.0, cosines, -1.0)
+
+
+def significance(
+    geometry: pycolmap.TwoViewGeometry,
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
+    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+    max_error_px: float,
+) -> float:
+    """Return the decimal logarithm of how many pairs chance needs to have one that looks as good.
+
+    Args:
+        geometry: as COLMAP estimated it from matches of keypoints of the same index.
+        cameras: of image 1 and 2.
+        keypoints: of the raw matches: twice (M, 2, 4 or 6), with columns as in the database;
+            without shapes, in 2 columns, positions count alone.
+        max_error_px: of inliers.
+
+    Returns:
+        Infinity for a geometry that there is nothing to test in (a watermark).
+    """
+    with np.errstate(all="ignore"):  # points that a camera cannot undistort are no inliers
+        model = _model(geometry, cameras, keypoints)
+        if model is None:
+            return math.inf
+        rows = np.arange(len(keypoints[0]))
+        inliers = rows[model.errors(rows, rows) <= max_error_px]
+        hits = model.errors(*shuffled(len(rows))) <= max_error_px
+        chance = max(float(hits.mean()), 1.0 / len(hits))
+        alarms = log10_false_alarms(len(rows), len(inliers), model.sample_size, chance)
+        shapes = (telling_shapes(keypoints[0]), telling_shapes(keypoints[1]))
+        if math.isinf(alarms) or shapes[0] is None or shapes[1] is None:
+            return -alarms
+        return _frame_evidence(model, inliers, (shapes[0], shapes[1])) - alarms
+
+
+def telling_shapes(keypoints: NDArray[np.floating]) -> Points | None:
+    """Return the shapes of keypoints; None without any, or if they all are circles, or alike."""
+    shapes = keypoint_shapes(keypoints)
+    if shapes is None or not len(shapes):
+        return None
+    areas = np.maximum(np.abs(determinants(shapes)), np.finfo(float).tiny)
+    alike = np.ptp(shapes / np.sqrt(areas)[:, None, None], axis=0).max() < MIN_VARIETY
+    return None if alike else shapes
+
+
+def _model(
+    geometry: pycolmap.TwoViewGeometry,
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
+    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+) -> _Epipolar | _Homography | None:
+    configs = pycolmap.TwoViewGeometryConfiguration
+    if geometry.config in PLANAR and geometry.H is not None:
+        points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
+        return _Homography(np.asarray(geometry.H, np.float64), (points1, points2))
+    pair = epipolar_pair(geometry, cameras, keypoints)
+    if pair is None or geometry.config == configs.WATERMARK:
+        return None
+    sample_size = 5 if geometry.config == configs.CALIBRATED else 7
+    return _Epipolar(pair.fundamental, (pair.points1, pair.points2), sample_size)
+
+
+def _frame_evidence(
+    model: _Epipolar | _Homography, inliers: Rows, shapes: tuple[Points, Points]
+) -> float:
+    """Return the Bayes factor of the agreement of frames, as a decimal logarithm."""
+    cosines = model.cosines(inliers, inliers, shapes)
+    first, second = shuffled(len(inliers))
+    by_chance = model.cosines(inliers[first], inliers[second], shapes)
+    limit = math.cos(math.radians(MAX_FRAME_ANGLE_DEG))
+    signs = (1.0, -1.0) if model.has_sign else (1.0,)
+    chance = max(float((by_chance * sign >= limit).mean()) for sign in signs)
+    chance = min(max(chance, CHANCE_OF_AGREEMENT), MAX_CHANCE)
+    sign = common_sign(cosines) if model.has_sign else 1.0
+    num_agreeing = int(np.count_nonzero(cosines * sign >= limit))
+    # The better of two signs: chance has two tries.
+    return log10_bayes_factor(len(inliers), num_agreeing, chance) - math.log10(len(signs))

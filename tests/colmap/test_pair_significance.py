@@ -1,0 +1,248 @@
+"""Verification by significance, on pairs whose frames are known and asymmetric."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database, unverified_pairs, write_matches
+from colmap_affrect.colmap.pair_significance import telling_shapes, turn_cosines
+from colmap_affrect.colmap.verification import (
+    PairVerifier,
+    Side,
+    VerificationOptions,
+    estimate_geometry,
+    max_error_px,
+    two_view_options,
+    verified_pairs,
+    verify,
+)
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.geometry.affine import project, rotation, transform_frames
+
+SIZE = (640, 480)
+K = np.array([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
+HOMOGRAPHY = np.array([[0.5, -0.6, 250.0], [0.8, 0.45, -90.0], [3e-4, -2e-4, 1.0]])
+
+
+def camera(camera_id: int, scale: float = 1.0) -> pycolmap.Camera:
+    size = [round(scale * side) for side in SIZE]
+    found = pycolmap.Camera.create_from_model_name(camera_id, "PINHOLE", scale * 700, *size)
+    found.has_prior_focal_length = True
+    return found
+
+
+def plane_homography(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Image 2 from image 1 of a plane; the camera turns, rolls by 40 degrees and moves."""
+    turn = np.array([[0.94, 0.0, 0.342], [0.0, 1.0, 0.0], [-0.342, 0.0, 0.94]])
+    roll = np.eye(3)
+    roll[:2, :2] = rotation(np.deg2rad(40.0))
+    motion = roll @ turn
+    return K @ (motion - np.outer((-1.2, 0.3, 0.2), normal)) @ np.linalg.inv(K)
+
+
+def frames_of(
+    homographies: list[NDArray[np.float64]], num: int, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Frames of image 1 at random, and those of image 2 that truly belong to them."""
+    rng = np.random.default_rng(seed)
+    lafs = np.zeros((num, 2, 3))
+    stretch = rng.uniform(2.0, 6.0, (num, 1, 2))
+    lafs[:, :, :2] = rotation(rng.uniform(0, 2 * np.pi, num)) * stretch
+    lafs[:, :, 2] = rng.uniform((60, 50), (580, 430), (num, 2))
+    parts = np.array_split(lafs, len(homographies))
+    seen = [transform_frames(h, part) for h, part in zip(homographies, parts, strict=True)]
+    return lafs, np.concatenate(seen)
+
+
+def rows(lafs: NDArray[np.float64], columns: int = 6) -> NDArray[np.float32]:
+    """Keypoints as in a database."""
+    shapes = lafs[:, :, :2].reshape(-1, 4)
+    if columns == 4:  # size and direction of the first axis
+        shapes = np.stack(
+            [np.hypot(shapes[:, 0], shapes[:, 2]), np.arctan2(shapes[:, 2], shapes[:, 0])], axis=1
+        )
+    return np.concatenate([lafs[:, :, 2], shapes[:, : columns - 2]], axis=1).astype(np.float32)
+
+
+def weak_pair(
+    *, frames_agree: bool, planar: bool = False
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """28 right matches among 130; their positions alone are too few."""
+    normals = [(0.05, 0.02, 0.2)] if planar else [(0.05, 0.02, 0.2), (-0.1, 0.1, 0.3)]
+    homographies = [HOMOGRAPHY] if planar else [plane_homography(np.array(n)) for n in normals]
+    first, second = frames_of(homographies, 28, 1)
+    other1, other2 = frames_of([HOMOGRAPHY], 102, 2)
+    other2[:, :, 2] = np.random.default_rng(3).uniform((0, 0), SIZE, (102, 2))
+    if not frames_agree:
+        turns = rotation(np.random.default_rng(6).uniform(0, 2 * np.pi, 28))
+        second[:, :, :2] = turns @ second[:, :, :2]
+    return np.concatenate([first, other1]), np.concatenate([second, other2])
+
+
+def num_inliers(
+    frames: tuple[NDArray[np.float64], NDArray[np.float64]],
+    columns: int = 6,
+    **options: float,
+) -> int:
+    sides = tuple(Side(camera(i), rows(lafs, columns)) for i, lafs in enumerate(frames, 1))
+    matches = np.stack([np.arange(len(frames[0]))] * 2, axis=1)
+    geometry = estimate_geometry(sides, matches, VerificationOptions(**options))
+    return len(geometry.inlier_matches)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_frames_decide_where_positions_do_not(planar: bool) -> None:
+    # With a plane the epipolar geometry is arbitrary: only its homography can agree.
+    right, wrong = (weak_pair(frames_agree=agree, planar=planar) for agree in (True, False))
+    by_colmap = VerificationOptions().min_num_inliers
+    assert num_inliers(right, min_significance=0.0) >= by_colmap
+    assert num_inliers(wrong, min_significance=0.0) == num_inliers(right, min_significance=0.0)
+    limit = 60.0 if planar else 5.0
+    assert num_inliers(right, min_significance=limit) >= by_colmap
+    assert num_inliers(wrong, min_significance=limit) == 0
+
+
+def test_database_without_shapes_needs_more_inliers() -> None:
+    frames = weak_pair(frames_agree=True)
+    assert num_inliers(frames, min_significance=5.0) > 0
+    assert num_inliers(frames, columns=2, min_significance=5.0) == 0
+    upright = [lafs.copy() for lafs in frames]
+    for lafs in upright:
+        lafs[:, :, :2] = 3.0 * np.eye(2)
+    assert num_inliers((upright[0], upright[1]), min_significance=5.0) == 0
+    many = tuple(np.concatenate(two) for two in zip(frames, frames, strict=True))
+    assert num_inliers((many[0], many[1]), columns=2, min_significance=5.0) > 0
+
+
+def test_shapes_that_are_all_alike_tell_nothing() -> None:
+    lafs, _ = frames_of([HOMOGRAPHY], 9, 4)
+    assert telling_shapes(rows(lafs, 2)) is None
+    for columns in (4, 6):
+        assert telling_shapes(rows(lafs, columns)) is not None
+    lafs[:, :, :2] = np.linspace(1, 9, 9)[:, None, None] * rotation(0.3)
+    assert telling_shapes(rows(lafs)) is None
+
+
+def test_frames_of_a_plane_turn_as_its_homography_does() -> None:
+    first, second = frames_of([HOMOGRAPHY], 40, 5)
+    np.testing.assert_allclose(second[:, :, 2], project(HOMOGRAPHY, first[:, :, 2]))
+    carried = transform_frames(HOMOGRAPHY, first)[:, :, :2]
+    np.testing.assert_allclose(turn_cosines(carried, second[:, :, :2]), 1.0)
+    turned = rotation(np.deg2rad(33.0)) @ second[:, :, :2]
+    np.testing.assert_allclose(turn_cosines(carried, turned), np.cos(np.deg2rad(33.0)))
+    assert (turn_cosines(carried, second[:, :, :2] @ np.diag([1.0, -1.0])) == -1.0).all()
+
+
+def write_pairs(path: Path, columns: int = 6) -> None:
+    """Write images 1 to 4: a right pair (1, 2) and a wrong one (3, 4)."""
+    pairs = [weak_pair(frames_agree=agree) for agree in (True, False)]
+    with open_database(path) as database:
+        database.write_camera(camera(1), use_camera_id=True)
+        for image_id, lafs in enumerate((*pairs[0], *pairs[1]), 1):
+            image = pycolmap.Image(name=f"{image_id}.png", image_id=image_id, camera_id=1)
+            database.write_image(image, use_image_id=True)
+            database.write_keypoints(image_id, rows(lafs, columns))
+        same = np.stack([np.arange(len(pairs[0][0]))] * 2, axis=1)
+        for pair in ((1, 2), (3, 4)):
+            write_matches(database, *pair, same)
+
+
+def test_rejected_pair_is_done_and_not_verified(tmp_path: Path) -> None:
+    path, calls = tmp_path / "database.db", []
+    write_pairs(path)
+    assert unverified_pairs(path) == [(1, 2), (3, 4)]
+    verify(path, VerificationOptions(min_significance=5.0), advance=calls.append)
+    assert list(verified_pairs(path, 1)) == [(1, 2)]
+    assert unverified_pairs(path) == []
+    assert sum(calls) == 2
+    verify(path, VerificationOptions(min_significance=0.0))
+    assert list(verified_pairs(path, 1)) == [(1, 2)]
+
+
+def test_pairs_before_an_interruption_are_judged_and_the_others_come_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, options = tmp_path / "database.db", VerificationOptions(min_significance=5.0)
+    write_pairs(path)
+
+    def interrupted(sides: tuple[Side, Side], *given: object) -> pycolmap.TwoViewGeometry:
+        if np.array_equal(sides[1].keypoints, last):
+            raise KeyboardInterrupt
+        return estimate_geometry(sides, *given)
+
+    with open_database(path) as database:
+        last = database.read_keypoints(4)
+    with monkeypatch.context() as patched:
+        patched.setattr("colmap_affrect.colmap.verification.estimate_geometry", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            verify(path, options)
+    assert unverified_pairs(path) == [(3, 4)]
+    verify(path, options)
+    assert list(verified_pairs(path, 1)) == [(1, 2)]
+
+
+def test_trial_is_what_verification_finds(tmp_path: Path) -> None:
+    path, options = tmp_path / "database.db", VerificationOptions(min_significance=5.0)
+    write_pairs(path)
+    verify(path, options)
+    verifier = PairVerifier(path, options)
+    for pair, agree in (((1, 2), True), ((3, 4), False)):
+        frames = [lafs.copy() for lafs in weak_pair(frames_agree=agree)]
+        for lafs in frames:
+            lafs[:, :, 2] -= 0.5
+            lafs[:, :, :2] *= MEASUREMENT_SIGMAS
+        same = np.stack([np.arange(len(frames[0]))] * 2, axis=1)
+        names = (f"{pair[0]}.png", f"{pair[1]}.png")
+        expected = verified_pairs(path, 1).get(pair, 0)
+        assert verifier.num_inliers(names, (frames[0], frames[1]), same) == expected
+        swapped = (names[1], names[0]), (frames[1], frames[0])
+        assert verifier.num_inliers(*swapped, same) == expected
+
+
+def test_preset_colmap_writes_what_pycolmap_does(tmp_path: Path) -> None:
+    paths = [tmp_path / "ours.db", tmp_path / "theirs.db"]
+    for path in paths:
+        write_pairs(path)
+    options = VerificationOptions.preset("colmap", max_num_trials=300)
+    verify(paths[0], options)
+    pycolmap.geometric_verification(paths[1], two_view_geometry_options=two_view_options(options))
+    found = []
+    for path in paths:
+        with open_database(path) as database:
+            found.append([database.read_two_view_geometry(*pair) for pair in ((1, 2), (3, 4))])
+    for ours, theirs in zip(*found, strict=True):
+        assert ours.config == theirs.config
+        np.testing.assert_array_equal(ours.inlier_matches, theirs.inlier_matches)
+        np.testing.assert_array_equal(ours.E, theirs.E)
+
+
+def test_missing_shapes_are_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for columns in (2, 6):
+        write_pairs(tmp_path / f"{columns}.db", columns)
+    with caplog.at_level(logging.WARNING):
+        verify(tmp_path / "6.db", VerificationOptions(max_num_trials=100))
+        assert not caplog.messages
+        verify(tmp_path / "2.db", VerificationOptions.preset("colmap", max_num_trials=100))
+        assert not caplog.messages
+    with open_database(tmp_path / "2.db") as database:
+        database.clear_two_view_geometries()
+    with caplog.at_level(logging.WARNING):
+        verify(tmp_path / "2.db", VerificationOptions(max_num_trials=100))
+    assert [message.split(": ")[1] for message in caplog.messages] == [
+        "keypoints have no shapes; pairs need more inliers to count as verified"
+    ]
+
+
+def test_threshold_grows_with_photographs_that_were_shrunk() -> None:
+    options, cameras = VerificationOptions(max_error_px=3.0), (camera(1, 2.5), camera(2))
+    assert max_error_px(cameras, options, None) == 3.0
+    assert max_error_px(cameras, options, 640) == pytest.approx(3.0 * (2.5 + 1.0) / 2)
+    assert max_error_px(cameras, options, 6400) == 3.0
+    colmap = VerificationOptions.preset("colmap", max_error_px=3.0)
+    assert max_error_px(cameras, colmap, 640) == 3.0
