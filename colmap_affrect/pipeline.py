@@ -247,10 +247,18 @@ def map_and_report(
 
 
 def map_guided(
-    context: Context, mapper: Mapper, extend: Extension | None = None, *, overwrite: bool = False
+    context: Context,
+    mapper: Mapper,
+    extend: Extension | None = None,
+    *,
+    overwrite: bool = False,
+    given: bool | None = None,
 ) -> tuple[list[StageReport], list[ModelSummary]]:
-    """Map; where images are missing or hang on few tracks, guide their pairs and map again."""
-    report, models = map_images(context, mapper, extend, overwrite=overwrite)
+    """Map; where images are missing or hang on few tracks, guide their pairs and map again.
+
+    Arguments are those of :func:`~colmap_affrect.stages.map.map_images`.
+    """
+    report, models = map_images(context, mapper, extend, overwrite=overwrite, given=given)
     if extend or is_copy(context.workspace):
         return [report], models
     before = {pair.names for pair in current(context)}
@@ -262,7 +270,7 @@ def map_guided(
     aside = sparse.with_name(sparse.name + ".aside")
     shutil.rmtree(aside, ignore_errors=True)
     sparse.rename(aside)
-    again, models_again = map_images(context, mapper)
+    again, models_again = map_images(context, mapper, given=given)
     reports = [report, guided, again]
     if agreement(context, sparse) > agreement(context, aside):
         shutil.rmtree(aside)

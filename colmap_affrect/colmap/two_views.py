@@ -57,7 +57,8 @@ def epipolar_pair(
     """
     points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
     essential, fundamental = geometry.E, geometry.F
-    if essential is not None and np.any(essential):
+    is_calibrated = geometry.config != pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+    if is_calibrated and essential is not None and np.any(essential):
         matrices = [camera.calibration_matrix() for camera in cameras]
         fundamental = np.linalg.inv(matrices[1]).T @ essential @ np.linalg.inv(matrices[0])
         points1 = undistorted(cameras[0], points1)

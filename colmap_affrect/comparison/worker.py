@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.database import image_ids, open_database, unverified_pairs
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import verified_pairs, verify
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP
@@ -41,6 +41,7 @@ from colmap_affrect.pairs.base import Pair, PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import BYTES_PER_RSS, peak_memory_bytes
 from colmap_affrect.parallel.subprocesses import end_with_parent
+from colmap_affrect.pipeline import map_guided
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary
@@ -50,6 +51,7 @@ from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verify_matches
@@ -186,19 +188,25 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
     copy_database(request.folder / "database.db", database_path)
     with open_database(database_path) as database:
         database.clear_two_view_geometries()
-        num_pairs = len(database.read_num_matches()[0])
     names = {image_id: name for name, image_id in image_ids(database_path).items()}
-    watch = Stopwatch()
-    title = f"verify, seed {seed}"
-    with watch.step("verify"), progress.stage(title, num_pairs, "pairs") as advance:
-        recipe = request.method.recipe
-        extracted_px = recipe.extraction.max_image_size_px if recipe else None
-        options = request.verification.changed(random_seed=seed)
-        verify(database_path, options, extracted_px, advance)
-    with watch.step("map"), progress.stage(f"map, seed {seed}", len(names), "images") as advance:
-        mapper = MAPPERS.make(request.mapping.changed(random_seed=seed))
-        task = MappingTask(database_path, request.image_path, request.intrinsics_given)
-        models = map_database(mapper, task, folder / "sparse", advance)
+    watch, told = Stopwatch(), _OfSeed(progress, seed)
+    options = request.verification.changed(random_seed=seed)
+    mapper = MAPPERS.make(request.mapping.changed(random_seed=seed))
+    if request.method.recipe:
+        workspace = Workspace(request.folder).branch(folder)
+        context = Context(workspace, request.resources, progress=told)
+        with watch.step("verify"):
+            verify_matches(context, options)
+        with watch.step("map"):
+            guide(context)
+            _, models = map_guided(context, mapper, given=request.intrinsics_given)
+    else:
+        num_pairs = len(unverified_pairs(database_path))
+        with watch.step("verify"), told.stage("verify", num_pairs, "pairs") as advance:
+            verify(database_path, options, advance=advance)
+        with watch.step("map"), told.stage("map", len(names), "images") as advance:
+            task = MappingTask(database_path, request.image_path, request.intrinsics_given)
+            models = map_database(mapper, task, folder / "sparse", advance)
     largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
     model_path = folder / "sparse" / "0" if models else None
     model = pycolmap.Reconstruction(model_path) if model_path else pycolmap.Reconstruction()
@@ -297,6 +305,20 @@ class _Reported(Progress):
         _tell(self._parent, stage=name, total=total, unit=unit)
         yield lambda count: _tell(self._parent, advance=count)
         _tell(self._parent, end=name)
+
+
+class _OfSeed(Progress):
+    """Progress whose stages name the seed."""
+
+    def __init__(self, progress: Progress, seed: int) -> None:
+        super().__init__()
+        self._progress, self._seed = progress, seed
+
+    @contextmanager
+    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
+        """See :class:`Progress`."""
+        with self._progress.stage(f"{name}, seed {self._seed}", total, unit) as advance:
+            yield advance
 
 
 def _tell(parent: TextIO, **event: Any) -> None:

@@ -111,6 +111,25 @@ class ExistingModel:
                 database.update_camera(self.reconstruction.camera(camera_id))
         return copy
 
+    def adjust_others(
+        self, model: pycolmap.Reconstruction, native: pycolmap.IncrementalPipelineOptions
+    ) -> None:
+        """Adjust a model whose bridged images pycolmap's mapper took for existing ones."""
+        if self.refine:
+            return
+        config, old = pycolmap.BundleAdjustmentConfig(), {image.name for image in self.images}
+        for image_id in model.reg_image_ids():
+            config.add_image(image_id)
+            image = model.images[image_id]
+            if image.name in old:
+                config.set_constant_rig_from_world_pose(image.frame_id)
+        for camera_id in native.constant_cameras:
+            config.set_constant_cam_intrinsics(camera_id)
+        adjuster = pycolmap.create_default_bundle_adjuster(
+            native.get_global_bundle_adjustment(), config, model
+        )
+        adjuster.solve()
+
     def restore(self, model: pycolmap.Reconstruction) -> None:
         """Give an extended model the poses that it had before, to the bit, and images it lost.
 

@@ -65,6 +65,7 @@ class SparseMapper:
         joined = Joiner(trusted, native, show).join(models)
         for model in joined:
             if task.extend:
+                task.extend.adjust_others(model.reconstruction, native)
                 task.extend.restore(model.reconstruction)
             if model.bridges and native.extract_colors and task.image_path:
                 model.reconstruction.extract_colors_for_all_images(task.image_path)
@@ -138,8 +139,7 @@ class Joiner:
         """Return a copy of a model with the images of a bridge, grown and refined from there."""
         model = copy.deepcopy(model)
         known = {model.images[i].camera_id for i in model.reg_image_ids()}
-        mapper = pycolmap.IncrementalMapper(self.graph.cache)
-        mapper.begin_reconstruction(model)
+        model.load(self.graph.cache)
         for image_id, (rotation, translation) in hypothesis.poses.items():
             image = model.images[image_id]
             if image.has_pose or image.frame is None:
@@ -149,7 +149,9 @@ class Joiner:
                 model.cameras[image.camera_id].params = parameters
             pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
             image.frame.set_cam_from_world(image.camera_id, pose)
-            mapper.observation_manager.register_frame(image.frame_id)
+            model.register_frame(image.frame_id)
+        mapper = pycolmap.IncrementalMapper(self.graph.cache)
+        mapper.begin_reconstruction(model)
         for image_id in hypothesis.poses:
             mapper.triangulate_image(self.native.get_triangulation(), image_id)
         self._refine(mapper)

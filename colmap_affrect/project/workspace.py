@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -56,6 +57,24 @@ class Workspace:
     def beside(cls, database_path: Path) -> Self:
         """Return the workspace of a user's database: ``x.affrect`` beside ``x.db``."""
         return cls(database_path.with_suffix(".affrect"), database_path)
+
+    def branch(self, path: Path) -> Workspace:
+        """Make another folder with the same features, pairs and raw matches, without a database.
+
+        Files are shared where the file system can do that.
+        """
+        path.mkdir(parents=True, exist_ok=True)
+        for source in (self.features, self.pairs, self.matches):
+            try:
+                os.link(source, path / source.name)
+            except OSError:
+                shutil.copy(source, path / source.name)
+        record = self.recorded()
+        later = STAGES[STAGES.index("verify") :]
+        record["begun"] = [stage for stage in record["begun"] if stage not in later]
+        text = tomli_w.dumps({"format_version": FORMAT_VERSION, **record})
+        replace_text(path / self.config.name, text)
+        return Workspace(path)
 
     @property
     def features(self) -> Path:

@@ -39,6 +39,9 @@ from colmap_affrect.stages.verify import recorded_verification, verify_new
 
 Matches = NDArray[np.int64]
 
+MIN_SHARE_KEPT = 0.8
+"""Of the inliers before, so many are still inliers of a geometry with guided matches."""
+
 IMAGES_IN_MEMORY = 40
 """Of 13,000 features; pairs come in an order that reads these seldom."""
 
@@ -253,18 +256,28 @@ class Guiding:
 
     def _keep(self, found: Sequence[GuidedPair]) -> None:
         """Put better geometries into the database, and all pairs on record before that."""
-        geometries = {}
+        geometries, configs = {}, self._configs([pair.names for pair in found])
         for pair in found:
             if len(pair.candidates) > len(pair.exact):
                 first, second = (self.context.features.read_frames(name) for name in pair.names)
                 geometry = self.verifier.geometry(pair.names, (first, second), pair.candidates)
-                if len(geometry.inlier_matches) > len(pair.exact):
+                if _is_better(geometry, pair, configs.get(pair.names)):
                     geometries[pair.names] = geometry
         counts = {names: len(geometry.inlier_matches) for names, geometry in geometries.items()}
         self.context.guided.write(
             replace(pair, num_inliers=counts.get(pair.names, 0)) for pair in found
         )
         self._write_geometries(geometries)
+
+    def _configs(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
+        """Return what kind of geometry the database has of each pair."""
+        with colmap_database.open_database(self.path) as database:
+            ids = {pair: (self.ids[pair[0]], self.ids[pair[1]]) for pair in pairs}
+            return {
+                pair: database.read_two_view_geometry(*ids[pair]).config
+                for pair in pairs
+                if database.exists_two_view_geometry(*ids[pair])
+            }
 
     def _write_geometries(self, geometries: Mapping[Pair, pycolmap.TwoViewGeometry]) -> None:
         with colmap_database.open_database(self.path) as database:
@@ -274,3 +287,23 @@ class Guiding:
                     database.update_two_view_geometry(first, second, geometry)
                 else:
                     database.write_two_view_geometry(first, second, geometry)
+
+
+def _is_better(
+    geometry: pycolmap.TwoViewGeometry,
+    pair: GuidedPair,
+    before: int | None,
+) -> bool:
+    """Tell whether a geometry has more inliers, and is still that of the exact matches.
+
+    Where structure repeats, guided matches may outvote them: exact inliers then fall out, or the
+    cameras, whose focal lengths the geometry agreed with, do not fit any more.
+    """
+    if len(geometry.inlier_matches) <= len(pair.exact):
+        return False
+    configs = pycolmap.TwoViewGeometryConfiguration
+    if before == configs.CALIBRATED and geometry.config == configs.UNCALIBRATED:
+        return False
+    found = set(map(tuple, geometry.inlier_matches.tolist()))
+    num_kept = sum(tuple(row) in found for row in pair.exact.tolist())
+    return num_kept >= MIN_SHARE_KEPT * len(pair.exact)

@@ -53,6 +53,7 @@ def map_images(
     extend: Extension | None = None,
     *,
     overwrite: bool = False,
+    given: bool | None = None,
 ) -> tuple[StageReport, list[ModelSummary]]:
     """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
 
@@ -61,6 +62,7 @@ def map_images(
         mapper: with its options.
         extend: the model that images are registered into; None begins anew.
         overwrite: discard the models that are there.
+        given: whether the user gave the camera parameters; by default as on record.
 
     Raises:
         MappingError: when the model cannot be extended with these images.
@@ -85,7 +87,7 @@ def map_images(
     task = MappingTask(
         workspace.database,
         _image_path(workspace),
-        intrinsics_given(workspace),
+        intrinsics_given(workspace) if given is None else given,
         existing,
         guided={} if is_copy(workspace) else guided_matches(context),
     )

@@ -40,7 +40,7 @@ KINDS: dict[str, MakeCoarse] = {
 def kind(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> MakeCoarse:
     """Each kind, on any processor."""
     if not has_fast_8_bit_products():
-        monkeypatch.setattr(coarse, "_packed", lambda codes: codes)
+        monkeypatch.setattr(coarse, "_packed", coarse._filled_up)
         monkeypatch.setattr(coarse, "_similarity_codes", similarity_codes)
     return KINDS[request.param]
 
