@@ -14,7 +14,7 @@ from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.arrivals import arrivals, read_arrivals, write_arrivals
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.doubts import find_doubts, without_impossible
-from colmap_affrect.mappers.exact import exact_only
+from colmap_affrect.mappers.exact import adjust_last
 from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
@@ -84,8 +84,8 @@ def map_database(
                 best = better(kept, best, sorted(found, key=_size, reverse=True))
                 if best and _size(best[0])[0] >= min(num_images, LARGE_MODEL):
                     break
-        if task.guided and not task.extend:
-            _adjust_exactly(mapper, task, best)
+        if not task.extend:
+            _adjust_weak(mapper, task, best)
         shutil.rmtree(sparse_path, ignore_errors=True)
         for index, model in enumerate(best):
             write_model(model.reconstruction, partial / str(index))
@@ -96,12 +96,13 @@ def map_database(
     return [summarize(model, task) for model in best]
 
 
-def _adjust_exactly(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -> None:
-    """Adjust models by exact matches where these suffice; see :mod:`..mappers.exact`."""
-    verified = inlier_matches(task.database_path, 1)
+def _adjust_weak(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -> None:
+    """Adjust models that guided matches or bridges hold; others stay as COLMAP made them."""
+    weak = [model for model in models if task.guided or model.bridges]
+    verified = inlier_matches(task.database_path, 1) if weak else {}
     refine = not (task.intrinsics_given and mapper.options.keep_given_intrinsics)
-    for model in models:
-        exact_only(model.reconstruction, verified, task.guided, refine_intrinsics=refine)
+    for model in weak:
+        adjust_last(model.reconstruction, verified, task.guided, refine_intrinsics=refine)
 
 
 def _size(model: MappedModel) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""The last adjustment of a model by exact matches, where guided ones have brought images together.
+"""The last adjustment of a model that guided matches or bridges have brought together.
 
 Guided matches are less exact than others. They register images and tie them together, but where
 exact matches suffice to hold images these alone say where they stand.
@@ -24,22 +24,31 @@ MIN_NUM_TRACKS = 30
 """Exact tracks through three images or more that hold an image, as many as COLMAP asks for when it
 registers one."""
 
+LOSS_SCALE_PX = 0.5
+"""Of the robust loss: about the error of exact matches."""
+
+NUM_ROUNDS = 3
+"""Adjustments, with what does not fit taken out after each."""
+
+MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
+"""What fits, as for COLMAP's mappers."""
+
 MIN_SHARED_TRACKS = 10
 """Of these tracks so many hold two images together."""
 
 
-def exact_only(
+def adjust_last(
     model: pycolmap.Reconstruction,
     verified: Matches,
     guided: Matches,
     *,
     refine_intrinsics: bool,
 ) -> int:
-    """Take guided observations out of a model that exact ones hold, and adjust it.
+    """Adjust a model that guided matches or bridges hold, and take out what no longer fits.
 
-    These are the observations that only guided matches tie to their tracks. Where exact matches do
-    not hold all images nothing is taken out: guided tracks then fix what exact ones leave open, the
-    scale of one part against another for one, and half of them would serve neither part.
+    Observations that only guided matches tie to their tracks are taken out first where exact ones
+    hold all images. Elsewhere they fix what exact ones leave open, the scale of one part against
+    another for one; the loss is robust, so that the exact ones, which fit better, count more.
 
     Args:
         model: changed in place.
@@ -48,18 +57,21 @@ def exact_only(
         refine_intrinsics: whether focal lengths and distortion are adjusted as well.
 
     Returns:
-        How many observations were taken out; the model is left alone if there are none.
+        How many observations of guided matches were taken out first.
     """
     points = {i: _points(model.images[i]) for i in model.reg_image_ids()}
     all_ties, guided_ties = _ties(points, verified), _ties(points, guided)
     ties = all_ties[~np.isin(_keys(all_ties), _keys(guided_ties))]
     dropped = np.setdiff1d(all_ties, ties)
-    if not len(dropped) or len(exactly_held(ties)) < len(points):
-        return 0
+    if len(exactly_held(ties)) < len(points):
+        dropped = dropped[:0]
     for image_id, index in zip(dropped >> 32, dropped & 0xFFFFFFFF, strict=True):
         if model.images[image_id].points2D[index].has_point3D():
             model.delete_observation(image_id, index)
-    _adjust(model, refine_intrinsics=refine_intrinsics)
+    for _ in range(NUM_ROUNDS):
+        _adjust(model, refine_intrinsics=refine_intrinsics)
+        pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
+    model.update_point_3d_errors()
     return len(dropped)
 
 
@@ -119,6 +131,7 @@ def _adjust(model: pycolmap.Reconstruction, *, refine_intrinsics: bool) -> None:
         refine_extra_params=refine_intrinsics,
         print_summary=False,
     )
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = LOSS_SCALE_PX
     options.ceres.solver_options.num_threads = 1
     pycolmap.bundle_adjustment(model, options)
-    model.update_point_3d_errors()

@@ -146,6 +146,16 @@ class PairGraph:
             if poses.keys() >= set(pair.ids)
         )
 
+    def supports(self, model: pycolmap.Reconstruction, image_ids: Iterable[int]) -> bool:
+        """Tell whether of the pairs of each of some images most agree with a model."""
+        poses, cameras = poses_of(model), cameras_of(model)
+        for image_id in image_ids:
+            pairs = [p for p in self.pairs if image_id in p.ids and poses.keys() >= set(p.ids)]
+            agreeing = sum(p.weight * self.agreement(p, poses, cameras) for p in pairs)
+            if agreeing < MIN_SHARE * sum(pair.weight for pair in pairs):
+                return False
+        return True
+
     def score_of(self, model: pycolmap.Reconstruction) -> float:
         """Return the :meth:`score` of the images that a model has registered."""
         return self.score(poses_of(model), cameras_of(model))

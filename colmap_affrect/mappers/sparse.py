@@ -124,7 +124,8 @@ class Joiner:
             for hypothesis in hypotheses[:MAX_TRIALS]:
                 grown = self.applied(hypothesis, model)
                 new_score = self.graph.score_of(grown)
-                if new_score > score and set(hypothesis.poses) & set(grown.reg_image_ids()):
+                new = set(grown.reg_image_ids()) - set(model.reg_image_ids())
+                if new and new_score > score and self.graph.supports(grown, new):
                     break
             else:
                 return model, built, others
