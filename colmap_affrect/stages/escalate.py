@@ -147,6 +147,9 @@ def first_level_database(context: Context) -> Iterator[Path | None]:
     It is what a recipe without escalation would have made. None when no pair of the database has
     climbed with success.
     """
+    if not recorded_extraction(context.workspace).escalation:
+        yield None
+        return
     escalation = Escalation(context, EscalateOptions())
     levels = context.matches.levels(escalation.pairs)
     climbed = [pair for pair, count in escalation.num_inliers().items() if count and levels[pair]]
@@ -370,8 +373,7 @@ class Escalation:
     def _worth(self, found: PairMatches, verifier: PairVerifier) -> tuple[int, int]:
         """Return the inliers of matches; where there are none, how many confirm each other."""
         first, second = (self.features.read_frames(name) for name in found.names)
-        keypoints = first[:, :, 2], second[:, :, 2]
-        count = verifier.num_inliers(found.names, keypoints, found.indices)
+        count = verifier.num_inliers(found.names, (first, second), found.indices)
         if count:
             return count, 0
         rows, columns = found.indices.T

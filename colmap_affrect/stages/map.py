@@ -97,7 +97,7 @@ def map_images(
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models = map_database(mapper, task, workspace.sparse, advance)
-    if _num_registered(models) < min(num_images, LARGE_MODEL):
+    if not is_copy(workspace) and _num_registered(models) < min(num_images, LARGE_MODEL):
         models = _or_first_level(context, mapper, task, models)
     replace_text(path, inputs)
     warnings = {}

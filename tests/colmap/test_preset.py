@@ -303,7 +303,10 @@ FIXED_INTRINSICS = {
         "mapper.bundle_adjustment.refine_extra_params": False,
     },
 }
+SPARSE_MAPPING["sparse"] = SPARSE_MAPPING["incremental"]
+FIXED_INTRINSICS["sparse"] = FIXED_INTRINSICS["incremental"]
 NATIVE = {
+    "sparse": pycolmap.IncrementalPipelineOptions,
     "incremental": pycolmap.IncrementalPipelineOptions,
     "global": pycolmap.GlobalPipelineOptions,
 }

@@ -33,7 +33,7 @@ from colmap_affrect.errors import (
     StaleStoreError,
 )
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers.incremental import IncrementalOptions
+from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.matchers import nearest
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.progress import Progress
@@ -234,7 +234,7 @@ def test_finished_methods_are_not_run_again(scene, options, compared) -> None:
     [
         ({"cameras": CameraOptions()}, r"compared there with camera.mode='per-image', and it is"),
         (
-            {"mapping": IncrementalOptions(min_model_size=3)},
+            {"mapping": SparseOptions(min_model_size=3)},
             "mapping.min_model_size=2, and it is 3",
         ),
         (

@@ -58,6 +58,7 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "registered_names": ["a.png", "č d.png"],
         "unregistered": REPORT.unregistered,
         "doubtful": {},
+        "guided": {},
         "doubts": [],
         "arrivals": {
             "a.png": {"how": "tracks"},
