@@ -70,12 +70,14 @@ def _rays(points: Array) -> Array:
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def _some(points: Array) -> Array:
+def _some(points: NDArray[np.floating]) -> Array:
     """Return at most ``MAX_NUM_POINTS``, evenly spaced in their order."""
     return points[:: -(-len(points) // MAX_NUM_POINTS)] if len(points) else points
 
 
-def mirrored_share(points1: Array, points2: Array, size: Size) -> float:
+def mirrored_share(
+    points1: NDArray[np.floating], points2: NDArray[np.floating], size: Size
+) -> float:
     """Return the share of all keypoints of image 1 that a mirrored copy of it has too.
 
     Args:
@@ -95,7 +97,7 @@ def mirrored_share(points1: Array, points2: Array, size: Size) -> float:
     return max(shares)
 
 
-def _cells(points: Array, row: int) -> NDArray[np.int64]:
+def _cells(points: NDArray[np.floating], row: int) -> NDArray[np.int64]:
     """Number the pixels that points lie in."""
     columns, rows = np.floor(points).astype(np.int64).T
     return np.asarray(rows * row + columns)

@@ -23,10 +23,6 @@ from colmap_affrect.project.report import ModelSummary
 ATTEMPT_SEED_STEP = 1_000_003
 """Distance of the seeds of repeated attempts, so that those of runs 0, 1, 2, ... differ."""
 
-MIN_NUM_MATCHES = 15
-"""Pairs with fewer inliers have no say in which attempt is the best; COLMAP's mappers leave them
-out."""
-
 LARGE_MODEL = 100
 """From this size on the first pair no longer matters, and another attempt takes long."""
 
@@ -115,7 +111,7 @@ def better(
     """Return the models of two attempts with which the verified pairs agree best."""
     if not models or not others:
         return models or others
-    graph = graph_of(task, MIN_NUM_MATCHES)
+    graph = graph_of(task)
     return max(models, others, key=lambda found: graph.best_score(m.reconstruction for m in found))
 
 

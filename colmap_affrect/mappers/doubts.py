@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from itertools import islice
 from math import ceil
 from typing import cast
@@ -16,13 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.colmap.two_views import undistorted
-from colmap_affrect.colmap.verification import REJECTED
-from colmap_affrect.geometry.epipolar import sampson_errors
 from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
 from colmap_affrect.mappers.arrivals import MIN_THREE_VIEW_POINTS
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
+from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, graph_of, poses_of
 
 FOCAL_LENGTHS = (0.3, 10.0)
 """Longer sides: 120 and 6 degrees, beyond all lenses of photographs that anybody reconstructs."""
@@ -41,7 +37,7 @@ MIN_AGREEMENT, NO_AGREEMENT = 0.5, 0.25
 quarters agree."""
 
 MAX_ERROR = 0.003
-"""Of a match, in longer sides: 3 px of 1000, the threshold of verification."""
+"""Of a match that a rotation explains, in longer sides: 3 px of 1000, as in verification."""
 
 MAX_SCALE_ERROR_FRAC = 0.1
 """Of a bridged image: beyond, its distance is a guess."""
@@ -60,8 +56,8 @@ MAX_ANGLE_DEG = 90.0
 """To the next image. Surfaces are then tilted by 45 degrees in one of both at least: single matches
 survive that, not most of an image; repeated and symmetric structures look so."""
 
-MAX_PAIRS_OF_IMAGE, MAX_PAIRS_FOR_PARALLAX, MAX_POINTS_FOR_ANGLES = 10, 100, 2000
-"""Strongest pairs of each image, pairs and points looked at; more change no share."""
+MAX_PAIRS_FOR_PARALLAX, MAX_POINTS_FOR_ANGLES = 100, 2000
+"""Pairs and points looked at; more change no share."""
 
 Points = NDArray[np.float64]
 Ids = tuple[int, int]
@@ -89,9 +85,9 @@ def find_doubts(model: MappedModel, task: MappingTask) -> Doubts:
         model: with all its images, also of bridges.
         task: what it was made from.
     """
-    pairs = _verified_pairs(model.reconstruction, task)
-    images = _image_doubts(model, pairs, task)
-    return replace(images, model=tuple(_model_doubts(model, pairs, task)))
+    graph = graph_of(task)
+    images = _image_doubts(model, graph, task)
+    return replace(images, model=tuple(_model_doubts(model, graph)))
 
 
 def without_impossible(model: MappedModel, task: MappingTask) -> MappedModel | None:
@@ -100,10 +96,10 @@ def without_impossible(model: MappedModel, task: MappingTask) -> MappedModel | N
     The reconstruction itself is changed.
     """
     reconstruction = model.reconstruction
-    pairs = _verified_pairs(reconstruction, task)
+    graph = graph_of(task)
     taken: dict[str, str] = {}
     while reconstruction.num_reg_images():
-        doubts = _image_doubts(model, pairs, task)
+        doubts = _image_doubts(model, graph, task)
         if not doubts.impossible:
             break
         name = doubts.impossible[0]
@@ -112,65 +108,6 @@ def without_impossible(model: MappedModel, task: MappingTask) -> MappedModel | N
     if reconstruction.num_reg_images() < 2:
         return None
     return replace(model, taken_out={**model.taken_out, **taken})
-
-
-@dataclass(frozen=True)
-class _Pair:
-    """A verified pair of registered images: both sides of its inliers, and how many agree."""
-
-    points: tuple[Points, Points]
-    keypoints: tuple[Points, Points]
-    num_agreeing: int
-
-    @property
-    def num_inliers(self) -> int:
-        return len(self.points[0])
-
-
-def _verified_pairs(model: pycolmap.Reconstruction, task: MappingTask) -> dict[Ids, _Pair]:
-    """Return the strongest pairs of each image, the strongest of all first."""
-    registered = set(model.reg_image_ids())
-    with open_database(task.database_path) as database:
-        inliers = {
-            pycolmap.pair_id_to_image_pair(pair_id): np.asarray(geometry.inlier_matches, np.int64)
-            for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True)
-            if geometry.config not in REJECTED and len(geometry.inlier_matches)
-        }
-
-        @lru_cache(maxsize=256)
-        def keypoints(image_id: int) -> Points:
-            return np.asarray(database.read_keypoints(image_id)[:, :2], np.float64)
-
-        counts = dict.fromkeys(registered, 0)
-        found = {}
-        for ids, matches in sorted(inliers.items(), key=lambda item: -len(item[1])):
-            wanted = registered.issuperset(ids) and min(counts[i] for i in ids) < MAX_PAIRS_OF_IMAGE
-            if not wanted:
-                continue
-            both = (keypoints(ids[0]), keypoints(ids[1]))
-            points = (both[0][matches[:, 0]], both[1][matches[:, 1]])
-            found[ids] = _Pair(points, both, _num_agreeing(model, ids, points))
-            for image_id in ids:
-                counts[image_id] += 1
-    return found
-
-
-def _num_agreeing(model: pycolmap.Reconstruction, ids: Ids, points: tuple[Points, Points]) -> int:
-    """Count the matches that lie on the epipolar lines of the model."""
-    images = [model.images[image_id] for image_id in ids]
-    poses = [image.cam_from_world() for image in images]
-    relative = poses[1] * poses[0].inverse()
-    x, y, z = relative.translation
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative.rotation.matrix()
-    cameras = [_camera(image) for image in images]
-    try:
-        inverses = [np.linalg.inv(camera.calibration_matrix()) for camera in cameras]
-    except np.linalg.LinAlgError:  # a focal length of 0
-        return 0
-    ideal = [undistorted(camera, side) for camera, side in zip(cameras, points, strict=True)]
-    with np.errstate(all="ignore"):  # of cameras that are impossible
-        errors = sampson_errors(inverses[1].T @ essential @ inverses[0], *ideal)
-        return int((errors <= MAX_ERROR * max(map(_side, cameras))).sum())
 
 
 def _camera(image: pycolmap.Image) -> pycolmap.Camera:
@@ -187,23 +124,24 @@ def _side(camera: pycolmap.Camera) -> int:
     return max(camera.width, camera.height)
 
 
-def _image_doubts(model: MappedModel, pairs: Mapping[Ids, _Pair], task: MappingTask) -> Doubts:
+def _image_doubts(model: MappedModel, graph: PairGraph, task: MappingTask) -> Doubts:
     """Judge the images one by one."""
     reconstruction = model.reconstruction
     registered = set(reconstruction.reg_image_ids())
     bridges = {name: bridge for bridge in model.bridges for name in bridge.names}
-    inside = [(ids, pair) for ids, pair in pairs.items() if registered.issuperset(ids)]
-    totals = dict.fromkeys(registered, np.zeros(2, np.int64))
-    for ids, pair in inside:
-        for image_id in ids:
-            totals[image_id] = totals[image_id] + (pair.num_agreeing, pair.num_inliers)
+    poses, cameras = poses_of(reconstruction), cameras_of(reconstruction)
+    totals = {image_id: np.zeros(2) for image_id in registered}
+    for pair in graph.pairs_inside(registered):
+        count = len(pair.matches)
+        for image_id in pair.ids:
+            totals[image_id] += count * graph.agreement(pair, poses, cameras), count
     reasons: dict[str, str] = {}
     angles = _angles_deg(reconstruction)
     impossible: list[tuple[float, int, str]] = []
     for image_id in registered:
         image = reconstruction.images[image_id]
-        agreeing, total = totals[image_id]
-        agreement = float(agreeing / total) if total else 1.0
+        agreeing, total = totals[image_id].tolist()
+        agreement = agreeing / total if total else 1.0
         found = [
             *([] if task.intrinsics_given else _camera_doubts(_camera(image))),
             *_observation_doubts(image.num_points3D),
@@ -258,22 +196,23 @@ def _bridge_doubts(bridge: Bridge | None) -> Iterator[tuple[str, bool]]:
         yield f"bridged by {bridge.pair[0]}, where only {some} depths agree on the scale", False
 
 
-def _model_doubts(
-    model: MappedModel, pairs: Mapping[Ids, _Pair], task: MappingTask
-) -> Iterator[str]:
+def _model_doubts(model: MappedModel, graph: PairGraph) -> Iterator[str]:
     """Judge the model as a whole."""
     reconstruction = model.reconstruction
-    num_images, num_given = reconstruction.num_reg_images(), len(image_ids(task.database_path))
+    num_images, num_given = reconstruction.num_reg_images(), len(graph.names)
     if num_images < 3 <= num_given:
         yield f"only {num_images} of {num_given} photographs, which no third one confirms"
     angles = [wide for of_image in _angles_deg(reconstruction).values() for _, wide in of_image]
-    some = list(pairs.items())[:: max(1, len(pairs) // MAX_PAIRS_FOR_PARALLAX)]
-    shown = {ids: tuple(reconstruction.images[i] for i in ids) for ids, _ in some}
+    pairs = graph.pairs_inside(set(reconstruction.reg_image_ids()))
+    some = pairs[:: max(1, len(pairs) // MAX_PAIRS_FOR_PARALLAX)]
+    shown = {pair.ids: tuple(reconstruction.images[i] for i in pair.ids) for pair in some}
     sizes = {ids: (_size(first), _size(second)) for ids, (first, second) in shown.items()}
     moving = (
-        ids
-        for ids, pair in some
-        if rotation_share(*pair.points, sizes[ids], MAX_ERROR * max(map(max, sizes[ids])))
+        pair
+        for pair in some
+        if rotation_share(
+            *graph.points(pair), sizes[pair.ids], MAX_ERROR * max(map(max, sizes[pair.ids]))
+        )
         < MIN_SHARE_STILL
     )
     max_num_moving = len(some) - ceil(MIN_SHARE_OF_STILL_PAIRS * len(some))
@@ -284,9 +223,10 @@ def _model_doubts(
         )
     elif np.mean(np.array(angles or [0.0]) >= MIN_WIDE_ANGLE_DEG) < MIN_SHARE_WIDE:
         yield f"hardly any parallax: rays are less than {MIN_WIDE_ANGLE_DEG:g} degrees apart"
-    for ids, pair in some:
+    for ids in shown:
         same = sizes[ids][0] == sizes[ids][1]
-        if same and mirrored_share(*pair.keypoints, sizes[ids][0]) >= MIN_SHARE_MIRRORED:
+        keypoints = (graph.keypoints[ids[0]], graph.keypoints[ids[1]])
+        if same and mirrored_share(*keypoints, sizes[ids][0]) >= MIN_SHARE_MIRRORED:
             first, second = sorted(image.name for image in shown[ids])
             yield f"{first} and {second} are mirrored copies of one photograph"
             break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -26,14 +27,22 @@ PoseById = Mapping[int, Pose]
 CameraById = Mapping[int, pycolmap.Camera]
 """Cameras by image id."""
 
-MAX_ERROR_PX = 4.0
-"""An inlier agrees with poses up to this Sampson error; COLMAP's limit for observations."""
+MAX_ERROR_PX, MAX_ERROR = 4.0, 0.003
+"""An inlier agrees with poses up to this Sampson error, or this part of the longer side if that is
+more: COLMAP's limit for observations, and what features of a shrunk photograph allow."""
 
 MIN_ANGLE_DEG = 1.0
 """Rays closer to parallel say nothing about depth, nor which side of the camera a point is."""
 
 MAX_MATCHES, MAX_TRIALS = 500, 1000
-"""What a relative pose is estimated from: inliers already, so that few are enough."""
+"""What agreement is measured with and relative poses are estimated from: inliers already, so that
+few are enough."""
+
+MAX_PAIRS_OF_IMAGE = 15
+"""An image's pairs with fewer inliers have no say, unless they are among those of the other one."""
+
+MIN_NUM_MATCHES = 15
+"""Pairs with fewer inliers are left out, as by COLMAP's mappers."""
 
 MIN_SHARE = 0.5
 """A pair speaks for poses when at least this share of its inliers agrees."""
@@ -58,6 +67,11 @@ class VerifiedPair:
         """What the pair counts beside others."""
         return float(np.sqrt(len(self.matches)))
 
+    def some_matches(self) -> VerifiedPair:
+        """Return the pair with ``MAX_MATCHES`` of its inliers at most, spread over all."""
+        step = -(-len(self.matches) // MAX_MATCHES)
+        return replace(self, matches=self.matches[::step])
+
 
 @dataclass(frozen=True)
 class RelativePose:
@@ -76,7 +90,7 @@ class RelativePose:
 
 @dataclass(frozen=True, eq=False)
 class PairGraph:
-    """All verified pairs of a database.
+    """The verified pairs of a database, of each image the strongest.
 
     Attributes:
         cache: the same for pycolmap's mappers.
@@ -89,26 +103,26 @@ class PairGraph:
     cache: pycolmap.DatabaseCache
     names: Mapping[int, str]
     cameras: CameraById
-    keypoints: Mapping[int, NDArray[np.float64]]
+    keypoints: Mapping[int, NDArray[np.float32]]
     pairs: tuple[VerifiedPair, ...]
 
     @classmethod
-    def read(cls, path: Path, min_num_matches: int) -> PairGraph:
+    def read(cls, path: Path, min_num_matches: int = MIN_NUM_MATCHES) -> PairGraph:
         """Read the pairs with at least as many inliers."""
         with open_database(path) as database:
             images = {image.image_id: image for image in database.read_all_images()}
             cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
             pair_ids, geometries = database.read_two_view_geometries()
-            pairs = [
+            pairs = _strongest(
                 _verified(pycolmap.pair_id_to_image_pair(pair_id), geometry)
                 for pair_id, geometry in zip(pair_ids, geometries, strict=True)
                 if len(geometry.inlier_matches) >= min_num_matches
-            ]
+            )
             options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches)
             cache = pycolmap.DatabaseCache.create(database, options)
             used = {image_id for pair in pairs for image_id in pair.ids}
             keypoints = {
-                image_id: np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
+                image_id: np.array(database.read_keypoints(image_id)[:, :2], np.float32)
                 for image_id in used
             }
         return cls(
@@ -125,14 +139,23 @@ class PairGraph:
 
     def points(self, pair: VerifiedPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the (M, 2) px of the inliers in both images."""
-        first, second = pair.ids
-        return self.keypoints[first][pair.matches[:, 0]], self.keypoints[second][pair.matches[:, 1]]
+        first, second = (
+            self.keypoints[image_id][pair.matches[:, side]].astype(np.float64)
+            for side, image_id in enumerate(pair.ids)
+        )
+        return first, second
+
+    def pairs_inside(self, image_ids: Collection[int]) -> list[VerifiedPair]:
+        """Return the pairs both of whose images are among some."""
+        inside = set(image_ids)
+        return [pair for pair in self.pairs if inside.issuperset(pair.ids)]
 
     def agreement(self, pair: VerifiedPair, poses: PoseById, cameras: CameraById) -> float:
         """Return the share of the inliers of a pair that agree with the poses of its images."""
         camera1, camera2 = (cameras[image_id] for image_id in pair.ids)
         pose = relative_pose(*(poses[image_id] for image_id in pair.ids))
-        return float(_agrees(pose, (camera1, camera2), self.points(pair))[0].mean())
+        some = pair.some_matches()
+        return float(_agrees(pose, (camera1, camera2), self.points(some))[0].mean())
 
     def score(self, poses: PoseById, cameras: CameraById) -> float:
         """Return how well poses agree with all pairs whose images have one.
@@ -142,16 +165,15 @@ class PairGraph:
         """
         return sum(
             pair.weight * (2.0 * self.agreement(pair, poses, cameras) - 1.0)
-            for pair in self.pairs
-            if poses.keys() >= set(pair.ids)
+            for pair in self.pairs_inside(poses)
         )
 
     def supports(self, model: pycolmap.Reconstruction, image_ids: Iterable[int]) -> bool:
         """Tell whether of the pairs of each of some images most agree with a model."""
         poses, cameras = poses_of(model), cameras_of(model)
         for image_id in image_ids:
-            pairs = [p for p in self.pairs if image_id in p.ids and poses.keys() >= set(p.ids)]
-            agreeing = sum(p.weight * self.agreement(p, poses, cameras) for p in pairs)
+            pairs = [pair for pair in self.pairs_inside(poses) if image_id in pair.ids]
+            agreeing = sum(pair.weight * self.agreement(pair, poses, cameras) for pair in pairs)
             if agreeing < MIN_SHARE * sum(pair.weight for pair in pairs):
                 return False
         return True
@@ -189,10 +211,10 @@ class PairGraph:
                 max_error=MAX_ERROR_PX, max_num_trials=MAX_TRIALS, random_seed=max(random_seed, 0)
             ),
         )
-        some = np.random.default_rng(0).permutation(len(pair.matches))[:MAX_MATCHES]
-        rows = np.stack([some, some], axis=1).astype(np.uint32)
+        some = self.points(pair.some_matches())
+        rows = np.arange(len(some[0]), dtype=np.uint32)
         geometry = pycolmap.estimate_calibrated_two_view_geometry(
-            camera1, points[0], camera2, points[1], rows, options
+            camera1, some[0], camera2, some[1], np.stack([rows, rows], axis=1), options
         )
         candidates = []
         if geometry.cam2_from_cam1 is not None:
@@ -213,7 +235,7 @@ class PairGraph:
 
 
 @lru_cache(maxsize=1)
-def graph_of(task: MappingTask, min_num_matches: int) -> PairGraph:
+def graph_of(task: MappingTask, min_num_matches: int = MIN_NUM_MATCHES) -> PairGraph:
     """Return the graph of what is to be mapped, read once for all attempts."""
     return PairGraph.read(task.database_path, min_num_matches)
 
@@ -244,14 +266,16 @@ def _agrees(
         np.asarray(camera.cam_from_img(part), np.float64)
         for camera, part in zip(cameras, points, strict=True)
     )
-    depths = triangulated_depths(*pose, rays1, rays2)
-    focal1, focal2 = (camera.mean_focal_length() for camera in cameras)
-    # Sampson errors are of px when rays are scaled by the focal lengths.
-    scale1, scale2 = (np.diag([1 / focal, 1 / focal, 1.0]) for focal in (focal1, focal2))
-    fundamental = scale2 @ essential_matrix(*pose) @ scale1
-    errors = sampson_errors(fundamental, focal1 * rays1, focal2 * rays2)
+    with np.errstate(all="ignore"):  # of cameras that are impossible
+        depths = triangulated_depths(*pose, rays1, rays2)
+        focal1, focal2 = (np.float64(camera.mean_focal_length()) for camera in cameras)
+        # Sampson errors are of px when rays are scaled by the focal lengths.
+        scale1, scale2 = (np.diag([1 / focal, 1 / focal, 1.0]) for focal in (focal1, focal2))
+        fundamental = scale2 @ essential_matrix(*pose) @ scale1
+        errors = sampson_errors(fundamental, focal1 * rays1, focal2 * rays2)
     sides = depths.in_front | (depths.angles_deg < MIN_ANGLE_DEG)
-    return (errors <= MAX_ERROR_PX) & sides, depths
+    tolerance = max(MAX_ERROR_PX, *(MAX_ERROR * max(c.width, c.height) for c in cameras))
+    return (errors <= tolerance) & sides, depths
 
 
 def _verified(ids: tuple[int, int], geometry: pycolmap.TwoViewGeometry) -> VerifiedPair:
@@ -259,3 +283,14 @@ def _verified(ids: tuple[int, int], geometry: pycolmap.TwoViewGeometry) -> Verif
     if homography is not None and not np.any(homography):
         homography = None
     return VerifiedPair(ids, np.asarray(geometry.inlier_matches, np.int64), homography)
+
+
+def _strongest(pairs: Iterable[VerifiedPair]) -> list[VerifiedPair]:
+    """Return the pairs among the ``MAX_PAIRS_OF_IMAGE`` strongest of one of their images."""
+    counts: Counter[int] = Counter()
+    kept = []
+    for pair in sorted(pairs, key=lambda pair: (-len(pair.matches), pair.ids)):
+        if min(counts[image_id] for image_id in pair.ids) < MAX_PAIRS_OF_IMAGE:
+            kept.append(pair)
+        counts.update(pair.ids)
+    return kept

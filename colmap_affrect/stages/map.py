@@ -17,7 +17,6 @@ from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.mappers.attempts import (
     LARGE_MODEL,
-    MIN_NUM_MATCHES,
     map_database,
     read_models,
 )
@@ -258,7 +257,7 @@ def advice(
 
 def agreement(context: Context, sparse_path: Path) -> float:
     """Return how well the best of some models agrees with the verified pairs."""
-    graph = PairGraph.read(context.workspace.database, MIN_NUM_MATCHES)
+    graph = PairGraph.read(context.workspace.database)
     folders = [path for path in sparse_path.iterdir() if path.name.isdigit()]
     return graph.best_score(pycolmap.Reconstruction(folder) for folder in folders)
 

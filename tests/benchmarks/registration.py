@@ -35,11 +35,13 @@ class Subset:
         scene: folder of the scene.
         step: every step-th image in sorted order is taken.
         calibrated: whether the runs are given the true intrinsics.
+        first: number of the first image.
     """
 
     scene: str
     step: int
     calibrated: bool
+    first: int = 0
 
 
 SUBSETS = {
@@ -50,6 +52,18 @@ SUBSETS = {
     "saharov /4": Subset("saharov32", 4, True),
     "temple /2": Subset("temple_sparse_ring", 2, True),
     "temple all": Subset("temple_sparse_ring", 1, True),
+    "temple 1/2": Subset("temple_sparse_ring", 2, True, 1),
+    "saharov 1/5": Subset("saharov32", 5, True, 1),
+    "kermit /3": Subset("kermit", 3, False),
+    "sacre_coeur /3": Subset("sacre_coeur", 3, False),
+    "fountain 1,5,9": Subset("strecha_fountain_p11", 4, True, 1),
+    "herz /6": Subset("strecha_herz_jesus_p25", 6, True),
+    "kitchen /2": Subset("kitchen", 2, False),
+    "kitchen all": Subset("kitchen", 1, False),
+    "et /2": Subset("et", 2, False),
+    "et 1/2": Subset("et", 2, False, 1),
+    "dunes /2": Subset("copr_kap", 2, False),
+    "dunes 1/3": Subset("copr_kap", 3, False, 1),
     "nadar all": Subset("nadar", 1, False),
     "sceaux all": Subset("sceaux", 1, False),
     "herz all": Subset("strecha_herz_jesus_p25", 1, True),
@@ -90,7 +104,8 @@ def compare_subset(
     """Compare methods on a subset; return a mapping as :func:`compare` does."""
     subset = SUBSETS[name]
     scene_path = scenes_path / subset.scene
-    names = sorted(path.name for path in (scene_path / "images").iterdir())[:: subset.step]
+    names = sorted(path.name for path in (scene_path / "images").iterdir())
+    names = names[subset.first :: subset.step]
     given = list(options)
     truths = [scene_path / folder for folder in ("ground_truth", "pseudo_ground_truth")]
     for truth in (path for path in truths if path.exists()):
