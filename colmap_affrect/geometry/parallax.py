@@ -70,7 +70,7 @@ def _rays(points: Array) -> Array:
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def _some(points: NDArray[np.floating]) -> Array:
+def _some(points: Array) -> Array:
     """Return at most ``MAX_NUM_POINTS``, evenly spaced in their order."""
     return points[:: -(-len(points) // MAX_NUM_POINTS)] if len(points) else points
 
@@ -90,7 +90,7 @@ def mirrored_share(
     neighbors = np.array([y * row + x for y in (-1, 0, 1) for x in (-1, 0, 1)])
     shares = [0.0]
     for axis in (0, 1) if len(points1) else ():
-        mirrored = _some(points1).copy()
+        mirrored = _some(points1.astype(np.float64))
         mirrored[:, axis] = size[axis] - mirrored[:, axis]
         found = np.isin(_cells(mirrored, row)[:, None] + neighbors, taken).any(axis=1)
         shares.append(float(found.mean()))

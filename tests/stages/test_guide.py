@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +14,13 @@ from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import geometry_digest, image_ids, open_database
+from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.mappers.exact import exact_only, exactly_held
+from colmap_affrect.mappers.exact import adjust_last
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.matchers.guided import GuidedOptions
-from colmap_affrect.pipeline import better, map_guided
-from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.pipeline import map_guided
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import guide as stage
@@ -31,11 +30,12 @@ from colmap_affrect.stages.guide import (
     exact_inliers,
     guide,
     guided_counts,
+    guided_matches,
     restore_exact,
     verified_inliers,
 )
 from colmap_affrect.stages.guide_by_model import guide_by_model
-from colmap_affrect.stages.map import map_images
+from colmap_affrect.stages.map import agreement, map_images
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verify_matches
@@ -220,22 +220,22 @@ def test_models_of_guided_pairs_are_adjusted_by_exact_matches(context: Context) 
                    for side, name in enumerate(pair)} - tied  # fmt: skip
     assert tied
     assert not guided_only
-    assert exact_only(model, exact, verified, refine_intrinsics=False) == 0
+    by_ids = inlier_matches(context.workspace.database, 1)
+    guided = guided_matches(context)
+    assert adjust_last(model, by_ids, guided, refine_intrinsics=False) == 0  # none is left
 
 
-def track(point: int, *images: int) -> list[list[int]]:
-    keys = [(image << 32) + point for image in images]
-    return [[keys[0], key] for key in keys[1:]]
-
-
-def test_images_are_held_by_exact_tracks_through_three() -> None:
-    ties = [tie for point in range(40) for tie in track(point, 1, 2, 3)]
-    ties += [tie for point in range(40, 75) for tie in track(point, 3, 5, 4, 2)]
-    ties += [tie for point in range(100, 200) for tie in track(point, 5, 6)]  # two views only
-    ties += [tie for point in range(200, 220) for tie in track(point, 7, 1, 2)]  # too few
-    ties += [tie for point in range(300, 340) for tie in track(point, 8, 9, 10)]  # elsewhere
-    assert exactly_held(np.array(ties)) == {1, 2, 3, 4, 5}
-    assert exactly_held(np.zeros((0, 2), np.int64)) == set()
+def test_guided_matches_are_the_inliers_that_came_by_guiding(context: Context) -> None:
+    assert guided_matches(context) == {}
+    guide(context, ALWAYS)
+    ids = image_ids(context.workspace.database)
+    exact, verified = exact_inliers(context), verified_inliers(context)
+    found = guided_matches(context)
+    assert len(found) == guided_counts(context)["pairs"]
+    for pair, inliers in verified.items():
+        new = {*map(tuple, inliers.tolist())} - {*map(tuple, exact[pair].tolist())}
+        rows = found.get((ids[pair[0]], ids[pair[1]]), np.zeros((0, 2)))
+        assert {*map(tuple, rows.tolist())} == new
 
 
 def test_images_that_are_missing_are_guided_and_the_better_model_stays(
@@ -249,8 +249,7 @@ def test_images_that_are_missing_are_guided_and_the_better_model_stays(
     assert [report.name for report in reports] == ["map"]
     digest = geometry_digest(context.workspace.database)
     monkeypatch.setattr(pipeline, "images_in_need", lambda *_: {NAMES[2]})
-    choice: Callable[[object, object], bool] = lambda *_: False  # noqa: E731
-    monkeypatch.setattr(pipeline, "better", choice)
+    monkeypatch.setattr(pipeline, "agreement", lambda *_: 1.0)  # not better: the first one stays
     reports, kept = map_guided(context, mapper())
     assert [report.name for report in reports] == ["map", "guide", "map"]
     assert kept == models
@@ -261,13 +260,16 @@ def test_images_that_are_missing_are_guided_and_the_better_model_stays(
     assert not list(context.workspace.path.glob("sparse.*"))
 
 
-def test_more_images_are_better_then_more_points() -> None:
-    small, large = (ModelSummary(tuple("abc"), points, 2.0, 0.5) for points in (10, 30))
-    most = ModelSummary(tuple("abcd"), 5, 2.0, 0.5)
-    assert better([most], [large])
-    assert better([small, large], [small])
-    assert not better([small], [small])
-    assert not better([], [small])
+def test_models_with_more_images_agree_better(context: Context, tmp_path: Path) -> None:
+    map_images(context, mapper())
+    whole = context.workspace.sparse
+    model = pycolmap.Reconstruction(whole / "0")
+    model.deregister_frame(model.images[min(model.reg_image_ids())].frame_id)
+    (tmp_path / "fewer" / "0").mkdir(parents=True)
+    model.write(tmp_path / "fewer" / "0")
+    (tmp_path / "none").mkdir()
+    fewer, none = (agreement(context, tmp_path / name) for name in ("fewer", "none"))
+    assert agreement(context, whole) > fewer > none == 0.0
 
 
 def test_pairs_that_never_matched_are_guided_by_a_model(context: Context) -> None:

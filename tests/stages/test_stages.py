@@ -109,6 +109,7 @@ def test_run_leaves_all_results(finished: tuple[Workspace, ReconstructionReport]
         "pairs",
         "match",
         "verify",
+        "guide",
         "map",
     ]
 
@@ -122,10 +123,11 @@ def test_report_file_has_the_promised_keys(
     assert {
         "status", "images_total", "images_registered", "registered_names", "unregistered",
         "num_models", "points3D", "mean_track_length", "mean_reprojection_error_px", "stages",
-        "recipe", "random_seed", "versions",
+        "recipe", "random_seed", "versions", "doubtful", "doubts", "arrivals", "advice", "extended",
+        "added", "guided",
     } <= set(read)  # fmt: skip
     assert [stage["name"] for stage in read["stages"]] == [
-        "extract", "pairs", "match", "verify", "map",
+        "extract", "pairs", "match", "verify", "guide", "map",
     ]  # fmt: skip
     assert all(stage["wall_s"] >= 0.0 for stage in read["stages"])
     assert (read["recipe"], read["random_seed"]) == ("default", 3)
@@ -169,6 +171,7 @@ def test_stage_commands_do_exactly_what_run_does(
         ["pairs"],
         ["match"],
         ["verify", *seed],
+        ["guide"],
         ["map", *seed],
     ):
         code, stdout, stderr = call(command[0], *out, *command[1:])
@@ -192,7 +195,8 @@ def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
     report = run(photos, copy.path, OPTIONS)
     done = {stage.name: (stage.num_done, stage.num_kept) for stage in report.stages}
     assert done == {
-        "extract": (0, 4), "pairs": (6, 0), "match": (0, 6), "verify": (0, 6), "map": (0, 1),
+        "extract": (0, 4), "pairs": (6, 0), "match": (0, 6), "verify": (0, 6), "guide": (0, 0),
+        "map": (0, 1),
     }  # fmt: skip
     assert report.status == "ok"
     assert {path: path.read_bytes() for path in before} == before
