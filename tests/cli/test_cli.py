@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import pytest
+from command import Call
 from small_scene import INTRINSICS, write_photographs
 
 from colmap_affrect import __version__
@@ -395,32 +396,33 @@ def test_missing_weights_are_one_error_with_the_way_out(tmp_path: Path) -> None:
 
 
 def test_finished_model_is_extended_and_another_database_mapped(
-    photos: Path, tmp_path: Path
+    photos: Path, tmp_path: Path, call: Call
 ) -> None:
     first, out = tmp_path / "first", tmp_path / "out"
     listed = tmp_path / "names.txt"
     names = sorted(str(p.relative_to(photos)) for p in photos.rglob("*.png"))
     listed.write_text("\n".join(names[:2]))
-    small = run_command("run", *run_arguments(photos, first), "--image-list-path", listed, "-q")
-    assert small.returncode == 0
+    fast = ["--recipe", "unrectified-rootsift", "-q"]
+    small = call("run", *run_arguments(photos, first), "--image-list-path", listed, *fast)
+    assert small.code == 0
     model = first / "sparse" / "0"
-    done = run_command("run", *run_arguments(photos, out), "--extend", model, "--json", "-q")
+    done = run_command("run", *run_arguments(photos, out), "--extend", model, "--json", *fast)
     assert (done.returncode, done.stderr) == (0, "")
     report = json.loads(done.stdout)
     assert (report["extended"], report["added"]) == (names[:2], names[2:])
-    refused = run_command("map", "--output-path", out, "-q")
-    assert refused.returncode == 1
-    assert "its model extends another one; give --extend again, or --overwrite" in refused.stderr
+    refused = call("map", "--output-path", out, "-q")
+    assert refused.code == 1
+    assert "its model extends another one; give --extend again, or --over" in refused.errors[-1]
     copied = ["map", "--output-path", tmp_path / "copied", "--from-database", out / "database.db"]
-    mapped = run_command(*copied, "--extend", model, "-q")
-    assert (mapped.returncode, mapped.stderr) == (0, "")
+    mapped = call(*copied, "--extend", model, "-q")
+    assert (mapped.code, mapped.errors) == (0, [])
     assert "extended    2 were there, 1 came in" in mapped.stdout
-    wrong = run_command(*copied, "--mapper", "global", "--extend", model, "-q", "--overwrite")
-    assert "the global mapper cannot" in wrong.stderr
-    wrong = run_command("map", "--output-path", out, "--refine-existing", "-q")
-    assert "--refine-existing: only with --extend MODEL" in wrong.stderr
-    wrong = run_command("run", *run_arguments(photos, tmp_path / "no"), "--extend", photos, "-q")
-    assert "not a COLMAP model" in wrong.stderr
+    wrong = call(*copied, "--mapper", "global", "--extend", model, "-q", "--overwrite")
+    assert "the global mapper cannot" in wrong.errors[-1]
+    wrong = call("map", "--output-path", out, "--refine-existing", "-q")
+    assert "--refine-existing: only with --extend MODEL" in wrong.errors[-1]
+    wrong = call("run", *run_arguments(photos, tmp_path / "no"), "--extend", photos, "-q")
+    assert "not a COLMAP model" in wrong.errors[-1]
     assert not (tmp_path / "no" / "features.h5").exists()
 
 

@@ -7,6 +7,7 @@ import json
 import signal
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -36,8 +37,10 @@ from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.matchers import nearest
 from colmap_affrect.pairs.base import PairOptions
-from colmap_affrect.progress import Progress
-from colmap_affrect.stages.context import Resources
+from colmap_affrect.progress import Advance, Progress
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.context import Context, Resources
+from colmap_affrect.stages.guide import guided_counts
 
 CAMERAS = CameraOptions(mode="per-image", model="PINHOLE", params=INTRINSICS)
 NUM_IMAGES = 3
@@ -305,14 +308,51 @@ def test_folders_that_were_not_made_here_are_left_alone(scene, options, tmp_path
     ]
 
 
+def run_here(request: Request, progress: Progress) -> MethodResult:
+    """Run a method in this process, by way of the request that its own would read."""
+    worker.compute(Request.from_json(request.path.read_text(encoding="utf-8")), progress)
+    return module._finished(request)
+
+
+class Names(Progress):
+    """Keeps the names of the stages."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[str] = []
+
+    @contextmanager
+    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
+        self.told.append(name)
+        with super().stage(name, total, unit) as advance:
+            yield advance
+
+
+@pytest.mark.usefixtures("no_page")
+def test_recipes_are_guided_seed_by_seed(
+    scene, options, compared, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each seed has geometries of its own; features and raw matches stay those of the method."""
+    monkeypatch.setattr(module, "_run", run_here)
+    out, names = tmp_path / "out", Names()
+    options = replace(options, methods=["guided=unrectified-rootsift:guided.enabled=always"])
+    (method,) = compare(scene / "images", out, options, progress=names).methods
+    plain = compared[0].methods[METHODS.index("unrectified-rootsift")]
+    assert method.raw_matches == plain.raw_matches
+    for seed, found, before in zip((0, 1), method.seeds, plain.seeds, strict=True):
+        stages = [name for name in names.told if name.endswith(f", seed {seed}")]
+        assert stages[:2] == [f"verify, seed {seed}", f"guide, seed {seed}"]
+        assert f"map, seed {seed}" in stages
+        guided = Workspace(out / method.folder / f"seed-{seed}")
+        assert guided_counts(Context(guided))["pairs"] > 0
+        assert sum(found.pair_inliers.values()) > sum(before.pair_inliers.values())
+        assert found.registered_names == before.registered_names
+    assert not Workspace(out / method.folder).guided.exists()
+
+
 @pytest.mark.usefixtures("no_page")
 def test_device_reaches_matching(scene, options, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By way of the request that a method's process reads."""
-
-    def run_here(request: Request, progress: Progress) -> MethodResult:
-        worker.compute(Request.from_json(request.path.read_text(encoding="utf-8")), progress)
-        return module._finished(request)
-
     devices: list[str] = []
     monkeypatch.setattr(nearest, "coarse_descriptors", lambda _, device: devices.append(device))
     monkeypatch.setattr(module, "_run", run_here)

@@ -242,3 +242,36 @@ def test_record_of_another_version_is_one_clear_line(workspace: Workspace, versi
         workspace.require("extract")
     with pytest.raises(WorkspaceError, match="use another --output-path or remove it"):
         workspace.record_options("extract", OPTIONS, overwrite=True)
+
+
+def test_branch_begins_after_the_raw_matches(finished: Workspace, tmp_path: Path) -> None:
+    branch = finished.branch(tmp_path / "branches" / "one")
+    names = ["config.toml", "features.h5", "matches.h5", "pairs.txt"]
+    assert sorted(path.name for path in branch.path.iterdir()) == names
+    for path in (branch.features, branch.matches, branch.pairs):
+        assert path.read_bytes() == (finished.path / path.name).read_bytes()
+    assert branch.recorded() == {
+        **finished.recorded(), "begun": ["extract", "pairs", "match"],
+    }  # fmt: skip
+    assert branch.options_digest("extract", "match") == finished.options_digest("extract", "match")
+    with pytest.raises(WorkspaceError, match="the verify stage has not been run"):
+        branch.require("verify")
+    branch.record_options("verify", {"by": "another seed"})
+    assert finished.require("verify") == {"by": "verify"}
+    assert finished.database.exists()
+    # What the branch discards stays where it came from.
+    branch.record_options("match", {"by": "other options"}, overwrite=True)
+    assert not branch.matches.exists()
+    assert finished.matches.read_bytes() == b"matches.h5"
+
+
+def test_branch_copies_where_files_cannot_be_shared(
+    finished: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise OSError("another file system")
+
+    monkeypatch.setattr("os.link", refused)
+    branch = finished.branch(tmp_path / "branch")
+    assert branch.features.read_bytes() == b"features.h5"
+    assert branch.features.stat().st_nlink == 1

@@ -22,7 +22,7 @@ from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers.incremental import IncrementalOptions
+from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.matchers import nearest
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.report import ReconstructionReport
@@ -39,7 +39,7 @@ CAMERA_ARGUMENTS = [
 OPTIONS = RunOptions(
     cameras=CAMERAS,
     verification=VerificationOptions(random_seed=3),
-    mapping=IncrementalOptions(random_seed=3),
+    mapping=SparseOptions(random_seed=3),
 )
 FAST = ["--recipe", "unrectified-rootsift", *CAMERA_ARGUMENTS]
 
