@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,25 +205,20 @@ class PairGraph:
         """
         camera1, camera2 = (cameras[image_id] for image_id in pair.ids)
         points = self.points(pair)
-        options = pycolmap.TwoViewGeometryOptions(
-            compute_relative_pose=True,
-            min_num_inliers=5,
-            ransac=dict(
-                max_error=MAX_ERROR_PX, max_num_trials=MAX_TRIALS, random_seed=max(random_seed, 0)
-            ),
+        options = pycolmap.RANSACOptions(
+            max_error=MAX_ERROR_PX, max_num_trials=MAX_TRIALS, random_seed=max(random_seed, 0)
         )
-        some = self.points(pair.some_matches())
-        rows = np.arange(len(some[0]), dtype=np.uint32)
-        geometry = pycolmap.estimate_calibrated_two_view_geometry(
-            camera1, some[0], camera2, some[1], np.stack([rows, rows], axis=1), options
+        # Not by a two-view geometry, which where a fundamental matrix has more inliers is that.
+        found: Any = pycolmap.estimate_essential_matrix(
+            *self.points(pair.some_matches()), camera1, camera2, options
         )
         candidates = []
-        if geometry.cam2_from_cam1 is not None:
-            matrix = geometry.cam2_from_cam1.matrix()
+        if found and found.get("cam2_from_cam1") is not None:
+            matrix = found["cam2_from_cam1"].matrix()
             candidates.append((matrix[:, :3], matrix[:, 3]))
         if pair.homography is not None:
             candidates += decomposed_homography(pair.homography, (camera1, camera2))
-        found = []
+        allowed = []
         for pose in candidates:
             if np.linalg.norm(pose[1]) < 1e-9:
                 continue
@@ -230,8 +226,8 @@ class PairGraph:
             known = agrees & (depths.angles_deg > MIN_ANGLE_DEG)
             if agrees.mean() >= MIN_SHARE and known.any():
                 kept = Depths(depths.first[known], depths.second[known], depths.angles_deg[known])
-                found.append(RelativePose(pose, pair.matches[known], kept))
-        return found
+                allowed.append(RelativePose(pose, pair.matches[known], kept))
+        return allowed
 
 
 @lru_cache(maxsize=1)
