@@ -171,6 +171,8 @@ def verify(
         advance: called with the number of pairs that are done.
     """
     todo = unverified_pairs(path)
+    if not todo:
+        return
     require_database_space(path, len(todo))
     with open_database(path) as database:
         reader = _PairReader(database)
