@@ -26,12 +26,18 @@ from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions, map_globally
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
+from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
-from colmap_affrect.pipeline import RunOptions, map_and_report, run
+from colmap_affrect.pipeline import map_and_report
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.guide import guide
+from colmap_affrect.stages.match import match
+from colmap_affrect.stages.pairs import choose_pairs
+from colmap_affrect.stages.verify import verify_matches
 
 SEED = 3
 TIMEOUT_S = 60
@@ -258,17 +264,20 @@ def test_global_mapper_ends_with_the_process_that_started_it(
 
 @pytest.fixture(scope="module")
 def two_places(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """A run on two photographs of one room and three of another."""
+    """Verified pairs of two photographs of one room and three of another, never guided."""
     photos = tmp_path_factory.mktemp("photos")
     write_photographs(photos / "here", 2)
     write_photographs(photos / "there", 3, first_seed=10)
-    options = RunOptions(
-        recipe=load_recipe("unrectified-rootsift"),
-        cameras=CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS),
-    )
-    out = tmp_path_factory.mktemp("places") / "out"
-    run(photos, out, options)
-    return Workspace(out)
+    cameras = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
+    workspace = Workspace(tmp_path_factory.mktemp("places") / "out")
+    context = Context(workspace)
+    with workspace.locked():
+        extract(context, Inputs.of(photos, cameras=cameras), load_recipe("unrectified-rootsift"))
+        choose_pairs(context)
+        match(context)
+        verify_matches(context)
+        guide(context, GuidedOptions(enabled="never"))
+    return workspace
 
 
 @pytest.mark.parametrize("mapper", MAPPERS.names())

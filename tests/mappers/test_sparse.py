@@ -47,7 +47,7 @@ def wall(random: np.random.Generator, count: int) -> NDArray[np.float64]:
 
 
 def write_scene(
-    path: Path, poses: Poses, pairs: Iterable[tuple[int, int]], num_points: int = 1000
+    path: Path, poses: Poses, pairs: Iterable[tuple[int, int]], num_points: int = 600
 ) -> None:
     """Write a verified database in which each pair of images has features of its own."""
     random = np.random.default_rng(5)
