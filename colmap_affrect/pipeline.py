@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import platform
 import shutil
 from collections.abc import Sequence
@@ -47,6 +48,9 @@ from colmap_affrect.stages.map import (
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
 from colmap_affrect.stages.verify import recorded_verification, verify_matches
+
+GUIDED_BEFORE = "guided-before.json"
+"""File beside models that wait for others to be compared with: the pairs that were guided then."""
 
 REPORTED_PACKAGES = (
     "colmap-affrect", "pycolmap", "opencv-python-headless", "numpy", "h5py", "torch", "kornia",
@@ -258,27 +262,34 @@ def map_guided(
 
     Arguments are those of :func:`~colmap_affrect.stages.map.map_images`.
     """
-    report, models = map_images(context, mapper, extend, overwrite=overwrite, given=given)
-    if extend or is_copy(context.workspace):
-        return [report], models
-    before = {pair.names for pair in current(context)}
-    images = images_in_need(context, recorded_guiding(context.workspace).min_num_tracks)
-    guided = guide(context, images=images) if images else None
-    if guided is None or not guided.num_done:
-        return [report], models
-    sparse = context.workspace.sparse
-    aside = sparse.with_name(sparse.name + ".aside")
-    shutil.rmtree(aside, ignore_errors=True)
-    sparse.rename(aside)
-    again, models_again = map_images(context, mapper, given=given)
-    reports = [report, guided, again]
-    if agreement(context, sparse) > agreement(context, aside):
-        shutil.rmtree(aside)
-        return reports, models_again
-    restore_exact(context, {pair.names for pair in current(context)} - before)
-    shutil.rmtree(sparse)
+    sparse, aside = context.workspace.sparse, context.workspace.aside
+    min_num_tracks = recorded_guiding(context.workspace).min_num_tracks
+    reports: list[StageReport] = []
+    if overwrite or not aside.exists():  # else a run has been killed in what follows
+        report, models = map_images(context, mapper, extend, overwrite=overwrite, given=given)
+        reports.append(report)
+        if extend or is_copy(context.workspace):
+            return reports, models
+        if not images_in_need(context, sparse, min_num_tracks):
+            return reports, models
+        before = [pair.names for pair in current(context)]
+        replace_text(sparse / GUIDED_BEFORE, json.dumps(before))
+        sparse.rename(aside)
+    known = {tuple(names) for names in json.loads((aside / GUIDED_BEFORE).read_text())}
+    guided = guide(context, images=images_in_need(context, aside, min_num_tracks))
+    new = {pair.names for pair in current(context)} - known
+    if new:
+        again, models = map_images(context, mapper, given=given)
+        reports += [guided, again]
+        if agreement(context, sparse) > agreement(context, aside):
+            shutil.rmtree(aside)
+            return reports, models
+        restore_exact(context, new)
+        shutil.rmtree(sparse)
     aside.rename(sparse)
-    return reports, models
+    (sparse / GUIDED_BEFORE).unlink()
+    report, models = map_images(context, mapper, given=given)  # which reads them
+    return reports or [report], models
 
 
 def installed_versions() -> dict[str, str]:

@@ -91,6 +91,9 @@ TOLERANCE = 0.08
 NUM_NEIGHBORS = 5
 """Known places looked at beside each place of a pair."""
 
+NUM_INDEPENDENT = 10
+"""Ratios that count for the standard error at most: all share the errors of the same poses."""
+
 NUM_ON_PLANE = 12
 """Known places to which a plane is fitted."""
 
@@ -167,7 +170,7 @@ def _densest(rows: NDArray[np.int64], ratios: Array, weights: Array) -> ScaleEst
         float(np.exp(np.average(ratios[agreeing], weights=weights[agreeing]))),
         num_agreeing,
         len(np.unique(rows)),
-        float(np.std(ratios[agreeing])) / np.sqrt(num_agreeing),
+        float(np.std(ratios[agreeing]) / np.sqrt(min(num_agreeing, NUM_INDEPENDENT))),
     )
 
 

@@ -107,6 +107,11 @@ class Workspace:
         return self.path / "sparse"
 
     @property
+    def aside(self) -> Path:
+        """Models that wait to be compared with those of guided matches."""
+        return self.path / "sparse.aside"
+
+    @property
     def snapshots(self) -> Path:
         """Folder of what a mapping that was interrupted goes on from."""
         return self.path / "sparse.snapshots"
@@ -283,7 +288,7 @@ class Workspace:
     def _discard(self, stage: str) -> None:
         """Remove what a stage and those after it made."""
         first = STAGES.index(stage)
-        outdated = [self.sparse, self.snapshots, self.report]
+        outdated = [self.sparse, self.aside, self.snapshots, self.report]
         if first <= STAGES.index("guide"):
             outdated.append(self.guided)
         if first <= STAGES.index("verify"):

@@ -262,16 +262,16 @@ def agreement(context: Context, sparse_path: Path) -> float:
     return graph.best_score(pycolmap.Reconstruction(folder) for folder in folders)
 
 
-def images_in_need(context: Context, min_num_tracks: int) -> set[str]:
+def images_in_need(context: Context, sparse_path: Path, min_num_tracks: int) -> set[str]:
     """Return the images that are not in the largest model, or there see few of its points.
 
     Args:
         context: after mapping.
+        sparse_path: folder of the models.
         min_num_tracks: an image that sees fewer points of three images or more is in need.
     """
-    workspace = context.workspace
-    names = set(colmap_database.image_ids(workspace.database))
-    path = workspace.sparse / "0"
+    names = set(colmap_database.image_ids(context.workspace.database))
+    path = sparse_path / "0"
     if not path.exists() or len(names) < 3:
         return names if len(names) > 2 else set()
     counts = num_long_tracks(path)

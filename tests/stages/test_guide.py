@@ -274,6 +274,30 @@ def test_model_of_guided_pairs_stays_where_it_agrees_better(
     assert not list(context.workspace.path.glob("sparse.*"))
 
 
+@pytest.mark.parametrize("killed", ["guide", "agreement"])
+def test_run_that_is_killed_beside_its_first_models_goes_on_to_compare_them(
+    context: Context, monkeypatch: pytest.MonkeyPatch, killed: str
+) -> None:
+    def kill(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "images_in_need", lambda *_: {NAMES[2]})
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, killed, kill)
+        with pytest.raises(KeyboardInterrupt):
+            map_guided(context, mapper())
+    digest = geometry_digest(context.workspace.database)
+    assert context.workspace.aside.exists()
+    monkeypatch.setattr(pipeline, "agreement", lambda *_: 1.0)  # not better: the first one stays
+    reports, models = map_guided(context, mapper())
+    assert [report.name for report in reports] == ["guide", "map"]
+    assert len(models) == 1
+    assert guided_counts(context) == {}
+    assert (geometry_digest(context.workspace.database) == digest) == (killed == "guide")
+    assert map_images(context, mapper())[0].num_done == 0
+    assert not list(context.workspace.path.glob("sparse.*"))
+
+
 def test_models_with_more_images_agree_better(context: Context, tmp_path: Path) -> None:
     map_images(context, mapper())
     whole = context.workspace.sparse
