@@ -28,8 +28,8 @@ from colmap_affrect.evaluation.recipe_features import RecipeFeatures
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
 from colmap_affrect.recipes import Recipe
+from colmap_affrect.stages.climbing import insecure_images
 from colmap_affrect.stages.one_pair import CachedMatcher
-from colmap_affrect.stages.pair_graph import insecure_images
 
 VERIFICATION_SEED = 0
 

@@ -14,8 +14,8 @@ from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.arrivals import arrivals, read_arrivals, write_arrivals
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.doubts import find_doubts, without_impossible
-from colmap_affrect.mappers.exact import adjust_last
 from colmap_affrect.mappers.existing import require_extends
+from colmap_affrect.mappers.last_adjustment import adjust_last
 from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.project.report import ModelSummary

@@ -45,6 +45,7 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions
+from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import (
     Inputs,
@@ -57,7 +58,6 @@ from colmap_affrect.stages.guide import restore_exact
 from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, recorded_matching
 from colmap_affrect.stages.one_image import ImageExtractor
 from colmap_affrect.stages.one_pair import iterate_matches
-from colmap_affrect.stages.pair_graph import PairGraph, insecure_images
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import recorded_verification, verify_new
 
@@ -211,7 +211,7 @@ class Escalation:
                 counts[first, second] = verified.get((low, high), 0)
         return counts
 
-    def graph(self) -> PairGraph:
+    def graph(self) -> ClimbingGraph:
         """Return the pairs as the database has them; tracks count where there are three images."""
         num_inliers = self.num_inliers()
         weakly_connected: set[str] = set()
@@ -221,7 +221,7 @@ class Escalation:
             )
         insecure = insecure_images(num_inliers, self.options.strong_num_inliers, weakly_connected)
         failed = [pair for pair, count in num_inliers.items() if not count]
-        return PairGraph(num_inliers, self._num_consistent(failed), insecure)
+        return ClimbingGraph(num_inliers, self._num_consistent(failed), insecure)
 
     def _num_consistent(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
         ids = colmap_database.image_ids(self.path)

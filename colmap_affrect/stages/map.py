@@ -26,12 +26,12 @@ from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.climbing import connected_parts
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copied_image_path, is_copy
 from colmap_affrect.stages.escalate import first_level_database
 from colmap_affrect.stages.extract import Inputs
 from colmap_affrect.stages.guide import guided_matches
-from colmap_affrect.stages.pair_graph import connected_parts
 from colmap_affrect.stages.verify import recorded_verification
 
 logger = logging.getLogger(__name__)

@@ -18,8 +18,8 @@ from colmap_affrect.colmap.database import geometry_digest, image_ids, open_data
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.mappers.exact import adjust_last
 from colmap_affrect.mappers.incremental import IncrementalOptions
+from colmap_affrect.mappers.last_adjustment import adjust_last
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.pipeline import map_guided
 from colmap_affrect.project.workspace import Workspace

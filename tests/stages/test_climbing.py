@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from colmap_affrect.recipes import EscalateOptions
-from colmap_affrect.stages.pair_graph import PairGraph, connected_parts, insecure_images
+from colmap_affrect.stages.climbing import ClimbingGraph, connected_parts, insecure_images
 
 PROMISING = EscalateOptions().min_num_consistent
 BEST_ONE = EscalateOptions(num_best_pairs=1)
@@ -38,9 +38,9 @@ def test_parts_come_by_size_with_lone_images() -> None:
     assert parts == [set("abc"), set("de"), set("f"), set("g")]
 
 
-def graph(inliers: dict[str, int], consistent: dict[str, int], insecure: str = "") -> PairGraph:
+def graph(inliers: dict[str, int], consistent: dict[str, int], insecure: str = "") -> ClimbingGraph:
     failed = {tuple(pair): consistent.get(pair, 0) for pair, n in inliers.items() if not n}
-    return PairGraph({tuple(pair): n for pair, n in inliers.items()}, failed, set(insecure))
+    return ClimbingGraph({tuple(pair): n for pair, n in inliers.items()}, failed, set(insecure))
 
 
 INLIERS = {"ab": 200, "ac": 150, "bc": 120, "ad": 0, "bd": 0, "cd": 0, "ce": 0, "de": 0, "be": 30}

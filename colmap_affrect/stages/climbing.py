@@ -47,7 +47,7 @@ def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> l
 
 
 @dataclass(frozen=True)
-class PairGraph:
+class ClimbingGraph:
     """The pairs of a set as they are now.
 
     Attributes:

@@ -10,7 +10,7 @@ import pytest
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import inlier_matches
-from colmap_affrect.mappers.exact import Matches, adjust_last, exactly_held
+from colmap_affrect.mappers.last_adjustment import Matches, adjust_last, exactly_held
 
 LAST = 5
 """The image some of whose matches are said to be guided."""
