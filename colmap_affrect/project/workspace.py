@@ -102,6 +102,11 @@ class Workspace:
         return self.users_database or self.path / "database.db"
 
     @property
+    def cameras(self) -> Path:
+        """What is known of the cameras of the database, and from where (JSON)."""
+        return self.path / "cameras.json"
+
+    @property
     def sparse(self) -> Path:
         """Folder of the COLMAP models 0, 1, ..."""
         return self.path / "sparse"
@@ -292,7 +297,7 @@ class Workspace:
         if first <= STAGES.index("guide"):
             outdated.append(self.guided)
         if first <= STAGES.index("verify"):
-            outdated.append(self.database)
+            outdated += [self.database, self.cameras]
         if first <= STAGES.index("match"):
             outdated.append(self.matches)
         if first <= STAGES.index("pairs"):
