@@ -6,7 +6,7 @@ COLMAP's database has one flag for a focal length, that somebody knows it. Here 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,11 +18,14 @@ Source = Literal["given", "exif", "exif-rescaled", "pairs", "guess"]
 """By the user; by EXIF as it is, or scaled to a photograph that was shrunk; by the votes of
 verified pairs; or COLMAP's usual guess."""
 
+Given = Literal["focal", "principal-point", "distortion"]
+"""Parts of intrinsics; a model without distortion counts as given once its focal length is."""
+
 TRUSTED: tuple[Source, ...] = ("given", "exif", "exif-rescaled")
 """Sources whose focal lengths are priors before any pair has been verified."""
 
 MAX_LINES = 5
-"""Cameras that are logged one by one."""
+"""Groups of cameras that are logged."""
 
 MAX_NAMES = 3
 """Images that are named of a camera."""
@@ -40,7 +43,7 @@ class CameraRecord:
         high_px: upper end.
         why: what was decided and for what reason, one clause.
         size: (width, height) of its images in px.
-        is_fixed: intrinsics are the user's and complete, to be left as they are.
+        given: what of the intrinsics is the user's, to be left as it is.
     """
 
     names: tuple[str, ...]
@@ -50,7 +53,7 @@ class CameraRecord:
     high_px: float | None = None
     why: str = ""
     size: tuple[int, int] = (0, 0)
-    is_fixed: bool = False
+    given: tuple[Given, ...] = ()
 
     def to_report(self, camera_id: int) -> dict[str, Any]:
         """Return the entry of ``report.json``."""
@@ -67,14 +70,10 @@ class CameraRecord:
             "why": self.why,
         }
 
-    def text(self) -> str:
-        """Return one line."""
-        names = ", ".join(self.names[:MAX_NAMES])
-        more = f" and {len(self.names) - MAX_NAMES} more" if len(self.names) > MAX_NAMES else ""
-        spread = (
-            f" ({self.low_px:.0f} to {self.high_px:.0f})" if self.low_px and self.high_px else ""
-        )
-        return f"{names}{more}: focal {self.focal_px:.0f} px{spread}, {self.source}; {self.why}"
+    @property
+    def is_fixed(self) -> bool:
+        """Whether nothing of the intrinsics that mapping would refine is free."""
+        return {"focal", "distortion"} <= set(self.given)
 
 
 def read_camera_records(path: Path) -> dict[int, CameraRecord]:
@@ -93,8 +92,8 @@ def read_camera_records(path: Path) -> dict[int, CameraRecord]:
 
 
 def _from_mapping(values: Mapping[str, Any]) -> CameraRecord:
-    width, height = values["size"]
-    return CameraRecord(**{**values, "names": tuple(values["names"]), "size": (width, height)})
+    lists = {key: tuple(values[key]) for key in ("names", "size", "given")}
+    return CameraRecord(**{**values, **lists})
 
 
 def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
@@ -104,7 +103,27 @@ def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> Non
 
 
 def notable_lines(records: Iterable[CameraRecord]) -> list[str]:
-    """Return a line for each camera that is not just as EXIF or the user has it, at most a few."""
-    texts = [record.text() for record in records if record.why and record.source != "given"]
-    more = len(texts) - MAX_LINES
-    return texts if more <= 1 else [*texts[:MAX_LINES], f"and {more} cameras more"]
+    """Return a line for cameras of one source and story, at most a few; none for those without."""
+    groups: dict[tuple[Source, str], list[CameraRecord]] = {}
+    for record in records:
+        if record.why:
+            groups.setdefault((record.source, record.why), []).append(record)
+    lines = [_line(same) for same in groups.values()]
+    more = len(lines) - MAX_LINES
+    return lines if more <= 1 else [*lines[:MAX_LINES], f"and {more} more, see report.json"]
+
+
+def _line(records: Sequence[CameraRecord]) -> str:
+    """Say what was decided for cameras of one source and story."""
+    names = [name for record in records for name in record.names]
+    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+    first = records[0]
+    spread = (
+        f" ({first.low_px:.0f} to {first.high_px:.0f})" if first.low_px and first.high_px else ""
+    )
+    focals = sorted({round(record.focal_px) for record in records})
+    focal = f"{focals[0]}" if len(focals) == 1 else f"{focals[0]} to {focals[-1]}"
+    return (
+        f"{', '.join(names[:MAX_NAMES])}{more}: focal length {focal} px"
+        f"{spread if len(records) == 1 else ''}, {first.source}: {first.why}"
+    )

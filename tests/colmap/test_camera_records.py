@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,13 @@ def test_report_has_the_focal_length_in_longer_sides_and_the_spread() -> None:
 def test_only_cameras_with_a_story_are_named_and_not_all() -> None:
     assert notable_lines([FROM_EXIF]) == []
     (line,) = notable_lines([FROM_EXIF, VOTED])
-    assert line == "c.jpg: focal 500 px (480 to 530), pairs; 40 pairs agree"
-    lines = notable_lines([VOTED] * 9)
-    assert (len(lines), lines[-1]) == (6, "and 4 cameras more")
+    assert line == "c.jpg: focal length 500 px (480 to 530), pairs: 40 pairs agree"
+    (line,) = notable_lines([VOTED, replace(VOTED, names=("d", "e", "f"), focal_px=700.4)])
+    assert line == "c.jpg, d, e and 1 more: focal length 500 to 700 px, pairs: 40 pairs agree"
+    lines = notable_lines([replace(VOTED, why=str(index)) for index in range(9)])
+    assert (len(lines), lines[-1]) == (6, "and 4 more, see report.json")
+
+
+def test_intrinsics_are_fixed_when_nothing_is_left_to_refine() -> None:
+    assert not replace(FROM_EXIF, given=("focal", "principal-point")).is_fixed
+    assert replace(FROM_EXIF, given=("focal", "distortion")).is_fixed
