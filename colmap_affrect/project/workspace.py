@@ -28,7 +28,7 @@ LOCAL = ("image_path", "image_list_path", "from_database", "cameras")
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
 COPY_STAGES = ("copy", "verify", "map")
 """Of a folder in which another program's database is mapped."""
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 """Of ``config.toml``: counts up when a stage records other options than before."""
 
 
@@ -64,7 +64,8 @@ class Workspace:
         Files are shared where the file system can do that.
         """
         path.mkdir(parents=True, exist_ok=True)
-        for source in (self.features, self.pairs, self.matches):
+        shared = [self.features, self.pairs, self.matches]
+        for source in [*shared, *([self.cameras] if self.cameras.exists() else [])]:
             try:
                 os.link(source, path / source.name)
             except OSError:
