@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 
+from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
@@ -243,6 +244,10 @@ def map_and_report(
         },
         pair_levels={} if copied else pair_levels(context),
         guided=guided_counts(context),
+        cameras=tuple(
+            record.to_report(camera_id)
+            for camera_id, record in read_camera_records(workspace.cameras).items()
+        ),
         extended=tuple(before),
         advice=advice(context, missing, models),
     )

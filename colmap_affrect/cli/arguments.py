@@ -77,11 +77,23 @@ MASKS = (
 )  # fmt: skip
 CAMERAS = (
     _choice("--camera-mode", ["auto", "single", "per-folder", "per-image"],
-        "which images share a camera (default: auto, by EXIF)", default="auto"),
+        "which images share a camera (default: auto, as given, else by EXIF)", default="auto"),
     _value("--camera-model", "MODEL", "COLMAP camera model (default: SIMPLE_RADIAL)",
         default="SIMPLE_RADIAL"),
     _value("--camera-params", "A,B,...",
         "known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792.0,524.5", default=""),
+    _path("--cameras-path", "FILE",
+        "known cameras: folder or cameras.txt of a COLMAP model of these images, or a CSV file "
+        "with the columns name and any of focal_px, focal_mm with sensor_width_mm or "
+        "plate_width_mm (of what the whole image shows), model, params, cx, cy, camera (images "
+        "with one label share a camera)"),
+    _value("--focal-length-px", "PX",
+        "known focal length of images that --cameras-path does not name; the rest is refined",
+        type=float, default=0.0),
+    _value("--principal-point", "CX,CY",
+        "where the lens looked, in px from the image's corner (default: its middle); matters for "
+        "what was cropped off centre by a tenth of its width or more", default=""),
+    _flag("--ignore-exif", "take neither focal lengths nor who shares a camera from EXIF"),
 )  # fmt: skip
 IMAGES = (
     IMAGE_PATH,

@@ -128,7 +128,13 @@ def _cameras(options: argparse.Namespace) -> CameraOptions:
     from colmap_affrect.images.photographs import CameraOptions
 
     return CameraOptions(
-        mode=options.camera_mode, model=options.camera_model, params=options.camera_params
+        mode=options.camera_mode,
+        model=options.camera_model,
+        params=options.camera_params,
+        ignore_exif=options.ignore_exif,
+        cameras_path=str(options.cameras_path.resolve()) if options.cameras_path else "",
+        focal_length_px=options.focal_length_px,
+        principal_point=options.principal_point,
     )
 
 

@@ -28,7 +28,7 @@ LOCAL = ("image_path", "image_list_path", "from_database", "cameras")
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
 COPY_STAGES = ("copy", "verify", "map")
 """Of a folder in which another program's database is mapped."""
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 """Of ``config.toml``: counts up when a stage records other options than before."""
 
 
@@ -64,7 +64,8 @@ class Workspace:
         Files are shared where the file system can do that.
         """
         path.mkdir(parents=True, exist_ok=True)
-        for source in (self.features, self.pairs, self.matches):
+        shared = [self.features, self.pairs, self.matches]
+        for source in [*shared, *([self.cameras] if self.cameras.exists() else [])]:
             try:
                 os.link(source, path / source.name)
             except OSError:
@@ -100,6 +101,11 @@ class Workspace:
     def database(self) -> Path:
         """COLMAP database."""
         return self.users_database or self.path / "database.db"
+
+    @property
+    def cameras(self) -> Path:
+        """What is known of the cameras of the database, and from where (JSON)."""
+        return self.path / "cameras.json"
 
     @property
     def sparse(self) -> Path:
@@ -292,7 +298,7 @@ class Workspace:
         if first <= STAGES.index("guide"):
             outdated.append(self.guided)
         if first <= STAGES.index("verify"):
-            outdated.append(self.database)
+            outdated += [self.database, self.cameras]
         if first <= STAGES.index("match"):
             outdated.append(self.matches)
         if first <= STAGES.index("pairs"):
