@@ -169,12 +169,16 @@ PAIRS = (
         f"gps: largest distance of neighbours (default: {PairOptions().max_distance_m:g})",
         type=float),
 )  # fmt: skip
+FOCAL_VOTE = _choice("--focal-vote", ["auto", "always", "never"],
+    "let verified pairs vote on focal lengths that nobody knows, and on which scans share a camera "
+    "(default: auto, unless cameras are of --from-database or --preset is colmap)",
+    default="auto")  # fmt: skip
 PRESET = _choice("--preset", list(PRESETS),
     "options of two-view geometry and mapping: ours for few photographs, or COLMAP's "
     "defaults (default: sparse)")  # fmt: skip
 MAPPER = (
     _value("--mapper", "NAME",
-        "incremental or global, COLMAP's mappers (default: incremental)"),
+        "sparse (ours), or COLMAP's incremental or global (default: sparse)"),
     _value("--mapper-options", "KEY=VALUE",
         "options of pycolmap's IncrementalPipelineOptions or GlobalPipelineOptions, e.g. "
         "ba_refine_principal_point=true mapper.abs_pose_min_num_inliers=10; they win over the "

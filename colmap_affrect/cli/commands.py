@@ -63,6 +63,7 @@ def _inputs(options: argparse.Namespace, recipe: Recipe | None = None) -> dict[s
         "image_list_path": options.image_list_path,
         "from_database": options.from_database,
         "resources": _resources(options),
+        "focal_vote": options.focal_vote,
     }
 
 
@@ -308,7 +309,10 @@ def guide(options: argparse.Namespace) -> int:
 
 def map(options: argparse.Namespace) -> int:
     from colmap_affrect.mappers.base import MAPPERS
-    from colmap_affrect.pipeline import map_and_report, map_from_database
+    from colmap_affrect.pipeline import holds_vote, map_and_report, map_from_database
+    from colmap_affrect.stages.cameras import choose_cameras
+    from colmap_affrect.stages.copy import is_copy
+    from colmap_affrect.stages.extract import Inputs
 
     extend = _extension(options)
     if options.from_database:
@@ -319,6 +323,7 @@ def map(options: argparse.Namespace) -> int:
             mapping=_mapping(options),
             verification=_verification(options),
             extend=extend,
+            check_cameras=options.focal_vote == "always",
             overwrite=options.overwrite,
             progress=_progress(options),
         )
@@ -327,7 +332,17 @@ def map(options: argparse.Namespace) -> int:
         raise OptionError("--image-path: only with --from-database; else that of extract is used")
     with _context(options) as context:
         mapper = MAPPERS.make(_mapping(options, recorded=context.workspace.planned("map")))
-        report = map_and_report(context, mapper, extend, overwrite=options.overwrite)
+        is_others = is_copy(context.workspace) or bool(
+            Inputs.recorded(context.workspace).from_database
+        )
+        votes = holds_vote(options.focal_vote, mapper.options, is_others=is_others)
+        report = map_and_report(
+            context,
+            mapper,
+            extend,
+            earlier=[choose_cameras(context)] if votes else [],
+            overwrite=options.overwrite,
+        )
     return _print_reconstruction(report, options)
 
 

@@ -167,7 +167,7 @@ class _Plan:
             "from_database": _absolute(options.from_database),
             "images": _fingerprint(self.names),
             "pairs": _fingerprint([f"{first}\n{second}" for first, second in self.pairs]),
-            "camera": options.cameras.to_mapping(),
+            "camera": {**options.cameras.to_mapping(), "focal_vote": options.holds_vote},
             "masks": options.masks.to_mapping(),
             "verification": _without_seed(options.verification),
             "mapping": _without_seed(options.mapping),
@@ -198,7 +198,8 @@ class _Plan:
                 masks=options.masks,
                 verification=options.verification,
                 mapping=options.mapping,
-                intrinsics_given=bool(options.cameras.params),
+                focal_vote=options.holds_vote,
+                may_share=options.cameras.mode == "auto",
                 seeds=tuple(options.seeds),
                 resources=options.resources,
             )

@@ -30,7 +30,7 @@ MAX_NUM_MATCHES = 100
 
 MAX_MISFIT = 5.0
 """By how much the log-likelihood of the best essential matrix may fall short of that of the best
-fundamental matrix; a pair beyond says nothing about cameras, its geometry is wrong or accidental."""
+fundamental matrix; a pair beyond says nothing about cameras: its geometry is wrong."""
 
 MAX_NUM_STEPS, MIN_GAIN = 15, 1e-3
 """Of Levenberg and Marquardt; the least gain of log-likelihood that is worth another step."""
@@ -229,7 +229,7 @@ def _rotations(turns: Array) -> Array:
 
 
 def _diagonal(matrices: Array) -> Array:
-    return np.einsum("gii->gi", matrices)
+    return np.asarray(np.einsum("gii->gi", matrices))
 
 
 def _diagonals(values: Array) -> Array:

@@ -27,7 +27,7 @@ FOCALS = np.geomspace(0.3, 10.0, 41)
 STEP = 2
 """Where two cameras are asked for at once every second candidate will do."""
 
-MIN_PROMISE = -30.0
+MIN_PROMISE = -12.0
 """Tables of two cameras are made at every second of these candidates first; the others are looked
 at beside those that fall short of the best one by less."""
 
@@ -127,16 +127,24 @@ def _table(pair: MatchedPair, focals: Array) -> Array:
     return np.where(promising, table, MIN_PROMISE)
 
 
-def merged(ballots: Sequence[Ballot]) -> list[Ballot]:
-    """Return the ballots as they are if all images share one camera, number 0."""
-    found = []
-    for item in ballots:
-        evidence = item.evidence
-        found.append(Ballot((0, 0), evidence if evidence.ndim == 1 else np.diagonal(evidence)))
-    return found
+def evidence_for_one(ballots: Sequence[Ballot]) -> float:
+    """Return the logarithm of the evidence if all cameras of the ballots are one.
+
+    To be compared with that of :func:`count`.
+    """
+    focals = _candidates(ballots)
+    same = [
+        Ballot((0, 0), item.evidence if item.evidence.ndim == 1 else np.diagonal(item.evidence))
+        for item in ballots
+    ]
+    return _propagate(same, [0], focals)[1]
 
 
-def count(ballots: Sequence[Ballot], cameras: Sequence[int], *, resample: bool = True, focals=None) -> Outcome:
+def _candidates(ballots: Sequence[Ballot]) -> Array:
+    return FOCALS if all(item.evidence.ndim == 1 for item in ballots) else FOCALS[::STEP]
+
+
+def count(ballots: Sequence[Ballot], cameras: Sequence[int], *, resample: bool = True) -> Outcome:
     """Count the votes.
 
     Args:
@@ -144,7 +152,7 @@ def count(ballots: Sequence[Ballot], cameras: Sequence[int], *, resample: bool =
         cameras: all that are asked for; one without ballots has the prior's focal length.
         resample: widen intervals where the pairs do not agree.
     """
-    focals = focals if focals is not None else FOCALS if all(item.evidence.ndim == 1 for item in ballots) else FOCALS[::STEP]
+    focals = _candidates(ballots)
     marginals, total = _propagate(ballots, cameras, focals)
     draws = [marginals]
     rng = np.random.default_rng(0)
@@ -174,7 +182,7 @@ def _peaks(marginals: Array, focals: Array) -> Array:
 
 def _votes(evidence: Array) -> Array:
     """Return the likelihoods of one ballot, between exp(-MAX_VOTE) and 1."""
-    return np.exp(np.logaddexp(evidence, -MAX_VOTE) - np.logaddexp(0.0, -MAX_VOTE))
+    return np.asarray(np.exp(np.logaddexp(evidence, -MAX_VOTE) - np.logaddexp(0.0, -MAX_VOTE)))
 
 
 def _propagate(
