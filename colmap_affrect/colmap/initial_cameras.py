@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import (
@@ -236,7 +237,7 @@ def sensor_width_mm(make: str, model: str) -> float | None:
     """
     exif = Image.Exif()
     exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = make, model
-    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = 1.0
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = IFDRational(1)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "one.jpg"
         Image.new("L", (8, 8)).save(path, exif=exif)
