@@ -8,7 +8,7 @@ import pytest
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.given_cameras import read_given_cameras
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.images.photographs import CameraOptions
 
 
@@ -73,6 +73,7 @@ def test_table_gives_as_much_as_is_known(tmp_path: Path) -> None:
         (["name,focal_px,focal_mm", "a,5,5"], "line 2: focal_px and focal_mm say the same twice"),
         (["name,focal_mm,sensor_width_mm,plate_width_mm", "a,5,5,5"], "sensor_width_mm and plate"),
         (["name,params,cx,cy", "a,1 2 3 4,1,1"], "line 2: params and cx say the same twice"),
+        (["name,cx", "a," + "5" * 200_000], "line 2: field larger than field limit"),
         (["name,cx", "a,5"], "line 2: give both cx and cy, or none"),
         (["name,cx,cy", "a,1 2,3"], "line 2: cx and cy must be one number each"),
         (["name,model", "a,PINHOL"], "line 2: model PINHOL: not one of SIMPLE_PINHOLE"),
@@ -166,4 +167,12 @@ def test_wrong_models_are_one_clear_line(
 
 def test_folder_without_a_model_is_one_clear_line(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"no COLMAP model, which has cameras\.txt"):
+        given(tmp_path)
+
+
+def test_damaged_binary_model_is_one_clear_line(tmp_path: Path) -> None:
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_points3D=5))
+    model.write(tmp_path)
+    (tmp_path / "images.bin").write_bytes((tmp_path / "images.bin").read_bytes()[:-3])
+    with pytest.raises(StoreError, match=r"images\.bin: damaged"):
         given(tmp_path)
