@@ -91,8 +91,8 @@ CAMERAS = (
         "known focal length of images that --cameras-path does not name; the rest is refined",
         type=float, default=0.0),
     _value("--principal-point", "CX,CY",
-        "where the lens looked, in px from the image's corner (default: its middle); matters for "
-        "what was cropped off centre by a tenth of its width or more", default=""),
+        "where the optical axis meets the image, in px from its corner (default: its middle, wrong "
+        "for prints and scans that were cropped off centre)", default=""),
     _flag("--ignore-exif", "take neither focal lengths nor who shares a camera from EXIF"),
 )  # fmt: skip
 IMAGES = (

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import registered_names
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.options import suggestion
@@ -118,6 +119,8 @@ def _read_model(path: Path) -> dict[str, GivenCamera]:
     folder = path if path.is_dir() else path.parent
     if (folder / "cameras.txt").is_file() and path.name != "cameras.bin":
         return _read_text_model(folder)
+    if (folder / "rigs.bin").is_file():
+        registered_names(folder)  # damaged files may keep pycolmap busy for ever
     try:
         model = pycolmap.Reconstruction(folder)
     except (RuntimeError, ValueError) as error:
@@ -175,9 +178,13 @@ def _read_text_model(folder: Path) -> dict[str, GivenCamera]:
 
 def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
     """Read a CSV file with a header; rows may leave cells empty."""
-    rows = csv.reader(_lines(path), skipinitialspace=True)
-    header = [cell.strip() for cell in next(rows, [])]
     where = f"--cameras-path {path}"
+    reader = csv.reader(_lines(path), skipinitialspace=True)
+    try:
+        rows = [(reader.line_num, cells) for cells in reader]
+    except csv.Error as error:
+        raise OptionError(f"{where}, line {reader.line_num}: {error}") from error
+    header = [cell.strip() for cell in rows[0][1]] if rows else []
     for column in header:
         if column not in COLUMNS:
             raise OptionError(f"{where}: unknown column '{column}'{suggestion(column, COLUMNS)}")
@@ -185,8 +192,8 @@ def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
         raise OptionError(f"{where}: its first line must have the column 'name', and each once")
     found: dict[str, GivenCamera] = {}
     labels: dict[str, GivenCamera] = {}
-    for cells in rows:
-        place = f"{where}, line {rows.line_num}"
+    for number, cells in rows[1:]:
+        place = f"{where}, line {number}"
         if not any(cell.strip() for cell in cells):
             continue
         if len(cells) > len(header):
@@ -258,4 +265,4 @@ def unknown_names(
     """Return the names in a table that no photograph has; of a model, if it has none of them."""
     others = [name for name in given if name and not (image_path / name).is_file()]
     is_model = any(camera.label.startswith("model/") for camera in given.values())
-    return [] if is_model and given.keys() & {"", *names} - {""} else others
+    return [] if is_model and given.keys() & set(names) else others

@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import (
@@ -236,7 +237,7 @@ def sensor_width_mm(make: str, model: str) -> float | None:
     """
     exif = Image.Exif()
     exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = make, model
-    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = 1.0
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = IFDRational(1)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "one.jpg"
         Image.new("L", (8, 8)).save(path, exif=exif)
@@ -306,16 +307,17 @@ class _Import:
     def add(self) -> None:
         """Write all of them, or none."""
         groups = self.initial.groups([image.name for image in self.images])
+        cameras = self._known_cameras()
+        new = {
+            group: self._camera(names) for group, names in groups.items() if group not in cameras
+        }
+        rigs = {rig.ref_sensor_id: rig.rig_id for rig in self.database.read_all_rigs()}
         with pycolmap.DatabaseTransaction(self.database):
-            known = self._known_cameras()
-            of_name: dict[str, pycolmap.Camera] = {}
-            rigs = {rig.ref_sensor_id: rig.rig_id for rig in self.database.read_all_rigs()}
+            for camera in new.values():
+                camera.camera_id = self.database.write_camera(camera)
+            cameras |= new
             for image in self.images:
-                if image.name not in of_name:
-                    group = self.initial.group(image.name)
-                    camera = known.get(group) or self._write_camera(groups[group])
-                    of_name |= dict.fromkeys(groups[group], camera)
-                camera = of_name[image.name]
+                camera = cameras[self.initial.group(image.name)]
                 if self.sizes[image.name] == (camera.width, camera.height):
                     self._write_image(image, camera, rigs)
 
@@ -332,12 +334,9 @@ class _Import:
             used[self.initial.group(image.name)].add(image.camera_id)
         return {group: cameras[min(ids)] for group, ids in used.items() if len(ids) == 1}
 
-    def _write_camera(self, names: Sequence[str]) -> pycolmap.Camera:
+    def _camera(self, names: Sequence[str]) -> pycolmap.Camera:
         size = self.sizes[names[0]]
-        same = [name for name in names if self.sizes[name] == size]
-        camera, _ = self.initial.camera(same, size)
-        camera.camera_id = self.database.write_camera(camera)
-        return camera
+        return self.initial.camera([n for n in names if self.sizes[n] == size], size)[0]
 
     def _write_image(
         self, image: pycolmap.Image, camera: pycolmap.Camera, rigs: dict[pycolmap.sensor_t, int]

@@ -59,7 +59,7 @@ class Workspace:
         return cls(database_path.with_suffix(".affrect"), database_path)
 
     def branch(self, path: Path) -> Workspace:
-        """Make another folder with the same features, pairs and raw matches, without a database.
+        """Make another folder with the same features, pairs, raw matches and records of cameras.
 
         Files are shared where the file system can do that.
         """

@@ -31,7 +31,8 @@ def tags_of(path: Path, size: tuple[int, int], tags: dict[str, Any]) -> CameraTa
         {**MM50, "FocalPlaneXResolution": 3 / 0.7, "FocalPlaneResolutionUnit": 4},
         {**MM50, "FocalPlaneXResolution": 90.0, "FocalPlaneResolutionUnit": 2},
         {
-            "FocalLength": 6.1, "FocalPlaneXResolution": 312.5, "FocalPlaneResolutionUnit": 3,
+            "Make": "A", "FocalLength": 6.1, "FocalPlaneXResolution": 312.5,
+            "FocalPlaneResolutionUnit": 3,
             "FocalPlaneYResolution": 312.5, "ExifImageWidth": 180, "ExifImageHeight": 120,
         },
         {},
