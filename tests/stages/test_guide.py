@@ -223,7 +223,7 @@ def test_models_of_guided_pairs_are_adjusted_by_exact_matches(context: Context) 
     assert len(guided_only) < 0.002 * len(tied)
     by_ids = inlier_matches(context.workspace.database, 1)
     guided = guided_matches(context)
-    assert adjust_last(model, by_ids, guided, refine_intrinsics=False) == len(guided_only)
+    assert adjust_last(model, by_ids, guided, constant_cameras=model.cameras) == len(guided_only)
 
 
 def test_guided_matches_are_the_inliers_that_came_by_guiding(context: Context) -> None:
