@@ -22,6 +22,7 @@ from colmap_affrect.colmap.database import (
 )
 from colmap_affrect.colmap.native_options import Plain, differences
 from colmap_affrect.colmap.pair_significance import significance, telling_shapes
+from colmap_affrect.geometry.affine import homography_errors
 from colmap_affrect.options import CUSTOM, MAX_SEED, PRESETS, Options, preset_values, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
@@ -152,7 +153,7 @@ def _planar_geometry(
     points: tuple[NDArray[np.float64], NDArray[np.float64]],
     options: VerificationOptions,
 ) -> pycolmap.TwoViewGeometry:
-    """Return the homography of the inliers of an epipolar geometry, with those that it explains.
+    """Return the homography of the inliers of an epipolar geometry, with all matches it explains.
 
     Epipolar lines hold wrong matches by chance that a homography does not, so that of few matches
     on a plane the one can be significant and the other not. Among all raw matches it would not be
@@ -167,7 +168,9 @@ def _planar_geometry(
         return planar
     planar.config = pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC
     planar.H = found["H"]
-    planar.inlier_matches = np.asarray(geometry.inlier_matches)[found["inlier_mask"]]
+    with np.errstate(all="ignore"):  # points on the horizon are no inliers
+        inliers = np.flatnonzero(homography_errors(planar.H, *points) <= options.max_error_px)
+    planar.inlier_matches = np.stack([inliers.astype(np.uint32)] * 2, axis=1)
     return planar
 
 
