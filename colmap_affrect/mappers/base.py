@@ -65,6 +65,11 @@ class MapperOptions(PartOptions):
         return next((name for name in PRESETS if self == self.preset(name, **free)), CUSTOM)
 
 
+DepthLookup = Callable[[str, NDArray[np.floating]], NDArray[np.float64]]
+"""Returns what the depth map of an image, by its name, has at (N, 2) px of COLMAP: (N,) depths in
+any unit, inverse depths in any unit and with any shift; NaN where it has none."""
+
+
 @dataclass(frozen=True, eq=False)
 class MappingTask:
     """What to map.
@@ -77,6 +82,7 @@ class MappingTask:
         snapshot_path: folder of snapshots, to be gone on from; mappers may leave it unused.
         cancellation: a token by which mapping is stopped from outside.
         guided: (M, 2) features of pairs of image ids that only guided matching has matched.
+        depth_at: depth maps of the images, where there are any.
     """
 
     database_path: Path
@@ -86,6 +92,7 @@ class MappingTask:
     snapshot_path: Path | None = None
     cancellation: pycolmap.CancellationToken | None = None
     guided: Mapping[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
+    depth_at: DepthLookup | None = None
 
     @property
     def colors_path(self) -> Path:

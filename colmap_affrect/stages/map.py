@@ -29,6 +29,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.climbing import connected_parts
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copied_image_path, is_copy
+from colmap_affrect.stages.depth_lookup import depth_lookup
 from colmap_affrect.stages.escalate import first_level_database
 from colmap_affrect.stages.extract import Inputs
 from colmap_affrect.stages.guide import guided_matches
@@ -89,6 +90,7 @@ def map_images(
         intrinsics_given(workspace) if given is None else given,
         existing,
         guided={} if is_copy(workspace) else guided_matches(context),
+        depth_at=None if is_copy(workspace) else depth_lookup(context),
     )
     if known == inputs:
         models = read_models(workspace.sparse, task)
