@@ -138,7 +138,8 @@ def _or_first_level(
 ) -> list[ModelSummary]:
     """Keep the models of the pairs as they were before they climbed, where those have more images.
 
-    So escalation never loses an image.
+    So escalation never loses an image; but a model that is doubtful as a whole does not take the
+    place of one that is not.
     """
     min_num_inliers = recorded_verification(context.workspace).min_num_inliers
     with first_level_database(context) as path:
@@ -147,7 +148,7 @@ def _or_first_level(
             return models
         sparse = path.with_name("sparse")
         firsts = map_database(mapper, replace(task, database_path=path), sparse, _ignore)
-        if _num_registered(firsts) <= _num_registered(models):
+        if _rank(firsts) <= _rank(models):
             return models
         logger.info("the model of the pairs before they climbed has more images and is kept")
         rmtree(context.workspace.sparse)
@@ -157,6 +158,10 @@ def _or_first_level(
 
 def _num_registered(models: Sequence[ModelSummary]) -> int:
     return len(models[0].registered_names) if models else 0
+
+
+def _rank(models: Sequence[ModelSummary]) -> tuple[bool, int]:
+    return bool(models) and models[0].is_trustworthy, _num_registered(models)
 
 
 def _ignore(_: int) -> None:
