@@ -186,10 +186,7 @@ class MethodResult:
 
     @property
     def usually_correct(self) -> frozenset[str]:
-        """Images that more than half of the seeds register correctly.
-
-        Without ground truth, register.
-        """
+        """Images that more than half of the seeds register correctly (without truth: register)."""
         return in_most([seed.correct_names for seed in self.seeds])
 
     @property
@@ -276,11 +273,7 @@ class Comparison:
         return tuple(method for method in self.methods if not method.failed)
 
     def model_paths(self, output_path: Path) -> dict[str, Path | None]:
-        """Return the folder of the first model of each finished method; None where there is none.
-
-        Args:
-            output_path: folder of the comparison.
-        """
+        """Return the folder of the first model of each finished method; None for none."""
         shown = {method.name: method.shown_seed for method in self.finished}
         return {
             name: output_path / seed.model_path if seed else None for name, seed in shown.items()
@@ -323,11 +316,7 @@ class Comparison:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Read ``comparison.json``.
-
-        Raises:
-            StoreError: when it is damaged or something else.
-        """
+        """Read ``comparison.json``; StoreError when it is damaged or something else."""
         try:
             values = json.loads(text)
             methods = tuple(MethodResult.from_mapping(*item) for item in values["methods"].items())

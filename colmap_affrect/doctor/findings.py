@@ -181,7 +181,7 @@ class Findings:
         advice: str = "",
         **values: object,
     ) -> None:
-        """Add a finding.
+        """Add a finding of a kind of ``TEXTS`` about a file, folder or part of the installation.
 
         Args:
             kind: of ``TEXTS``.

@@ -95,7 +95,8 @@ def evaluate(
 ) -> Evaluation:
     """Score recipes on a dataset; go on after a stop.
 
-    An image or pair that cannot be used counts as failed, and the others go on.
+    An image or pair that cannot be used counts as failed, and the others go on. What is returned is
+    also written to ``evaluation.json``, ``evaluation.csv`` and plots.
 
     Args:
         protocol: its name, or one with changed settings.
@@ -104,9 +105,6 @@ def evaluate(
         options: see :class:`EvaluateOptions`.
         overwrite: discard features and scores of these recipes first.
         progress: where to show progress.
-
-    Returns:
-        What is also written to ``evaluation.json``, ``evaluation.csv`` and the plots.
 
     Raises:
         AffrectError: for anything that the caller can mend, before any image is worked on.

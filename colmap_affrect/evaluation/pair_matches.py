@@ -173,8 +173,7 @@ def verified_inliers(
     """Return the inliers of COLMAP's two-view geometry; 0 if a run would not take it.
 
     Args:
-        frames: (M, 2, 3) local affine frames of image 1, in pixel-centre px, and those of image 2
-            that match them.
+        frames: of both images, (M, 2, 3) local affine frames that match, pixel-centre px.
         sizes: (width, height) of both images in px.
         extracted_px: longest side that photographs were shrunk to before extraction.
     """

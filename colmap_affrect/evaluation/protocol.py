@@ -141,11 +141,7 @@ class EvaluationProtocol(Protocol):
     category_title: str
 
     def load(self, dataset_path: Path) -> Dataset:
-        """Find the pairs of a dataset.
-
-        Raises:
-            EvaluationError: when the layout is not that of the protocol.
-        """
+        """Find the pairs of a dataset; EvaluationError when the layout is another one."""
 
     def score(
         self,
@@ -159,8 +155,7 @@ class EvaluationProtocol(Protocol):
     def success(self, score: PairScore) -> float:
         """Return how far a pair counts as matched, in [0, 1]: 1 or 0 where there is a threshold.
 
-        Plots over categories show its mean, intervals are those of its mean, and the paired test
-        against the baseline compares it pair by pair.
+        Plots and intervals are of its mean; the test against the baseline compares it pair by pair.
         """
 
     def summarize(self, results: Sequence[PairResult]) -> dict[str, float]:
@@ -184,10 +179,7 @@ def with_truth(
 ) -> Dataset:
     """Return a pair with its truth; one that cannot be used with its problem, which is a note too.
 
-    Args:
-        pair: without truth.
-        paths: of files that must be there.
-        read: returns the pair with its truth, and what is odd about it: texts, or empty ones.
+    ``paths`` must be there; ``read`` returns the pair with its truth, and what is odd about it.
     """
     try:
         for path in paths:
@@ -201,11 +193,7 @@ def with_truth(
 
 
 def read_numbers(path: Path) -> NDArray[np.float64]:
-    """Read a table of numbers from text.
-
-    Raises:
-        EvaluationError: when it is none.
-    """
+    """Read a table of numbers from text; EvaluationError when it is none."""
     try:
         return np.loadtxt(path, dtype=np.float64, ndmin=2)
     except (OSError, ValueError) as error:
@@ -215,8 +203,7 @@ def read_numbers(path: Path) -> NDArray[np.float64]:
 def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
     """Return an array of some shape, -1 in it for any number of rows but none.
 
-    Raises:
-        EvaluationError: saying what is wrong.
+    EvaluationError says what is wrong with ``what``.
     """
     try:
         values = np.asarray(given, dtype=np.float64)

@@ -54,11 +54,7 @@ class RecipeFeatures:
             images: of the dataset, by name.
             inputs: what the images depend on, for the record.
             resources: weights and device of networks.
-            overwrite: discard what is there.
-
-        Raises:
-            StaleStoreError: when features of other options are there.
-            AffrectError: when weights, a device or all depth maps are missing.
+            overwrite: discard what is there, also of other options, which are refused otherwise.
         """
         self._images, self.resources = images, resources
         self._extractor = prepare(options, resources, list(images))

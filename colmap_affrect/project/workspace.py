@@ -138,11 +138,7 @@ class Workspace:
 
     @contextmanager
     def locked(self) -> Iterator[Workspace]:
-        """Create the folder and keep other runs out of it.
-
-        Raises:
-            WorkspaceError: when it cannot be written or another run uses it.
-        """
+        """Create the folder and keep other runs out; WorkspaceError when that cannot be done."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             lock = FileLock(self.path / ".lock")
@@ -164,8 +160,7 @@ class Workspace:
     def recorded(self) -> dict[str, Any]:
         """Return the options on record by stage; empty where there are none.
 
-        Raises:
-            WorkspaceError: when the record is damaged or of another version of this package.
+        Raises WorkspaceError when the record is damaged or of another version of this package.
         """
         if not self.config.exists():
             return {}
@@ -253,11 +248,7 @@ class Workspace:
         return hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()
 
     def require(self, stage: str) -> dict[str, Any]:
-        """Return the recorded options of an earlier stage.
-
-        Raises:
-            WorkspaceError: when it has not been run.
-        """
+        """Return the recorded options of an earlier stage; WorkspaceError when it was not run."""
         record = self.recorded()
         if stage not in record.get("begun", []):
             raise WorkspaceError(

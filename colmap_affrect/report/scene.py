@@ -115,8 +115,7 @@ class Model:
 def read_scene(paths: Mapping[str, Path | None]) -> Scene:
     """Read models, bring them into the frame of the largest, and prepare them for the page.
 
-    Args:
-        paths: folders of the models by the names that they have on the page; None for no model.
+    ``paths`` are the folders by the names that the page has for the models; None for no model.
     """
     models, notes = read_models(paths)
     zoom = _zoom_from_above(list(models.values()))
@@ -127,11 +126,7 @@ def read_scene(paths: Mapping[str, Path | None]) -> Scene:
 def read_models(paths: Mapping[str, Path | None]) -> tuple[dict[str, Model], dict[str, str]]:
     """Read models and bring them into the frame of the largest.
 
-    Args:
-        paths: folders of the models by name; None for no model.
-
-    Returns:
-        The models, and what is special about them or why they are missing, by name.
+    Returns the models, and what is special about them or why they are missing, by name.
     """
     models: dict[str, Model] = {}
     notes: dict[str, str] = {}

@@ -68,13 +68,8 @@ def warped_photographs(
 ) -> list[WarpedPhotograph]:
     """Plan the warps of photographs again, of each those of the first level that has any.
 
-    Args:
-        workspace: where the photographs were extracted.
-        names: of the photographs.
-        resources: weights and device; depth maps of networks are taken from the workspace.
-
-    Raises:
-        AffrectError: when what the recipe needs, or a photograph, cannot be used.
+    Depth maps of networks are taken from the workspace. Raises AffrectError when what the recipe
+    needs, or a photograph, cannot be used.
     """
     resources = resources or Resources(depth_cache_path=workspace.depth)
     extractor = prepare(recorded_extraction(workspace), resources)
