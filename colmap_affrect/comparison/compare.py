@@ -66,18 +66,10 @@ def compare(
     """Find out how many photographs each method registers, and which; go on after a stop.
 
     Each method runs in a process of its own. One that fails is reported as failed, and the others
-    go on. What is returned is also written to ``comparison.json``, ``comparison.csv`` and
-    ``report.html``.
-
-    Args:
-        image_path: folder of the photographs, searched with its sub-folders.
-        output_path: folder for all results, made if missing.
-        options: see :class:`CompareOptions`.
-        overwrite: run the methods again though they have results there.
-        progress: where to show progress.
-
-    Raises:
-        AffrectError: for anything that the caller can mend, before any method is run.
+    go on; with ``overwrite`` methods run again though they have results there. What is returned is
+    also written to ``comparison.json``, ``comparison.csv`` and ``report.html`` in the output
+    folder, which is made if missing. Raises AffrectError for anything that the caller can mend,
+    before any method is run.
     """
     require_png()
     options = options or CompareOptions()
@@ -111,12 +103,8 @@ class _Plan:
     """A comparison whose options have been checked.
 
     Attributes:
-        image_path: folder of the images.
-        layout: of the output folder.
         options: with checked mapping options.
-        methods: the methods.
         names: all images given, sorted.
-        pairs: to match.
         truth: true poses; None without ground truth.
     """
 

@@ -40,7 +40,6 @@ class ChosenPair:
     """A pair to draw, and the two methods that differ on it.
 
     Attributes:
-        names: of the images.
         before: the method with fewer inliers, or the one that does not rectify.
         after: the other one.
     """

@@ -30,7 +30,6 @@ class Layout:
         inputs: record of what ``shared`` was made from, and of the options all methods have.
         database: cameras and images, no features.
         images: names of the images that COLMAP can read, one a line.
-        pairs: the pairs to match.
         methods: folder of the folders of the methods.
     """
 
@@ -53,15 +52,9 @@ class Request:
     """What one process is to do.
 
     Attributes:
-        method: the method.
-        output_path: folder of the comparison.
-        image_path: folder of the photographs.
-        masks: where features may be.
-        verification: options of two-view geometry.
         mapping: checked.
         intrinsics_given: the user gave the camera parameters.
         seeds: of verification and mapping; recipes that climb do it with the first.
-        resources: weights and device of networks.
     """
 
     method: Method

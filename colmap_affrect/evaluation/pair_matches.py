@@ -41,7 +41,6 @@ class MatchedPair:
     """The matches of a pair.
 
     Attributes:
-        pair: the pair.
         points: (M, 2) pixel-centre px of the matches in each image.
         num_keypoints: features of the two images that were matched.
         level: rectifier of the level of escalation that counts, ``none`` when no level was
@@ -72,11 +71,7 @@ class PairMatcher:
     """Matches pairs by the features of a recipe.
 
     Attributes:
-        recipe: how to match.
-        features: of the recipe.
         max_num_keypoints: of each image, the strongest of all its features; None for all.
-        title: of the recipe, for progress.
-        progress: where to show progress.
     """
 
     recipe: Recipe

@@ -27,7 +27,6 @@ class EvaluationImage:
 
     Attributes:
         name: unique in the dataset, the key of its features and depth map.
-        path: the file.
         intrinsics: (3, 3) camera matrix in pixel-centre px; None where the dataset has none.
     """
 
@@ -42,7 +41,6 @@ class EvaluationPair:
 
     Attributes:
         name: unique in the dataset.
-        images: the two.
         category: of difficulty, as the protocol's tables group pairs; empty where it does not.
         truth: what the score needs; known to the protocol only.
         problem: why it cannot be scored (a file that is missing, a truth that is not finite); such
@@ -78,11 +76,8 @@ class PairResult(PairScore):
     """The score of one pair by one recipe: what ``evaluation.json`` lists.
 
     Attributes:
-        name: of the pair.
-        category: of the pair.
         num_matches: before the estimation.
         num_keypoints: features of the two images that were matched.
-        seconds: matching and estimation.
         seconds_by_step: the same by step, ``match`` and ``estimate``.
         level: rectifier of the level of escalation that decided; empty without escalation.
         num_levels: levels whose features were extracted for the pair, 1 without escalation.
@@ -106,7 +101,6 @@ class Dataset:
     """The pairs of a dataset that can be evaluated.
 
     Attributes:
-        pairs: in a fixed order.
         notes: what is missing or odd, in words: files that are not there (counted), truth that
             failed its sanity check (named).
     """

@@ -42,7 +42,6 @@ class PosedImage:
     """An image with the truth about its camera.
 
     Attributes:
-        image: the file.
         camera: intrinsics with distortion.
         pose: cam_from_world, (3, 3) rotation and (3,) translation.
     """

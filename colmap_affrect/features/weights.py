@@ -131,8 +131,6 @@ class WeightStatus:
     """What is known of one file of weights.
 
     Attributes:
-        key: of :data:`WEIGHT_FILES`.
-        published: the file as it should be.
         path: where it was found; None if nowhere.
         verified: whether its sha256 is that of the published file; None if there is no file
             or no sha256 to compare with.

@@ -70,8 +70,7 @@ def extract_features(
     report, and the others go on. Raises AffrectError for anything that the caller can mend.
 
     Args:
-        database_path: database, made if it is missing. One that has features of another program is
-            refused; see ``from_database``.
+        database_path: made if it is missing; one that has features of another program is refused.
         image_path: folder of the photographs.
         image_names: names below it; all images by default.
         camera_mode: which images share a camera, as in pycolmap.
@@ -111,15 +110,11 @@ def match_exhaustive(
 ) -> tuple[StageReport, ...]:
     """Match and verify all pairs of the images that :func:`extract_features` was given.
 
-    Args:
-        database_path: that of :func:`extract_features`.
-        matching_options: by default those of the recipe.
-        pairing_options: accepted for pycolmap's sake; the size of blocks does not change results.
-        verification_options: ours, or those of pycolmap that have a counterpart.
-        device: where matching and, for recipes that escalate, networks run.
-        random_seed: of verification; by default that of its options, which is 0.
-        weights_path: folder with the weights of networks, for recipes that escalate.
-        progress: where to show progress.
+    ``matching_options`` are by default those of the recipe; ``verification_options`` are ours, or
+    those of pycolmap that have a counterpart, and ``random_seed`` wins over theirs.
+    ``pairing_options`` are accepted for pycolmap's sake: the size of blocks does not change
+    results. For recipes that escalate, ``device`` is that of networks too, and ``weights_path`` has
+    their weights.
     """
     verification = _verification_options(verification_options, random_seed)
     with _context(database_path, device, weights_path, progress) as context:

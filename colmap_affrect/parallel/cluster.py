@@ -54,7 +54,6 @@ class WorkerEnvironment:
     """What results depend on besides the task.
 
     Attributes:
-        host: name of the machine.
         versions: (package, version) of ``PACKAGES``.
         files: (path, fingerprint) of files and folders, '' for a missing one.
     """

@@ -45,7 +45,6 @@ class Workspace:
     A folder begins with ``extract``, or with ``copy`` of another program's database to be mapped.
 
     Attributes:
-        path: the folder.
         users_database: database of the user that results go to instead of one in the folder;
             never removed.
     """
@@ -193,18 +192,12 @@ class Workspace:
         recipe: str = "",
         overwrite: bool = False,
     ) -> None:
-        """Put the options of a stage on record before it begins.
+        """Put the options of a stage, nested mappings of plain values, on record before it begins.
 
-        Args:
-            stage: one of ``STAGES``.
-            options: what the results depend on; nested mappings of plain values.
-            plan: options of later stages; those of stages that have begun stay as they are.
-            recipe: name of the recipe, for the record only; by default that on record.
-            overwrite: discard the results of this stage and the later ones first. With the first
-                stage their options are forgotten, too.
-
-        Raises:
-            StaleStoreError: when other options made the results that are there.
+        ``plan`` has options of later stages, those of stages that have begun stay as they are;
+        ``recipe`` is a name for the record only. ``overwrite`` discards the results of this stage
+        and the later ones first; with the first stage their options are forgotten, too. Raises
+        StaleStoreError when other options made the results that are there.
         """
         record = self.recorded()
         self._refuse_foreign_results(record, stage)

@@ -36,7 +36,6 @@ class PlanarSegment:
     """Connected part of an image that shows surfaces of about the same orientation.
 
     Attributes:
-        region: the part of the image.
         normal: (3,) unit normal in camera coordinates, facing the camera.
     """
 

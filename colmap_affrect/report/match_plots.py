@@ -26,7 +26,6 @@ class SideBySide:
     """Two photographs side by side.
 
     Attributes:
-        names: of the images.
         widths: of the two photographs; both are ``PLOT_HEIGHT`` high.
     """
 

@@ -60,7 +60,6 @@ class Scene:
     """Models to be shown side by side.
 
     Attributes:
-        views: one per model.
         zoom: with which they fill the view from above.
     """
 
@@ -88,7 +87,6 @@ class Model:
     """A model as arrays.
 
     Attributes:
-        names: of the registered images.
         centers: (M, 3) of the cameras.
         axes: (M, 3, 3) rotations world_from_camera.
         half_sizes: (M, 2) half width and height of the view at depth 1.

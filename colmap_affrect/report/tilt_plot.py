@@ -48,7 +48,6 @@ class TiltClass:
     Attributes:
         tilt, angle_rad: its coordinates.
         label: text beside the mark; may be empty.
-        color: of mark and ball.
     """
 
     tilt: float

@@ -28,7 +28,6 @@ class WarpView:
     """One warp.
 
     Attributes:
-        picture: of it.
         color: of its region, as #rrggbb.
         tilt: that it undoes.
         angle_deg: direction in which it stretches.
@@ -45,9 +44,7 @@ class WarpedPhotograph:
     """What one level of a recipe does with a photograph.
 
     Attributes:
-        name: of the photograph.
         level: of escalation; 0 is what every photograph gets.
-        rectifier: its name.
         num_warps: all that were planned.
         regions: the photograph with the regions of the warps in colour.
         warps: the largest.
