@@ -10,7 +10,6 @@ import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -32,7 +31,6 @@ FORMAT_VERSION = 4
 """Of ``config.toml``: counts up when a stage records other options than before."""
 
 
-@dataclass(frozen=True)
 class Workspace:
     """Paths below an output folder.
 
@@ -47,10 +45,28 @@ class Workspace:
     Attributes:
         users_database: database of the user that results go to instead of one in the folder;
             never removed.
+        features: by image (HDF5).
+        pairs: list of the pairs to match (text).
+        matches: raw matches by pair (HDF5).
+        guided: what guided matching found, by pair (HDF5).
+        sparse: folder of the COLMAP models 0, 1, ...
+        aside: models that wait to be compared with those of guided matches.
+        snapshots: folder of what a mapping that was interrupted goes on from.
+        report: of the last run (JSON).
+        depth: folder of the depth maps that a network made.
+        config: record of the options (TOML).
+        log: of all runs.
     """
 
-    path: Path
-    users_database: Path | None = None
+    def __init__(self, path: Path, users_database: Path | None = None) -> None:
+        self.path, self.users_database = path, users_database
+        self.database = users_database or path / "database.db"
+        self.features, self.matches = path / "features.h5", path / "matches.h5"
+        self.guided, self.pairs = path / "guided.h5", path / "pairs.txt"
+        self.sparse, self.aside = path / "sparse", path / "sparse.aside"
+        self.snapshots, self.depth = path / "sparse.snapshots", path / "depth"
+        self.config, self.log = path / "config.toml", path / "run.log"
+        self.report = path / "report.json"
 
     @classmethod
     def beside(cls, database_path: Path) -> Self:
@@ -74,66 +90,6 @@ class Workspace:
         text = tomli_w.dumps({"format_version": FORMAT_VERSION, **record})
         replace_text(path / self.config.name, text)
         return Workspace(path)
-
-    @property
-    def features(self) -> Path:
-        """Features by image (HDF5)."""
-        return self.path / "features.h5"
-
-    @property
-    def pairs(self) -> Path:
-        """List of the pairs to match (text)."""
-        return self.path / "pairs.txt"
-
-    @property
-    def matches(self) -> Path:
-        """Raw matches by pair (HDF5)."""
-        return self.path / "matches.h5"
-
-    @property
-    def guided(self) -> Path:
-        """What guided matching found, by pair (HDF5)."""
-        return self.path / "guided.h5"
-
-    @property
-    def database(self) -> Path:
-        """COLMAP database."""
-        return self.users_database or self.path / "database.db"
-
-    @property
-    def sparse(self) -> Path:
-        """Folder of the COLMAP models 0, 1, ..."""
-        return self.path / "sparse"
-
-    @property
-    def aside(self) -> Path:
-        """Models that wait to be compared with those of guided matches."""
-        return self.path / "sparse.aside"
-
-    @property
-    def snapshots(self) -> Path:
-        """Folder of what a mapping that was interrupted goes on from."""
-        return self.path / "sparse.snapshots"
-
-    @property
-    def report(self) -> Path:
-        """Report of the last run (JSON)."""
-        return self.path / "report.json"
-
-    @property
-    def depth(self) -> Path:
-        """Folder of the depth maps that a network made."""
-        return self.path / "depth"
-
-    @property
-    def config(self) -> Path:
-        """Record of the options (TOML)."""
-        return self.path / "config.toml"
-
-    @property
-    def log(self) -> Path:
-        """Log of all runs."""
-        return self.path / "run.log"
 
     @contextmanager
     def locked(self) -> Iterator[Workspace]:
