@@ -15,17 +15,19 @@ from typing import TYPE_CHECKING, Any
 
 from colmap_affrect.errors import ComparisonError, OptionError
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK, ReconstructionReport
+from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK
 from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap.verification import VerificationOptions
     from colmap_affrect.comparison.results import Comparison
     from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+    from colmap_affrect.interop.hdf5 import InterchangeReport
     from colmap_affrect.mappers.base import MapperOptions
     from colmap_affrect.mappers.existing import Extension
     from colmap_affrect.pairs.base import PairOptions
     from colmap_affrect.parallel.executor import Executor
+    from colmap_affrect.project.report import ReconstructionReport, StageReport
     from colmap_affrect.recipes import Recipe
     from colmap_affrect.stages.context import Context, Resources
 
@@ -79,20 +81,18 @@ def _extension(options: argparse.Namespace) -> Extension | None:
 def _recipe(options: argparse.Namespace) -> Recipe:
     from colmap_affrect.recipes import load_recipe
 
-    matcher = getattr(options, "matcher", None)
-    settings = [f"matching.name={json.dumps(matcher)}"] if matcher else []
-    guided = getattr(options, "guided", None)
-    settings += [f"guided.enabled={json.dumps(guided)}"] if guided else []
+    given = {"matching.name": options.matcher, "guided.enabled": options.guided}
+    settings = [f"{key}={json.dumps(value)}" for key, value in given.items() if value]
     return load_recipe(options.recipe, [*settings, *options.set, *_depth_settings(options)])
 
 
 def _depth_settings(options: argparse.Namespace) -> list[str]:
-    path, model = getattr(options, "depth_path", None), getattr(options, "depth_model", None)
+    path, model = options.depth_path, options.depth_model
     given = {
         "name": "monocular" if model else "files" if path else None,
         "path": str(path.resolve()) if path else None,
         "model": model,
-        "kind": getattr(options, "depth_kind", None),
+        "kind": options.depth_kind,
     }
     return [f"depth.{key}={json.dumps(value)}" for key, value in given.items() if value]
 
@@ -100,13 +100,13 @@ def _depth_settings(options: argparse.Namespace) -> list[str]:
 def _resources(options: argparse.Namespace) -> Resources:
     from colmap_affrect.stages.context import Resources
 
-    return Resources(getattr(options, "weights", None), getattr(options, "device", "auto"))
+    return Resources(options.weights, options.device)
 
 
 @contextmanager
 def _executor(options: argparse.Namespace) -> Iterator[Executor | None]:
     """Use the cluster that was named, None if there is none."""
-    if not getattr(options, "scheduler", None):
+    if not options.scheduler:
         yield None
         return
     from colmap_affrect.parallel.cluster import connected
@@ -148,9 +148,9 @@ def _pair_options(
 
     listed = options.match_list_path
     given = {
-        "methods": getattr(options, "pairs", None),
-        "num_neighbors": getattr(options, "num_neighbors", None),
-        "max_distance_m": getattr(options, "max_distance_m", None),
+        "methods": options.pairs,
+        "num_neighbors": options.num_neighbors,
+        "max_distance_m": options.max_distance_m,
         "match_list_path": str(listed.resolve()) if listed else None,
     }
     chosen = {key: value for key, value in given.items() if value is not None}
@@ -163,11 +163,13 @@ def _verification(
     """Return the preset that is given, or what is on record."""
     from colmap_affrect.colmap.verification import VerificationOptions
 
-    seed = getattr(options, "random_seed", None)
-    given = {} if seed is None else {"random_seed": seed}
     if recorded and not options.preset:
-        return VerificationOptions(**{**recorded, **given})
-    return VerificationOptions.preset(options.preset or "sparse", **given)
+        return VerificationOptions(**{**recorded, **_seed(options)})
+    return VerificationOptions.preset(options.preset or "sparse", **_seed(options))
+
+
+def _seed(options: argparse.Namespace) -> dict[str, int]:
+    return {} if options.random_seed is None else {"random_seed": options.random_seed}
 
 
 def _mapping(
@@ -185,10 +187,7 @@ def _mapping(
         if not separator or not key.strip():
             raise OptionError(f"--mapper-options {setting}: expected KEY=VALUE")
         native[key.strip()] = value
-    seed = getattr(options, "random_seed", None)
-    given: dict[str, Any] = {} if seed is None else {"random_seed": seed}
-    if native:
-        given["mapper_options"] = native
+    given = {**_seed(options), **({"mapper_options": native} if native else {})}
     if recorded and not (options.preset or options.mapper):
         found: MapperOptions = MAPPERS.options({**recorded, **given})
         return found
@@ -220,8 +219,7 @@ def pairs(options: argparse.Namespace) -> int:
     with _context(options) as context:
         chosen = _pair_options(options, context.workspace.planned("pairs"))
         report = choose_pairs(context, chosen, overwrite=options.overwrite)
-    print(report.summary())
-    return EXIT_OK
+    return _printed(report)
 
 
 def match(options: argparse.Namespace) -> int:
@@ -233,21 +231,17 @@ def match(options: argparse.Namespace) -> int:
             matching = _recipe(options).matching
         else:
             chosen = [f"matching.name={json.dumps(options.matcher)}"] if options.matcher else []
-            recorded = context.workspace.planned("match")
-            values = _changed("matching", recorded, [*chosen, *options.set])
+            values = _changed(context, "match", "matching", [*chosen, *options.set])
             matching = MATCHERS.options(values, where="matching")
         report = match(context, matching, overwrite=options.overwrite)
-    print(report.summary())
-    return EXIT_OK
+    return _printed(report)
 
 
-def _changed(
-    section: str, recorded: Mapping[str, Any] | None, settings: Sequence[str]
-) -> dict[str, Any]:
-    """Return the options on record of one section of a recipe, some of them changed."""
+def _changed(context: Context, stage: str, section: str, settings: Sequence[str]) -> dict[str, Any]:
+    """Return the options on record of a stage, a section of the recipe, some of them changed."""
     from colmap_affrect.recipes import with_settings
 
-    values = with_settings({section: recorded or {}}, settings)
+    values = with_settings({section: context.workspace.planned(stage) or {}}, settings)
     if len(values) > 1:
         raise OptionError(f"--set: only options of {section} can be changed here")
     changed: dict[str, Any] = values[section]
@@ -260,8 +254,7 @@ def verify(options: argparse.Namespace) -> int:
     with _context(options) as context:
         chosen = _verification(options, context.workspace.planned("verify"))
         report = verify_matches(context, chosen, overwrite=options.overwrite)
-    print(report.summary())
-    return EXIT_OK
+    return _printed(report)
 
 
 def escalate(options: argparse.Namespace) -> int:
@@ -269,7 +262,7 @@ def escalate(options: argparse.Namespace) -> int:
     from colmap_affrect.stages.escalate import escalate, pair_levels
 
     with _context(options) as context:
-        values = _changed("escalate", context.workspace.planned("escalate"), options.set)
+        values = _changed(context, "escalate", "escalate", options.set)
         chosen = EscalateOptions.from_mapping(values, "escalate")
         report = escalate(context, chosen, overwrite=options.overwrite)
         levels = pair_levels(context)
@@ -285,7 +278,7 @@ def guide(options: argparse.Namespace) -> int:
     from colmap_affrect.stages.guide_by_model import guide_by_model
 
     with _context(options) as context:
-        values = _changed("guided", context.workspace.planned("guide"), options.set)
+        values = _changed(context, "guide", "guided", options.set)
         values |= {"enabled": options.guided} if options.guided else {}
         chosen = GuidedOptions.from_mapping(values, "guided")
         report = guide(
@@ -407,8 +400,7 @@ def import_h5(options: argparse.Namespace) -> int:
         random_seed=options.random_seed,
         progress=_progress(options),
     )
-    print(report.summary())
-    return EXIT_OK
+    return _printed(report)
 
 
 def export_h5(options: argparse.Namespace) -> int:
@@ -423,8 +415,7 @@ def export_h5(options: argparse.Namespace) -> int:
         half=options.half,
         progress=_progress(options),
     )
-    print(report.summary())
-    return EXIT_OK
+    return _printed(report)
 
 
 def doctor(options: argparse.Namespace) -> int:
@@ -440,25 +431,30 @@ def doctor(options: argparse.Namespace) -> int:
     return EXIT_FAILED if diagnosis.num_errors else EXIT_OK
 
 
+def _printed(report: StageReport | InterchangeReport) -> int:
+    print(report.summary())
+    return EXIT_OK
+
+
 def _progress(options: argparse.Namespace) -> Progress:
     return SILENT if options.quiet else Progress(sys.stderr)
 
 
 def _print_reconstruction(report: ReconstructionReport, options: argparse.Namespace) -> int:
     print(report.to_json() if options.json else report.summary())
+    why = ""
     if not report.models:
         why = "one image cannot make a model" if report.images_total == 1 else "no model was found"
+    elif not report.models[0].is_trustworthy:
+        why = "nothing in the model can be trusted"
+    if why:
         print(f"error: {why}; see {options.output_path / 'report.json'}", file=sys.stderr)
-        return EXIT_NO_MODEL
-    if not report.models[0].is_trustworthy:
-        where = options.output_path / "report.json"
-        print(f"error: nothing in the model can be trusted; see {where}", file=sys.stderr)
         return EXIT_NO_MODEL
     return _exit_code(report.failures, options)
 
 
 def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
-    if len(failures) <= getattr(options, "max_failures", 0):
+    if len(failures) <= options.max_failures:
         return EXIT_OK
     names = ", ".join(failures)
     print(f"error: could not read {len(failures)} of the images: {names}", file=sys.stderr)
