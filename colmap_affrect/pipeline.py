@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
+from typing import Literal
 
+from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
@@ -24,6 +26,7 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
+from colmap_affrect.stages.cameras import choose_cameras
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.copy import copy_verified, is_copy
 from colmap_affrect.stages.escalate import escalate, pair_levels
@@ -49,12 +52,27 @@ from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
 from colmap_affrect.stages.verify import recorded_verification, verify_matches
 
+FocalVote = Literal["auto", "always", "never"]
+
 GUIDED_BEFORE = "guided-before.json"
 """File beside models that wait for others to be compared with: the pairs that were guided then."""
 
 REPORTED_PACKAGES = (
     "colmap-affrect", "pycolmap", "opencv-python-headless", "numpy", "h5py", "torch", "kornia",
 )  # fmt: skip
+
+
+def holds_vote(focal_vote: FocalVote, mapping: MapperOptions, *, is_others: bool) -> bool:
+    """Tell whether verified pairs vote on cameras that nobody knows.
+
+    Args:
+        focal_vote: what is asked for; by default there is one.
+        mapping: COLMAP's preset has none by default.
+        is_others: cameras of another program's database have none by default.
+    """
+    if focal_vote == "auto":
+        return not is_others and mapping.preset_name != "colmap"
+    return focal_vote == "always"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +89,7 @@ class InputOptions:
         from_database: COLMAP database whose images, cameras, rigs, frames and pose priors are
             used; it stays as it is.
         resources: weights and device of networks.
+        focal_vote: whether verified pairs vote on cameras that nobody knows.
     """
 
     cameras: CameraOptions = field(default_factory=CameraOptions)
@@ -81,6 +100,12 @@ class InputOptions:
     image_list_path: Path | None = None
     from_database: Path | None = None
     resources: Resources = field(default_factory=Resources)
+    focal_vote: FocalVote = "auto"
+
+    @property
+    def holds_vote(self) -> bool:
+        """Whether verified pairs vote on cameras."""
+        return holds_vote(self.focal_vote, self.mapping, is_others=bool(self.from_database))
 
     def inputs(self, image_path: Path) -> Inputs:
         """Return the photographs of a folder, with their cameras and masks."""
@@ -156,6 +181,8 @@ def run(
         ]
         if options.recipe.extraction.escalation:
             reports.append(escalate(context, options.recipe.escalate))
+        if options.holds_vote:
+            reports.append(choose_cameras(context))
         reports.append(guide(context, options.recipe.guided))
         if options.database_descriptors:
             write_descriptors(context)
@@ -170,6 +197,7 @@ def map_from_database(
     mapping: MapperOptions | None = None,
     verification: VerificationOptions | None = None,
     extend: Extension | None = None,
+    check_cameras: bool = False,
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> ReconstructionReport:
@@ -182,6 +210,7 @@ def map_from_database(
         mapping: mapper and its options.
         verification: of pairs that are not verified yet.
         extend: register the images into this model instead of beginning one.
+        check_cameras: let the pairs vote on cameras whose focal length is no prior.
         overwrite: discard results that are there.
         progress: where to show progress.
 
@@ -204,7 +233,8 @@ def map_from_database(
             verification or VerificationOptions(),
             overwrite=overwrite,
         )
-        return map_and_report(context, mapper, extend, earlier=[report])
+        reports = [report, choose_cameras(context)] if check_cameras else [report]
+        return map_and_report(context, mapper, extend, earlier=reports)
 
 
 def map_and_report(
@@ -223,7 +253,6 @@ def map_and_report(
     reports, models = map_guided(context, mapper, extend, overwrite=overwrite)
     names, copied = image_names(workspace), is_copy(workspace)
     verification = recorded_verification(workspace)
-    given = intrinsics_given(workspace)
     missing = unregistered(context, names, models)
     result = ReconstructionReport(
         images_total=len(names),
@@ -239,10 +268,14 @@ def map_and_report(
         mapping=options.to_mapping(),
         differs_from_colmap={
             "verification": verification_differences(verification),
-            "mapping": mapper.differences(intrinsics_given=given),
+            "mapping": mapper.differences(intrinsics_given=intrinsics_given(workspace)),
         },
         pair_levels={} if copied else pair_levels(context),
         guided=guided_counts(context),
+        cameras=tuple(
+            record.to_report(camera_id)
+            for camera_id, record in read_camera_records(workspace.cameras).items()
+        ),
         extended=tuple(before),
         advice=advice(context, missing, models),
     )
@@ -256,7 +289,6 @@ def map_guided(
     extend: Extension | None = None,
     *,
     overwrite: bool = False,
-    given: bool | None = None,
 ) -> tuple[list[StageReport], list[ModelSummary]]:
     """Map; where images are missing or hang on few tracks, guide their pairs and map again.
 
@@ -266,7 +298,7 @@ def map_guided(
     min_num_tracks = recorded_guiding(context.workspace).min_num_tracks
     reports: list[StageReport] = []
     if overwrite or not aside.exists():  # else a run has been killed in what follows
-        report, models = map_images(context, mapper, extend, overwrite=overwrite, given=given)
+        report, models = map_images(context, mapper, extend, overwrite=overwrite)
         reports.append(report)
         if extend or is_copy(context.workspace):
             return reports, models
@@ -279,7 +311,7 @@ def map_guided(
     guided = guide(context, images=images_in_need(context, aside, min_num_tracks))
     new = {pair.names for pair in current(context)} - known
     if new:
-        again, models = map_images(context, mapper, given=given)
+        again, models = map_images(context, mapper)
         reports += [guided, again]
         if agreement(context, sparse) > agreement(context, aside):
             shutil.rmtree(aside)
@@ -288,7 +320,7 @@ def map_guided(
         shutil.rmtree(sparse)
     aside.rename(sparse)
     (sparse / GUIDED_BEFORE).unlink()
-    report, models = map_images(context, mapper, given=given)  # which reads them
+    report, models = map_images(context, mapper)  # which reads them
     return reports or [report], models
 
 

@@ -77,11 +77,23 @@ MASKS = (
 )  # fmt: skip
 CAMERAS = (
     _choice("--camera-mode", ["auto", "single", "per-folder", "per-image"],
-        "which images share a camera (default: auto, by EXIF)", default="auto"),
+        "which images share a camera (default: auto, as given, else by EXIF)", default="auto"),
     _value("--camera-model", "MODEL", "COLMAP camera model (default: SIMPLE_RADIAL)",
         default="SIMPLE_RADIAL"),
     _value("--camera-params", "A,B,...",
         "known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792.0,524.5", default=""),
+    _path("--cameras-path", "FILE",
+        "known cameras: folder or cameras.txt of a COLMAP model of these images, or a CSV file "
+        "with the columns name and any of focal_px, focal_mm with sensor_width_mm or "
+        "plate_width_mm (of what the whole image shows), model, params, cx, cy, camera (images "
+        "with one label share a camera)"),
+    _value("--focal-length-px", "PX",
+        "known focal length of images that --cameras-path does not name; the rest is refined",
+        type=float, default=0.0),
+    _value("--principal-point", "CX,CY",
+        "where the optical axis meets the image, in px from its corner (default: its middle, wrong "
+        "for prints and scans that were cropped off centre)", default=""),
+    _flag("--ignore-exif", "take neither focal lengths nor who shares a camera from EXIF"),
 )  # fmt: skip
 IMAGES = (
     IMAGE_PATH,
@@ -157,12 +169,16 @@ PAIRS = (
         f"gps: largest distance of neighbours (default: {PairOptions().max_distance_m:g})",
         type=float),
 )  # fmt: skip
+FOCAL_VOTE = _choice("--focal-vote", ["auto", "always", "never"],
+    "let verified pairs vote on focal lengths that nobody knows, and on which scans share a camera "
+    "(default: auto, unless cameras are of --from-database or --preset is colmap)",
+    default="auto")  # fmt: skip
 PRESET = _choice("--preset", list(PRESETS),
     "options of two-view geometry and mapping: ours for few photographs, or COLMAP's "
     "defaults (default: sparse)")  # fmt: skip
 MAPPER = (
     _value("--mapper", "NAME",
-        "incremental or global, COLMAP's mappers (default: incremental)"),
+        "sparse (ours), or COLMAP's incremental or global (default: sparse)"),
     _value("--mapper-options", "KEY=VALUE",
         "options of pycolmap's IncrementalPipelineOptions or GlobalPipelineOptions, e.g. "
         "ba_refine_principal_point=true mapper.abs_pose_min_num_inliers=10; they win over the "

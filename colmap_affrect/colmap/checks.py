@@ -32,8 +32,8 @@ CHECKS: dict[str, Check] = {
     "no-camera": ("error", "images whose camera does not exist",
         "import these images again into a new database"),
     "no-prior-focal": ("note", "cameras whose focal length is a guess",
-        "if you know the intrinsics, give them: --camera-params here, --ImageReader.camera_params"
-        " in COLMAP"),
+        "if you know the intrinsics, give them: --cameras-path or --focal-length-px here, "
+        "--ImageReader.camera_params in COLMAP"),
     "no-frame": ("error", "images without a frame while others have one, at which mapping aborts",
         "give each of them a frame (pycolmap.Database.write_frame), or begin anew with "
         "'colmap-affrect run --database-path {path}', which adds frames to its copy"),

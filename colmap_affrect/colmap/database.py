@@ -1,4 +1,4 @@
-"""The COLMAP database: cameras and images through pycolmap, keypoints and matches by us.
+"""The COLMAP database: what it holds, and keypoints and matches into it.
 
 Everything is checked before it is written: pycolmap stores wrong dtypes silently, and an
 index out of range would later end the Python process.
@@ -7,19 +7,17 @@ index out of range would later end the Python process.
 from __future__ import annotations
 
 import hashlib
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
-from colmap_affrect.errors import DatabaseError, OptionError
-from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 
 BYTES_PER_ROW = 4096
@@ -54,76 +52,6 @@ def require_database_space(path: Path, num_new: int) -> None:
     """
     size = path.stat().st_size if path.exists() else 0
     require_space(path, 2 * size + num_new * BYTES_PER_ROW + BYTES_OF_EMPTY_DATABASE)
-
-
-def import_images(
-    path: Path, image_path: Path, names: Sequence[str], cameras: CameraOptions
-) -> list[str]:
-    """Add cameras, rigs, frames and images for the names that the database lacks.
-
-    Image sizes, EXIF focal lengths and GPS priors are read by COLMAP itself, from the files as
-    stored, not rotated. Images that are added later share cameras as if all had been added at
-    once. A new database appears only when all images are in it.
-
-    Returns:
-        Names of the images that COLMAP could not read.
-    """
-    if path.exists():
-        _import_into(path, image_path, names, cameras)
-    else:
-        beside = path.with_name(path.name + ".new")
-        for file in (path, beside):
-            for suffix in ("", "-wal", "-shm"):
-                file.with_name(file.name + suffix).unlink(missing_ok=True)
-        _import_into(beside, image_path, names, cameras)
-        beside.replace(path)
-    return sorted(set(names) - set(image_ids(path)))
-
-
-def _import_into(
-    path: Path, image_path: Path, names: Sequence[str], cameras: CameraOptions
-) -> None:
-    for camera_id, new in _by_camera(path, names, cameras).items():
-        # Only in this mode does COLMAP use an existing camera.
-        mode = cameras.mode if camera_id == cameras.existing_camera_id else "single"
-        require_database_space(path, len(new))
-        pycolmap.import_images(
-            path,
-            image_path,
-            camera_mode=getattr(pycolmap.CameraMode, mode.upper().replace("-", "_")),
-            image_names=new,
-            options=reader_options(cameras.changed(existing_camera_id=camera_id)),
-        )
-
-
-def _by_camera(path: Path, names: Sequence[str], cameras: CameraOptions) -> dict[int, list[str]]:
-    """Group the names that a database lacks by the existing camera they share, -1 for none."""
-
-    def group(name: str) -> str:
-        return str(PurePosixPath(name).parent) if cameras.mode == "per-folder" else ""
-
-    with open_database(path) as database:
-        existing = {image.name: image.camera_id for image in database.read_all_images()}
-    shared: dict[str, set[int]] = defaultdict(set)
-    if cameras.mode in ("single", "per-folder"):
-        for name, camera_id in existing.items():
-            shared[group(name)].add(camera_id)
-    found: dict[int, list[str]] = defaultdict(list)
-    for name in sorted(set(names) - set(existing)):
-        camera_ids = shared[group(name)]
-        known = min(camera_ids) if len(camera_ids) == 1 else cameras.existing_camera_id
-        found[known].append(name)
-    return found
-
-
-def reader_options(cameras: CameraOptions) -> pycolmap.ImageReaderOptions:
-    """Translate our options into pycolmap's."""
-    return pycolmap.ImageReaderOptions(
-        camera_model=cameras.model,
-        camera_params=cameras.params,
-        default_focal_length_factor=cameras.default_focal_length_factor,
-        existing_camera_id=cameras.existing_camera_id,
-    )
 
 
 def image_ids(path: Path) -> dict[str, int]:
@@ -166,31 +94,6 @@ def nearest_positions(
         names = {image.image_id: image.name for image in database.read_all_images()}
         found = pycolmap.SpatialPairGenerator(options, database).all_pairs()
     return sorted({(min(names[i], names[j]), max(names[i], names[j])) for i, j in found})
-
-
-def check_cameras(cameras: CameraOptions) -> None:
-    """Refuse a camera model that COLMAP does not have, or parameters that do not fit it.
-
-    Raises:
-        OptionError: naming the option.
-    """
-    models = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
-    if cameras.model not in models:
-        raise OptionError(f"--camera-model {cameras.model}: not one of {', '.join(models)}")
-    if not cameras.params:
-        return
-    try:
-        values = [float(value) for value in cameras.params.split(",")]
-    except ValueError as error:
-        raise OptionError(
-            f"--camera-params {cameras.params}: not numbers separated by commas"
-        ) from error
-    expected = pycolmap.Camera.create_from_model_name(1, cameras.model, 1.0, 1, 1)
-    if len(values) != len(expected.params):
-        raise OptionError(
-            f"--camera-params: {cameras.model} needs {len(expected.params)} values "
-            f"({expected.params_info}), not {len(values)}"
-        )
 
 
 def geometry_digest(path: Path) -> str:
@@ -332,24 +235,8 @@ def replace_matches(
     write_matches(database, image_id1, image_id2, indices)
 
 
-def read_camera_matrix(path: Path, cameras: CameraOptions) -> NDArray[np.float64] | None:
-    """Return the (3, 3) intrinsics that COLMAP gives an image, in pixel-centre px.
-
-    From ``cameras.params``, else from EXIF, else COLMAP's guess; without distortion. None
-    for a file that COLMAP cannot read.
-    """
-    if cameras.params:  # pycolmap's inference would ignore them
-        camera = pycolmap.Camera.create_from_model_name(1, cameras.model, 1.0, 1, 1)
-        camera.params = [float(value) for value in cameras.params.split(",")]
-    else:
-        try:
-            camera = pycolmap.infer_camera_from_image(path, reader_options(cameras))
-        except (RuntimeError, ValueError):
-            return None
-    return _camera_matrix(camera)
-
-
-def _camera_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
+def camera_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
+    """Return (3, 3) intrinsics in pixel-centre px, without distortion."""
     matrix = np.asarray(camera.calibration_matrix(), dtype=np.float64)
     matrix[:2, 2] = pixel_from_colmap(matrix[:2, 2])
     return matrix
@@ -372,7 +259,7 @@ def read_cameras(path: Path) -> dict[str, ImageCamera]:
     """Return the camera of every image of a database by image name."""
     with open_database(path) as database:
         cameras = {
-            camera.camera_id: ImageCamera((camera.width, camera.height), _camera_matrix(camera))
+            camera.camera_id: ImageCamera((camera.width, camera.height), camera_matrix(camera))
             for camera in database.read_all_cameras()
         }
         return {image.name: cameras[image.camera_id] for image in database.read_all_images()}

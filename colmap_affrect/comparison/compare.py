@@ -16,8 +16,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.colmap.database import image_ids, import_images
+from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.database_copy import copy_without_features
+from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
 from colmap_affrect.colmap.poses import Poses, disagreeing_images, pose_scores, read_poses
 from colmap_affrect.comparison import DEFAULT_METHODS, worker
 from colmap_affrect.comparison.methods import Method, parse_methods
@@ -152,7 +153,7 @@ class _Plan:
             "from_database": _absolute(options.from_database),
             "images": _fingerprint(self.names),
             "pairs": _fingerprint([f"{first}\n{second}" for first, second in self.pairs]),
-            "camera": options.cameras.to_mapping(),
+            "camera": {**options.cameras.to_mapping(), "focal_vote": options.holds_vote},
             "masks": options.masks.to_mapping(),
             "verification": _without_seed(options.verification),
             "mapping": _without_seed(options.mapping),
@@ -183,7 +184,8 @@ class _Plan:
                 masks=options.masks,
                 verification=options.verification,
                 mapping=options.mapping,
-                intrinsics_given=bool(options.cameras.params),
+                focal_vote=options.holds_vote,
+                may_share=options.cameras.mode == "auto",
                 seeds=tuple(options.seeds),
                 resources=options.resources,
             )
@@ -257,7 +259,10 @@ def _make_shared(plan: _Plan, inputs: Mapping[str, Any]) -> None:
         if plan.options.from_database:
             copy_without_features(plan.options.from_database, new.database)
         else:
-            import_images(new.database, plan.image_path, plan.names, plan.options.cameras)
+            cameras = plan.options.cameras
+            import_images(new.database, plan.image_path, plan.names, cameras)
+            initial = InitialCameras(plan.image_path, cameras)
+            record_cameras(new.database, Workspace(partial).cameras, initial)
         taken = image_ids(new.database)
         names = [name for name in plan.names if name in taken]
         pairs = [pair for pair in plan.pairs if set(pair) <= taken.keys()]

@@ -29,6 +29,7 @@ class Layout:
         shared: folder of what all methods begin with.
         inputs: record of what ``shared`` was made from, and of the options all methods have.
         database: cameras and images, no features.
+        cameras: what is known of the cameras.
         images: names of the images that COLMAP can read, one a line.
         methods: folder of the folders of the methods.
     """
@@ -38,6 +39,7 @@ class Layout:
         self.shared = path / shared_name
         self.inputs = self.shared / "inputs.json"
         self.database = self.shared / "database.db"
+        self.cameras = self.shared / "cameras.json"
         self.images = self.shared / "images.txt"
         self.pairs = self.shared / "pairs.txt"
         self.methods = path / "methods"
@@ -53,7 +55,8 @@ class Request:
 
     Attributes:
         mapping: checked.
-        intrinsics_given: the user gave the camera parameters.
+        focal_vote: whether verified pairs vote on cameras that nobody knows.
+        may_share: whether cameras of images of one size may then turn out to be the same.
         seeds: of verification and mapping; recipes that climb do it with the first.
     """
 
@@ -63,7 +66,8 @@ class Request:
     masks: MaskOptions
     verification: VerificationOptions
     mapping: MapperOptions
-    intrinsics_given: bool
+    focal_vote: bool
+    may_share: bool
     seeds: tuple[int, ...]
     resources: Resources
 
@@ -116,7 +120,8 @@ class Request:
             "masks": self.masks.to_mapping(),
             "verification": self.verification.to_mapping(),
             "mapping": self.mapping.to_mapping(),
-            "intrinsics_given": self.intrinsics_given,
+            "focal_vote": self.focal_vote,
+            "may_share": self.may_share,
             "seeds": self.seeds,
             "weights_path": str(weights.resolve()) if weights else "",
             "device": self.resources.device,
@@ -137,7 +142,8 @@ class Request:
             masks=MaskOptions(**values["masks"]),
             verification=VerificationOptions(**values["verification"]),
             mapping=MAPPERS.options(values["mapping"]),
-            intrinsics_given=values["intrinsics_given"],
+            focal_vote=values["focal_vote"],
+            may_share=values["may_share"],
             seeds=tuple(values["seeds"]),
             resources=Resources(
                 Path(values["weights_path"]) if values["weights_path"] else None, values["device"]

@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import all_given, read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database, unverified_pairs
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.verification import verified_pairs, verify
+from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP
 from colmap_affrect.comparison.request import Request
 from colmap_affrect.comparison.results import MethodResult, SeedResult
@@ -48,9 +49,10 @@ from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stopwatch import Stopwatch
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
+from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import escalate
-from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.extract import Inputs, extract, recorded_extraction
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
@@ -197,15 +199,22 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
         context = Context(workspace, request.resources, progress=told)
         with watch.step("verify"):
             verify_matches(context, options)
+            _vote(request, workspace, options, recorded_extraction(workspace).max_image_size_px)
         with watch.step("map"):
             guide(context)
-            _, models = map_guided(context, mapper, given=request.intrinsics_given)
+            _, models = map_guided(context, mapper)
     else:
         num_pairs = len(unverified_pairs(database_path))
         with watch.step("verify"), told.stage("verify", num_pairs, "pairs") as advance:
             verify(database_path, options, advance=advance)
+            workspace = Workspace(folder)
+            shutil.copy(request.layout.cameras, workspace.cameras)
+            _vote(request, workspace, options)
         with watch.step("map"), told.stage("map", len(names), "images") as advance:
-            task = MappingTask(database_path, request.image_path, request.intrinsics_given)
+            records = read_camera_records(workspace.cameras)
+            task = MappingTask(
+                database_path, request.image_path, all_given(records), cameras=records
+            )
             models = map_database(mapper, task, folder / "sparse", advance)
     largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
     model_path = folder / "sparse" / "0" if models else None
@@ -231,6 +240,23 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
     )
     replace_text(result_path, json.dumps(result.to_mapping(), ensure_ascii=False))
     return result
+
+
+def _vote(
+    request: Request,
+    workspace: Workspace,
+    verification: VerificationOptions,
+    extracted_px: int | None = None,
+) -> None:
+    """Let the pairs vote on cameras if they are to do that."""
+    if request.focal_vote:
+        hold_vote(
+            workspace.database,
+            workspace.cameras,
+            verification,
+            extracted_px,
+            may_share=request.may_share,
+        )
 
 
 class _Costs:

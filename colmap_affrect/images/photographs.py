@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, Self
@@ -13,9 +13,8 @@ import numpy as np
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import ImageError, OptionError, StoreError
 from colmap_affrect.images.masks import read_mask
-from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES, read_gray
+from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
-from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.project.stores import pair_key
 
 
@@ -29,6 +28,14 @@ class CameraOptions(Options):
     """Focal length in units of the longer side where EXIF has none."""
     existing_camera_id: Annotated[int, within(-1, 2**31)] = -1
     """Camera of the database that all new images get; -1 makes cameras for them."""
+    ignore_exif: bool = False
+    """Take no focal length from EXIF, and do not ask it which images share a camera."""
+    cameras_path: str = ""
+    """COLMAP model, or CSV table by image name, with cameras that are known; empty for none."""
+    focal_length_px: Annotated[float, within(0.0, 1e7)] = 0.0
+    """Of all images that ``cameras_path`` does not name; 0 if it is not known."""
+    principal_point: str = ""
+    """``cx,cy`` in px from the image's corner; empty for the middle."""
 
 
 class MaskOptions(Options):
@@ -219,28 +226,4 @@ def refuse_colliding_keys(names: Sequence[str]) -> None:
             raise StoreError(
                 f"{other} and {name} have the same key in hloc's match files, where '/' becomes "
                 "'-'; rename one of them"
-            )
-
-
-def refuse_mixed_sizes(
-    image_path: Path, names: Sequence[str], mode: str, known: Mapping[str, tuple[int, int]]
-) -> None:
-    """Refuse images of several sizes with one camera, of which COLMAP would leave some out."""
-
-    def size_of(name: str) -> tuple[int, int] | None:
-        try:
-            return known.get(name) or read_gray(image_path / name).shape[::-1]
-        except ImageError:
-            return None
-
-    first: dict[PurePosixPath, tuple[str, tuple[int, int]]] = {}
-    for name, size in zip(names, map_ordered(size_of, names, available_cores()), strict=True):
-        if size is None:
-            continue
-        folder = PurePosixPath(name).parent if mode == "per-folder" else PurePosixPath()
-        other, expected = first.setdefault(folder, (name, size))
-        if size != expected:
-            raise OptionError(
-                f"--camera-mode {mode}: {other} is {expected[0]} x {expected[1]} px, {name} is "
-                f"{size[0]} x {size[1]} px; images that share a camera must have one size"
             )

@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
     DESCRIPTOR_NORM,
-    check_cameras,
     colmap_keypoints,
-    import_images,
     open_database,
     write_matches,
 )
 from colmap_affrect.colmap.database_copy import open_copy
+from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import DatabaseError, ImageError, OptionError, StoreError
@@ -117,8 +116,8 @@ def import_h5(
     _refuse_existing(database_path, DatabaseError)
     cameras = cameras or CameraOptions()
     verification = VerificationOptions(random_seed=random_seed)
-    check_cameras(cameras)
     names = list_images(image_path)
+    InitialCameras(image_path, cameras).check(names)
     with (
         open_files(features_path, matches_path, layout, names, image_path) as files,
         # Verification may take hours, and half a database must not be left behind.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
@@ -18,10 +19,14 @@ from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.last_adjustment import adjust_last
 from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
+from colmap_affrect.mappers.starts import focal_starts, runaways, started
 from colmap_affrect.project.report import ModelSummary
 
 ATTEMPT_SEED_STEP = 1_000_003
 """Distance of the seeds of repeated attempts, so that those of runs 0, 1, 2, ... differ."""
+
+MAX_HOLDING_ATTEMPTS = 2
+"""More than the others, to hold cameras that ran away."""
 
 LARGE_MODEL = 100
 """From this size on the first pair no longer matters, and another attempt takes long."""
@@ -69,17 +74,16 @@ def map_database(
 
     try:
         with with_snapshots(task, mapper.options, snapshots_of(sparse_path), num_images) as kept:
-            for attempt in range(1 if task.extend else mapper.options.max_num_attempts):
+            attempts = _Attempts(mapper, kept, num_images)
+            while attempts.go_on(best):
                 raw = partial / "raw"
                 raw.mkdir(parents=True)
-                seed = mapper.options.random_seed + attempt * ATTEMPT_SEED_STEP
-                found = mapper.map(kept, raw, seed, show)
+                found = attempts.next(partial / "started.db", raw, show)
                 shutil.rmtree(raw)
                 if not task.extend:  # whose images stay, whatever they are
                     found = [m for m in (without_impossible(model, kept) for model in found) if m]
                 best = better(kept, best, sorted(found, key=_size, reverse=True))
-                if best and _size(best[0])[0] >= min(num_images, LARGE_MODEL):
-                    break
+            (partial / "started.db").unlink(missing_ok=True)
         if not task.extend:
             _adjust_weak(mapper, task, best)
         shutil.rmtree(sparse_path, ignore_errors=True)
@@ -92,13 +96,54 @@ def map_database(
     return [summarize(model, task) for model in best]
 
 
+class _Attempts:
+    """Which attempts there are: with several seeds, and from several focal lengths.
+
+    Cameras that ran away in the best models so far are held in those that follow.
+    """
+
+    def __init__(self, mapper: Mapper, task: MappingTask, num_images: int) -> None:
+        self._mapper, self._task, self._num_images = mapper, task, num_images
+        is_large = num_images >= LARGE_MODEL
+        self._starts = [{}] if task.extend or is_large else focal_starts(task)
+        num = 1 if task.extend else mapper.options.max_num_attempts
+        self._limit = max(num, len(self._starts))
+        self._most = self._limit + MAX_HOLDING_ATTEMPTS
+        self._done = 0
+
+    def go_on(self, best: list[MappedModel]) -> bool:
+        """Tell whether there is another attempt, after the best models so far."""
+        task = self._task
+        ran = runaways(best[0].reconstruction, task) - task.held if best else set()
+        if ran and not task.extend and self._done < self._most:
+            self._task = replace(task, held=task.held | ran)
+            self._limit = max(self._limit, self._done + 1)
+            return True
+        if self._done >= self._limit:
+            return False
+        is_complete = best and _size(best[0])[0] >= min(self._num_images, LARGE_MODEL)
+        return self._done < len(self._starts) or not is_complete
+
+    def next(
+        self, database_path: Path, output_path: Path, show: Callable[[int], None]
+    ) -> list[MappedModel]:
+        """Map once more."""
+        seed = self._mapper.options.random_seed + self._done * ATTEMPT_SEED_STEP
+        start = self._starts[self._done % len(self._starts)]
+        self._done += 1
+        task = started(self._task, start, database_path)
+        return self._mapper.map(task, output_path, seed, show)
+
+
 def _adjust_weak(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -> None:
     """Adjust models that guided matches or bridges hold; others stay as COLMAP made them."""
     weak = [model for model in models if task.guided or model.bridges]
     verified = inlier_matches(task.database_path, 1) if weak else {}
-    refine = not (task.intrinsics_given and mapper.options.keep_given_intrinsics)
     for model in weak:
-        adjust_last(model.reconstruction, verified, task.guided, refine_intrinsics=refine)
+        constant = task.constant_cameras(mapper.options) | runaways(model.reconstruction, task)
+        if task.intrinsics_given and mapper.options.keep_given_intrinsics:
+            constant = set(model.reconstruction.cameras)
+        adjust_last(model.reconstruction, verified, task.guided, constant_cameras=constant)
 
 
 def _size(model: MappedModel) -> tuple[int, int]:

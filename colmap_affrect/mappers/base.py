@@ -27,6 +27,7 @@ from colmap_affrect.options import (
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap import pycolmap
+    from colmap_affrect.colmap.camera_records import CameraRecord
     from colmap_affrect.mappers.existing import ExistingModel
 
 
@@ -77,6 +78,8 @@ class MappingTask:
         snapshot_path: folder of snapshots, to be gone on from; mappers may leave it unused.
         cancellation: a token by which mapping is stopped from outside.
         guided: (M, 2) features of pairs of image ids that only guided matching has matched.
+        cameras: what is known of the cameras, by id.
+        held: ids of cameras whose parameters stay as they are in the database.
     """
 
     database_path: Path
@@ -86,11 +89,18 @@ class MappingTask:
     snapshot_path: Path | None = None
     cancellation: pycolmap.CancellationToken | None = None
     guided: Mapping[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
+    cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
+    held: frozenset[int] = frozenset()
 
     @property
     def colors_path(self) -> Path:
         """A folder that exists, as pycolmap needs one also where there are no photographs."""
         return self.image_path or self.database_path.parent
+
+    def constant_cameras(self, options: MapperOptions) -> set[int]:
+        """Return the ids of the cameras that are not to be refined."""
+        fixed = {key for key, record in self.cameras.items() if record.is_fixed}
+        return (fixed if options.keep_given_intrinsics else set()) | self.held
 
 
 @dataclass(frozen=True)

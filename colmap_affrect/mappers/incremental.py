@@ -76,6 +76,7 @@ class IncrementalMapper:
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
         native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
+        native.constant_cameras = task.constant_cameras(self.options)
         if task.image_path is None:
             native.extract_colors = False
         call = _Call(task, native, output_path, show)

@@ -7,7 +7,7 @@ exact matches suffice to hold images these alone say where they stand.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from itertools import combinations
 
 import networkx as nx
@@ -42,7 +42,7 @@ def adjust_last(
     verified: Matches,
     guided: Matches,
     *,
-    refine_intrinsics: bool,
+    constant_cameras: Collection[int] = (),
 ) -> int:
     """Adjust a model that guided matches or bridges hold, and take out what no longer fits.
 
@@ -54,7 +54,7 @@ def adjust_last(
         model: changed in place.
         verified: (M, 2) inliers of each pair of image ids, as they made the model.
         guided: those of them that only guided matching has found.
-        refine_intrinsics: whether focal lengths and distortion are adjusted as well.
+        constant_cameras: ids of cameras whose parameters stay as they are.
 
     Returns:
         How many observations of guided matches were taken out first.
@@ -69,7 +69,7 @@ def adjust_last(
         if model.images[image_id].points2D[index].has_point3D():
             model.delete_observation(image_id, index)
     for _ in range(NUM_ROUNDS):
-        _adjust(model, refine_intrinsics=refine_intrinsics)
+        _adjust(model, constant_cameras)
         pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
     model.update_point_3d_errors()
     return len(dropped)
@@ -125,13 +125,15 @@ def exactly_held(ties: Observations) -> set[int]:
     return set(max(nx.connected_components(parts), key=len, default=()))
 
 
-def _adjust(model: pycolmap.Reconstruction, *, refine_intrinsics: bool) -> None:
-    options = pycolmap.BundleAdjustmentOptions(
-        refine_focal_length=refine_intrinsics,
-        refine_extra_params=refine_intrinsics,
-        print_summary=False,
-    )
+def _adjust(model: pycolmap.Reconstruction, constant_cameras: Collection[int]) -> None:
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = LOSS_SCALE_PX
     options.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(model, options)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    for camera_id in constant_cameras:
+        config.set_constant_cam_intrinsics(camera_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import io
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -148,6 +149,7 @@ class ReconstructionReport:
         advice: what to try for the images that are missing.
         guided: ``pairs`` that guided matching gave more inliers, and these inliers
             ``matches_before`` and ``matches_after``; empty where no pair needed it.
+        cameras: for each its images, where its focal length is from, and its spread.
     """
 
     images_total: int
@@ -166,6 +168,7 @@ class ReconstructionReport:
     extended: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
     guided: dict[str, int] = dataclasses.field(default_factory=dict)
+    cameras: tuple[dict[str, Any], ...] = ()
 
     @property
     def status(self) -> str:
@@ -233,6 +236,7 @@ class ReconstructionReport:
             "num_verified_pairs": self.num_verified_pairs,
             "pair_levels": self.pair_levels,
             "guided": self.guided,
+            "cameras": list(self.cameras),
             "stages": [dataclasses.asdict(stage) for stage in self.stages],
             "recipe": self.recipe,
             "preset": self.preset,
@@ -265,6 +269,9 @@ class ReconstructionReport:
         if self.guided:
             before, after = self.guided["matches_before"], self.guided["matches_after"]
             lines += [f"guided      {self.guided['pairs']} pairs, {before} to {after} inliers"]
+        if self.cameras:
+            sources = Counter(str(camera["source"]) for camera in self.cameras).most_common()
+            lines += [f"cameras     {', '.join(f'{n} {source}' for source, n in sources)}"]
         if self.models:
             model = self.models[0]
             lines += _some(

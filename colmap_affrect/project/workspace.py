@@ -27,7 +27,7 @@ LOCAL = ("image_path", "image_list_path", "from_database", "cameras")
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
 COPY_STAGES = ("copy", "verify", "map")
 """Of a folder in which another program's database is mapped."""
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 """Of ``config.toml``: counts up when a stage records other options than before."""
 
 
@@ -53,6 +53,7 @@ class Workspace:
         aside: models that wait to be compared with those of guided matches.
         snapshots: folder of what a mapping that was interrupted goes on from.
         report: of the last run (JSON).
+        cameras: what is known of the cameras of the database, and from where (JSON).
         depth: folder of the depth maps that a network made.
         config: record of the options (TOML).
         log: of all runs.
@@ -66,7 +67,7 @@ class Workspace:
         self.sparse, self.aside = path / "sparse", path / "sparse.aside"
         self.snapshots, self.depth = path / "sparse.snapshots", path / "depth"
         self.config, self.log = path / "config.toml", path / "run.log"
-        self.report = path / "report.json"
+        self.report, self.cameras = path / "report.json", path / "cameras.json"
 
     @classmethod
     def beside(cls, database_path: Path) -> Self:
@@ -74,12 +75,13 @@ class Workspace:
         return cls(database_path.with_suffix(".affrect"), database_path)
 
     def branch(self, path: Path) -> Workspace:
-        """Make another folder with the same features, pairs and raw matches, without a database.
+        """Make another folder with the same features, pairs, raw matches and records of cameras.
 
         Files are shared where the file system can do that.
         """
         path.mkdir(parents=True, exist_ok=True)
-        for source in (self.features, self.pairs, self.matches):
+        shared = [self.features, self.pairs, self.matches]
+        for source in [*shared, *([self.cameras] if self.cameras.exists() else [])]:
             try:
                 os.link(source, path / source.name)
             except OSError:
@@ -232,7 +234,7 @@ class Workspace:
         if first <= STAGES.index("guide"):
             outdated.append(self.guided)
         if first <= STAGES.index("verify"):
-            outdated.append(self.database)
+            outdated += [self.database, self.cameras]
         if first <= STAGES.index("match"):
             outdated.append(self.matches)
         if first <= STAGES.index("pairs"):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.database_copy import copy_with_frames
+from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.report import StageReport
@@ -38,7 +39,9 @@ def copy_verified(
     workspace.record_options("copy", given, overwrite=overwrite)
     if _is_older(workspace.database, source):
         workspace.database.unlink(missing_ok=True)
+        workspace.cameras.unlink(missing_ok=True)
         copy_with_frames(source, workspace.database)
+    record_cameras(workspace.database, workspace.cameras)
     colmap_database.refuse_wrong_matches(workspace.database)
     workspace.record_options("verify", verification.to_mapping())
     num_pairs = colmap_database.num_matched_pairs(workspace.database)

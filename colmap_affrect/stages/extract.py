@@ -10,7 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database_copy import copy_without_features, open_copy
+from colmap_affrect.colmap.given_cameras import read_given_cameras
+from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
 from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
 from colmap_affrect.features.weights import file_sha256
 from colmap_affrect.images.photographs import (
@@ -21,12 +24,10 @@ from colmap_affrect.images.photographs import (
     left_out,
     list_images,
     refuse_colliding_keys,
-    refuse_mixed_sizes,
 )
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe
 from colmap_affrect.stages.context import Context
@@ -112,28 +113,28 @@ class Inputs(Options):
             OptionError: naming the option.
         """
         self.photographs.check()
-        colmap_database.check_cameras(self.cameras)
+        read_given_cameras(self.cameras)
         if self.from_database and self.cameras != CameraOptions():
             raise OptionError(
                 f"the cameras of {self.from_database} are used; leave out camera mode, model and "
-                "parameters"
+                "parameters, and other options of cameras"
             )
 
-    def check_names(self, names: Sequence[str], workspace: Workspace | None = None) -> None:
+    def check_names(self, names: Sequence[str]) -> None:
         """Refuse photographs that cannot be used together.
-
-        Args:
-            names: of the photographs.
-            workspace: where some have features, and their sizes are known.
 
         Raises:
             StoreError: when two have the same key in hloc's files.
-            OptionError: when photographs that share a camera differ in size.
+            OptionError: when photographs cannot share the cameras that they should.
         """
         refuse_colliding_keys(names)
-        if self.cameras.mode in ("single", "per-folder"):
-            known = FeatureStore(workspace.features).image_sizes() if workspace else {}
-            refuse_mixed_sizes(Path(self.image_path), names, self.cameras.mode, known)
+        if not self.from_database:
+            self.initial_cameras.check(names)
+
+    @property
+    def initial_cameras(self) -> InitialCameras:
+        """What decides on cameras."""
+        return InitialCameras(Path(self.image_path), self.cameras)
 
 
 def recorded_extraction(workspace: Workspace) -> ExtractionOptions:
@@ -173,7 +174,7 @@ def extract(
     names = inputs.names()
     if image_names:
         names = checked_names(folder, image_names, "image_names")
-    inputs.check_names(names, None if overwrite else workspace)
+    inputs.check_names(names)
     extractor = prepared_recipe(context, recipe.extraction, names)
     _record(workspace, inputs, recipe, extractor, later or {}, overwrite=overwrite)
     _start_database(workspace)
@@ -312,16 +313,13 @@ def image_tasks(
     known = {}
     if workspace.database.exists():
         known = colmap_database.read_cameras(workspace.database)
+    initial = inputs.initial_cameras
+    names = inputs.names() if options.uses_depth else []
     for name, level in images:
         camera = known.get(name)
         intrinsics = None
         if options.uses_depth:
-            path = Path(inputs.image_path) / name
-            intrinsics = (
-                camera.matrix
-                if camera
-                else colmap_database.read_camera_matrix(path, inputs.cameras)
-            )
+            intrinsics = camera.matrix if camera else initial.matrix(name, names)
         size = camera.size if camera else None
         yield ImageTask(inputs.photographs, name, level, intrinsics, size)
 
@@ -353,8 +351,15 @@ def write_images_and_keypoints(context: Context) -> dict[str, str]:
     _start_database(workspace)
     inputs = Inputs.recorded(workspace)
     counts = store.num_keypoints()
-    rejected = colmap_database.import_images(
+    rejected = import_images(
         workspace.database, Path(inputs.image_path), list(counts), inputs.cameras
+    )
+    original = Path(inputs.from_database) if inputs.from_database else None
+    record_cameras(
+        workspace.database,
+        workspace.cameras,
+        None if original else inputs.initial_cameras,
+        read_camera_records(original.with_name(workspace.cameras.name)) if original else None,
     )
     ids = colmap_database.image_ids(workspace.database)
     with colmap_database.open_database(workspace.database) as database:

@@ -12,6 +12,7 @@ from shutil import rmtree
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import all_given, read_camera_records
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.errors import StaleStoreError
@@ -52,7 +53,6 @@ def map_images(
     extend: Extension | None = None,
     *,
     overwrite: bool = False,
-    given: bool | None = None,
 ) -> tuple[StageReport, list[ModelSummary]]:
     """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
 
@@ -61,7 +61,6 @@ def map_images(
         mapper: with its options.
         extend: the model that images are registered into; None begins anew.
         overwrite: discard the models that are there.
-        given: whether the user gave the camera parameters; by default as on record.
 
     Raises:
         MappingError: when the model cannot be extended with these images.
@@ -86,9 +85,10 @@ def map_images(
     task = MappingTask(
         workspace.database,
         _image_path(workspace),
-        intrinsics_given(workspace) if given is None else given,
+        intrinsics_given(workspace),
         existing,
         guided={} if is_copy(workspace) else guided_matches(context),
+        cameras=read_camera_records(workspace.cameras),
     )
     if known == inputs:
         models = read_models(workspace.sparse, task)
@@ -162,8 +162,8 @@ def _ignore(_: int) -> None:
 
 
 def intrinsics_given(workspace: Workspace) -> bool:
-    """Tell whether the user gave the camera parameters; of a copied database it is not known."""
-    return not is_copy(workspace) and bool(Inputs.recorded(workspace).cameras.params)
+    """Tell whether the user gave all cameras' parameters; of a copied database it is not known."""
+    return all_given(read_camera_records(workspace.cameras))
 
 
 def num_verified_pairs(workspace: Workspace) -> int:

@@ -30,7 +30,8 @@ from machine import describe_machine, table
 from speed_by_core import feature_growth, pixel_growth, stage_seconds
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import import_images, open_database
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.initial_cameras import import_images
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.comparison.methods import SIFT, SIFT_AFFINE_DSP, Method, parse_method
 from colmap_affrect.comparison.sift import extract_sift, match_sift

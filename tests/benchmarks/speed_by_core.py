@@ -20,11 +20,11 @@ from machine import one_core
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
     image_ids,
-    import_images,
     open_database,
     write_descriptors,
     write_keypoints,
 )
+from colmap_affrect.colmap.initial_cameras import import_images
 from colmap_affrect.comparison.methods import SIFT, Method
 from colmap_affrect.comparison.sift import extraction_options
 from colmap_affrect.conventions import camera_matrix

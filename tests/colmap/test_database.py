@@ -14,11 +14,11 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
     colmap_keypoints,
     image_ids,
-    import_images,
     open_database,
     write_keypoints,
     write_matches,
 )
+from colmap_affrect.colmap.initial_cameras import import_images
 from colmap_affrect.data import Rectification
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.features.sift import RootSift, SiftOptions

@@ -11,7 +11,7 @@ import pytest
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import import_images, open_database
+from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import (
     copy_database,
     copy_without_features,
@@ -19,6 +19,7 @@ from colmap_affrect.colmap.database_copy import (
     open_copy,
     schema_version,
 )
+from colmap_affrect.colmap.initial_cameras import import_images
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.images.photographs import CameraOptions
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from small_scene import NAMES, write_photographs
 
-from colmap_affrect.colmap.database import image_ids, import_images, open_database
+from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.initial_cameras import import_images
 from colmap_affrect.comparison import DEFAULT_METHODS
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.comparison.sift import (

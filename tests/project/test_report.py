@@ -41,6 +41,11 @@ REPORT = ReconstructionReport(
     differs_from_colmap={"verification": {"min_num_inliers": 20}, "mapping": {}},
     pair_levels={"identity": 2, "asift": 1, "none": 7},
     advice=("--recipe on-demand",),
+    cameras=(
+        {"id": 4, "source": "exif"},
+        {"id": 2, "source": "guess"},
+        {"id": 3, "source": "exif"},
+    ),
 )
 
 SHAKY = replace(LARGE, doubtful={"a.png": "only 9 points hold it"})
@@ -59,6 +64,7 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "unregistered": REPORT.unregistered,
         "doubtful": {},
         "guided": {},
+        "cameras": list(REPORT.cameras),
         "doubts": [],
         "arrivals": {
             "a.png": {"how": "tracks"},
@@ -134,6 +140,7 @@ def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
         "try         --recipe on-demand",
         "came in     č d.png bridged by a.png, 32 of 36 depths agree, scale +-3.1%",
         "3 of 10 verified",
+        "cameras     2 exif, 1 guess",
         "points      120",
         "2.25 images",
         "0.51 px",

@@ -29,7 +29,7 @@ def finished(workspace: Workspace) -> Workspace:
     for stage in STAGES:
         workspace.record_options(stage, {"by": stage}, recipe="default")
     files = (workspace.features, workspace.pairs, workspace.matches, workspace.guided)
-    for path in (*files, workspace.database):
+    for path in (*files, workspace.database, workspace.cameras):
         path.write_bytes(path.name.encode())
     (workspace.sparse / "0").mkdir(parents=True)
     (workspace.sparse / "0" / "images.bin").write_bytes(b"model")
@@ -100,9 +100,9 @@ KEPT = {
     "pairs": ["features.h5"],
     "match": ["features.h5", "pairs.txt"],
     "verify": ["features.h5", "matches.h5", "pairs.txt"],
-    "escalate": ["database.db", "features.h5", "matches.h5", "pairs.txt"],
-    "guide": ["database.db", "features.h5", "matches.h5", "pairs.txt"],
-    "map": ["database.db", "features.h5", "guided.h5", "matches.h5", "pairs.txt"],
+    "escalate": ["cameras.json", "database.db", "features.h5", "matches.h5", "pairs.txt"],
+    "guide": ["cameras.json", "database.db", "features.h5", "matches.h5", "pairs.txt"],
+    "map": ["cameras.json", "database.db", "features.h5", "guided.h5", "matches.h5", "pairs.txt"],
 }
 
 
@@ -246,7 +246,7 @@ def test_record_of_another_version_is_one_clear_line(workspace: Workspace, versi
 
 def test_branch_begins_after_the_raw_matches(finished: Workspace, tmp_path: Path) -> None:
     branch = finished.branch(tmp_path / "branches" / "one")
-    names = ["config.toml", "features.h5", "matches.h5", "pairs.txt"]
+    names = ["cameras.json", "config.toml", "features.h5", "matches.h5", "pairs.txt"]
     assert sorted(path.name for path in branch.path.iterdir()) == names
     for path in (branch.features, branch.matches, branch.pairs):
         assert path.read_bytes() == (finished.path / path.name).read_bytes()

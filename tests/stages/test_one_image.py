@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from colmap_affrect.colmap.database import image_ids, open_database, read_camera_matrix
+from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.conventions import camera_matrix
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import DepthError, DeviceError, OptionError, WeightsError
@@ -168,12 +169,14 @@ def test_device_that_is_not_there_is_one_clear_line(monkeypatch):
 def test_intrinsics_are_those_of_the_user_else_colmaps_guess(tmp_path):
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), np.zeros((30, 50), np.uint8))
-    given = read_camera_matrix(path, CameraOptions(model="PINHOLE", params="61,62,24.5,16"))
+    options = CameraOptions(model="PINHOLE", params="61,62,24.5,16")
+    given = InitialCameras(tmp_path, options).matrix("a.png", ["a.png"])
     np.testing.assert_allclose(given, [[61, 0, 24.0], [0, 62, 15.5], [0, 0, 1]])
-    guessed = read_camera_matrix(path, CameraOptions())
+    initial = InitialCameras(tmp_path, CameraOptions())
+    guessed = initial.matrix("a.png", ["a.png", "b.png"])
     np.testing.assert_allclose(guessed, camera_matrix((50, 30)))
     (tmp_path / "b.png").write_bytes(b"no image")
-    assert read_camera_matrix(tmp_path / "b.png", CameraOptions()) is None
+    assert initial.matrix("b.png", ["a.png", "b.png"]) is None
 
 
 def test_images_at_once_are_as_many_as_there_are_cores_and_memory_for(

@@ -18,6 +18,7 @@ from results import database_content, hdf5_content
 from small_scene import IMAGE_SIZE, INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError
@@ -101,6 +102,8 @@ def test_run_leaves_all_results(finished: tuple[Workspace, ReconstructionReport]
     (camera,) = model.cameras.values()
     assert camera.params.tolist() == [float(value) for value in INTRINSICS.split(",")]
     assert (camera.width, camera.height) == IMAGE_SIZE
+    (record,) = read_camera_records(workspace.cameras).values()
+    assert (record.names, record.source, record.is_fixed) == (tuple(names), "given", True)
     assert len(workspace.pairs.read_text(encoding="utf-8").splitlines()) == 6
     assert list(workspace.recorded()) == [
         "recipe",
@@ -120,6 +123,7 @@ def test_report_file_has_the_promised_keys(
     workspace, report = finished
     read = json.loads(workspace.report.read_text(encoding="utf-8"))
     assert read == json.loads(report.to_json())
+    assert [camera["source"] for camera in read["cameras"]] == ["given"]
     assert {
         "status", "images_total", "images_registered", "registered_names", "unregistered",
         "num_models", "points3D", "mean_track_length", "mean_reprojection_error_px", "stages",

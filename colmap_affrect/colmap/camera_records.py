@@ -1,0 +1,134 @@
+"""What is known of the cameras of a run, and from where: ``cameras.json`` beside the database.
+
+COLMAP's database has one flag for a focal length, that somebody knows it. Here is who.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from colmap_affrect.errors import WorkspaceError
+from colmap_affrect.project.atomic_files import replace_text
+
+Source = Literal["given", "exif", "exif-rescaled", "pairs", "guess"]
+"""By the user; by EXIF as it is, or scaled to a photograph that was shrunk; by the votes of
+verified pairs; or COLMAP's usual guess."""
+
+Given = Literal["focal", "principal-point", "distortion"]
+"""Parts of intrinsics; a model without distortion counts as given once its focal length is."""
+
+TRUSTED: tuple[Source, ...] = ("given", "exif", "exif-rescaled")
+"""Sources whose focal lengths are priors before any pair has been verified."""
+
+MAX_LINES = 5
+"""Groups of cameras that are logged."""
+
+MAX_NAMES = 3
+"""Images that are named of a camera."""
+
+
+@dataclass(frozen=True)
+class CameraRecord:
+    """One camera of the database.
+
+    Attributes:
+        names: of its images, sorted.
+        source: of the focal length.
+        focal_px: in px of the stored file; the mean of two.
+        low_px: lower end of what the focal length may be, None where nothing says so.
+        high_px: upper end.
+        why: what was decided and for what reason, one clause.
+        size: (width, height) of its images in px.
+        given: what of the intrinsics is the user's, to be left as it is.
+    """
+
+    names: tuple[str, ...]
+    source: Source
+    focal_px: float
+    low_px: float | None = None
+    high_px: float | None = None
+    why: str = ""
+    size: tuple[int, int] = (0, 0)
+    given: tuple[Given, ...] = ()
+
+    def to_report(self, camera_id: int) -> dict[str, Any]:
+        """Return the entry of ``report.json``."""
+        longer = max(self.size)
+        has_spread = self.low_px is not None and self.high_px is not None
+        return {
+            "id": camera_id,
+            "num_images": len(self.names),
+            "names": list(self.names),
+            "source": self.source,
+            "focal_px": self.focal_px,
+            "focal_longer_sides": self.focal_px / longer if longer else None,
+            "spread_px": [self.low_px, self.high_px] if has_spread else None,
+            "why": self.why,
+        }
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether nothing of the intrinsics that mapping would refine is free."""
+        return {"focal", "distortion"} <= set(self.given)
+
+
+def all_given(records: Mapping[int, CameraRecord]) -> bool:
+    """Tell whether nothing of any camera is to be refined."""
+    return bool(records) and all(record.is_fixed for record in records.values())
+
+
+def read_camera_records(path: Path) -> dict[int, CameraRecord]:
+    """Return the records by camera id of the database; none where there is no file.
+
+    Raises:
+        WorkspaceError: when the file is damaged.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return {int(key): _from_mapping(values) for key, values in content.items()}
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise WorkspaceError(f"{path}: damaged ({error}); remove it") from error
+
+
+def _from_mapping(values: Mapping[str, Any]) -> CameraRecord:
+    lists = {key: tuple(values[key]) for key in ("names", "size", "given")}
+    return CameraRecord(**{**values, **lists})
+
+
+def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
+    """Replace the file as a whole."""
+    content = {str(key): asdict(records[key]) for key in sorted(records)}
+    replace_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+
+
+def notable_lines(records: Iterable[CameraRecord]) -> list[str]:
+    """Return a line for cameras of one source and story, at most a few; none for those without."""
+    groups: dict[tuple[Source, str], list[CameraRecord]] = {}
+    for record in records:
+        if record.why:
+            groups.setdefault((record.source, record.why), []).append(record)
+    lines = [_line(same) for same in groups.values()]
+    more = len(lines) - MAX_LINES
+    return lines if more <= 1 else [*lines[:MAX_LINES], f"and {more} more, see report.json"]
+
+
+def _line(records: Sequence[CameraRecord]) -> str:
+    """Say what was decided for cameras of one source and story."""
+    names = [name for record in records for name in record.names]
+    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+    first = records[0]
+    spread = (
+        f" ({first.low_px:.0f} to {first.high_px:.0f})" if first.low_px and first.high_px else ""
+    )
+    focals = sorted({round(record.focal_px) for record in records})
+    focal = f"{focals[0]}" if len(focals) == 1 else f"{focals[0]} to {focals[-1]}"
+    return (
+        f"{', '.join(names[:MAX_NAMES])}{more}: focal length {focal} px"
+        f"{spread if len(records) == 1 else ''}, {first.source}: {first.why}"
+    )

@@ -1,0 +1,313 @@
+"""The vote of verified pairs over cameras that nobody knows, and what it changes in a database."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.two_views import PLANAR
+from colmap_affrect.geometry.focal_evidence import MatchedPair
+from colmap_affrect.geometry.focal_vote import (
+    Ballot,
+    FocalEstimate,
+    ballot,
+    count,
+    evidence_for_one,
+)
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+
+MIN_NUM_INLIERS = 20
+"""Of a pair that votes; a fundamental matrix of few more than it needs says nothing else."""
+
+MATCH_ERROR_PX = 0.5
+"""Least error of matches, px of the photograph as features were extracted."""
+
+MAX_PAIRS_OF_IMAGE = 4
+"""The strongest pairs of each image vote."""
+
+MAX_PAIRS_OF_DECISION = 24
+"""Pairs that are asked whether images of one size share a camera."""
+
+MIN_LOG_EVIDENCE = 3.0
+"""For one camera against many: twenty to one."""
+
+MAX_SPREAD = 1.4
+"""Ratio of the ends of an interval that counts as knowledge."""
+
+
+@dataclass(frozen=True)
+class VotingPair:
+    """A verified pair that votes: ids of its cameras, and its inliers."""
+
+    cameras: tuple[int, int]
+    matched: MatchedPair
+
+
+@dataclass
+class CameraVote:
+    """Decides on cameras by the votes of pairs.
+
+    Attributes:
+        records: of all cameras by id.
+        pairs: that vote.
+        may_share: whether cameras of images of one size may turn out to be the same.
+        tied: cameras that have one focal length, each by the first of them.
+        decisions: what was found out about cameras of one size.
+    """
+
+    records: Mapping[int, CameraRecord]
+    pairs: Sequence[VotingPair]
+    may_share: bool
+    tied: dict[int, int] = field(default_factory=dict)
+    decisions: dict[int, str] = field(default_factory=dict)
+
+    def decide(self) -> dict[int, CameraRecord]:
+        """Return the records as they are after the vote.
+
+        Cameras that turn out to be the same are one record, of the first of them.
+        """
+        unknown = [key for key, record in self.records.items() if record.source == "guess"]
+        self.tied = {key: key for key in unknown}
+        if self.may_share:
+            for same_size in self._classes(unknown):
+                self._decide_sharing(same_size)
+        known = {
+            key: record.focal_px / max(record.size)
+            for key, record in self.records.items()
+            if key not in self.tied
+        }
+        ballots = self._ballots(self.pairs, self.tied, known)
+        num_votes = Counter(camera for item in ballots for camera in set(item.cameras))
+        outcome = count(ballots, sorted(set(self.tied.values())))
+        records = {key: record for key, record in self.records.items() if key in known}
+        for size, first in sorted({(self.records[key].size, self.tied[key]) for key in unknown}):
+            keys = [
+                key for key in unknown if (self.records[key].size, self.tied[key]) == (size, first)
+            ]
+            estimate = outcome.estimates[first]
+            records[keys[0]] = self._record(keys, estimate, num_votes[first])
+        return records
+
+    def _classes(self, unknown: Sequence[int]) -> Iterator[list[int]]:
+        """Yield cameras of one size, of which some may have been turned by 90 degrees."""
+        sizes: dict[tuple[int, ...], list[int]] = defaultdict(list)
+        for key in unknown:
+            if "principal-point" not in self.records[key].given:
+                sizes[tuple(sorted(self.records[key].size))].append(key)
+        yield from (keys for keys in sizes.values() if len(keys) > 1)
+
+    def _decide_sharing(self, same_size: Sequence[int]) -> None:
+        inside = [pair for pair in self.pairs if set(pair.cameras) <= set(same_size)]
+        ballots = self._ballots(inside[:MAX_PAIRS_OF_DECISION], self.tied, {})
+        if not ballots:
+            return
+        asked = sorted({camera for item in ballots for camera in item.cameras})
+        many = count(ballots, asked, resample=False).log_evidence
+        one = evidence_for_one(ballots)
+        first = min(same_size)
+        if one - many >= MIN_LOG_EVIDENCE:
+            self.tied |= dict.fromkeys(same_size, first)
+            text = f"one camera for {len(same_size)} images of one size, by the votes of pairs"
+        elif many - one >= MIN_LOG_EVIDENCE:
+            text = "a camera for each of these images of one size, by the votes of pairs"
+        else:
+            text = "pairs do not tell whether images of this size share a camera"
+        self.decisions |= dict.fromkeys(same_size, text)
+
+    @staticmethod
+    def _ballots(
+        pairs: Sequence[VotingPair], tied: Mapping[int, int], known: Mapping[int, float]
+    ) -> list[Ballot]:
+        def ask(pair: VotingPair) -> Ballot | None:
+            first, second = (tied.get(camera, camera) for camera in pair.cameras)
+            return ballot(pair.matched, (first, second), known)
+
+        return [found for found in map_ordered(ask, pairs, available_cores()) if found]
+
+    def _record(self, keys: Sequence[int], estimate: FocalEstimate, num_votes: int) -> CameraRecord:
+        """Return the record of cameras of one size that turned out to be the same."""
+        first = self.records[keys[0]]
+        longer = max(first.size)
+        is_known = num_votes > 0 and estimate.spread <= MAX_SPREAD
+        texts = [self.decisions.get(keys[0], ""), first.why if not is_known else ""]
+        if not num_votes:
+            texts.append("no pair can tell its focal length")
+        elif not is_known:
+            texts.append("its pairs do not tell the focal length well")
+        return replace(
+            first,
+            names=tuple(sorted(name for key in keys for name in self.records[key].names)),
+            source="pairs" if is_known else "guess",
+            focal_px=estimate.focal * longer,
+            low_px=estimate.low * longer,
+            high_px=estimate.high * longer,
+            why="; ".join(text for text in texts if text),
+        )
+
+
+def needs_vote(records: Mapping[int, CameraRecord]) -> bool:
+    """Tell whether there are cameras that nobody knows and no vote was held for."""
+    return any(item.source == "guess" and item.low_px is None for item in records.values())
+
+
+def forget_votes(path: Path, records: Mapping[int, CameraRecord]) -> dict[int, CameraRecord]:
+    """Return records as before a vote, and let the pairs of cameras that one decided go unverified.
+
+    Args:
+        path: of the database.
+        records: of its cameras.
+    """
+    voted = {key for key, record in records.items() if record.source == "pairs"}
+    if voted:
+        with open_database(path) as database, pycolmap.DatabaseTransaction(database):
+            for camera in database.read_all_cameras():
+                if camera.camera_id in voted:
+                    camera.has_prior_focal_length = False
+                    database.update_camera(camera)
+            _delete_geometries(database, voted)
+    return {
+        key: replace(record, source="guess", low_px=None, high_px=None, why="")
+        if record.low_px is not None
+        else record
+        for key, record in records.items()
+    }
+
+
+def voting_pairs(
+    path: Path, unknown: Collection[int], extracted_px: int | None
+) -> list[VotingPair]:
+    """Read the verified pairs that can say something about cameras, strongest first.
+
+    Args:
+        path: of the database.
+        unknown: ids of the cameras that are asked for.
+        extracted_px: longest side that photographs were shrunk to before extraction, if any.
+    """
+    with open_database(path) as database:
+        images = {image.image_id: image.camera_id for image in database.read_all_images()}
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        pair_ids, geometries = database.read_two_view_geometries()
+        ids = map(pycolmap.pair_id_to_image_pair, pair_ids)
+        useful = [
+            (pair, geometry)
+            for pair, geometry in zip(ids, geometries, strict=True)
+            if len(geometry.inlier_matches) >= MIN_NUM_INLIERS
+            and geometry.F is not None
+            and geometry.config not in PLANAR
+            and any(images[image_id] in unknown for image_id in pair)
+        ]
+        useful.sort(key=lambda item: (-len(item[1].inlier_matches), item[0]))
+        chosen, num = [], Counter[int]()
+        for pair, geometry in useful:
+            if min(num[image_id] for image_id in pair) < MAX_PAIRS_OF_IMAGE:
+                chosen.append((pair, geometry))
+                num.update(pair)
+        keypoints = {
+            image_id: np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
+            for image_id in num
+        }
+    return [
+        _voting_pair(
+            tuple(cameras[images[image_id]] for image_id in pair),
+            tuple(keypoints[image_id] for image_id in pair),
+            geometry,
+            extracted_px,
+        )
+        for pair, geometry in chosen
+    ]
+
+
+def _voting_pair(
+    cameras: Sequence[pycolmap.Camera],
+    keypoints: Sequence[NDArray[np.float64]],
+    geometry: pycolmap.TwoViewGeometry,
+    extracted_px: int | None,
+) -> VotingPair:
+    matches = np.asarray(geometry.inlier_matches, np.int64)
+    to_px, points, errors = [], [], []
+    for side, camera in enumerate(cameras):
+        longer = max(camera.width, camera.height)
+        center = np.array([camera.principal_point_x, camera.principal_point_y])
+        points.append((keypoints[side][matches[:, side]] - center) / longer)
+        to_px.append(
+            np.array([[longer, 0.0, center[0]], [0.0, longer, center[1]], [0.0, 0.0, 1.0]])
+        )
+        errors.append(MATCH_ERROR_PX / min(longer, extracted_px or longer))
+    fundamental = to_px[1].T @ np.asarray(geometry.F, np.float64) @ to_px[0]
+    matched = MatchedPair.of(
+        points[0], points[1], fundamental / np.linalg.norm(fundamental), float(np.mean(errors))
+    )
+    return VotingPair((cameras[0].camera_id, cameras[1].camera_id), matched)
+
+
+def apply_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
+    """Make the cameras of a database what the records say, and let pairs go unverified by that.
+
+    Args:
+        path: of the database.
+        records: a record for each camera that stays; of its images some may have had another one.
+    """
+    camera_of = {name: key for key, record in records.items() for name in record.names}
+    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
+        rigs = {rig.ref_sensor_id: rig.rig_id for rig in database.read_all_rigs()}
+        frames = {frame.frame_id: frame for frame in database.read_all_frames()}
+        new_priors = set()
+        for camera in database.read_all_cameras():
+            record = records.get(camera.camera_id)
+            if record and record.low_px is not None:
+                for index in camera.focal_length_idxs():
+                    camera.params[index] = record.focal_px
+                if record.source == "pairs" and not camera.has_prior_focal_length:
+                    camera.has_prior_focal_length = True
+                    new_priors.add(camera.camera_id)
+                database.update_camera(camera)
+        for image in database.read_all_images():
+            key = camera_of.get(image.name, image.camera_id)
+            if key != image.camera_id:
+                _move(database, image, key, frames[image.frame_id], rigs)
+        _delete_geometries(database, new_priors)
+    _delete_unused_cameras(path)
+
+
+def _move(
+    database: pycolmap.Database,
+    image: pycolmap.Image,
+    camera_id: int,
+    frame: pycolmap.Frame,
+    rigs: Mapping[pycolmap.sensor_t, int],
+) -> None:
+    """Give an image another camera, and its frame the rig of this camera."""
+    sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
+    moved = pycolmap.Frame(frame_id=frame.frame_id, rig_id=rigs[sensor])
+    moved.add_data_id(pycolmap.data_t(sensor, image.image_id))
+    database.update_frame(moved)
+    image.camera_id = camera_id
+    database.update_image(image)
+
+
+def _delete_geometries(database: pycolmap.Database, cameras: Collection[int]) -> None:
+    """Delete the two-view geometries of all pairs with an image of some cameras."""
+    images = {image.image_id: image.camera_id for image in database.read_all_images()}
+    for pair_id in database.read_two_view_geometry_num_inliers()[0]:
+        pair = pycolmap.pair_id_to_image_pair(pair_id)
+        if any(images[image_id] in cameras for image_id in pair):
+            database.delete_two_view_geometry(*pair)
+
+
+def _delete_unused_cameras(path: Path) -> None:
+    """Delete cameras and rigs without images, which pycolmap cannot; models would have them all."""
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("DELETE FROM rigs WHERE rig_id NOT IN (SELECT rig_id FROM frames)")
+        connection.execute(
+            "DELETE FROM cameras WHERE camera_id NOT IN (SELECT camera_id FROM images)"
+        )

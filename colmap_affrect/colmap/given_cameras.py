@@ -1,0 +1,268 @@
+"""Cameras that the user gives: by options, in a COLMAP model, or in a table by image name."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import registered_names
+from colmap_affrect.errors import OptionError
+from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.options import suggestion
+
+WIDTHS = ("sensor_width_mm", "plate_width_mm")
+COLUMNS = ("name", "camera", "model", "params", "focal_px", "focal_mm", *WIDTHS, "cx", "cy")
+"""Of tables of cameras; only the name is needed."""
+
+
+@dataclass(frozen=True)
+class GivenCamera:
+    """What the user says of the camera of an image; empty where nothing is said.
+
+    Attributes:
+        model: COLMAP's name of the camera model.
+        params: all parameters of the model.
+        focal_px: focal length.
+        focal_widths: focal length in units of the width of what the whole image shows.
+        principal_point: x, y in COLMAP's px, from the corner of the image.
+        size: (width, height) in px of the images that it is of.
+        label: images with one label share a camera.
+        where: file and line.
+    """
+
+    model: str = ""
+    params: tuple[float, ...] = ()
+    focal_px: float = 0.0
+    focal_widths: float = 0.0
+    principal_point: tuple[float, ...] = ()
+    size: tuple[int, ...] = ()
+    label: str = field(default="", compare=False)
+    where: str = field(default="", compare=False)
+
+
+def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
+    """Return the cameras that the user gives by image name; ``""`` stands for all other images.
+
+    Raises:
+        OptionError: for options that are wrong or contradict each other, and for a file that
+            cannot be read, naming the line.
+    """
+    _require_model(options.model, "--camera-model")
+    others = GivenCamera(
+        model=options.model,
+        params=_numbers(options.params, "--camera-params"),
+        focal_px=options.focal_length_px,
+        principal_point=_numbers(options.principal_point, "--principal-point"),
+        where="the options",
+    )
+    if others.params and (others.focal_px or others.principal_point):
+        raise OptionError(
+            "--camera-params: has focal length and principal point already; leave out "
+            "--focal-length-px and --principal-point"
+        )
+    _require_params(others, "--camera-params")
+    if len(others.principal_point) not in (0, 2):
+        raise OptionError(f"--principal-point {options.principal_point}: give cx,cy, two numbers")
+    if not options.cameras_path:
+        return {"": others}
+    path = Path(options.cameras_path)
+    is_model = path.is_dir() or path.name in ("cameras.txt", "cameras.bin")
+    found = _read_model(path) if is_model else _read_table(path, others)
+    return {"": others, **found}
+
+
+def _numbers(text: str, where: str) -> tuple[float, ...]:
+    """Read finite numbers that commas, semicolons or spaces separate."""
+    try:
+        values = tuple(float(word) for word in text.replace(",", " ").replace(";", " ").split())
+    except ValueError as error:
+        raise OptionError(f"{where} {text}: not numbers separated by commas") from error
+    if not all(math.isfinite(value) for value in values):
+        raise OptionError(f"{where} {text}: has a number that is not finite")
+    return values
+
+
+def _require_model(name: str, where: str) -> None:
+    models = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    if name not in models:
+        raise OptionError(f"{where} {name}: not one of {', '.join(models)}")
+
+
+def _require_params(given: GivenCamera, where: str) -> None:
+    """Refuse parameters that do not fit the model."""
+    if not given.params:
+        return
+    expected = pycolmap.Camera.create_from_model_name(1, given.model, 1.0, 1, 1)
+    if len(given.params) != len(expected.params):
+        raise OptionError(
+            f"{where}: {given.model} needs {len(expected.params)} values "
+            f"({expected.params_info}), not {len(given.params)}"
+        )
+    if any(given.params[index] <= 0.0 for index in expected.focal_length_idxs()):
+        raise OptionError(f"{where}: a focal length of {given.params[0]:g} px cannot be")
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise OptionError(f"--cameras-path {path}: cannot be read ({reason})") from error
+
+
+def _read_model(path: Path) -> dict[str, GivenCamera]:
+    """Read the cameras of a COLMAP model: its folder, or its file of cameras."""
+    folder = path if path.is_dir() else path.parent
+    if (folder / "cameras.txt").is_file() and path.name != "cameras.bin":
+        return _read_text_model(folder)
+    if (folder / "rigs.bin").is_file():
+        registered_names(folder)  # damaged files may keep pycolmap busy for ever
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except (RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise OptionError(
+            f"--cameras-path {path}: no COLMAP model, which has cameras.txt and images.txt, or the "
+            f"same as .bin ({reason})"
+        ) from error
+    cameras = {
+        key: GivenCamera(
+            camera.model_name,
+            tuple(camera.params.tolist()),
+            size=(camera.width, camera.height),
+            label=f"model/{key}",
+            where=f"{folder / 'cameras.bin'}, camera {key}",
+        )
+        for key, camera in model.cameras.items()
+    }
+    return {image.name: cameras[image.camera_id] for image in model.images.values()}
+
+
+def _read_text_model(folder: Path) -> dict[str, GivenCamera]:
+    path, listed = folder / "cameras.txt", folder / "images.txt"
+    cameras = {}
+    for number, line in enumerate(_lines(path), start=1):
+        words = line.split()
+        if not words or line.startswith("#"):
+            continue
+        where = f"--cameras-path {path}, line {number}"
+        try:
+            key, size = words[0], (int(words[2]), int(words[3]))
+        except (IndexError, ValueError) as error:
+            raise OptionError(f"{where}: not CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from error
+        _require_model(words[1], where)
+        values = _numbers(" ".join(words[4:]), where)
+        given = GivenCamera(words[1], values, size=size, label=f"model/{key}", where=where)
+        _require_params(given, where)
+        cameras[key] = given
+    if len(cameras) == 1 and not listed.exists():
+        return {"": next(iter(cameras.values()))}
+    # Every other line lists the points of an image, which may be none.
+    lines = [(n, line) for n, line in enumerate(_lines(listed), 1) if not line.startswith("#")]
+    found = {}
+    for number, line in lines[::2]:
+        words = line.split(maxsplit=9)
+        if not words:
+            continue
+        if len(words) != 10 or words[8] not in cameras:
+            raise OptionError(
+                f"--cameras-path {listed}, line {number}: not an image of a camera in {path.name}"
+            )
+        found[words[9]] = cameras[words[8]]
+    return found
+
+
+def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
+    """Read a CSV file with a header; rows may leave cells empty."""
+    where = f"--cameras-path {path}"
+    reader = csv.reader(_lines(path), skipinitialspace=True)
+    try:
+        rows = [(reader.line_num, cells) for cells in reader]
+    except csv.Error as error:
+        raise OptionError(f"{where}, line {reader.line_num}: {error}") from error
+    header = [cell.strip() for cell in rows[0][1]] if rows else []
+    for column in header:
+        if column not in COLUMNS:
+            raise OptionError(f"{where}: unknown column '{column}'{suggestion(column, COLUMNS)}")
+    if "name" not in header or len(set(header)) < len(header):
+        raise OptionError(f"{where}: its first line must have the column 'name', and each once")
+    found: dict[str, GivenCamera] = {}
+    labels: dict[str, GivenCamera] = {}
+    for number, cells in rows[1:]:
+        place = f"{where}, line {number}"
+        if not any(cell.strip() for cell in cells):
+            continue
+        if len(cells) > len(header):
+            raise OptionError(
+                f"{place}: has {len(cells)} cells and the first line {len(header)}; params with "
+                'commas need quotes, "1437,1440,792,524"'
+            )
+        row = {k: cell.strip() for k, cell in zip(header, cells, strict=False) if cell.strip()}
+        name = row.get("name", "")
+        if not name or name in found:
+            raise OptionError(f"{place}: {f'{name} is there twice' if name else 'has no name'}")
+        given = found[name] = _read_row(row, others, place)
+        first = labels.setdefault(given.label, given)
+        if given.label and given != first:
+            raise OptionError(
+                f"{place}: says something else of camera '{row['camera']}' than "
+                f"{first.where.rpartition(', ')[2]}; give them two labels, or the same values"
+            )
+    return found
+
+
+def _read_row(row: Mapping[str, str], others: GivenCamera, where: str) -> GivenCamera:
+    def positive(column: str) -> float:
+        values = _numbers(row.get(column, ""), f"{where}: {column}")
+        if column in row and (len(values) != 1 or values[0] <= 0.0):
+            raise OptionError(f"{where}: {column} {row[column]}: not a positive number")
+        return values[0] if values else 0.0
+
+    def together(first: Iterable[str], second: Iterable[str], problem: str) -> None:
+        both = [[column for column in columns if column in row] for columns in (first, second)]
+        if all(both):
+            raise OptionError(f"{where}: {both[0][0]} and {both[1][0]} {problem}")
+
+    together(["params"], [*COLUMNS[4:]], "say the same twice; leave one out")
+    together(["focal_px"], ["focal_mm", *WIDTHS], "say the same twice; leave one out")
+    together(WIDTHS[:1], WIDTHS[1:], "say the same twice; leave one out")
+    widths = [positive(column) for column in WIDTHS if column in row]
+    if ("focal_mm" in row) != bool(widths):
+        raise OptionError(
+            f"{where}: focal_mm needs sensor_width_mm or plate_width_mm, the width of what the "
+            "whole image shows, and these need focal_mm"
+        )
+    if ("cx" in row) != ("cy" in row):
+        raise OptionError(f"{where}: give both cx and cy, or none")
+    center = [_numbers(row[column], f"{where}: {column}") for column in ("cx", "cy") if "cx" in row]
+    if any(len(values) != 1 for values in center):
+        raise OptionError(f"{where}: cx and cy must be one number each")
+    model = row.get("model", others.model)
+    _require_model(model, f"{where}: model")
+    params = _numbers(row.get("params", ""), f"{where}: params")
+    focal_mm, focal_px = positive("focal_mm"), positive("focal_px")
+    has_focal = bool(params or focal_mm or focal_px)
+    given = GivenCamera(
+        model,
+        params or (others.params if len(row) == 1 + ("camera" in row) else ()),
+        focal_px or (0.0 if has_focal else others.focal_px),
+        focal_mm / widths[0] if widths else 0.0,
+        tuple(v for values in center for v in values) or (() if params else others.principal_point),
+        label=f"label/{row['camera']}" if "camera" in row else "",
+        where=where,
+    )
+    _require_params(given, f"{where}: params")
+    return given
+
+
+def unknown_names(
+    given: Mapping[str, GivenCamera], image_path: Path, names: Sequence[str]
+) -> list[str]:
+    """Return the names in a table that no photograph has; of a model, if it has none of them."""
+    others = [name for name in given if name and not (image_path / name).is_file()]
+    is_model = any(camera.label.startswith("model/") for camera in given.values())
+    return [] if is_model and given.keys() & set(names) else others

@@ -1,0 +1,408 @@
+"""Cameras before any pair is verified: which images share one, and what is known of it.
+
+pycolmap reads the images, and their positions by GPS. Which cameras they have is decided here.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import (
+    TRUSTED,
+    CameraRecord,
+    Given,
+    Source,
+    notable_lines,
+    read_camera_records,
+    write_camera_records,
+)
+from colmap_affrect.colmap.database import (
+    camera_matrix,
+    image_ids,
+    open_database,
+    require_database_space,
+)
+from colmap_affrect.colmap.given_cameras import GivenCamera, read_given_cameras, unknown_names
+from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.images.exif import (
+    MAX_CONTRADICTION,
+    PLAUSIBLE_FOCALS,
+    CameraTags,
+    ExifFocal,
+    exif_focal,
+    read_camera_tags,
+)
+from colmap_affrect.images.photographs import CameraOptions
+
+logger = logging.getLogger(__name__)
+
+Size = tuple[int, int]
+Group = tuple[object, ...]
+"""Images of one group share a camera."""
+
+
+class InitialCameras:
+    """Which images share a camera, and which one."""
+
+    def __init__(self, image_path: Path, options: CameraOptions) -> None:
+        """Read what the user gives.
+
+        Raises:
+            OptionError: when it is wrong.
+        """
+        self.image_path = image_path
+        self.options = options
+        self._given = read_given_cameras(options)
+        self._tags: dict[str, CameraTags | None] = {}
+
+    def given(self, name: str) -> GivenCamera:
+        """Return what the user says of the camera of an image."""
+        return self._given.get(name, self._given[""])
+
+    def size(self, name: str) -> Size | None:
+        """Return the (width, height) that the header of an image tells; None if it is damaged."""
+        tags = self._read(name)
+        return tags.size if tags else None
+
+    def _read(self, name: str) -> CameraTags | None:
+        if name not in self._tags:
+            self._tags[name] = read_camera_tags(self.image_path / name)
+        return self._tags[name]
+
+    def group(self, name: str) -> Group:
+        """Return what is the same for images that share a camera."""
+        match self.options.mode:
+            case "single":
+                return ("single",)
+            case "per-folder":
+                return ("per-folder", str(PurePosixPath(name).parent))
+            case "per-image":
+                return ("per-image", name)
+        label = self.given(name).label
+        if label:
+            return ("given", label)
+        tags = None if self.options.ignore_exif else self._read(name)
+        if tags and tags.identity:
+            return ("exif", *tags.identity, self.given(name))
+        return ("image", name)
+
+    def groups(self, names: Sequence[str]) -> dict[Group, list[str]]:
+        """Return the names of each group, in the order in which the groups begin."""
+        found: dict[Group, list[str]] = {}
+        for name in names:
+            found.setdefault(self.group(name), []).append(name)
+        return found
+
+    def check(self, names: Sequence[str]) -> None:
+        """Refuse images that cannot share the cameras that they should.
+
+        Raises:
+            OptionError: naming the option, or file and line, and what to do.
+        """
+        unknown = unknown_names(self._given, self.image_path, names)
+        if unknown:
+            given = self.given(unknown[0])
+            raise OptionError(f"{given.where}: {unknown[0]} is not in {self.image_path}")
+        for group, same in self.groups(names).items():
+            self._given_of(same)
+            sizes = {name: size for name in same if (size := self.size(name))}
+            for name, size in sizes.items():
+                first, expected = next(iter(sizes.items()))
+                if size != expected:
+                    raise OptionError(
+                        f"{self._who_groups(group, name)}: {first} is {expected[0]} x "
+                        f"{expected[1]} px, {name} is {size[0]} x {size[1]} px; images that share "
+                        "a camera must have one size"
+                    )
+                given = self.given(name)
+                if given.size and size != given.size:
+                    raise OptionError(
+                        f"{given.where}: its camera is of {given.size[0]} x {given.size[1]} px, "
+                        f"and {name} has {size[0]} x {size[1]} px; give cameras of these images"
+                    )
+
+    def _who_groups(self, group: Group, name: str) -> str:
+        if group[0] in ("single", "per-folder"):
+            return f"--camera-mode {group[0]}"
+        return self.given(name).where
+
+    def _given_of(self, names: Sequence[str]) -> GivenCamera:
+        """Return what the user says of the one camera of some images."""
+        named = [self._given[name] for name in names if name in self._given]
+        first = named[0] if named else self._given[""]
+        for other in named:
+            if other != first:
+                raise OptionError(
+                    f"{other.where}: says something else than {first.where.rpartition(', ')[2]}, "
+                    f"and --camera-mode {self.options.mode} lets these images share a camera"
+                )
+        return first
+
+    def camera(self, names: Sequence[str], size: Size) -> tuple[pycolmap.Camera, CameraRecord]:
+        """Return the camera that images of one size share, and what is known of it."""
+        given, longer = self._given_of(names), max(size)
+        camera = pycolmap.Camera.create_from_model_name(
+            1, given.model, self.options.default_focal_length_factor * longer, *size
+        )
+        source, why = self._set_focal(camera, given, names)
+        parts: list[Given] = ["focal"] if source == "given" else []
+        if given.params:
+            camera.params = list(given.params)
+        elif given.principal_point and len(camera.principal_point_idxs()):
+            camera.principal_point_x, camera.principal_point_y = given.principal_point
+        if given.params or given.principal_point:
+            parts.append("principal-point")
+        if given.params or (parts and not len(camera.extra_params_idxs())):
+            parts.append("distortion")
+        camera.has_prior_focal_length = source in TRUSTED
+        focal = _focal(camera)
+        if source == "given" and focal and not _is_plausible(focal / longer):
+            why = f"{focal / longer:.2g} longer sides; is it in px of the stored files?"
+        return camera, CameraRecord(
+            tuple(sorted(names)), source, focal, why=why, size=size, given=tuple(parts)
+        )
+
+    def _set_focal(
+        self, camera: pycolmap.Camera, given: GivenCamera, names: Sequence[str]
+    ) -> tuple[Source, str]:
+        if given.params:
+            return "given", ""
+        focal = given.focal_px or given.focal_widths * camera.width
+        source: Source = "given"
+        why = ""
+        if not focal:
+            found = self._exif_focal(names)
+            focal = found.focal_px or 0.0
+            source, why = ("exif-rescaled" if found.is_rescaled else "exif"), found.why
+        if not focal:
+            return "guess", why
+        for index in camera.focal_length_idxs():
+            camera.params[index] = focal
+        return source, why
+
+    def _exif_focal(self, names: Sequence[str]) -> ExifFocal:
+        """Return the focal length that EXIF gives images of one camera; first that has one."""
+        if self.options.ignore_exif:
+            return ExifFocal(None, why="EXIF is ignored")
+        found = [_checked_focal(tags) for tags in map(self._read, names) if tags]
+        trusted = [focal for focal in found if focal.focal_px]
+        if not trusted:
+            return found[0] if found else ExifFocal(None, why="no readable header")
+        values = [focal.focal_px or 0.0 for focal in trusted]
+        if max(values) > MAX_CONTRADICTION * min(values):
+            why = f"EXIF of its images says {min(values):.0f} to {max(values):.0f} px"
+            return ExifFocal(None, why=why)
+        return trusted[0]
+
+    def matrix(self, name: str, names: Sequence[str]) -> NDArray[np.float64] | None:
+        """Return the (3, 3) intrinsics that an image will have, in pixel-centre px.
+
+        Args:
+            name: of the image.
+            names: all images, of which some may share its camera.
+
+        Returns:
+            The intrinsics without distortion; None for a file that cannot be read.
+        """
+        size = self.size(name)
+        if not size:
+            return None
+        same = self.groups(names).get(self.group(name), [name])
+        return camera_matrix(self.camera(same, size)[0])
+
+
+def _checked_focal(tags: CameraTags) -> ExifFocal:
+    make, model, _ = tags.body
+    width = sensor_width_mm(make, model) if tags.focal_mm else None
+    return exif_focal(tags, width)
+
+
+@cache
+def sensor_width_mm(make: str, model: str) -> float | None:
+    """Return the longer side of the sensor of a camera model that COLMAP knows, else None.
+
+    COLMAP's table is only asked when an image is read, so it is given one of 8 px.
+    """
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = make, model
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = IFDRational(1)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "one.jpg"
+        Image.new("L", (8, 8)).save(path, exif=exif)
+        bitmap = pycolmap.Bitmap.read(path, as_rgb=False)
+    focal = bitmap.exif_focal_length() if bitmap else None
+    return 8.0 / focal if focal else None
+
+
+def _focal(camera: pycolmap.Camera) -> float:
+    return float(camera.mean_focal_length()) if len(camera.focal_length_idxs()) else 0.0
+
+
+def _is_plausible(longer_sides: float) -> bool:
+    return PLAUSIBLE_FOCALS[0] <= longer_sides <= PLAUSIBLE_FOCALS[1]
+
+
+def import_images(
+    path: Path, image_path: Path, names: Sequence[str], options: CameraOptions
+) -> list[str]:
+    """Add cameras, rigs, frames and images for the names that a database lacks.
+
+    Sizes and GPS priors are read by COLMAP, from the files as stored, not rotated. Images that
+    are added later share cameras as if all had been added at once. All of them are added, or none;
+    a new database appears with them.
+
+    Returns:
+        Names of the images that COLMAP cannot read, or whose size is not that of their camera.
+    """
+    initial = InitialCameras(image_path, options)
+    new = path if path.exists() else path.with_name(path.name + ".new")
+    read = path.with_name(path.name + ".read")
+    for file in {path, new, read} if new != path else {read}:
+        _remove_database(file)
+    missing = sorted(set(names) - set(image_ids(new)))
+    if missing:
+        require_database_space(new, 2 * len(missing))
+        image_ids(read)  # makes it
+        pycolmap.import_images(read, image_path, pycolmap.CameraMode.PER_IMAGE, missing)
+        with open_database(read) as found, open_database(new) as database:
+            _Import(initial, found, database).add()
+        _remove_database(read)
+    if new != path:
+        new.replace(path)
+    return sorted(set(names) - set(image_ids(path)))
+
+
+def _remove_database(path: Path) -> None:
+    for suffix in ("", "-wal", "-shm"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
+class _Import:
+    """Takes over images that COLMAP has read into a database of their own."""
+
+    def __init__(
+        self, initial: InitialCameras, found: pycolmap.Database, database: pycolmap.Database
+    ) -> None:
+        self.initial, self.database = initial, database
+        self.images = sorted(found.read_all_images(), key=lambda image: image.name)
+        cameras = {camera.camera_id: camera for camera in found.read_all_cameras()}
+        self.sizes = {
+            image.name: (cameras[image.camera_id].width, cameras[image.camera_id].height)
+            for image in self.images
+        }
+        self.priors = {prior.corr_data_id.id: prior for prior in found.read_all_pose_priors()}
+
+    def add(self) -> None:
+        """Write all of them, or none."""
+        groups = self.initial.groups([image.name for image in self.images])
+        cameras = self._known_cameras()
+        new = {
+            group: self._camera(names) for group, names in groups.items() if group not in cameras
+        }
+        rigs = {rig.ref_sensor_id: rig.rig_id for rig in self.database.read_all_rigs()}
+        with pycolmap.DatabaseTransaction(self.database):
+            for camera in new.values():
+                camera.camera_id = self.database.write_camera(camera)
+            cameras |= new
+            for image in self.images:
+                camera = cameras[self.initial.group(image.name)]
+                if self.sizes[image.name] == (camera.width, camera.height):
+                    self._write_image(image, camera, rigs)
+
+    def _known_cameras(self) -> dict[Group, pycolmap.Camera]:
+        """Return the cameras of the database that new images of a group get."""
+        cameras = {camera.camera_id: camera for camera in self.database.read_all_cameras()}
+        existing = self.initial.options.existing_camera_id
+        if existing >= 0:
+            if existing not in cameras:
+                raise DatabaseError(f"the database has no camera {existing} (existing_camera_id)")
+            return {self.initial.group(name): cameras[existing] for name in self.sizes}
+        used: dict[Group, set[int]] = defaultdict(set)
+        for image in self.database.read_all_images():
+            used[self.initial.group(image.name)].add(image.camera_id)
+        return {group: cameras[min(ids)] for group, ids in used.items() if len(ids) == 1}
+
+    def _camera(self, names: Sequence[str]) -> pycolmap.Camera:
+        size = self.sizes[names[0]]
+        return self.initial.camera([n for n in names if self.sizes[n] == size], size)[0]
+
+    def _write_image(
+        self, image: pycolmap.Image, camera: pycolmap.Camera, rigs: dict[pycolmap.sensor_t, int]
+    ) -> None:
+        if camera.sensor_id not in rigs:
+            rig = pycolmap.Rig()
+            rig.add_ref_sensor(camera.sensor_id)
+            rigs[camera.sensor_id] = self.database.write_rig(rig)
+        written = pycolmap.Image(name=image.name, camera_id=camera.camera_id)
+        written.image_id = self.database.write_image(written)
+        frame = pycolmap.Frame(rig_id=rigs[camera.sensor_id])
+        frame.add_data_id(written.data_id)
+        self.database.write_frame(frame)
+        prior = self.priors.get(image.image_id)
+        if prior:
+            prior.corr_data_id = written.data_id
+            self.database.write_pose_prior(prior)
+
+
+def record_cameras(
+    database_path: Path,
+    records_path: Path,
+    initial: InitialCameras | None = None,
+    known: Mapping[int, CameraRecord] | None = None,
+) -> None:
+    """Put the cameras that are not on record yet on record, and log what is worth knowing of them.
+
+    Args:
+        database_path: the database.
+        records_path: where the records are.
+        initial: what the cameras were made from; None for those of another database.
+        known: records of the other database, if there are any.
+    """
+    before = read_camera_records(records_path)
+    known = before or known or {}
+    with open_database(database_path) as database:
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        images = database.read_all_images()
+    names: dict[int, list[str]] = defaultdict(list)
+    for image in images:
+        names[image.camera_id].append(image.name)
+    records = {}
+    for camera_id, same in names.items():
+        record = known.get(camera_id)
+        if record and set(record.names) <= set(same):
+            records[camera_id] = replace(record, names=tuple(sorted(same)))
+        else:
+            records[camera_id] = _record(cameras[camera_id], tuple(sorted(same)), initial)
+    if records != before:
+        write_camera_records(records_path, records)
+        for line in notable_lines(r for key, r in records.items() if r != before.get(key)):
+            logger.info("cameras: %s", line)
+
+
+def _record(
+    camera: pycolmap.Camera, names: tuple[str, ...], initial: InitialCameras | None
+) -> CameraRecord:
+    """Say what is known of a camera: as it was made here, or only by COLMAP's flag."""
+    size = (camera.width, camera.height)
+    if initial:
+        made, record = initial.camera(names, size)
+        if _values(made) == _values(camera):
+            return record
+    source: Source = "given" if camera.has_prior_focal_length else "guess"
+    return CameraRecord(names, source, _focal(camera), size=size)
+
+
+def _values(camera: pycolmap.Camera) -> tuple[object, ...]:
+    return camera.model_name, camera.params.tolist(), camera.has_prior_focal_length

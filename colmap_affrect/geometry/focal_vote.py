@@ -1,0 +1,242 @@
+"""A vote of matched pairs over the focal lengths of the cameras that took their images.
+
+Every pair votes for the focal lengths of its two images; a pair that is wrong counts for little
+more than one that is right (:data:`MAX_VOTE`). Images of one camera vote together. Cameras that are
+tied by pairs inform each other: belief propagation on the graph of the cameras.
+
+Focal lengths are in units of the longer side.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.geometry.focal_evidence import MatchedPair, log_evidence
+
+Array = NDArray[np.float64]
+
+FOCALS = np.geomspace(0.3, 10.0, 41)
+"""Candidates, 9 per cent apart: 120 to 6 degrees."""
+
+STEP = 2
+"""Where two cameras are asked for at once every second candidate will do."""
+
+MIN_PROMISE = -12.0
+"""Tables of two cameras are made at every second of these candidates first; the others are looked
+at beside those that fall short of the best one by less."""
+
+PRIOR_FOCAL, PRIOR_SIGMA = 1.1, 0.6
+"""Lenses of photographs: most between .6 and 2 longer sides (logarithmic)."""
+
+MAX_VOTE = 3.0
+"""Largest difference of log-evidence that one pair makes."""
+
+NUM_ITERATIONS, DAMPING = 30, 0.3
+"""Of belief propagation."""
+
+NUM_RESAMPLES = 50
+"""Votes among pairs drawn with replacement: do the pairs agree?"""
+
+LOW, HIGH = 0.05, 0.95
+"""Quantiles of an interval."""
+
+
+@dataclass(frozen=True)
+class Ballot:
+    """The votes of one pair.
+
+    Attributes:
+        cameras: of both images, twice the same where they share it.
+        evidence: (F,) for one camera, also where the other one is known, else (C, C) for every
+            second candidate.
+    """
+
+    cameras: tuple[int, int]
+    evidence: Array
+
+
+@dataclass(frozen=True)
+class FocalEstimate:
+    """What a vote says of one camera, longer sides.
+
+    Attributes:
+        focal: most likely one.
+        low: lower end of the interval that holds it with 90 per cent.
+        high: upper end.
+    """
+
+    focal: float
+    low: float
+    high: float
+
+    @property
+    def spread(self) -> float:
+        """Ratio of both ends."""
+        return self.high / self.low
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Estimates by camera, and the logarithm of the evidence for these cameras as a whole."""
+
+    estimates: Mapping[int, FocalEstimate]
+    log_evidence: float
+
+
+def ballot(
+    pair: MatchedPair, cameras: tuple[int, int], known: Mapping[int, float]
+) -> Ballot | None:
+    """Ask one pair; None where both focal lengths are known.
+
+    Args:
+        pair: its matches.
+        cameras: of both images.
+        known: focal lengths of cameras that need no vote.
+    """
+    first, second = (known.get(camera) for camera in cameras)
+    if first is not None and second is not None:
+        return None
+    if cameras[0] == cameras[1]:
+        return Ballot(cameras, log_evidence(pair, FOCALS, FOCALS))
+    if first is not None:
+        evidence = log_evidence(pair, np.full_like(FOCALS, first), FOCALS)
+        return Ballot((cameras[1], cameras[1]), evidence)
+    if second is not None:
+        evidence = log_evidence(pair, FOCALS, np.full_like(FOCALS, second))
+        return Ballot((cameras[0], cameras[0]), evidence)
+    return Ballot(cameras, _table(pair, FOCALS[::STEP]))
+
+
+def _table(pair: MatchedPair, focals: Array) -> Array:
+    """Return the evidence for two cameras; hopeless candidates get what the best of them has."""
+    grid = np.stack(np.meshgrid(focals, focals, indexing="ij"), axis=2)
+    table = np.full(grid.shape[:2], np.nan)
+    table[::2, ::2] = log_evidence(pair, *grid[::2, ::2].reshape(-1, 2).T).reshape(
+        grid[::2, ::2].shape[:2]
+    )
+    if not table[::2, ::2].any():  # the pair fits no camera
+        return np.zeros_like(table)
+    promising = cv2.dilate((table > MIN_PROMISE).astype(np.uint8), np.ones((3, 3))) > 0
+    table[promising] = log_evidence(pair, *grid[promising].T)
+    return np.where(promising, table, MIN_PROMISE)
+
+
+def evidence_for_one(ballots: Sequence[Ballot]) -> float:
+    """Return the logarithm of the evidence if all cameras of the ballots are one.
+
+    To be compared with that of :func:`count`.
+    """
+    focals = _candidates(ballots)
+    same = [
+        Ballot((0, 0), item.evidence if item.evidence.ndim == 1 else np.diagonal(item.evidence))
+        for item in ballots
+    ]
+    return _propagate(same, [0], focals)[1]
+
+
+def _candidates(ballots: Sequence[Ballot]) -> Array:
+    return FOCALS if all(item.evidence.ndim == 1 for item in ballots) else FOCALS[::STEP]
+
+
+def count(ballots: Sequence[Ballot], cameras: Sequence[int], *, resample: bool = True) -> Outcome:
+    """Count the votes.
+
+    Args:
+        ballots: of all pairs.
+        cameras: all that are asked for; one without ballots has the prior's focal length.
+        resample: widen intervals where the pairs do not agree.
+    """
+    focals = _candidates(ballots)
+    marginals, total = _propagate(ballots, cameras, focals)
+    draws = [marginals]
+    rng = np.random.default_rng(0)
+    for _ in range(NUM_RESAMPLES if resample and ballots else 0):
+        chosen = rng.integers(len(ballots), size=len(ballots))
+        draws.append(_propagate([ballots[i] for i in chosen], cameras, focals)[0])
+    peaks = np.stack([_peaks(draw, focals) for draw in draws])
+    sums = np.cumsum(marginals, axis=1)
+    estimates = {}
+    for row, camera in enumerate(cameras):
+        inside = [np.interp(level, sums[row], focals) for level in (LOW, HIGH)]
+        among = np.quantile(peaks[:, row], [LOW, HIGH])
+        low, high = min(inside[0], among[0]), max(inside[1], among[1])
+        estimates[camera] = FocalEstimate(float(peaks[0, row]), float(low), float(high))
+    return Outcome(estimates, total)
+
+
+def _peaks(marginals: Array, focals: Array) -> Array:
+    """Return the (C,) most likely focal lengths, between the candidates."""
+    best = np.clip(marginals.argmax(axis=1), 1, len(focals) - 2)
+    rows = np.arange(len(marginals))
+    left, middle, right = (np.log(marginals[rows, best + i] + 1e-300) for i in (-1, 0, 1))
+    curvature = np.minimum(left - 2 * middle + right, -1e-9)
+    shift = np.clip(0.5 * (left - right) / curvature, -1.0, 1.0)
+    return np.asarray(focals[best] * (focals[1] / focals[0]) ** shift)
+
+
+def _votes(evidence: Array) -> Array:
+    """Return the likelihoods of one ballot, between exp(-MAX_VOTE) and 1."""
+    return np.asarray(np.exp(np.logaddexp(evidence, -MAX_VOTE) - np.logaddexp(0.0, -MAX_VOTE)))
+
+
+def _propagate(
+    ballots: Sequence[Ballot], cameras: Sequence[int], focals: Array
+) -> tuple[Array, float]:
+    """Return the (C, F) marginals, and the logarithm of the evidence (Bethe's approximation)."""
+    row_of = {camera: row for row, camera in enumerate(cameras)}
+    prior = np.exp(-0.5 * (np.log(focals / PRIOR_FOCAL) / PRIOR_SIGMA) ** 2)
+    own = np.tile(np.log(prior / prior.sum()), (len(cameras), 1))
+    tables: dict[tuple[int, int], Array] = defaultdict(lambda: np.zeros((len(focals),) * 2))
+    for item in ballots:
+        first, second = (row_of[camera] for camera in item.cameras)
+        evidence = item.evidence
+        if evidence.ndim == 1 and len(evidence) != len(focals):
+            evidence = evidence[::STEP]
+        votes = np.log(_votes(evidence))
+        if evidence.ndim == 1:
+            own[first] += votes
+        elif first < second:
+            tables[first, second] += votes
+        else:
+            tables[second, first] += votes.T
+    edges = np.array(sorted(tables), int).reshape(-1, 2)
+    # every edge twice, once for each direction a message takes
+    sources, targets = edges.T.ravel(), edges[:, ::-1].T.ravel()
+    forward = [np.exp(tables[first, second]) for first, second in edges.tolist()]
+    links = np.array(forward + [table.T for table in forward]).reshape(-1, *[len(focals)] * 2)
+    messages = np.zeros((len(links), len(focals)))
+    opposite = np.roll(np.arange(len(links)), len(edges))
+    for _ in range(NUM_ITERATIONS if len(edges) else 0):
+        outgoing = _beliefs(own, targets, messages)[sources] - messages[opposite]
+        outgoing = np.exp(outgoing - outgoing.max(axis=1, keepdims=True))
+        new = np.log(np.einsum("ef,efg->eg", outgoing, links))
+        new -= new.max(axis=1, keepdims=True)
+        messages = DAMPING * messages + (1.0 - DAMPING) * new
+    beliefs = _beliefs(own, targets, messages)
+    total = float(_log_sums(beliefs).sum())
+    cavities = beliefs[sources] - messages[opposite]
+    for edge, (first, second) in enumerate(edges.tolist()):
+        joint = (
+            cavities[edge][:, None] + np.log(forward[edge]) + cavities[edge + len(edges)][None, :]
+        )
+        total += float(_log_sums(joint.reshape(1, -1))[0])
+        total -= float(_log_sums(beliefs[[first, second]]).sum())
+    shares = np.exp(beliefs - beliefs.max(axis=1, keepdims=True))
+    return shares / shares.sum(axis=1, keepdims=True), total
+
+
+def _beliefs(own: Array, targets: NDArray[np.int64], messages: Array) -> Array:
+    found = own.copy()
+    np.add.at(found, targets, messages)
+    return found
+
+
+def _log_sums(values: Array) -> Array:
+    top = values.max(axis=1)
+    return np.asarray(top + np.log(np.exp(values - top[:, None]).sum(axis=1)))

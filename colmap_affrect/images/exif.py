@@ -1,0 +1,263 @@
+"""What EXIF says of the camera of a photograph, and whether that can be true.
+
+EXIF tells of the file that a camera wrote. What has been shrunk, cropped or edited since often
+keeps it as it was, so that every statement is held against the others and against the file.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import ExifTags, Image
+
+FILM_DIAGONAL_MM = 43.27
+"""Of 35 mm film, to which equivalent focal lengths refer (by COLMAP's rounding)."""
+MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+"""By EXIF's number of the unit of focal-plane resolutions: inches, cm, and, as COLMAP reads them,
+mm and micrometres."""
+PLAUSIBLE_FOCALS = (0.3, 6.0)
+"""In longer sides: fields of view of 118 to 10 degrees, which hold nearly all lenses."""
+MAX_CONTRADICTION = 1.15
+"""Ratio of two focal lengths that still agree: equivalents and widths of sensors are rounded."""
+MAX_ASPECT_ERROR = 0.01
+"""Lossless rotation cuts off up to 15 px, shrinking rounds."""
+SENSOR_ASPECTS = (3 / 2, 4 / 3, 16 / 9)
+"""Photographs of another shape have been cropped, or may have been."""
+MAX_THUMBNAIL_PX = 160
+"""Longer side of the thumbnails that cameras put into their files, often with black bars."""
+
+RESOLUTION, EQUIVALENT, SENSOR = "focal-plane resolution", "35 mm equivalent", "known sensor"
+
+
+@dataclass(frozen=True)
+class CameraTags:
+    """What the file of a photograph says of its camera; missing and absurd values are None.
+
+    Attributes:
+        size: (width, height) of the stored pixels.
+        body: make, model and serial number, as far as they are there.
+        lens: model of the lens.
+        focal_mm: focal length.
+        equivalent_mm: of a camera with 35 mm film and the same field of view.
+        px_per_mm: focal-plane resolution, horizontal and vertical, the second may be missing.
+        original_size: (width, height) of the pixels when EXIF was written.
+        zoom: of the part of the sensor that was enlarged; 1 without.
+        absurd: names of tags whose values cannot be true.
+    """
+
+    size: tuple[int, int]
+    body: tuple[str, str, str] = ("", "", "")
+    lens: str = ""
+    focal_mm: float | None = None
+    equivalent_mm: float | None = None
+    px_per_mm: tuple[float, float | None] | None = None
+    original_size: tuple[int, int] | None = None
+    zoom: float = 1.0
+    absurd: tuple[str, ...] = ()
+
+    @property
+    def identity(self) -> tuple[object, ...] | None:
+        """What photographs of one camera have in common; None where EXIF does not tell cameras."""
+        make, model, _ = self.body
+        if not (make and model and (self.focal_mm or self.equivalent_mm)) or self.was_cropped:
+            return None
+        return (*self.body, self.lens, self.focal_mm, self.equivalent_mm, self.zoom, self.size)
+
+    @property
+    def scale(self) -> float:
+        """Longer side in units of the one that EXIF tells of, whichever way it was turned."""
+        scale = max(self.size) / max(self.original_size or self.size)
+        return 1.0 if _similar(scale, 1.0) else scale
+
+    @property
+    def was_cropped(self) -> bool:
+        """Whether the shape is not that of the pixels that EXIF tells of."""
+        return not _similar(_aspect(self.size), _aspect(self.original_size or self.size))
+
+
+@dataclass(frozen=True)
+class ExifFocal:
+    """A focal length, or why there is none.
+
+    Attributes:
+        focal_px: in px of the stored file; None where EXIF does not say or cannot be trusted.
+        is_rescaled: it had to be scaled to the photograph, COLMAP would take another one.
+        why: what was found wrong; empty if nothing.
+    """
+
+    focal_px: float | None
+    is_rescaled: bool = False
+    why: str = ""
+
+
+def read_camera_tags(path: Path) -> CameraTags | None:
+    """Read the header of a photograph, without its pixels; None if it has no readable one."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow warns of large photographs and broken EXIF
+            with Image.open(path) as image:
+                return _with_exif(image)
+    except Exception:  # noqa: BLE001 - damaged files raise nearly anything in Pillow
+        return None
+
+
+def _with_exif(image: Image.Image) -> CameraTags:
+    size = image.size
+    tiff: Any = getattr(image, "tag_v2", None)
+    if image.format == "TIFF" and tiff:  # Pillow turns what has an orientation
+        size = int(tiff[ExifTags.Base.ImageWidth]), int(tiff[ExifTags.Base.ImageLength])
+    if image.format == "PNG" and "exif" not in image.info:  # else Pillow reads the pixels
+        return CameraTags(size)
+    try:
+        exif = image.getexif()
+        tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+    except Exception:  # noqa: BLE001 - as above
+        return CameraTags(size, absurd=("EXIF",))
+    return _camera_tags(size, tags)
+
+
+def _camera_tags(size: tuple[int, int], tags: Mapping[int, Any]) -> CameraTags:
+    tag = ExifTags.Base
+    absurd: list[str] = []
+
+    def number(key: ExifTags.Base) -> float | None:
+        if key not in tags or tags[key] in (0, 0.0):  # how many programs say 'not known'
+            return None
+        value = _positive(tags[key])
+        if value is None:
+            absurd.append(key.name)
+        return value
+
+    unit = MM_PER_UNIT.get(int(_positive(tags.get(tag.FocalPlaneResolutionUnit)) or 0))
+    across, down = number(tag.FocalPlaneXResolution), number(tag.FocalPlaneYResolution)
+    width, height = number(tag.ExifImageWidth), number(tag.ExifImageHeight)
+    return CameraTags(
+        size,
+        (
+            _text(tags.get(tag.Make)),
+            _text(tags.get(tag.Model)),
+            _text(tags.get(tag.BodySerialNumber)),
+        ),
+        _text(tags.get(tag.LensModel)),
+        number(tag.FocalLength),
+        number(tag.FocalLengthIn35mmFilm),
+        (across / unit, down / unit if down else None) if across and unit else None,
+        (int(width), int(height)) if width and height and min(width, height) >= 1 else None,
+        max(1.0, number(tag.DigitalZoomRatio) or 1.0),
+        tuple(absurd),
+    )
+
+
+def _positive(value: object) -> float | None:
+    """Return a positive number in single precision, as COLMAP reads it; None for others."""
+    try:
+        with np.errstate(all="ignore"):
+            number = float(np.float32(float(value)))  # type: ignore[arg-type]
+    except (TypeError, ValueError, ArithmeticError):
+        return None
+    return number if math.isfinite(number) and number > 0.0 else None
+
+
+def _text(value: object) -> str:
+    return value.strip(" \t\r\n\0") if isinstance(value, str) else ""
+
+
+def _aspect(size: tuple[int, int]) -> float:
+    return max(size) / min(size)
+
+
+def _similar(first: float, second: float) -> bool:
+    return abs(first / second - 1.0) <= MAX_ASPECT_ERROR
+
+
+def exif_focal(tags: CameraTags, sensor_width_mm: float | None = None) -> ExifFocal:
+    """Decide on the focal length that EXIF gives a photograph.
+
+    Of statements that agree the first counts, in COLMAP's order: 35 mm equivalent, focal-plane
+    resolution, width of the sensor of this model.
+
+    Args:
+        tags: of the photograph.
+        sensor_width_mm: of the longer side of the sensor of this model, where it is known.
+    """
+    if tags.was_cropped:
+        return ExifFocal(None, why=f"cropped or padded: {_sizes(tags)}")
+    if tags.original_size and tags.scale < 1.0 and max(tags.size) <= MAX_THUMBNAIL_PX:
+        return ExifFocal(None, why=f"a thumbnail: {_sizes(tags)}")
+    if tags.absurd:
+        problem = f"EXIF has an absurd {' and '.join(tags.absurd)}"
+    else:
+        problem = "EXIF has no focal length that can be converted to px" if _speaks(tags) else ""
+    stated = _statements(tags, sensor_width_mm)
+    longer = max(tags.size)
+    low, high = PLAUSIBLE_FOCALS
+    plausible = {k: f for k, f in stated.items() if low * longer <= f <= high * longer}
+    if not plausible:
+        key, focal = next(iter(stated.items()), ("", 0.0))
+        wrong = f"EXIF's {key} would be a focal length of {focal / longer:.2g} longer sides"
+        return ExifFocal(None, why=wrong if stated else problem or "no EXIF focal length")
+    return _reconciled(tags, stated, plausible)
+
+
+def _speaks(tags: CameraTags) -> bool:
+    return bool(tags.focal_mm or tags.equivalent_mm)
+
+
+def _sizes(tags: CameraTags) -> str:
+    size, original = tags.size, tags.original_size or tags.size
+    return f"{size[0]} x {size[1]} px, when taken {original[0]} x {original[1]}"
+
+
+def _statements(tags: CameraTags, sensor_width_mm: float | None) -> dict[str, float]:
+    """Return the focal lengths in px that can be derived, in COLMAP's order."""
+    found = {}
+    if tags.equivalent_mm:
+        found[EQUIVALENT] = tags.equivalent_mm / FILM_DIAGONAL_MM * math.hypot(*tags.size)
+    if tags.focal_mm and tags.zoom == 1.0:
+        if tags.px_per_mm and _is_square(*tags.px_per_mm):
+            found[RESOLUTION] = tags.focal_mm * tags.px_per_mm[0] * tags.scale
+        if sensor_width_mm:
+            found[SENSOR] = tags.focal_mm / sensor_width_mm * max(tags.size)
+    return found
+
+
+def _is_square(across: float, down: float | None) -> bool:
+    return down is None or 1 / MAX_CONTRADICTION <= across / down <= MAX_CONTRADICTION
+
+
+def _reconciled(
+    tags: CameraTags, stated: Mapping[str, float], plausible: Mapping[str, float]
+) -> ExifFocal:
+    """Choose among plausible focal lengths, of which some may contradict each other.
+
+    Equivalents and sensors count for the whole frame, resolutions for pixels: against a resolution
+    of more pixels the others are right if the photograph was shrunk, wrong if it was cropped.
+    """
+    colmaps, pixels = next(iter(stated)), plausible.get(RESOLUTION)
+    key, focal = next(iter(plausible.items()))
+    if not all(_agree(other, focal) for other in plausible.values()):
+        agreeing = [k for k, f in plausible.items() if pixels and _agree(f, pixels)]
+        framed = {k: f for k, f in plausible.items() if k != RESOLUTION}
+        whole = any(_similar(_aspect(tags.size), aspect) for aspect in SENSOR_ASPECTS)
+        if len(agreeing) > 1:
+            key = agreeing[0]
+        elif pixels and whole and pixels > max(framed.values()):
+            key = next(iter(framed))
+        else:
+            values = " and ".join(f"{f:.0f} px by its {k}" for k, f in plausible.items())
+            return ExifFocal(None, why=f"EXIF contradicts itself: {values}")
+    if key == RESOLUTION and tags.scale != 1.0:
+        return ExifFocal(plausible[key], True, f"shrunk: {_sizes(tags)}")
+    wrong = [k for k, f in stated.items() if not _agree(f, plausible[key])]
+    why = f"EXIF's {' and '.join(wrong)} is not that of these pixels, its {key} counts"
+    return ExifFocal(plausible[key], key != colmaps, why if wrong else "")
+
+
+def _agree(first: float, second: float) -> bool:
+    return 1 / MAX_CONTRADICTION <= first / second <= MAX_CONTRADICTION

@@ -1,0 +1,80 @@
+"""Focal lengths that mapping starts from where nobody knows them, and cameras that ran away."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.mappers.base import MappingTask
+
+MIN_STEP = 1.15
+"""Starts that are nearer to one another end in the same model."""
+
+MAX_EXCESS = 1.5
+"""How far beyond its interval a focal length may be refined; a camera that few points see goes
+anywhere."""
+
+
+def focal_starts(task: MappingTask) -> list[dict[int, float]]:
+    """Return focal lengths by camera id to start from, px; the first start has those of the task.
+
+    The others are halfway to both ends of what the pairs allow, for all unknown cameras at once.
+    """
+    unknown = {key: record for key, record in task.cameras.items() if record.source == "guess"}
+    found: list[dict[int, float]] = [{}]
+    for side in ("low_px", "high_px"):
+        moved = dict(_halfway(unknown, side))
+        if moved:
+            found.append(moved)
+    return found
+
+
+def _halfway(records: Mapping[int, CameraRecord], side: str) -> Iterator[tuple[int, float]]:
+    for key, record in records.items():
+        end = getattr(record, side)
+        if end:
+            focal = float((record.focal_px * end) ** 0.5)
+            if max(focal, record.focal_px) > MIN_STEP * min(focal, record.focal_px):
+                yield key, focal
+
+
+def started(task: MappingTask, focals: Mapping[int, float], path: Path) -> MappingTask:
+    """Return a task that starts from other focal lengths, with a database of its own.
+
+    Args:
+        task: as it is.
+        focals: px, by camera id.
+        path: where the database goes; one that is there is replaced.
+    """
+    if not focals:
+        return task
+    path.unlink(missing_ok=True)
+    copy_database(task.database_path, path)
+    with open_database(path) as database:
+        for camera in database.read_all_cameras():
+            for index in camera.focal_length_idxs() if camera.camera_id in focals else ():
+                camera.params[index] = focals[camera.camera_id]
+            database.update_camera(camera)
+    return replace(task, database_path=path, snapshot_path=None)
+
+
+def runaways(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:
+    """Return the ids of cameras that were refined far beyond what their pairs allow."""
+    used = {model.images[image_id].camera_id for image_id in model.reg_image_ids()}
+    return {
+        key
+        for key, record in task.cameras.items()
+        if key in used and not is_within(model.cameras[key].mean_focal_length(), record)
+    }
+
+
+def is_within(focal_px: float, record: CameraRecord) -> bool:
+    """Tell whether a focal length agrees with what is on record of it; so does any without."""
+    if record.low_px is None or record.high_px is None:
+        return True
+    return record.low_px / MAX_EXCESS <= focal_px <= record.high_px * MAX_EXCESS

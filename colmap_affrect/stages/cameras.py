@@ -1,0 +1,97 @@
+"""Cameras: a vote of the verified pairs over those that nobody knows, into the database."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from colmap_affrect.colmap.camera_records import (
+    notable_lines,
+    read_camera_records,
+    write_camera_records,
+)
+from colmap_affrect.colmap.camera_vote import (
+    CameraVote,
+    apply_records,
+    forget_votes,
+    needs_vote,
+    voting_pairs,
+)
+from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.project.report import StageReport
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.copy import is_copy
+from colmap_affrect.stages.extract import Inputs, recorded_extraction
+from colmap_affrect.stages.verify import recorded_verification
+
+logger = logging.getLogger(__name__)
+
+
+def choose_cameras(context: Context) -> StageReport:
+    """Hold a vote over cameras that nobody knows, unless it was held; verify pairs again by it.
+
+    Args:
+        context: with verified pairs.
+    """
+    start = time.perf_counter()
+    workspace = context.workspace
+    workspace.require("verify")
+    copied = is_copy(workspace)
+    extracted_px = None if copied else recorded_extraction(workspace).max_image_size_px
+    may_share = not copied and Inputs.recorded(workspace).cameras.mode == "auto"
+    records = read_camera_records(workspace.cameras)
+    num = sum(record.source == "guess" for record in records.values())
+    with context.progress.stage("cameras", num, "cameras") as advance:
+        hold_vote(
+            workspace.database,
+            workspace.cameras,
+            recorded_verification(workspace),
+            extracted_px,
+            may_share=may_share,
+            advance=advance,
+        )
+    records = read_camera_records(workspace.cameras)
+    found = sum(record.source == "pairs" for record in records.values())
+    return StageReport("cameras", time.perf_counter() - start, found, len(records) - found)
+
+
+def hold_vote(
+    database_path: Path,
+    records_path: Path,
+    verification: VerificationOptions,
+    extracted_px: int | None = None,
+    *,
+    may_share: bool,
+    advance: Callable[[int], None] | None = None,
+) -> None:
+    """Vote on the cameras of a database whose pairs are verified, unless that was done.
+
+    A killed one is gone on with: what was decided is written first, and putting it into the
+    database may be repeated.
+
+    Args:
+        database_path: its cameras change, and pairs are verified again with those that the pairs
+            know.
+        records_path: what is known of the cameras; brought up to date.
+        verification: options.
+        extracted_px: longest side that photographs were shrunk to before extraction, if any.
+        may_share: whether cameras of images of one size may turn out to be the same.
+        advance: called with the number of cameras that were decided.
+    """
+    records = read_camera_records(records_path)
+    if needs_vote(records):
+        records = forget_votes(database_path, records)
+        verify(database_path, verification, extracted_px)
+        unknown = {key for key, record in records.items() if record.source == "guess"}
+        pairs = voting_pairs(database_path, unknown, extracted_px)
+        records = CameraVote(records, pairs, may_share).decide()
+        write_camera_records(records_path, records)
+        for line in notable_lines(r for r in records.values() if r.low_px is not None):
+            logger.info("cameras: %s", line)
+        if advance:
+            advance(len(unknown))
+    if any(record.low_px is not None for record in records.values()):
+        apply_records(database_path, records)
+        verify(database_path, verification, extracted_px)

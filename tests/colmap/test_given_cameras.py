@@ -1,0 +1,178 @@
+"""Cameras that the user gives are read as they are meant, or refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.given_cameras import read_given_cameras
+from colmap_affrect.errors import OptionError, StoreError
+from colmap_affrect.images.photographs import CameraOptions
+
+
+def given(path: Path, **options: object):
+    return read_given_cameras(CameraOptions(cameras_path=str(path), **options))
+
+
+def table(tmp_path: Path, *lines: str) -> Path:
+    path = tmp_path / "plates.csv"
+    path.write_text("\ufeff" + "\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def test_table_gives_as_much_as_is_known(tmp_path: Path) -> None:
+    found = given(
+        table(
+            tmp_path,
+            "name, focal_px, focal_mm, plate_width_mm, model, params, cx, cy, camera",
+            "a.jpg, 900",
+            "b č.jpg,, 210, 180,,,,, plates",
+            "side/c.jpg,,,, PINHOLE, 901;902;401;301",
+            'd.jpg,,,, PINHOLE, "901,902,401,301"',
+            "e.jpg,,,,,, 390.5, 310",
+            "",
+            "f.jpg,,,, OPENCV",
+        ),
+        principal_point="1,2",
+    )
+    assert found["a.jpg"].focal_px == 900
+    assert found["a.jpg"].principal_point == (1, 2)
+    assert found["b č.jpg"].focal_widths == pytest.approx(210 / 180)
+    assert found["b č.jpg"].label
+    assert found["side/c.jpg"] == found["d.jpg"]
+    assert found["d.jpg"].params == (901, 902, 401, 301)
+    assert found["e.jpg"].principal_point == (390.5, 310)
+    assert (found["f.jpg"].model, found["f.jpg"].focal_px) == ("OPENCV", 0)
+    assert found["f.jpg"].where.endswith("plates.csv, line 8")
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["name,focal_cm", "a,3"], "plates.csv: unknown column 'focal_cm' .did you mean 'focal_"),
+        (["focal_px", "3"], "must have the column 'name'"),
+        ([], "must have the column 'name'"),
+        (["name,cx,cx", "a,3,4"], "must have the column 'name', and each once"),
+        (["name,focal_px", "a,3", "a,4"], "line 3: a is there twice"),
+        (["name,focal_px", ",3"], "line 2: has no name"),
+        (
+            ["name,focal_px", "a,3,4"],
+            "line 2: has 3 cells and the first line 2; params with commas",
+        ),
+        (["name,focal_px", "a,long"], "line 2: focal_px long: not numbers"),
+        (["name,focal_px", "a,35mm"], "line 2: focal_px 35mm: not numbers"),
+        (["name,focal_px", "a,-3"], "line 2: focal_px -3: not a positive number"),
+        (["name,focal_px", "a,0"], "line 2: focal_px 0: not a positive number"),
+        (["name,focal_px", "a,1 2"], "line 2: focal_px 1 2: not a positive number"),
+        (["name,focal_px", "a,nan"], "line 2: focal_px nan: has a number that is not finite"),
+        (["name,focal_px", "a,1e999"], "not finite"),
+        (["name,focal_mm", "a,50"], "line 2: focal_mm needs sensor_width_mm or plate_width_mm"),
+        (["name,plate_width_mm", "a,50"], "line 2: focal_mm needs"),
+        (["name,focal_px,focal_mm", "a,5,5"], "line 2: focal_px and focal_mm say the same twice"),
+        (["name,focal_mm,sensor_width_mm,plate_width_mm", "a,5,5,5"], "sensor_width_mm and plate"),
+        (["name,params,cx,cy", "a,1 2 3 4,1,1"], "line 2: params and cx say the same twice"),
+        (["name,cx", "a," + "5" * 200_000], "line 2: field larger than field limit"),
+        (["name,cx", "a,5"], "line 2: give both cx and cy, or none"),
+        (["name,cx,cy", "a,1 2,3"], "line 2: cx and cy must be one number each"),
+        (["name,model", "a,PINHOL"], "line 2: model PINHOL: not one of SIMPLE_PINHOLE"),
+        (["name,model,params", "a,PINHOLE,1 2 3"], r"line 2: params: PINHOLE needs 4 values \(fx"),
+        (["name,params", "a,-1 2 3 0"], "line 2: params: a focal length of -1 px cannot be"),
+        (
+            ["name,focal_px,camera", "a,3,X", "b,,Y", "c,4,X"],
+            "line 4: says something else of camera 'X' than line 2; give them two labels",
+        ),
+    ],
+)
+def test_wrong_tables_are_one_clear_line(tmp_path: Path, lines: list[str], message: str) -> None:
+    with pytest.raises(OptionError, match=message) as error:
+        given(table(tmp_path, *lines))
+    assert "plates.csv" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"focal_length_px": -1.0}, "outside"),
+        ({"focal_length_px": float("nan")}, "focal_length_px"),
+        ({"params": "900,450,300,0", "focal_length_px": 5.0}, "--camera-params: has focal length"),
+        ({"params": "900,450,300,0", "principal_point": "1,2"}, "leave out --focal-length-px"),
+        ({"params": "0,450,300,0"}, "--camera-params: a focal length of 0 px cannot be"),
+        ({"params": "inf,450,300,0"}, "--camera-params inf,450,300,0: has a number that is not"),
+        ({"principal_point": "1"}, "--principal-point 1: give cx,cy, two numbers"),
+        ({"principal_point": "a,b"}, "--principal-point a,b: not numbers"),
+        ({"cameras_path": "nowhere.csv"}, "--cameras-path nowhere.csv: cannot be read .No such"),
+    ],
+)
+def test_wrong_options_are_one_clear_line(options: dict[str, object], message: str) -> None:
+    with pytest.raises(OptionError, match=message) as error:
+        read_given_cameras(CameraOptions(**options))
+    assert "\n" not in str(error.value)
+
+
+CAMERAS = "# comment\n7 PINHOLE 90 60 101 102 44 31\n9 SIMPLE_RADIAL 90 60 80 45 30 0.1\n"
+IMAGES = "# comment\n3 1 0 0 0 0 0 0 9 b 1.jpg\n1.5 2 -1\n1 1 0 0 0 0 0 0 7 a.jpg\n\n"
+
+
+def test_cameras_of_a_text_model_without_points_are_read(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text(CAMERAS)
+    (tmp_path / "images.txt").write_text(IMAGES)
+    for path in (tmp_path, tmp_path / "cameras.txt"):
+        found = given(path)
+        assert found["a.jpg"].params == (101, 102, 44, 31)
+        assert found["b 1.jpg"].params == (80, 45, 30, 0.1)
+        assert found["b 1.jpg"].size == (90, 60)
+        assert found["a.jpg"].label != found["b 1.jpg"].label
+        assert found[""].params == ()
+
+
+def test_one_camera_without_images_is_that_of_all(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text(CAMERAS.rpartition("9 ")[0])
+    assert given(tmp_path / "cameras.txt")[""].params == (101, 102, 44, 31)
+
+
+def test_cameras_of_a_binary_model_are_read(tmp_path: Path) -> None:
+    model = pycolmap.synthesize_dataset(
+        pycolmap.SyntheticDatasetOptions(num_points3D=5, num_rigs=2, num_frames_per_rig=2)
+    )
+    model.write(tmp_path)
+    found = given(tmp_path)
+    for image in model.images.values():
+        assert found[image.name].params == tuple(model.cameras[image.camera_id].params)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "images", "message"),
+    [
+        ("7 PINHOLE 90 x 1 2 3 4\n", IMAGES, "cameras.txt, line 1: not CAMERA_ID MODEL WIDTH"),
+        ("7 PIN 90 60 1 2 3 4\n", IMAGES, "line 1 PIN: not one of"),
+        ("7 PINHOLE 90 60 1 2 3\n", IMAGES, "line 1: PINHOLE needs 4 values"),
+        (CAMERAS, IMAGES.replace(" 9 b", " 8 b"), "images.txt, line 2: not an image of a camera"),
+        (CAMERAS, "1 2 3\n", "images.txt, line 1: not an image"),
+        (CAMERAS, None, "images.txt: cannot be read"),
+    ],
+)
+def test_wrong_models_are_one_clear_line(
+    tmp_path: Path, cameras: str, images: str | None, message: str
+) -> None:
+    (tmp_path / "cameras.txt").write_text(cameras)
+    if images is not None:
+        (tmp_path / "images.txt").write_text(images)
+    with pytest.raises(OptionError, match=message) as error:
+        given(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_folder_without_a_model_is_one_clear_line(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"no COLMAP model, which has cameras\.txt"):
+        given(tmp_path)
+
+
+def test_damaged_binary_model_is_one_clear_line(tmp_path: Path) -> None:
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_points3D=5))
+    model.write(tmp_path)
+    (tmp_path / "images.bin").write_bytes((tmp_path / "images.bin").read_bytes()[:-3])
+    with pytest.raises(StoreError, match=r"images\.bin: damaged"):
+        given(tmp_path)

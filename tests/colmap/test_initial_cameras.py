@@ -1,0 +1,324 @@
+"""Which images share a camera before pairs are verified, and which one they get."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from numpy.testing import assert_allclose
+from photographs_with_exif import BODY, LENS_50, write_photograph
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import (
+    CameraRecord,
+    read_camera_records,
+    write_camera_records,
+)
+from colmap_affrect.colmap.database import open_database, read_cameras
+from colmap_affrect.colmap.initial_cameras import (
+    InitialCameras,
+    import_images,
+    record_cameras,
+    sensor_width_mm,
+)
+from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.images.photographs import CameraOptions
+
+WIDE = {**BODY, "FocalLengthIn35mmFilm": 28}
+LONG = {**BODY, "FocalLengthIn35mmFilm": 80}
+DIAGONAL = (90**2 + 60**2) ** 0.5
+WIDE_PX, LONG_PX = 28 / 43.27 * DIAGONAL, 80 / 43.27 * DIAGONAL
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """Wide ones of one camera, one of them turned; a long one; a scan; all in two folders."""
+    folder = tmp_path / "photos"
+    write_photograph(folder / "a.jpg", (90, 60), WIDE)
+    write_photograph(folder / "b.jpg", (90, 60), {**WIDE, "Orientation": 3})
+    write_photograph(folder / "c.jpg", (90, 60), LONG)
+    write_photograph(folder / "side" / "d.jpg", (60, 90), WIDE)
+    write_photograph(folder / "side" / "e.jpg", (60, 90), WIDE)
+    write_photograph(folder / "side" / "f.png", (60, 90), {})
+    return folder
+
+
+NAMES = ["a.jpg", "b.jpg", "c.jpg", "side/d.jpg", "side/e.jpg", "side/f.png"]
+
+
+def imported(path: Path, photos: Path, names: list[str], **options: object) -> list[str]:
+    """Import images, and return for each the first image with the same camera."""
+    assert import_images(path, photos, names, CameraOptions(**options)) == []
+    return sharing(path)
+
+
+def sharing(path: Path) -> list[str]:
+    with open_database(path) as database:
+        images = sorted(database.read_all_images(), key=lambda image: image.name)
+    firsts: dict[int, str] = {}
+    return [firsts.setdefault(image.camera_id, image.name) for image in images]
+
+
+def camera_of(path: Path, name: str) -> pycolmap.Camera:
+    with open_database(path) as database:
+        return database.read_camera(database.read_image_with_name(name).camera_id)
+
+
+SHARED = ["a.jpg", "a.jpg", "c.jpg", "side/d.jpg", "side/d.jpg", "side/f.png"]
+
+
+def test_images_of_one_body_lens_focal_length_and_size_share_a_camera(
+    photos: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.db"
+    assert imported(path, photos, NAMES) == SHARED
+    assert camera_of(path, "b.jpg").focal_length == pytest.approx(WIDE_PX)
+    assert camera_of(path, "side/e.jpg").focal_length == pytest.approx(WIDE_PX)
+    scan = camera_of(path, "side/f.png")
+    assert (scan.focal_length, scan.has_prior_focal_length) == (1.2 * 90, False)
+    with open_database(path) as database:
+        assert (database.num_rigs(), database.num_frames(), database.num_images()) == (4, 6, 6)
+
+
+@pytest.mark.parametrize("first", [NAMES[1:2], NAMES[1:5:2], NAMES[:3]])
+def test_images_that_come_later_share_the_cameras_that_exif_says(
+    photos: Path, tmp_path: Path, first: list[str]
+) -> None:
+    path = tmp_path / "a.db"
+    imported(path, photos, first)
+    assert imported(path, photos, NAMES) == SHARED
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"mode": "per-image"}, NAMES),
+        ({"ignore_exif": True}, NAMES),
+    ],
+)
+def test_cameras_that_nobody_shares(
+    photos: Path, tmp_path: Path, options: dict[str, object], expected: list[str]
+) -> None:
+    path = tmp_path / "a.db"
+    assert imported(path, photos, NAMES, **options) == expected
+    priors = [camera_of(path, name).has_prior_focal_length for name in NAMES]
+    assert priors == [not options.get("ignore_exif") and name != "side/f.png" for name in NAMES]
+
+
+def test_forced_camera_takes_no_focal_length_that_its_images_contradict(
+    photos: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.db"
+    assert imported(path, photos, NAMES[:3], mode="single") == ["a.jpg"] * 3
+    assert not camera_of(path, "a.jpg").has_prior_focal_length
+    initial = InitialCameras(photos, CameraOptions(mode="single"))
+    _, record = initial.camera(NAMES[:3], (90, 60))
+    assert record.source == "guess"
+    assert record.why == f"EXIF of its images says {WIDE_PX:.0f} to {LONG_PX:.0f} px"
+    # One that knows nothing does not disturb.
+    _, record = initial.camera(["side/f.png", "side/d.jpg"], (60, 90))
+    assert (record.source, record.focal_px) == ("exif", pytest.approx(WIDE_PX))
+
+
+def test_wrong_exif_of_a_shrunk_photograph_is_rescaled_in_the_database(tmp_path: Path) -> None:
+    tags = {**LENS_50, "ExifImageWidth": 4368, "ExifImageHeight": 2912}
+    write_photograph(tmp_path / "photos" / "a.jpg", (728, 1092), tags)
+    path = tmp_path / "a.db"
+    imported(path, tmp_path / "photos", ["a.jpg"])
+    camera = camera_of(path, "a.jpg")
+    assert camera.focal_length == pytest.approx(50 / 35.8 * 1092)
+    assert camera.has_prior_focal_length
+    record_cameras(
+        path, tmp_path / "cameras.json", InitialCameras(tmp_path / "photos", CameraOptions())
+    )
+    assert read_camera_records(tmp_path / "cameras.json")[1].source == "exif-rescaled"
+
+
+def test_absurd_exif_is_a_guess_with_its_reason(tmp_path: Path) -> None:
+    write_photograph(tmp_path / "a.jpg", (90, 60), {**BODY, "FocalLengthIn35mmFilm": 1})
+    path = tmp_path / "a.db"
+    imported(path, tmp_path, ["a.jpg"])
+    assert not camera_of(path, "a.jpg").has_prior_focal_length
+    _, record = InitialCameras(tmp_path, CameraOptions()).camera(["a.jpg"], (90, 60))
+    assert record.why == "EXIF's 35 mm equivalent would be a focal length of 0.028 longer sides"
+
+
+@pytest.mark.parametrize(
+    ("options", "params", "given"),
+    [
+        ({"focal_length_px": 70.0}, [70, 45, 30, 0], ("focal",)),
+        ({"principal_point": "40,33"}, [WIDE_PX, 40, 33, 0], ("principal-point",)),
+        ({"model": "PINHOLE"}, [WIDE_PX, WIDE_PX, 45, 30], ()),
+        (
+            {"model": "PINHOLE", "focal_length_px": 70.0, "principal_point": "40 33"},
+            [70, 70, 40, 33],
+            ("focal", "principal-point", "distortion"),
+        ),
+        (
+            {"params": "70,40,33,0.1"},
+            [70, 40, 33, 0.1],
+            ("focal", "principal-point", "distortion"),
+        ),
+    ],
+)
+def test_what_is_given_stays_and_the_rest_is_as_it_would_be(
+    photos: Path, tmp_path: Path, options: dict[str, object], params: list[float], given: object
+) -> None:
+    path = tmp_path / "a.db"
+    imported(path, photos, ["a.jpg"], **options)
+    camera = camera_of(path, "a.jpg")
+    assert_allclose(camera.params, params)
+    assert camera.has_prior_focal_length
+    _, record = InitialCameras(photos, CameraOptions(**options)).camera(["a.jpg"], (90, 60))
+    assert record.given == given
+    assert record.source == ("given" if "focal" in record.given else "exif")
+    assert record.is_fixed == ("distortion" in record.given)
+
+
+def test_table_decides_who_shares_a_camera_and_the_rest_is_as_without(
+    photos: Path, tmp_path: Path
+) -> None:
+    listed = tmp_path / "plates.csv"
+    listed.write_text(
+        "name,focal_mm,plate_width_mm,camera\n"
+        "a.jpg,150,180,plates\nc.jpg,150,180,plates\nside/f.png,200,120,\n"
+    )
+    path = tmp_path / "a.db"
+    found = imported(path, photos, NAMES, cameras_path=str(listed))
+    assert found == ["a.jpg", "b.jpg", "a.jpg", "side/d.jpg", "side/d.jpg", "side/f.png"]
+    assert camera_of(path, "c.jpg").focal_length == pytest.approx(150 / 180 * 90)
+    assert camera_of(path, "side/f.png").focal_length == pytest.approx(200 / 120 * 60)
+    assert camera_of(path, "b.jpg").focal_length == pytest.approx(WIDE_PX)
+    assert camera_of(path, "side/f.png").has_prior_focal_length
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "message"),
+    [
+        (["z.jpg,70,"], {}, r"plates\.csv, line 2: z\.jpg is not in .*photos$"),
+        (["a.jpg,70,X", "side/d.jpg,70,X"], {}, r"line 3: a\.jpg is 90 x 60 px, side/d\.jpg is 60"),
+        (
+            ["a.jpg,70,", "b.jpg,80,"],
+            {"mode": "per-folder"},
+            r"line 3: says something else than line 2, and --camera-mode per-folder lets",
+        ),
+        ([], {"mode": "single"}, "^--camera-mode single: a.jpg is 90 x 60 px, side/d.jpg is 60 x"),
+    ],
+)
+def test_cameras_that_cannot_be_are_one_clear_line(
+    photos: Path, tmp_path: Path, rows: list[str], options: dict[str, object], message: str
+) -> None:
+    listed = tmp_path / "plates.csv"
+    listed.write_text("\n".join(["name,focal_px,camera", *rows]))
+    initial = InitialCameras(photos, CameraOptions(cameras_path=str(listed), **options))
+    with pytest.raises(OptionError, match=message) as error:
+        initial.check(NAMES)
+    assert "\n" not in str(error.value)
+
+
+def test_model_must_be_of_these_images(photos: Path, tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 90 60 71 44 31\n")
+    images = "1 1 0 0 0 0 0 0 1 {}\n\n2 1 0 0 0 0 0 0 1 others.jpg\n\n"
+    (tmp_path / "images.txt").write_text(images.format("c.jpg"))
+    initial = InitialCameras(photos, CameraOptions(cameras_path=str(tmp_path)))
+    initial.check(NAMES)  # it may have more images
+    with pytest.raises(OptionError, match=r"cameras\.txt, line 1: others\.jpg is not in"):
+        initial.check(NAMES[:2])
+    (tmp_path / "images.txt").write_text(images.format("side/d.jpg"))
+    initial = InitialCameras(photos, CameraOptions(cameras_path=str(tmp_path)))
+    with pytest.raises(OptionError, match=r"its camera is of 90 x 60 px, and side/d\.jpg has 60 x"):
+        initial.check(NAMES)
+
+
+def test_intrinsics_before_the_import_are_those_of_the_database(
+    photos: Path, tmp_path: Path
+) -> None:
+    listed = tmp_path / "plates.csv"
+    listed.write_text("name,cx,cy\na.jpg,40,33\n")
+    for number, options in enumerate(
+        [{}, {"cameras_path": str(listed)}, {"mode": "per-image", "principal_point": "40,33"}]
+    ):
+        path = tmp_path / f"{number}.db"
+        imported(path, photos, NAMES, **options)
+        initial = InitialCameras(photos, CameraOptions(**options))
+        for name, camera in read_cameras(path).items():
+            assert_allclose(initial.matrix(name, NAMES), camera.matrix)
+
+
+def test_existing_camera_is_that_of_all_new_images(photos: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    imported(path, photos, NAMES[:1])
+    assert imported(path, photos, NAMES[:3], existing_camera_id=1) == ["a.jpg"] * 3
+    with pytest.raises(DatabaseError, match="no camera 8"):
+        import_images(path, photos, NAMES, CameraOptions(existing_camera_id=8))
+
+
+def test_images_of_another_size_than_their_camera_are_not_taken(
+    photos: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.db"
+    assert import_images(path, photos, NAMES, CameraOptions(mode="single")) == NAMES[3:]
+
+
+def test_import_that_fails_leaves_the_database_as_it_was(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.db"
+    imported(path, photos, NAMES[:1])
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "colmap_affrect.colmap.initial_cameras.pycolmap.import_images",
+            lambda *_: pytest.fail("killed"),
+        )
+        with pytest.raises(pytest.fail.Exception):
+            import_images(path, photos, NAMES, CameraOptions())
+    assert sharing(path) == NAMES[:1]
+    assert imported(path, photos, NAMES) == SHARED
+    assert sorted(file.name for file in tmp_path.glob("a.db*")) == ["a.db"]
+
+
+def test_records_are_kept_and_follow_the_images_that_come_later(
+    photos: Path, tmp_path: Path
+) -> None:
+    path, records_path = tmp_path / "a.db", tmp_path / "cameras.json"
+    initial = InitialCameras(photos, CameraOptions())
+    imported(path, photos, NAMES[:1])
+    record_cameras(path, records_path, initial)
+    (record,) = read_camera_records(records_path).values()
+    assert (record.names, record.source, record.size) == (("a.jpg",), "exif", (90, 60))
+    voted = CameraRecord(("a.jpg",), "pairs", 70.0, 65.0, 75.0, "", (90, 60))
+    write_camera_records(records_path, {1: voted})
+    imported(path, photos, NAMES)
+    record_cameras(path, records_path, initial)
+    records = read_camera_records(records_path)
+    assert [(r.names, r.source) for r in records.values()] == [
+        (("a.jpg", "b.jpg"), "pairs"),
+        (("c.jpg",), "exif"),
+        (("side/d.jpg", "side/e.jpg"), "exif"),
+        (("side/f.png",), "guess"),
+    ]
+    assert records[1].focal_px == 70.0
+
+
+def test_cameras_of_another_program_are_given_where_they_are_flagged(
+    photos: Path, tmp_path: Path
+) -> None:
+    path, records_path = tmp_path / "a.db", tmp_path / "cameras.json"
+    options = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params="71,72,44,31")
+    with open_database(path):
+        pass
+    pycolmap.import_images(path, photos, pycolmap.CameraMode.SINGLE, NAMES[:1], options)
+    pycolmap.import_images(path, photos, pycolmap.CameraMode.PER_IMAGE, NAMES[5:])
+    record_cameras(path, records_path)
+    before = read_camera_records(records_path)
+    assert [(r.source, r.focal_px) for r in before.values()] == [("given", 71.5), ("guess", 108)]
+    records_path.unlink()
+    record_cameras(path, records_path, InitialCameras(photos, CameraOptions()))
+    assert [r.source for r in read_camera_records(records_path).values()] == ["given", "guess"]
+    assert camera_of(path, "a.jpg").params.tolist() == [71, 72, 44, 31]
+
+
+def test_sensors_are_those_that_colmap_knows() -> None:
+    assert sensor_width_mm("NIKON CORPORATION", "NIKON D90") == pytest.approx(23.6, abs=0.3)
+    assert sensor_width_mm("", "") is None
+    assert sensor_width_mm("Nobody", "č 1") is None
