@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database, refuse_wrong_matches
 from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.native_options import differences, flat_values
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.colmap.verification import verify as verify_database
@@ -37,6 +38,7 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
+from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import Inputs, extract, recorded_extraction, write_descriptors
@@ -150,6 +152,7 @@ def verify(
     options: GivenVerification = None,
     *,
     pairs_path: PathLike | None = None,
+    check_cameras: bool = False,
     random_seed: int | None = None,
 ) -> None:
     """Estimate the two-view geometries of the matched pairs of any database that lack one.
@@ -157,7 +160,8 @@ def verify(
     As ``pycolmap.geometric_verification``, with the preset for sparse sets (or ``options``, ours or
     those of pycolmap that have a counterpart). Every match is checked first, because one that
     points at no keypoint ends the process inside COLMAP: DatabaseError. ``pairs_path`` lists the
-    pairs to verify, two names per line; all by default.
+    pairs to verify, two names per line; all by default. With ``check_cameras`` all verified pairs
+    vote on cameras whose focal length is no prior; those that they know become priors.
     """
     path = Path(database_path)
     verification = _verification_options(options, random_seed)
@@ -166,6 +170,11 @@ def verify(
         verify_database(path, verification)
     else:
         _verify_pairs(path, read_pairs(Path(pairs_path), list(image_ids(path))), verification)
+    if check_cameras:
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            records = Path(folder) / "cameras.json"
+            record_cameras(path, records)
+            hold_vote(path, records, verification, may_share=False)
 
 
 def _verify_pairs(path: Path, pairs: Sequence[Pair], verification: VerificationOptions) -> None:
