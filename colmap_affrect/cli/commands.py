@@ -165,7 +165,7 @@ def map(options: argparse.Namespace) -> int:
             context,
             mapper,
             extend,
-            earlier=[choose_cameras(context)] if votes else [],
+            earlier=[choose_cameras(context, may_share=not extend)] if votes else [],
             overwrite=options.overwrite,
         )
     return _print_reconstruction(report, options)

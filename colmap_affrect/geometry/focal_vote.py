@@ -27,7 +27,7 @@ FOCALS = np.geomspace(0.3, 10.0, 41)
 STEP = 2
 """Where two cameras are asked for at once every second candidate will do."""
 
-MIN_PROMISE = -12.0
+MIN_PROMISE = -30.0
 """Tables of two cameras are made at every second of these candidates first; the others are looked
 at beside those that fall short of the best one by less."""
 

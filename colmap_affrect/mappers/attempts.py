@@ -188,4 +188,8 @@ def summarize(mapped: MappedModel, task: MappingTask) -> ModelSummary:
         doubts=doubts.model,
         arrivals=arrivals(mapped, task),
         taken_out=dict(mapped.taken_out),
+        focals_px={
+            key: model.cameras[key].mean_focal_length()
+            for key in {model.images[image_id].camera_id for image_id in model.reg_image_ids()}
+        },
     )

@@ -228,7 +228,7 @@ def test_models_of_guided_pairs_are_adjusted_by_exact_matches(guided: Context) -
     assert len(guided_only) < 0.002 * len(tied)
     by_ids = inlier_matches(guided.workspace.database, 1)
     added = guided_matches(guided)
-    assert adjust_last(model, by_ids, added, refine_intrinsics=False) == len(guided_only)
+    assert adjust_last(model, by_ids, added, constant_cameras=model.cameras) == len(guided_only)
 
 
 def test_guided_matches_are_the_inliers_that_came_by_guiding(
