@@ -67,20 +67,23 @@ class MatchedPair:
         return cls(points1[chosen], points2[chosen], fundamental, error)
 
 
-def log_evidence(pair: MatchedPair, focals1: Array, focals2: Array) -> Array:
+def log_evidence(
+    pair: MatchedPair, focals1: Array, focals2: Array, *, max_misfit: float = MAX_MISFIT
+) -> Array:
     """Return the logarithm of the evidence for pairs of focal lengths, up to a constant.
 
     Args:
         pair: what is known.
         focals1: (N,) of image 1.
         focals2: (N,) of image 2.
+        max_misfit: see :data:`MAX_MISFIT`.
 
     Returns:
         (N,), all 0 where the pair fits no camera.
     """
     essential = _Fit(pair, focals1, focals2, is_essential=True)
     fundamental = _Fit(pair, np.ones(1), np.ones(1), is_essential=False)
-    if essential.costs.min() > fundamental.costs[0] + MAX_MISFIT:
+    if essential.costs.min() > fundamental.costs[0] + max_misfit:
         return np.zeros(len(focals1))
     found = -essential.costs - 0.5 * essential.log_determinants()
     return np.asarray(found - found.max())

@@ -31,6 +31,9 @@ MIN_PROMISE = -30.0
 """Tables of two cameras are made at every second of these candidates first; the others are looked
 at beside those that fall short of the best one by less."""
 
+MAX_FIRST_MISFIT = 15.0
+"""Like :data:`MAX_MISFIT`, of the first candidates of a table: they may be far from the truth."""
+
 PRIOR_FOCAL, PRIOR_SIGMA = 1.1, 0.6
 """Lenses of photographs: most between .6 and 2 longer sides (logarithmic)."""
 
@@ -117,14 +120,15 @@ def _table(pair: MatchedPair, focals: Array) -> Array:
     """Return the evidence for two cameras; hopeless candidates get what the best of them has."""
     grid = np.stack(np.meshgrid(focals, focals, indexing="ij"), axis=2)
     table = np.full(grid.shape[:2], np.nan)
-    table[::2, ::2] = log_evidence(pair, *grid[::2, ::2].reshape(-1, 2).T).reshape(
-        grid[::2, ::2].shape[:2]
-    )
-    if not table[::2, ::2].any():  # the pair fits no camera
-        return np.zeros_like(table)
-    promising = cv2.dilate((table > MIN_PROMISE).astype(np.uint8), np.ones((3, 3))) > 0
-    table[promising] = log_evidence(pair, *grid[promising].T)
-    return np.where(promising, table, MIN_PROMISE)
+    table[::2, ::2] = log_evidence(
+        pair, *grid[::2, ::2].reshape(-1, 2).T, max_misfit=MAX_FIRST_MISFIT
+    ).reshape(grid[::2, ::2].shape[:2])
+    if table[::2, ::2].any():
+        promising = cv2.dilate((table > MIN_PROMISE).astype(np.uint8), np.ones((3, 3))) > 0
+        table[promising] = log_evidence(pair, *grid[promising].T)
+        if table[promising].any():
+            return np.where(promising, table, MIN_PROMISE)
+    return np.zeros_like(table)  # the pair fits no camera
 
 
 def evidence_for_one(ballots: Sequence[Ballot]) -> float:
@@ -149,7 +153,8 @@ def count(ballots: Sequence[Ballot], cameras: Sequence[int], *, resample: bool =
 
     Args:
         ballots: of all pairs.
-        cameras: all that are asked for; one without ballots has the prior's focal length.
+        cameras: all that are asked for; one without ballots, or whose best candidate is the first
+            or the last, has the prior's focal length.
         resample: widen intervals where the pairs do not agree.
     """
     focals = _candidates(ballots)
@@ -160,10 +165,15 @@ def count(ballots: Sequence[Ballot], cameras: Sequence[int], *, resample: bool =
         chosen = rng.integers(len(ballots), size=len(ballots))
         draws.append(_propagate([ballots[i] for i in chosen], cameras, focals)[0])
     peaks = np.stack([_peaks(draw, focals) for draw in draws])
-    sums = np.cumsum(marginals, axis=1)
+    sums = np.pad(np.cumsum(marginals, axis=1), ((0, 0), (1, 0)))
+    half_step = (focals[1] / focals[0]) ** 0.5
+    bounds = np.append(focals / half_step, focals[-1] * half_step)
     estimates = {}
     for row, camera in enumerate(cameras):
-        inside = [np.interp(level, sums[row], focals) for level in (LOW, HIGH)]
+        if marginals[row].argmax() in (0, len(focals) - 1):  # there is no peak
+            estimates[camera] = FocalEstimate(PRIOR_FOCAL, focals[0], focals[-1])
+            continue
+        inside = [np.interp(level, sums[row], bounds) for level in (LOW, HIGH)]
         among = np.quantile(peaks[:, row], [LOW, HIGH])
         low, high = min(inside[0], among[0]), max(inside[1], among[1])
         estimates[camera] = FocalEstimate(float(peaks[0, row]), float(low), float(high))

@@ -1,0 +1,115 @@
+"""Matches of synthetic photographs by cameras with known focal lengths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.geometry.focal_evidence import MatchedPair
+
+Array = NDArray[np.float64]
+
+NOISE, OUTLIER, SHARE_OF_OUTLIERS = 0.5e-3, 3e-3, 0.1
+"""Of matches, longer sides: the error, how far some are off that still are inliers, how many."""
+
+IMAGE = np.array([0.5, 0.375])
+"""Half of an image."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A photograph: focal length in longer sides, (3, 3) world to camera, and where it stood."""
+
+    focal: float
+    rotation: Array
+    center: Array
+
+    def project(self, points: Array) -> Array:
+        """Return (N, 2) in units of the longer side, from the image centre."""
+        seen = (points - self.center) @ self.rotation.T
+        return np.asarray(self.focal * seen[:, :2] / seen[:, 2:])
+
+
+def looking(focal: float, center: Array, target: Array, roll: float = 0.0) -> View:
+    """Return a view of a target."""
+    forward = (target - center) / np.linalg.norm(target - center)
+    right = np.cross([np.sin(roll), np.cos(roll), 0.0], forward)
+    right /= np.linalg.norm(right)
+    return View(focal, np.stack([right, np.cross(forward, right), forward]), center)
+
+
+def views_around(focals: Iterable[float], rng: np.random.Generator) -> list[View]:
+    """Return views of the origin from as far as fills the image, some nearer than others."""
+    views = []
+    for focal in focals:
+        turn, lift = rng.uniform(-0.7, 0.7), rng.uniform(-0.3, 0.3)
+        away = 3.2 * focal * rng.uniform(0.8, 1.3)
+        center = away * np.array([np.sin(turn), np.sin(lift), -np.cos(turn) * np.cos(lift)])
+        views.append(looking(focal, center, rng.uniform(-0.3, 0.3, 3), rng.uniform(-0.2, 0.2)))
+    return views
+
+
+def views_from_one_place(focals: Iterable[float], rng: np.random.Generator) -> list[View]:
+    """Return views that a panorama is made of."""
+    target = np.array([0.0, 0.0, 4.0])
+    return [
+        looking(focal, np.zeros(3), target + rng.uniform(-0.5, 0.5, 3), rng.uniform(-0.2, 0.2))
+        for focal in focals
+    ]
+
+
+def in_a_box(num: int, rng: np.random.Generator) -> Array:
+    """Return (N, 3) points about the origin."""
+    return rng.uniform(-1.0, 1.0, (num, 3)) * [1.0, 0.8, 0.9]
+
+
+def on_a_plane(num: int, rng: np.random.Generator) -> Array:
+    """Return (N, 3) points of a slanted wall through the origin."""
+    x, y = rng.uniform(-1.0, 1.0, (2, num)) * [[1.2], [0.9]]
+    return np.stack([x, y, 0.4 * x - 0.2 * y], axis=1)
+
+
+def matches(
+    view1: View, view2: View, points: Array, rng: np.random.Generator, num: int = 100
+) -> tuple[Array, Array]:
+    """Return noisy projections of points that both images show."""
+    first, second = view1.project(points), view2.project(points)
+    both = (np.abs(first) < IMAGE).all(axis=1) & (np.abs(second) < IMAGE).all(axis=1)
+    chosen = np.flatnonzero(both)[:num]
+    found = [
+        side[chosen] + NOISE * rng.standard_normal((len(chosen), 2)) for side in (first, second)
+    ]
+    off = rng.random(len(chosen)) < SHARE_OF_OUTLIERS
+    found[1][off] += rng.uniform(-OUTLIER, OUTLIER, (off.sum(), 2))
+    return found[0], found[1]
+
+
+def fundamental(points1: Array, points2: Array) -> Array:
+    """Estimate a fundamental matrix, as any program would."""
+    found, _ = cv2.findFundamentalMat(1000.0 * points1, 1000.0 * points2, cv2.FM_LMEDS)
+    to_px = np.diag([1000.0, 1000.0, 1.0])
+    matrix = to_px @ found @ to_px
+    return np.asarray(matrix / np.linalg.norm(matrix))
+
+
+def matched_pair(
+    view1: View, view2: View, points: Array, rng: np.random.Generator, num: int = 100
+) -> MatchedPair:
+    """Return the matches of two views with their fundamental matrix."""
+    found = matches(view1, view2, points, rng, num)
+    return MatchedPair.of(*found, fundamental(*found), NOISE)
+
+
+def all_pairs(
+    views: Sequence[View], points: Array, rng: np.random.Generator, num: int = 100
+) -> list[tuple[tuple[int, int], MatchedPair]]:
+    """Return the matched pairs of all views that see enough of the same, by their indices."""
+    return [
+        ((i, j), matched_pair(views[i], views[j], points, rng, num))
+        for i, j in combinations(range(len(views)), 2)
+    ]
