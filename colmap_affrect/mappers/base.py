@@ -85,6 +85,7 @@ class MappingTask:
         guided: (M, 2) features of pairs of image ids that only guided matching has matched.
         cameras: what is known of the cameras, by id.
         held: ids of cameras whose parameters stay as they are in the database.
+        distortion_held: only focal lengths are refined.
         depth_at: depth maps of the images, where there are any.
     """
 
@@ -97,6 +98,7 @@ class MappingTask:
     guided: Mapping[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
     held: frozenset[int] = frozenset()
+    distortion_held: bool = False
     depth_at: DepthLookup | None = None
 
     @property

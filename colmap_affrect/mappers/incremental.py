@@ -75,8 +75,7 @@ class IncrementalMapper:
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
-        native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
-        native.constant_cameras = task.constant_cameras(self.options)
+        native = self.native_of(task, random_seed)
         if task.image_path is None:
             native.extract_colors = False
         call = _Call(task, native, output_path, show)
@@ -88,6 +87,14 @@ class IncrementalMapper:
             reason = " ".join(str(error).split())
             raise MappingError(f"COLMAP's incremental mapper failed: {reason}") from error
         return [MappedModel(model) for model in models]
+
+    def native_of(self, task: MappingTask, random_seed: int) -> pycolmap.IncrementalPipelineOptions:
+        """Return pycolmap's options for a task, with what is not to be refined of its cameras."""
+        native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
+        native.constant_cameras = task.constant_cameras(self.options)
+        if task.distortion_held:
+            native.ba_refine_extra_params = native.mapper.abs_pose_refine_extra_params = False
+        return native
 
     def native(
         self, random_seed: int, *, intrinsics_given: bool

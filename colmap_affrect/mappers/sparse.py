@@ -48,8 +48,7 @@ class SparseMapper:
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
         models = self._mapped(task, output_path / "all", random_seed, show)
-        native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
-        native.constant_cameras = task.constant_cameras(self.options)
+        native = self._incremental.native_of(task, random_seed)
         graph = graph_of(task, native.min_num_matches)
         if models and graph.is_explained_by(models[0]):
             return [MappedModel(model) for model in models]
