@@ -17,7 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.geometry.focal_evidence import MatchedPair, log_evidence
+from colmap_affrect.geometry.focal_evidence import (
+    MAX_MISFIT_OF_CANDIDATES,
+    MatchedPair,
+    log_evidence,
+)
 
 Array = NDArray[np.float64]
 
@@ -30,9 +34,6 @@ STEP = 2
 MIN_PROMISE = -12.0
 """Tables of two cameras are made at every second of these candidates first; the others are looked
 at beside those that fall short of the best one by less."""
-
-MAX_FIRST_MISFIT = 15.0
-"""Like :data:`MAX_MISFIT`, of the first candidates of a table: they may be far from the truth."""
 
 PRIOR_FOCAL, PRIOR_SIGMA = 1.1, 0.6
 """Lenses of photographs: most between .6 and 2 longer sides (logarithmic)."""
@@ -121,7 +122,7 @@ def _table(pair: MatchedPair, focals: Array) -> Array:
     grid = np.stack(np.meshgrid(focals, focals, indexing="ij"), axis=2)
     table = np.full(grid.shape[:2], np.nan)
     table[::2, ::2] = log_evidence(
-        pair, *grid[::2, ::2].reshape(-1, 2).T, max_misfit=MAX_FIRST_MISFIT
+        pair, *grid[::2, ::2].reshape(-1, 2).T, max_misfit=MAX_MISFIT_OF_CANDIDATES
     ).reshape(grid[::2, ::2].shape[:2])
     if table[::2, ::2].any():
         promising = cv2.dilate((table > MIN_PROMISE).astype(np.uint8), np.ones((3, 3))) > 0
