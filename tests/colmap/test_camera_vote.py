@@ -44,7 +44,7 @@ NUM_POINTS = 900
 
 
 def write(path: Path, focals: Sequence[float], sizes: Sequence[tuple[int, int]]) -> Path:
-    rng = np.random.default_rng(2)
+    rng = np.random.default_rng(4)
     points = in_a_box(NUM_POINTS, rng)
     write_views(path, views_around(focals, rng), sizes, points, 3)
     record_cameras(path, path.with_name("cameras.json"))
