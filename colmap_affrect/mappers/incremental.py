@@ -76,7 +76,7 @@ class IncrementalMapper:
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
         native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
-        native.constant_cameras = task.constant_cameras(self.options)
+        constrain(native, task, self.options)
         if task.image_path is None:
             native.extract_colors = False
         call = _Call(task, native, output_path, show)
@@ -121,6 +121,18 @@ class IncrementalMapper:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
         native = self.native(self.options.random_seed, intrinsics_given=intrinsics_given)
         return differences(native, pycolmap.IncrementalPipelineOptions())
+
+
+def constrain(
+    native: pycolmap.IncrementalPipelineOptions, task: MappingTask, options: MapperOptions
+) -> None:
+    """Have pycolmap's mapper keep what is given or held of the cameras of a task."""
+    native.constant_cameras = task.constant_cameras(options)
+    if task.keeps_focal_lengths(options):
+        kept = dict.fromkeys(
+            ("ba_refine_focal_length", "mapper.abs_pose_refine_focal_length"), False
+        )
+        set_values(native, kept | options.mapper_options)
 
 
 @dataclass
