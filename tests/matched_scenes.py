@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import open_database
 from colmap_affrect.geometry.focal_evidence import MatchedPair
 
 Array = NDArray[np.float64]
@@ -113,3 +116,53 @@ def all_pairs(
         ((i, j), matched_pair(views[i], views[j], points, rng, num))
         for i, j in combinations(range(len(views)), 2)
     ]
+
+
+def write_views(
+    path: Path, views: Sequence[View], sizes: Sequence[tuple[int, int]], points: Array, seed: int
+) -> None:
+    """Write a database of matched images, each with a camera, a rig and a frame of its own.
+
+    Images higher than wide show the view turned by 90 degrees. Wrong matches are among the others.
+
+    Args:
+        path: of the database; images that it has stay.
+        views: of all images.
+        sizes: (width, height) of all images, px.
+        points: (N, 3) what they show.
+        seed: of noise.
+    """
+    rng = np.random.default_rng(seed)
+    with open_database(path) as database:
+        known = database.num_images()
+        seen = []
+        for index, (view, size) in enumerate(zip(views, sizes, strict=True)):
+            places = view.project(points)
+            seen.append((np.abs(places) < IMAGE).all(axis=1))
+            places += NOISE * rng.standard_normal(places.shape)
+            if size[1] > size[0]:
+                places = places[:, ::-1] * [-1.0, 1.0]
+            if index >= known:
+                _write_image(database, f"{index}.jpg", size)
+            keypoints = (max(size) * places + np.array(size) / 2).astype(np.float32)
+            if index >= known:
+                database.write_keypoints(index + 1, keypoints)
+        for i, j in combinations(range(len(views)), 2):
+            if j >= known:
+                both = np.flatnonzero(seen[i] & seen[j])
+                wrong = rng.permutation(both)[: len(both) // 6]
+                rows = np.stack([both, both], axis=1)
+                rows[np.isin(both, wrong), 1] = rng.permutation(wrong)
+                database.write_matches(i + 1, j + 1, rows.astype(np.uint32))
+
+
+def _write_image(database: pycolmap.Database, name: str, size: tuple[int, int]) -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.2 * max(size), *size)
+    camera.camera_id = database.write_camera(camera)
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(camera.sensor_id)
+    image = pycolmap.Image(name=name, camera_id=camera.camera_id)
+    image.image_id = database.write_image(image)
+    frame = pycolmap.Frame(rig_id=database.write_rig(rig))
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame)

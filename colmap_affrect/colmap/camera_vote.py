@@ -47,9 +47,10 @@ MAX_SPREAD = 1.4
 
 @dataclass(frozen=True)
 class VotingPair:
-    """A verified pair that votes: ids of its cameras, and its inliers."""
+    """A verified pair that votes: ids of its cameras and images, and its inliers."""
 
     cameras: tuple[int, int]
+    images: tuple[int, int]
     matched: MatchedPair
 
 
@@ -86,7 +87,7 @@ class CameraVote:
             for key, record in self.records.items()
             if key not in self.tied
         }
-        ballots = self._ballots(self.pairs, self.tied, known)
+        ballots = _ballots(self.pairs, self.tied, known)
         num_votes = Counter(camera for item in ballots for camera in set(item.cameras))
         outcome = count(ballots, sorted(set(self.tied.values())))
         records = {key: record for key, record in self.records.items() if key in known}
@@ -107,32 +108,17 @@ class CameraVote:
         yield from (keys for keys in sizes.values() if len(keys) > 1)
 
     def _decide_sharing(self, same_size: Sequence[int]) -> None:
-        inside = [pair for pair in self.pairs if set(pair.cameras) <= set(same_size)]
-        ballots = self._ballots(inside[:MAX_PAIRS_OF_DECISION], self.tied, {})
-        if not ballots:
+        difference = log_evidence_for_sharing(self.pairs, same_size)
+        if difference is None:
             return
-        asked = sorted({camera for item in ballots for camera in item.cameras})
-        many = count(ballots, asked, resample=False).log_evidence
-        one = evidence_for_one(ballots)
-        first = min(same_size)
-        if one - many >= MIN_LOG_EVIDENCE:
-            self.tied |= dict.fromkeys(same_size, first)
+        if difference >= MIN_LOG_EVIDENCE:
+            self.tied |= dict.fromkeys(same_size, min(same_size))
             text = f"one camera for {len(same_size)} images of one size, by the votes of pairs"
-        elif many - one >= MIN_LOG_EVIDENCE:
+        elif -difference >= MIN_LOG_EVIDENCE:
             text = "a camera for each of these images of one size, by the votes of pairs"
         else:
             text = "pairs do not tell whether images of this size share a camera"
         self.decisions |= dict.fromkeys(same_size, text)
-
-    @staticmethod
-    def _ballots(
-        pairs: Sequence[VotingPair], tied: Mapping[int, int], known: Mapping[int, float]
-    ) -> list[Ballot]:
-        def ask(pair: VotingPair) -> Ballot | None:
-            first, second = (tied.get(camera, camera) for camera in pair.cameras)
-            return ballot(pair.matched, (first, second), known)
-
-        return [found for found in map_ordered(ask, pairs, available_cores()) if found]
 
     def _record(self, keys: Sequence[int], estimate: FocalEstimate, num_votes: int) -> CameraRecord:
         """Return the record of cameras of one size that turned out to be the same."""
@@ -153,6 +139,31 @@ class CameraVote:
             high_px=estimate.high * longer,
             why="; ".join(text for text in texts if text),
         )
+
+
+def log_evidence_for_sharing(pairs: Sequence[VotingPair], cameras: Collection[int]) -> float | None:
+    """Return how much more likely one camera is than many, as a logarithm; None without pairs.
+
+    Args:
+        pairs: strongest first; those of other cameras are left out.
+        cameras: ids of cameras of which nothing is known.
+    """
+    inside = [pair for pair in pairs if set(pair.cameras) <= set(cameras)]
+    ballots = _ballots(inside[:MAX_PAIRS_OF_DECISION], {}, {})
+    if not ballots:
+        return None
+    asked = sorted({camera for item in ballots for camera in item.cameras})
+    return evidence_for_one(ballots) - count(ballots, asked, resample=False).log_evidence
+
+
+def _ballots(
+    pairs: Sequence[VotingPair], tied: Mapping[int, int], known: Mapping[int, float]
+) -> list[Ballot]:
+    def ask(pair: VotingPair) -> Ballot | None:
+        first, second = (tied.get(camera, camera) for camera in pair.cameras)
+        return ballot(pair.matched, (first, second), known)
+
+    return [found for found in map_ordered(ask, pairs, available_cores()) if found]
 
 
 def needs_vote(records: Mapping[int, CameraRecord]) -> bool:
@@ -218,6 +229,7 @@ def voting_pairs(
         }
     return [
         _voting_pair(
+            pair,
             tuple(cameras[images[image_id]] for image_id in pair),
             tuple(keypoints[image_id] for image_id in pair),
             geometry,
@@ -228,6 +240,7 @@ def voting_pairs(
 
 
 def _voting_pair(
+    images: tuple[int, int],
     cameras: Sequence[pycolmap.Camera],
     keypoints: Sequence[NDArray[np.float64]],
     geometry: pycolmap.TwoViewGeometry,
@@ -247,7 +260,7 @@ def _voting_pair(
     matched = MatchedPair.of(
         points[0], points[1], fundamental / np.linalg.norm(fundamental), float(np.mean(errors))
     )
-    return VotingPair((cameras[0].camera_id, cameras[1].camera_id), matched)
+    return VotingPair((cameras[0].camera_id, cameras[1].camera_id), images, matched)
 
 
 def apply_records(path: Path, records: Mapping[int, CameraRecord]) -> None:

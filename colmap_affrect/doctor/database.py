@@ -15,6 +15,7 @@ from colmap_affrect.colmap.checks import (
     is_unsafe,
 )
 from colmap_affrect.colmap.database_copy import copy_database, newest_schema_version, schema_version
+from colmap_affrect.doctor.cameras import examine_cameras
 from colmap_affrect.doctor.findings import Findings, without_path
 from colmap_affrect.errors import DatabaseError, ImageError
 from colmap_affrect.images.reading import read_gray
@@ -64,6 +65,8 @@ def examined_copy(
         for kind in sorted(problems, key=list(CHECKS).index):
             advice = own_advice.get(kind, "")
             findings.add(kind, path, problems[kind], advice=advice, path=path, folder=path.parent)
+        if not any(CHECKS[kind][0] == "error" for kind in problems):
+            examine_cameras(findings, path, copy)
         yield copy, tables
 
 

@@ -50,6 +50,22 @@ TEXTS: dict[str, Check] = CHECKS | {
         "schema as soon as COLMAP or pycolmap opens it",
         "keep a copy: cp {path} {copy}"),
     "database-damaged": ("error", "{error}", f"{RECOVER} of it; else make it anew"),
+    "implausible-focal": ("warning",
+        "cameras with focal lengths that hardly any photograph has, in px of the image and longer "
+        "sides",
+        "give the right ones in a table (--cameras-path), or let the pairs vote on them: "
+        "--ignore-exif for photographs, --focal-vote always for scans"),
+    "contradicted-focal": ("warning",
+        "cameras whose pairs contradict the focal length that is known of them; px, and what pairs "
+        "say",
+        "run again with --ignore-exif if it is from EXIF, or give others (--cameras-path)"),
+    "cameras-not-shared": ("note",
+        "images of one size with a camera each, though pairs say that they share one",
+        "run again with --focal-vote always or, if all images are by one camera, "
+        "--camera-mode single"),
+    "cameras-shared": ("warning",
+        "images that share a camera, though pairs say that they do not",
+        "run again with --camera-mode per-image"),
     # an output folder
     "foreign-folder": ("note",
         "is no output folder of colmap-affrect (it has no config.toml); only its database is "

@@ -32,6 +32,12 @@ MAX_MISFIT = 5.0
 """By how much the log-likelihood of the best essential matrix may fall short of that of the best
 fundamental matrix; a pair beyond says nothing about cameras: its geometry is wrong."""
 
+MAX_MISFIT_OF_CANDIDATES = 100.0
+"""Like :data:`MAX_MISFIT` of candidates that are far apart, before those beside are looked at."""
+
+BESIDE = np.geomspace(1 / 1.2, 1.2, 11)
+"""Factors from a candidate to focal lengths beside it, halfway to the next one or nearer."""
+
 MAX_NUM_STEPS, MIN_GAIN = 15, 1e-3
 """Of Levenberg and Marquardt; the least gain of log-likelihood that is worth another step."""
 
@@ -83,10 +89,23 @@ def log_evidence(
     """
     essential = _Fit(pair, focals1, focals2, is_essential=True)
     fundamental = _Fit(pair, np.ones(1), np.ones(1), is_essential=False)
-    if essential.costs.min() > fundamental.costs[0] + max_misfit:
+    best = int(essential.costs.argmin())
+    misfit = essential.costs[best] - fundamental.costs[0]
+    if max_misfit < misfit < MAX_MISFIT_OF_CANDIDATES:
+        beside = np.stack(np.meshgrid(BESIDE * focals1[best], BESIDE * focals2[best]))
+        nearby = _Fit(pair, *beside.reshape(2, -1), is_essential=True)
+        misfit = nearby.costs.min() - fundamental.costs[0]
+    if misfit > max_misfit:
         return np.zeros(len(focals1))
     found = -essential.costs - 0.5 * essential.log_determinants()
     return np.asarray(found - found.max())
+
+
+def fits(pair: MatchedPair, focal1: float, focal2: float) -> bool:
+    """Tell whether cameras of these focal lengths explain a pair; so do those beside them."""
+    essential = _Fit(pair, BESIDE * focal1, BESIDE * focal2, is_essential=True)
+    fundamental = _Fit(pair, np.ones(1), np.ones(1), is_essential=False)
+    return bool(essential.costs.min() <= fundamental.costs[0] + MAX_MISFIT)
 
 
 class _Fit:

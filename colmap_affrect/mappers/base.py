@@ -106,9 +106,23 @@ class MappingTask:
         """A folder that exists, as pycolmap needs one also where there are no photographs."""
         return self.image_path or self.database_path.parent
 
+    def keeps_focal_lengths(self, options: MapperOptions) -> bool:
+        """Tell whether no focal length is to be refined: the user gave all of them."""
+        given = ("focal" in record.given for record in self.cameras.values())
+        return options.keep_given_intrinsics and bool(self.cameras) and all(given)
+
     def constant_cameras(self, options: MapperOptions) -> set[int]:
-        """Return the ids of the cameras that are not to be refined."""
-        fixed = {key for key, record in self.cameras.items() if record.is_fixed}
+        """Return the ids of the cameras that are not to be refined.
+
+        One whose focal length alone is given is among them where others are refined: pycolmap has
+        no focal length that is fixed for some cameras only.
+        """
+        focals = options.keep_given_intrinsics and not self.keeps_focal_lengths(options)
+        fixed = {
+            key
+            for key, record in self.cameras.items()
+            if record.is_fixed or (focals and "focal" in record.given)
+        }
         return (fixed if options.keep_given_intrinsics else set()) | self.held
 
 

@@ -90,7 +90,7 @@ class ExistingModel:
         native.load_all_images = True  # also those of the model that no match ties to others
         if not self.refine:
             native.fix_existing_frames = True
-            native.constant_cameras = {image.camera_id for image in self.images}
+            native.constant_cameras |= {image.camera_id for image in self.images}
             native.constant_rigs = {
                 self.reconstruction.frame(image.frame_id).rig_id for image in self.images
             }

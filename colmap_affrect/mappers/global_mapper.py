@@ -66,6 +66,8 @@ class GlobalMapper:
         """See :class:`colmap_affrect.mappers.base.Mapper`; all images register at once."""
         native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
         values = differences(native, pycolmap.GlobalPipelineOptions())
+        if task.keeps_focal_lengths(self.options):
+            values.setdefault("mapper.bundle_adjustment.refine_focal_length", False)
         map_globally(task.database_path, task.colors_path, output_path, values)
         models = [MappedModel(read_model(path)) for path in sorted(output_path.iterdir())]
         show(max((model.reconstruction.num_reg_images() for model in models), default=0))

@@ -92,8 +92,12 @@ class IncrementalMapper:
         """Return pycolmap's options for a task, with what is not to be refined of its cameras."""
         native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
         native.constant_cameras = task.constant_cameras(self.options)
+        kept = []
+        if task.keeps_focal_lengths(self.options):
+            kept += ["ba_refine_focal_length", "mapper.abs_pose_refine_focal_length"]
         if task.distortion_held:
-            native.ba_refine_extra_params = native.mapper.abs_pose_refine_extra_params = False
+            kept += ["ba_refine_extra_params", "mapper.abs_pose_refine_extra_params"]
+        set_values(native, dict.fromkeys(kept, False) | self.options.mapper_options)
         return native
 
     def native(

@@ -19,7 +19,7 @@ from matched_scenes import (
 )
 
 from colmap_affrect.colmap.camera_vote import MAX_SPREAD, MIN_LOG_EVIDENCE
-from colmap_affrect.geometry.focal_evidence import MatchedPair
+from colmap_affrect.geometry.focal_evidence import MatchedPair, log_evidence
 from colmap_affrect.geometry.focal_vote import (
     FOCALS,
     PRIOR_FOCAL,
@@ -103,7 +103,7 @@ def test_sharing_is_decided_right(seed: int) -> None:
 
 
 def test_a_good_pair_between_the_first_candidates_votes() -> None:
-    """Its best candidate at first is far off, for what is known so well."""
+    """The first candidates fit badly, the best of them by chance far from the truth."""
     ids, pair = scene((1.0, 1.5, 1.2), 8)[1]
     (found,) = ballots([(ids, pair)], shared=False)
     assert np.ptp(found.evidence) > 0.0
@@ -118,6 +118,18 @@ def test_a_known_camera_tells_the_other(side: int) -> None:
     assert found.cameras == (other, other)
     assert holds(count([found], [other]).estimates[other], focals[other])
     assert ballots(pairs, shared=False, known=dict(enumerate(focals))) == []
+
+
+def test_a_good_pair_votes_for_the_candidate_next_to_the_truth() -> None:
+    """Where one camera is known the other one is so well that no candidate fits."""
+    rng = np.random.default_rng(4)
+    points = in_a_box(900, rng)
+    views = views_around([1.4] * 3, rng)
+    pair = matched_pair(views[0], views[2], points, rng, 100)
+    for focal in np.geomspace(1.33, 1.47, 5):  # as if the candidates were elsewhere
+        evidence = log_evidence(pair, np.full(5, 1.4), focal * 1.09 ** np.arange(-2.0, 3.0))
+        assert evidence.argmax() in (1, 2, 3)
+        assert np.ptp(evidence) > 10.0
 
 
 def test_planes_tell_nothing() -> None:
