@@ -138,8 +138,8 @@ def _table(pair: MatchedPair, focals: Array) -> Array:
 def _softened(table: Array) -> Array:
     """Widen a table so that no peak is lost between candidates.
 
-    Evidence is a parabola about its best candidate: halfway to the next one it falls by a quarter of
-    the second difference.
+    Evidence is a parabola about its best candidate: halfway to the next one it falls by a quarter
+    of the second difference.
     """
     row, column = np.unravel_index(table.argmax(), table.shape)
     lines = (np.pad(table[row], 1, "edge"), np.pad(table[:, column], 1, "edge"))
@@ -147,7 +147,7 @@ def _softened(table: Array) -> Array:
         line[at + 1] - 0.5 * (line[at] + line[at + 2])
         for line, at in zip(lines, (column, row), strict=True)
     ]
-    return table * min(1.0, 4.0 * MAX_LOSS / max(*bends, 1e-9))
+    return np.asarray(table * min(1.0, 4.0 * MAX_LOSS / max(*bends, 1e-9)))
 
 
 def evidence_for_one(ballots: Sequence[Ballot]) -> float:
