@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from colmap_affrect.mappers.arrivals import arrivals, read_arrivals, write_arriv
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.doubts import find_doubts, without_impossible
 from colmap_affrect.mappers.existing import require_extends
-from colmap_affrect.mappers.last_adjustment import adjust_last
+from colmap_affrect.mappers.last_adjustment import MIN_NUM_TRACKS, adjust_last
 from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.mappers.starts import Start, runaways, started, starts
@@ -99,6 +100,7 @@ def map_database(
 class _Attempts:
     """Which attempts there are: with several seeds, and from several focal lengths.
 
+    One that has all images, each with enough points of three images, is the last.
     Cameras that ran away in the best models so far are held in those that follow.
     """
 
@@ -121,8 +123,9 @@ class _Attempts:
             return True
         if self._done >= self._limit:
             return False
-        is_complete = best and _size(best[0])[0] >= min(self._num_images, LARGE_MODEL)
-        return self._done < len(self._starts) or not is_complete
+        if not best or _size(best[0])[0] < min(self._num_images, LARGE_MODEL):
+            return True
+        return self._done < len(self._starts) and not _is_well_tied(best[0].reconstruction)
 
     def next(
         self, database_path: Path, output_path: Path, show: Callable[[int], None]
@@ -133,6 +136,17 @@ class _Attempts:
         self._done += 1
         task = started(self._task, start, database_path)
         return self._mapper.map(task, output_path, seed, show)
+
+
+def _is_well_tied(model: pycolmap.Reconstruction) -> bool:
+    """Tell whether all images see enough points of three images, which know focal lengths."""
+    counts = Counter(
+        image_id
+        for point in model.points3D.values()
+        if len(images := {element.image_id for element in point.track.elements}) > 2
+        for image_id in images
+    )
+    return all(counts[image_id] >= MIN_NUM_TRACKS for image_id in model.reg_image_ids())
 
 
 def _adjust_weak(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -> None:

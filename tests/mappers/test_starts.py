@@ -140,11 +140,15 @@ def without(
     return [MappedModel(model)]
 
 
-def test_unknown_cameras_are_started_from_all_sides_even_if_the_model_is_complete(
-    scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
+def test_unknown_cameras_are_started_from_all_sides_unless_all_images_are_tied_well(
+    scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mapper = Recorder(lambda _: without(scene, 0))
     cameras = {**records(scene, replace(KNOWN, focal_px=TRUE_FOCAL)), 2: VAGUE}
+    tied = Recorder(lambda _: without(scene, 0))
+    mapped(scene, tmp_path, tied, cameras)
+    assert len(tied.focals) == 1
+    monkeypatch.setattr(attempts, "MIN_NUM_TRACKS", 1_000)
+    mapper = Recorder(lambda _: without(scene, 0))
     mapped(scene, tmp_path, mapper, cameras)
     assert [focals[1] for focals in mapper.focals] == pytest.approx(
         [1280.0, 1280.0, 707.1, 1414.2], abs=0.1
