@@ -101,13 +101,6 @@ def log_evidence(
     return np.asarray(found - found.max())
 
 
-def fits(pair: MatchedPair, focal1: float, focal2: float) -> bool:
-    """Tell whether cameras of these focal lengths explain a pair; so do those beside them."""
-    essential = _Fit(pair, BESIDE * focal1, BESIDE * focal2, is_essential=True)
-    fundamental = _Fit(pair, np.ones(1), np.ones(1), is_essential=False)
-    return bool(essential.costs.min() <= fundamental.costs[0] + MAX_MISFIT)
-
-
 class _Fit:
     """Epipolar matrices ``E = U diag(1, s, 0) V^T`` in camera coordinates, one for each focals.
 
