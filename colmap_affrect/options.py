@@ -31,11 +31,7 @@ CUSTOM = "custom"
 
 
 def preset_values(preset: str, colmap: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what a preset sets: nothing for ours, the values given for COLMAP's.
-
-    Raises:
-        OptionError: for an unknown preset.
-    """
+    """Return what a preset sets: nothing for ours, the values given for COLMAP's."""
     if preset not in PRESETS:
         raise OptionError(f"preset {preset!r} is not one of {', '.join(PRESETS)}")
     return colmap if preset == "colmap" else {}
@@ -52,11 +48,7 @@ class Options(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     def __init__(self, /, **values: Any) -> None:
-        """Check the values.
-
-        Raises:
-            OptionError: naming the option.
-        """
+        """Check the values; OptionError names the option."""
         try:
             super().__init__(**values)
         except ValidationError as error:
@@ -64,11 +56,7 @@ class Options(BaseModel):
 
     @classmethod
     def from_mapping(cls, values: Any, where: str) -> Self:
-        """Build from a mapping that comes from ``where``, a file for instance.
-
-        Raises:
-            OptionError: naming ``where`` and the option.
-        """
+        """Build from a mapping that comes from ``where``; OptionError names that and the option."""
         if not isinstance(values, Mapping):
             raise OptionError(f"{where}: expected options, got {values!r}")
         try:
@@ -155,11 +143,7 @@ class Registry(Generic[Part]):
         return {point.name: point for point in [*metadata.entry_points(group=self.group), *ours]}
 
     def part(self, name: str) -> Any:
-        """Return the class of a part.
-
-        Raises:
-            OptionError: for an unknown name.
-        """
+        """Return the class of a part; OptionError for an unknown name."""
         if name in self.built_in:  # do not ask for the entry points of all installed packages
             return metadata.EntryPoint(name, self.built_in[name], self.group).load()
         known = self._entry_points()
@@ -170,9 +154,7 @@ class Registry(Generic[Part]):
     def options(self, given: Any, *, where: str = "") -> Any:
         """Return the options of a part: as they are, by its name, or from a mapping with ``name``.
 
-        Raises:
-            OptionError: for an unknown part or option, naming ``where`` it is given, if that is
-                known.
+        Raises OptionError for an unknown part or option, naming ``where`` it is given.
         """
         if isinstance(given, PartOptions):
             return given

@@ -182,7 +182,7 @@ def run(
         if options.recipe.extraction.escalation:
             reports.append(escalate(context, options.recipe.escalate))
         if options.holds_vote:
-            reports.append(choose_cameras(context))
+            reports.append(choose_cameras(context, may_share=not options.extend))
         reports.append(guide(context, options.recipe.guided))
         if options.database_descriptors:
             write_descriptors(context)
@@ -273,7 +273,7 @@ def map_and_report(
         pair_levels={} if copied else pair_levels(context),
         guided=guided_counts(context),
         cameras=tuple(
-            record.to_report(camera_id)
+            record.to_report(camera_id, models[0].focals_px.get(camera_id) if models else None)
             for camera_id, record in read_camera_records(workspace.cameras).items()
         ),
         extended=tuple(before),

@@ -128,11 +128,7 @@ class Recipe:
 
     @classmethod
     def from_mapping(cls, name: str, values: Mapping[str, Any], where: str = "") -> Self:
-        """Build from the sections of a recipe.
-
-        Raises:
-            OptionError: for an unknown option, or a value out of range.
-        """
+        """Build from the sections of a recipe; OptionError for unknown or wrong options."""
         where = where or f"recipe {name}"
         options = RecipeOptions.from_mapping(values, where)
         fields = {key: getattr(options, key) for key in ExtractionOptions.model_fields}
@@ -165,13 +161,8 @@ class Recipe:
     def mapper_options(self, preset: str, name: str = "", **values: Any) -> MapperOptions:
         """Return the options of the mapper: those of a preset, of the recipe, and others given.
 
-        Args:
-            preset: ``sparse`` or ``colmap``.
-            name: of the mapper; by default that of the recipe, or of the preset.
-            values: win over those of the recipe.
-
-        Raises:
-            OptionError: for an unknown mapper or option.
+        ``name`` is by default that of the recipe, or of the preset; ``values`` win over the
+        recipe's. Raises OptionError for an unknown mapper or option.
         """
         own = dict(self.mapping)
         recipes_name = str(own.pop("name", DEFAULT_MAPPERS.get(preset, MAPPERS.default)))
@@ -198,14 +189,10 @@ def recipe_names() -> list[str]:
 
 
 def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
-    """Load a recipe by name or path and change single options.
+    """Load a recipe by its name or the path of a TOML file, and change single options.
 
-    Args:
-        name: one of :func:`recipe_names`, or the path of a TOML file.
-        settings: ``section.option=value`` with a TOML value; strings may go without quotes.
-
-    Raises:
-        OptionError: for an unknown recipe or option, or a value out of range.
+    ``settings`` are ``section.option=value`` with a TOML value; strings may go without quotes.
+    Raises OptionError for an unknown recipe or option, or a value out of range.
     """
     return Recipe.from_mapping(name, with_settings(_read(name), settings))
 

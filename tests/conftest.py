@@ -38,7 +38,10 @@ def call(capfd: pytest.CaptureFixture[str]) -> Call:
 
     def run_command(*arguments: object) -> Ended:
         capfd.readouterr()
-        code = main([str(argument) for argument in arguments])
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as end:  # argparse: help, or wrong usage
+            code = end.code
         captured = capfd.readouterr()
         return Ended(code, captured.out, captured.err.splitlines())
 

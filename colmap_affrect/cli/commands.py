@@ -9,198 +9,40 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
+from colmap_affrect.cli import given
 from colmap_affrect.errors import ComparisonError, OptionError
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK, ReconstructionReport
-from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK
 
 if TYPE_CHECKING:
-    from colmap_affrect.colmap.verification import VerificationOptions
     from colmap_affrect.comparison.results import Comparison
-    from colmap_affrect.images.photographs import CameraOptions, MaskOptions
-    from colmap_affrect.mappers.base import MapperOptions
-    from colmap_affrect.mappers.existing import Extension
-    from colmap_affrect.pairs.base import PairOptions
-    from colmap_affrect.parallel.executor import Executor
-    from colmap_affrect.recipes import Recipe
-    from colmap_affrect.stages.context import Context, Resources
+    from colmap_affrect.interop.hdf5 import InterchangeReport
+    from colmap_affrect.project.report import ReconstructionReport, StageReport
 
 
 def run(options: argparse.Namespace) -> int:
     from colmap_affrect import pipeline
 
-    recipe = _recipe(options)
-    given = pipeline.RunOptions(
+    recipe = given.recipe(options)
+    run_options = pipeline.RunOptions(
         recipe=recipe,
         database_descriptors=options.database_descriptors,
-        extend=_extension(options),
-        **_inputs(options, recipe),
+        extend=given.extension(options),
+        **given.inputs(options, recipe),
     )
-    with _executor(options) as executor:
+    with given.executor(options) as executor:
         report = pipeline.run(
             options.image_path,
             options.output_path,
-            given,
+            run_options,
             executor=executor,
             overwrite=options.overwrite,
-            progress=_progress(options),
+            progress=given.progress(options),
         )
     return _print_reconstruction(report, options)
-
-
-def _inputs(options: argparse.Namespace, recipe: Recipe | None = None) -> dict[str, Any]:
-    """Return the fields of InputOptions, which run and compare have in common."""
-    return {
-        "cameras": _cameras(options),
-        "masks": _masks(options),
-        "pairs": _pair_options(options),
-        "verification": _verification(options),
-        "mapping": _mapping(options, recipe),
-        "image_list_path": options.image_list_path,
-        "from_database": options.from_database,
-        "resources": _resources(options),
-        "focal_vote": options.focal_vote,
-    }
-
-
-def _extension(options: argparse.Namespace) -> Extension | None:
-    from colmap_affrect.mappers.existing import Extension
-
-    if options.extend:
-        return Extension(options.extend, options.refine_existing)
-    if options.refine_existing:
-        raise OptionError("--refine-existing: only with --extend MODEL")
-    return None
-
-
-def _recipe(options: argparse.Namespace) -> Recipe:
-    from colmap_affrect.recipes import load_recipe
-
-    matcher = getattr(options, "matcher", None)
-    settings = [f"matching.name={json.dumps(matcher)}"] if matcher else []
-    guided = getattr(options, "guided", None)
-    settings += [f"guided.enabled={json.dumps(guided)}"] if guided else []
-    return load_recipe(options.recipe, [*settings, *options.set, *_depth_settings(options)])
-
-
-def _depth_settings(options: argparse.Namespace) -> list[str]:
-    path, model = getattr(options, "depth_path", None), getattr(options, "depth_model", None)
-    given = {
-        "name": "monocular" if model else "files" if path else None,
-        "path": str(path.resolve()) if path else None,
-        "model": model,
-        "kind": getattr(options, "depth_kind", None),
-    }
-    return [f"depth.{key}={json.dumps(value)}" for key, value in given.items() if value]
-
-
-def _resources(options: argparse.Namespace) -> Resources:
-    from colmap_affrect.stages.context import Resources
-
-    return Resources(getattr(options, "weights", None), getattr(options, "device", "auto"))
-
-
-@contextmanager
-def _executor(options: argparse.Namespace) -> Iterator[Executor | None]:
-    """Use the cluster that was named, None if there is none."""
-    if not getattr(options, "scheduler", None):
-        yield None
-        return
-    from colmap_affrect.parallel.cluster import connected
-
-    with connected(options.scheduler) as cluster:
-        yield cluster
-
-
-@contextmanager
-def _context(options: argparse.Namespace) -> Iterator[Context]:
-    """Lock the output folder and return what the stages work with."""
-    from colmap_affrect.stages.context import Context
-
-    with Workspace(options.output_path).locked() as workspace, _executor(options) as executor:
-        yield Context(workspace, _resources(options), executor, _progress(options))
-
-
-def _cameras(options: argparse.Namespace) -> CameraOptions:
-    from colmap_affrect.images.photographs import CameraOptions
-
-    return CameraOptions(
-        mode=options.camera_mode,
-        model=options.camera_model,
-        params=options.camera_params,
-        ignore_exif=options.ignore_exif,
-        cameras_path=str(options.cameras_path.resolve()) if options.cameras_path else "",
-        focal_length_px=options.focal_length_px,
-        principal_point=options.principal_point,
-    )
-
-
-def _masks(options: argparse.Namespace) -> MaskOptions:
-    from colmap_affrect.images.photographs import MaskOptions
-
-    paths = (options.mask_path, options.camera_mask_path)
-    folder, camera = (str(path.resolve()) if path else "" for path in paths)
-    return MaskOptions(path=folder, camera_path=camera)
-
-
-def _pair_options(
-    options: argparse.Namespace, recorded: Mapping[str, Any] | None = None
-) -> PairOptions:
-    """Return what is given on the command line, over what is on record."""
-    from colmap_affrect.pairs.base import PairOptions
-
-    listed = options.match_list_path
-    given = {
-        "methods": getattr(options, "pairs", None),
-        "num_neighbors": getattr(options, "num_neighbors", None),
-        "max_distance_m": getattr(options, "max_distance_m", None),
-        "match_list_path": str(listed.resolve()) if listed else None,
-    }
-    chosen = {key: value for key, value in given.items() if value is not None}
-    return PairOptions.from_mapping({**(recorded or {}), **chosen}, "pairs")
-
-
-def _verification(
-    options: argparse.Namespace, recorded: Mapping[str, Any] | None = None
-) -> VerificationOptions:
-    """Return the preset that is given, or what is on record."""
-    from colmap_affrect.colmap.verification import VerificationOptions
-
-    seed = getattr(options, "random_seed", None)
-    given = {} if seed is None else {"random_seed": seed}
-    if recorded and not options.preset:
-        return VerificationOptions(**{**recorded, **given})
-    return VerificationOptions.preset(options.preset or "sparse", **given)
-
-
-def _mapping(
-    options: argparse.Namespace,
-    recipe: Recipe | None = None,
-    recorded: Mapping[str, Any] | None = None,
-) -> MapperOptions:
-    """Return the mapper that is given, or what is on record."""
-    from colmap_affrect.mappers.base import MAPPERS
-    from colmap_affrect.recipes import Recipe
-
-    native = {}
-    for setting in options.mapper_options:
-        key, separator, value = setting.partition("=")
-        if not separator or not key.strip():
-            raise OptionError(f"--mapper-options {setting}: expected KEY=VALUE")
-        native[key.strip()] = value
-    seed = getattr(options, "random_seed", None)
-    given: dict[str, Any] = {} if seed is None else {"random_seed": seed}
-    if native:
-        given["mapper_options"] = native
-    if recorded and not (options.preset or options.mapper):
-        found: MapperOptions = MAPPERS.options({**recorded, **given})
-        return found
-    recipe = recipe or Recipe("")
-    return recipe.mapper_options(options.preset or "sparse", options.mapper or "", **given)
 
 
 def extract(options: argparse.Namespace) -> int:
@@ -210,11 +52,11 @@ def extract(options: argparse.Namespace) -> int:
         options.image_path,
         image_list_path=options.image_list_path,
         from_database=options.from_database,
-        cameras=_cameras(options),
-        masks=_masks(options),
+        cameras=given.cameras(options),
+        masks=given.masks(options),
     )
-    with _context(options) as context:
-        report = stage.extract(context, inputs, _recipe(options), overwrite=options.overwrite)
+    with given.context(options) as context:
+        report = stage.extract(context, inputs, given.recipe(options), overwrite=options.overwrite)
         if options.database_descriptors:
             stage.write_descriptors(context)
     print(report.summary())
@@ -224,59 +66,42 @@ def extract(options: argparse.Namespace) -> int:
 def pairs(options: argparse.Namespace) -> int:
     from colmap_affrect.stages.pairs import choose_pairs
 
-    with _context(options) as context:
-        chosen = _pair_options(options, context.workspace.planned("pairs"))
+    with given.context(options) as context:
+        chosen = given.pair_options(options, context.workspace.planned("pairs"))
         report = choose_pairs(context, chosen, overwrite=options.overwrite)
-    print(report.summary())
-    return EXIT_OK
+    return _printed(report)
 
 
 def match(options: argparse.Namespace) -> int:
     from colmap_affrect.matchers.base import MATCHERS
     from colmap_affrect.stages.match import match
 
-    with _context(options) as context:
+    with given.context(options) as context:
         if options.recipe:
-            matching = _recipe(options).matching
+            matching = given.recipe(options).matching
         else:
             chosen = [f"matching.name={json.dumps(options.matcher)}"] if options.matcher else []
-            recorded = context.workspace.planned("match")
-            values = _changed("matching", recorded, [*chosen, *options.set])
+            values = given.changed(context, "match", "matching", [*chosen, *options.set])
             matching = MATCHERS.options(values, where="matching")
         report = match(context, matching, overwrite=options.overwrite)
-    print(report.summary())
-    return EXIT_OK
-
-
-def _changed(
-    section: str, recorded: Mapping[str, Any] | None, settings: Sequence[str]
-) -> dict[str, Any]:
-    """Return the options on record of one section of a recipe, some of them changed."""
-    from colmap_affrect.recipes import with_settings
-
-    values = with_settings({section: recorded or {}}, settings)
-    if len(values) > 1:
-        raise OptionError(f"--set: only options of {section} can be changed here")
-    changed: dict[str, Any] = values[section]
-    return changed
+    return _printed(report)
 
 
 def verify(options: argparse.Namespace) -> int:
     from colmap_affrect.stages.verify import verify_matches
 
-    with _context(options) as context:
-        chosen = _verification(options, context.workspace.planned("verify"))
+    with given.context(options) as context:
+        chosen = given.verification(options, context.workspace.planned("verify"))
         report = verify_matches(context, chosen, overwrite=options.overwrite)
-    print(report.summary())
-    return EXIT_OK
+    return _printed(report)
 
 
 def escalate(options: argparse.Namespace) -> int:
     from colmap_affrect.recipes import EscalateOptions
     from colmap_affrect.stages.escalate import escalate, pair_levels
 
-    with _context(options) as context:
-        values = _changed("escalate", context.workspace.planned("escalate"), options.set)
+    with given.context(options) as context:
+        values = given.changed(context, "escalate", "escalate", options.set)
         chosen = EscalateOptions.from_mapping(values, "escalate")
         report = escalate(context, chosen, overwrite=options.overwrite)
         levels = pair_levels(context)
@@ -291,8 +116,8 @@ def guide(options: argparse.Namespace) -> int:
     from colmap_affrect.stages.guide import guide, guided_counts
     from colmap_affrect.stages.guide_by_model import guide_by_model
 
-    with _context(options) as context:
-        values = _changed("guided", context.workspace.planned("guide"), options.set)
+    with given.context(options) as context:
+        values = given.changed(context, "guide", "guided", options.set)
         values |= {"enabled": options.guided} if options.guided else {}
         chosen = GuidedOptions.from_mapping(values, "guided")
         report = guide(
@@ -314,24 +139,24 @@ def map(options: argparse.Namespace) -> int:
     from colmap_affrect.stages.copy import is_copy
     from colmap_affrect.stages.extract import Inputs
 
-    extend = _extension(options)
+    extend = given.extension(options)
     if options.from_database:
         report = map_from_database(
             options.from_database,
             options.output_path,
             image_path=options.image_path,
-            mapping=_mapping(options),
-            verification=_verification(options),
+            mapping=given.mapping(options),
+            verification=given.verification(options),
             extend=extend,
             check_cameras=options.focal_vote == "always",
             overwrite=options.overwrite,
-            progress=_progress(options),
+            progress=given.progress(options),
         )
         return _print_reconstruction(report, options)
     if options.image_path:
         raise OptionError("--image-path: only with --from-database; else that of extract is used")
-    with _context(options) as context:
-        mapper = MAPPERS.make(_mapping(options, recorded=context.workspace.planned("map")))
+    with given.context(options) as context:
+        mapper = MAPPERS.make(given.mapping(options, recorded=context.workspace.planned("map")))
         is_others = is_copy(context.workspace) or bool(
             Inputs.recorded(context.workspace).from_database
         )
@@ -340,7 +165,7 @@ def map(options: argparse.Namespace) -> int:
             context,
             mapper,
             extend,
-            earlier=[choose_cameras(context)] if votes else [],
+            earlier=[choose_cameras(context, may_share=not extend)] if votes else [],
             overwrite=options.overwrite,
         )
     return _print_reconstruction(report, options)
@@ -358,10 +183,10 @@ def compare(options: argparse.Namespace) -> int:
         options.image_path,
         options.output_path,
         CompareOptions(
-            methods=parse_methods(options.methods, _depth_settings(options)),
+            methods=parse_methods(options.methods, given.depth_settings(options)),
             seeds=options.seeds,
             ground_truth_path=options.ground_truth_path,
-            **_inputs(options),
+            **given.inputs(options),
         ),
         overwrite=options.overwrite,
         progress=SILENT if options.quiet else Progress(sys.stderr, num_plain_lines=1),
@@ -385,14 +210,14 @@ def evaluate(options: argparse.Namespace) -> int:
         options.dataset_path,
         options.output_path,
         EvaluateOptions(
-            recipes=parse_methods(options.recipes, _depth_settings(options)),
+            recipes=parse_methods(options.recipes, given.depth_settings(options)),
             baseline=options.baseline,
             max_num_keypoints=options.max_num_keypoints,
             random_seed=options.random_seed,
-            resources=_resources(options),
+            resources=given.resources(options),
         ),
         overwrite=options.overwrite,
-        progress=_progress(options),
+        progress=given.progress(options),
     )
     print(evaluation.to_json() if options.json else evaluation.summary())
     if not options.json:
@@ -421,15 +246,14 @@ def import_h5(options: argparse.Namespace) -> int:
         options.features_path,
         options.matches_path,
         options.database_path,
-        cameras=_cameras(options),
+        cameras=given.cameras(options),
         layout=options.layout,
         pixel_origin=options.pixel_origin,
         skip_verification=options.skip_verification,
         random_seed=options.random_seed,
-        progress=_progress(options),
+        progress=given.progress(options),
     )
-    print(report.summary())
-    return EXIT_OK
+    return _printed(report)
 
 
 def export_h5(options: argparse.Namespace) -> int:
@@ -442,10 +266,9 @@ def export_h5(options: argparse.Namespace) -> int:
         database_path=options.database_path,
         layout=options.layout,
         half=options.half,
-        progress=_progress(options),
+        progress=given.progress(options),
     )
-    print(report.summary())
-    return EXIT_OK
+    return _printed(report)
 
 
 def doctor(options: argparse.Namespace) -> int:
@@ -455,31 +278,32 @@ def doctor(options: argparse.Namespace) -> int:
         options.path,
         image_path=options.image_path,
         weights_path=options.weights,
-        progress=_progress(options),
+        progress=given.progress(options),
     )
     print(diagnosis.to_json() if options.json else diagnosis.summary())
     return EXIT_FAILED if diagnosis.num_errors else EXIT_OK
 
 
-def _progress(options: argparse.Namespace) -> Progress:
-    return SILENT if options.quiet else Progress(sys.stderr)
+def _printed(report: StageReport | InterchangeReport) -> int:
+    print(report.summary())
+    return EXIT_OK
 
 
 def _print_reconstruction(report: ReconstructionReport, options: argparse.Namespace) -> int:
     print(report.to_json() if options.json else report.summary())
+    why = ""
     if not report.models:
         why = "one image cannot make a model" if report.images_total == 1 else "no model was found"
+    elif not report.models[0].is_trustworthy:
+        why = "nothing in the model can be trusted"
+    if why:
         print(f"error: {why}; see {options.output_path / 'report.json'}", file=sys.stderr)
-        return EXIT_NO_MODEL
-    if not report.models[0].is_trustworthy:
-        where = options.output_path / "report.json"
-        print(f"error: nothing in the model can be trusted; see {where}", file=sys.stderr)
         return EXIT_NO_MODEL
     return _exit_code(report.failures, options)
 
 
 def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
-    if len(failures) <= getattr(options, "max_failures", 0):
+    if len(failures) <= options.max_failures:
         return EXIT_OK
     names = ", ".join(failures)
     print(f"error: could not read {len(failures)} of the images: {names}", file=sys.stderr)
@@ -491,11 +315,11 @@ def inspect(options: argparse.Namespace) -> int:
     from colmap_affrect.report.inspection import inspect_image
     from colmap_affrect.stages.one_image import prepare
 
-    recipe = _recipe(options)
-    photographs = Photographs(options.image.parent, _masks(options))
+    recipe = given.recipe(options)
+    photographs = Photographs(options.image.parent, given.masks(options))
     photographs.check()
     mask = photographs.mask(options.image.name)
-    extractor = prepare(recipe.extraction, _resources(options), [options.image.name])
+    extractor = prepare(recipe.extraction, given.resources(options), [options.image.name])
     print(inspect_image(extractor, options.image, options.output_path, mask))
     return EXIT_OK
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from colmap_affrect import __version__
 from colmap_affrect.cli import arguments as args
@@ -66,9 +66,20 @@ def build_parser() -> argparse.ArgumentParser:
             epilog=EPILOG,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        command.set_defaults(function=function, output_path=None)
+        command.set_defaults(function=function, **ABSENT)
         _add(command, options)
     return parser
+
+
+ABSENT: dict[str, Any] = {
+    **dict.fromkeys((
+        "output_path", "matcher", "guided", "depth_path", "depth_model", "depth_kind", "weights",
+        "scheduler", "pairs", "num_neighbors", "max_distance_m", "random_seed",
+    )),
+    "device": "auto",
+    "max_failures": 0,
+}  # fmt: skip
+"""What commands read that not all of them have as options."""
 
 
 def _add(container: Container, options: tuple[args.Option | args.OneOf, ...]) -> None:

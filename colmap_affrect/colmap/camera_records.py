@@ -55,8 +55,8 @@ class CameraRecord:
     size: tuple[int, int] = (0, 0)
     given: tuple[Given, ...] = ()
 
-    def to_report(self, camera_id: int) -> dict[str, Any]:
-        """Return the entry of ``report.json``."""
+    def to_report(self, camera_id: int, refined_px: float | None) -> dict[str, Any]:
+        """Return the entry of ``report.json``, with the focal length that mapping ended with."""
         longer = max(self.size)
         has_spread = self.low_px is not None and self.high_px is not None
         return {
@@ -66,6 +66,7 @@ class CameraRecord:
             "source": self.source,
             "focal_px": self.focal_px,
             "focal_longer_sides": self.focal_px / longer if longer else None,
+            "refined_px": refined_px,
             "spread_px": [self.low_px, self.high_px] if has_spread else None,
             "why": self.why,
         }

@@ -171,11 +171,7 @@ def pair_images(pair_id: int) -> tuple[int, int]:
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:
-    """Read a database with the current schema that nobody else has open, and check its content.
-
-    Raises:
-        DatabaseError: when the file itself is damaged.
-    """
+    """Check a database of the current schema that nobody has open; DatabaseError if damaged."""
     found: Problems = defaultdict(list)
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
@@ -202,13 +198,7 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
 def check_image_files(
     tables: Tables, image_path: Path, sizes: Mapping[str, tuple[int, int] | None]
 ) -> Problems:
-    """Compare the images of a database with their files.
-
-    Args:
-        tables: of the database.
-        image_path: folder of the photographs.
-        sizes: (width, height) in px of files that were read, None for those that cannot be.
-    """
+    """Compare a database with the (width, height) of its images' files, None if unreadable."""
     found: Problems = defaultdict(list)
     for image_id, name in tables.names.items():
         if is_unsafe(name):

@@ -25,10 +25,9 @@ DAMAGED = (sqlite3.Error, UnicodeDecodeError)
 
 
 def schema_version(path: Path) -> int:
-    """Return the version that a database says its tables have, e.g. 4020100 for COLMAP 4.2.1.
+    """Return the version of a database's tables, e.g. 4020100 for COLMAP 4.2.1.
 
-    Raises:
-        DatabaseError: when the file is missing or no COLMAP database.
+    Raises DatabaseError when the file is missing or no COLMAP database.
     """
     with _open_read_only(path) as connection:
         version = connection.execute("PRAGMA user_version").fetchone()[0]
@@ -48,11 +47,8 @@ def newest_schema_version() -> int:
 def copy_database(source: Path, target: Path) -> None:
     """Copy a database as it is now, including its write-ahead log.
 
-    The copy has the schema of the installed pycolmap.
-
-    Raises:
-        DatabaseError: when the source is missing, not a COLMAP database, or one of a newer COLMAP;
-            or when the target exists.
+    The copy has the schema of the installed pycolmap. Raises DatabaseError when the source is
+    missing, not a COLMAP database, or one of a newer COLMAP; or when the target exists.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
@@ -76,11 +72,7 @@ def copy_database(source: Path, target: Path) -> None:
 
 
 def copy_with_frames(source: Path, target: Path) -> None:
-    """Copy a database with all its content; images without a frame get one.
-
-    Raises:
-        DatabaseError: as :func:`copy_database`.
-    """
+    """Copy a database with all its content, as :func:`copy_database`; every image gets a frame."""
     partial = target.with_name(target.name + ".partial")
     partial.unlink(missing_ok=True)
     copy_database(source, partial)
@@ -90,13 +82,10 @@ def copy_with_frames(source: Path, target: Path) -> None:
 
 
 def copy_without_features(source: Path, target: Path) -> None:
-    """Copy cameras, rigs, frames, images and pose priors of a database, and nothing else.
+    """Copy cameras, rigs, frames, images and pose priors of a database, as :func:`copy_database`.
 
     Ids stay the same. Images without a frame get one: frames came with COLMAP 3.12, and mapping
     refuses a database in which only some images have one.
-
-    Raises:
-        DatabaseError: as :func:`copy_database`.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
@@ -138,11 +127,7 @@ def _add_frames(database: pycolmap.Database) -> None:
 
 @contextmanager
 def open_copy(source: Path) -> Iterator[pycolmap.Database]:
-    """Open a temporary copy of a database; the original stays as it is.
-
-    Raises:
-        DatabaseError: as :func:`copy_database`.
-    """
+    """Open a temporary :func:`copy_database`; the original stays as it is."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "database.db"
         copy_database(source, copy)

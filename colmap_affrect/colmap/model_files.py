@@ -53,11 +53,7 @@ class _Reader:
 
 
 def registered_names(model_path: Path) -> list[str]:
-    """Return the sorted names of the images of a model whose files are all intact.
-
-    Raises:
-        StoreError: when a file is missing or damaged.
-    """
+    """Return the sorted names of the images of a model; StoreError unless its files are intact."""
     names: list[str] = []
     for file_name, walk in RECORDS.items():
         path = model_path / file_name

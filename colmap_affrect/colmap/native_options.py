@@ -51,13 +51,13 @@ def resolve(options: Any, given: Mapping[str, Any], flag: str) -> dict[str, Plai
 
     Args:
         options: of the class that the values are for; they are changed.
-        given: value by key. Sections may be left out where a name exists once. Values may be
-            text: ``true``, ``false``, ``1`` or ``0`` for truth values, a name for enumerations.
+        given: value by key. Sections may be left out where a name exists once. Values may be text:
+            ``true``, ``false``, ``1`` or ``0`` for truth values, a name for enumerations.
         flag: how a user gives them, for messages.
 
     Raises:
-        OptionError: naming the key, if it is unknown, ambiguous or cannot be given in this way,
-            or if its value is of the wrong type.
+        OptionError: naming the key, if it is unknown, ambiguous or cannot be given in this way, or
+            if its value is of the wrong type.
     """
     known = flat_values(options)
     resolved: dict[str, Plain] = {}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import PLANAR, epipolar_pair, keypoint_shapes
-from colmap_affrect.geometry.affine import determinants, project, transform_frames
+from colmap_affrect.geometry.affine import determinants, homography_errors, transform_frames
 from colmap_affrect.geometry.epipolar import common_sign, direction_cosines, sampson_errors
 from colmap_affrect.geometry.significance import (
     log10_bayes_factor,
@@ -68,8 +68,7 @@ class _Homography:
 
     def errors(self, rows1: Rows, rows2: Rows) -> Points:
         """Return (M,) px."""
-        offsets = project(self.matrix, self.points[0][rows1]) - self.points[1][rows2]
-        return np.asarray(np.linalg.norm(offsets, axis=1))
+        return homography_errors(self.matrix, self.points[0][rows1], self.points[1][rows2])
 
     def cosines(self, rows1: Rows, rows2: Rows, shapes: tuple[Points, Points]) -> Points:
         """Return (M,) cosines between what frames carry over and what the geometry does."""

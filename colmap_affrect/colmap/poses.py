@@ -89,11 +89,7 @@ class PoseScores:
 
 
 def read_poses(model_path: Path) -> Poses:
-    """Read the poses of the registered images of a COLMAP model, text or binary.
-
-    Raises:
-        ComparisonError: when it is not a model or holds no poses.
-    """
+    """Read the poses of a COLMAP model, text or binary; ComparisonError when it has none."""
     try:
         model = pycolmap.Reconstruction(model_path)
     except (RuntimeError, ValueError) as error:
@@ -121,11 +117,7 @@ def relative_pose(pose1: Pose, pose2: Pose) -> Pose:
 
 
 def pose_errors(estimated: Pose, truth: Pose) -> tuple[float, float]:
-    """Compare two relative poses, whatever the lengths of their translations.
-
-    Returns:
-        The rotation angle and the angle between the translation directions, in degrees.
-    """
+    """Return the angles between two relative poses, degrees: rotation, translation direction."""
     rotation, translation = estimated
     true_rotation, true_translation = truth
     difference = rotation @ true_rotation.T
@@ -152,10 +144,7 @@ def pair_errors(estimated: Poses, truth: Poses) -> PairErrors:
 def correct_images(errors: PairErrors) -> tuple[str, ...]:
     """Return the images whose relative poses to at least half of the others are right.
 
-    A pair is right if both of its errors are at most ``MAX_CORRECT_ERROR_DEG``.
-
-    Args:
-        errors: of all pairs of the images, see :func:`pair_errors`.
+    A pair is right if both of its errors are at most ``MAX_CORRECT_ERROR_DEG``; all are given.
     """
     num_right = {name: 0 for pair in errors for name in pair}
     for pair, both in errors.items():
@@ -169,16 +158,8 @@ def correct_images(errors: PairErrors) -> tuple[str, ...]:
 def area_under_curve(errors_deg: Iterable[float], num_pairs: int, threshold_deg: float) -> float:
     """Integrate the share of pairs with at most an error over errors from 0 to a threshold.
 
-    Args:
-        errors_deg: one per pair that was estimated.
-        num_pairs: all pairs; those that were not estimated are never below a threshold.
-        threshold_deg: where to stop.
-
-    Returns:
-        The exact area under the steps, divided by the threshold: from 0 to 1.
-
-    >>> area_under_curve([0.0, 2.5, 90.0], 4, 5.0)
-    0.375
+    The exact area under the steps, divided by the threshold: from 0 to 1. Of ``num_pairs`` those
+    without an error were not estimated, and are never below a threshold.
     """
     if not num_pairs:
         return 0.0
@@ -188,11 +169,8 @@ def area_under_curve(errors_deg: Iterable[float], num_pairs: int, threshold_deg:
 def position_errors(estimated: Poses, truth: Poses) -> dict[str, float]:
     """Compute the distances of camera centres after the best similarity has aligned them.
 
-    Centres that are far off do not pull at the alignment.
-
-    Returns:
-        Distances by name in units of the ground truth; empty with fewer than three images, or
-        when the centres are on one line, which leaves the similarity open.
+    Centres that are far off do not pull at the alignment. In units of the ground truth; empty with
+    fewer than three images, or centres on one line, which leaves the similarity open.
     """
     names = sorted(estimated.keys() & truth.keys())
     if len(names) < MIN_IMAGES_TO_ALIGN:
@@ -215,13 +193,7 @@ def position_errors(estimated: Poses, truth: Poses) -> dict[str, float]:
 
 
 def pose_scores(estimated: Poses, truth: Poses, image_names: Sequence[str]) -> PoseScores:
-    """Measure a model against ground truth.
-
-    Args:
-        estimated: poses of the registered images.
-        truth: poses of the ground truth.
-        image_names: all images that were given; others do not count.
-    """
+    """Measure the poses of registered images against ground truth, of the images given only."""
     given = {name: pose for name, pose in truth.items() if name in set(image_names)}
     errors = pair_errors(estimated, given)
     largest = [max(both) for both in errors.values()]

@@ -22,6 +22,7 @@ from colmap_affrect.colmap.database import (
 )
 from colmap_affrect.colmap.native_options import Plain, differences
 from colmap_affrect.colmap.pair_significance import significance, telling_shapes
+from colmap_affrect.geometry.affine import homography_errors
 from colmap_affrect.options import CUSTOM, MAX_SEED, PRESETS, Options, preset_values, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
@@ -130,17 +131,47 @@ def estimate_geometry(
     geometry = pycolmap.estimate_two_view_geometry(
         cameras[0], points1, cameras[1], points2, rows, two_view_options(chosen)
     )
+    min_num_inliers = max(options.min_num_inliers, options.min_inlier_ratio * len(matches))
     # Of a geometry that it rejects the estimator returns the inliers all the same.
-    is_rejected = (
-        geometry.config in REJECTED or len(geometry.inlier_matches) < options.min_num_inliers
-    )
-    if not is_rejected and options.min_significance:
-        found = significance(geometry, cameras, matched, chosen.max_error_px)
-        is_rejected = found < options.min_significance
-    if is_rejected:
+    if geometry.config in REJECTED or len(geometry.inlier_matches) < min_num_inliers:
         return pycolmap.TwoViewGeometry()
+
+    def is_chance(found: pycolmap.TwoViewGeometry) -> bool:
+        of_chance = significance(found, cameras, matched, chosen.max_error_px)
+        return of_chance < options.min_significance
+
+    if options.min_significance and is_chance(geometry):
+        geometry = _planar_geometry(geometry, (points1, points2), chosen)
+        if len(geometry.inlier_matches) < min_num_inliers or is_chance(geometry):
+            return pycolmap.TwoViewGeometry()
     geometry.inlier_matches = matches.astype(np.uint32)[np.asarray(geometry.inlier_matches)[:, 0]]
     return geometry
+
+
+def _planar_geometry(
+    geometry: pycolmap.TwoViewGeometry,
+    points: tuple[NDArray[np.float64], NDArray[np.float64]],
+    options: VerificationOptions,
+) -> pycolmap.TwoViewGeometry:
+    """Return the homography of the inliers of an epipolar geometry, with all matches it explains.
+
+    Epipolar lines hold wrong matches by chance that a homography does not, so that of few matches
+    on a plane the one can be significant and the other not. Among all raw matches it would not be
+    found: fours of them are hardly ever all right.
+    """
+    rows = np.asarray(geometry.inlier_matches, np.int64)[:, 0]
+    found: Any = pycolmap.estimate_homography_matrix(
+        points[0][rows], points[1][rows], two_view_options(options).ransac
+    )
+    planar = pycolmap.TwoViewGeometry()
+    if found is None:
+        return planar
+    planar.config = pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC
+    planar.H = found["H"]
+    with np.errstate(all="ignore"):  # points on the horizon are no inliers
+        inliers = np.flatnonzero(homography_errors(planar.H, *points) <= options.max_error_px)
+    planar.inlier_matches = np.stack([inliers.astype(np.uint32)] * 2, axis=1)
+    return planar
 
 
 def max_error_px(

@@ -67,20 +67,10 @@ def compare(
     """Find out how many photographs each method registers, and which; go on after a stop.
 
     Each method runs in a process of its own. One that fails is reported as failed, and the others
-    go on.
-
-    Args:
-        image_path: folder of the photographs, searched with its sub-folders.
-        output_path: folder for all results, made if missing.
-        options: see :class:`CompareOptions`.
-        overwrite: run the methods again though they have results there.
-        progress: where to show progress.
-
-    Returns:
-        What is also written to ``comparison.json``, ``comparison.csv`` and ``report.html``.
-
-    Raises:
-        AffrectError: for anything that the caller can mend, before any method is run.
+    go on; with ``overwrite`` methods run again though they have results there. What is returned is
+    also written to ``comparison.json``, ``comparison.csv`` and ``report.html`` in the output
+    folder, which is made if missing. Raises AffrectError for anything that the caller can mend,
+    before any method is run.
     """
     require_png()
     options = options or CompareOptions()
@@ -114,12 +104,8 @@ class _Plan:
     """A comparison whose options have been checked.
 
     Attributes:
-        image_path: folder of the images.
-        layout: of the output folder.
         options: with checked mapping options.
-        methods: the methods.
         names: all images given, sorted.
-        pairs: to match.
         truth: true poses; None without ground truth.
     """
 
@@ -237,11 +223,8 @@ def _ground_truth(path: Path | None, names: Sequence[str]) -> Poses | None:
 def _share(plan: _Plan, *, overwrite: bool) -> dict[str, str]:
     """Make the database and the lists that all methods begin with, unless they are there.
 
-    Returns:
-        Images that COLMAP does not take, with the reason.
-
-    Raises:
-        StaleStoreError: when they were made for something else.
+    Returns the images that COLMAP does not take, with the reason. Raises StaleStoreError when the
+    lists were made for something else.
     """
     layout, inputs = plan.layout, plan.inputs()
     if layout.inputs.exists():
@@ -297,11 +280,7 @@ def _make_shared(plan: _Plan, inputs: Mapping[str, Any]) -> None:
 
 
 def _record(request: Request, *, overwrite: bool) -> None:
-    """Put a request on record before its method is run.
-
-    Raises:
-        StaleStoreError: when there are results of other options.
-    """
+    """Put a request on record; StaleStoreError when there are results of other options."""
     folder, path, name = request.folder, request.path, request.method.label
     if path.exists() and overwrite:
         shutil.rmtree(folder)

@@ -24,7 +24,6 @@ class Mark(Node):
     """What one method does with one photograph.
 
     Attributes:
-        column: the method.
         is_doubtful: registered in poses that contradict those of other seeds or methods.
     """
 
@@ -38,9 +37,6 @@ class Card:
 
     Attributes:
         number: from 1, the same everywhere on the page.
-        name: of the image.
-        marks: one per method.
-        groups: filters that it passes.
     """
 
     number: int

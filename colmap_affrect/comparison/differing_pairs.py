@@ -40,7 +40,6 @@ class ChosenPair:
     """A pair to draw, and the two methods that differ on it.
 
     Attributes:
-        names: of the images.
         before: the method with fewer inliers, or the one that does not rectify.
         after: the other one.
     """
@@ -59,12 +58,8 @@ class ChosenPair:
 def choose_pairs(methods: Sequence[MethodResult], rectifying: Collection[str]) -> list[ChosenPair]:
     """Return the pairs with the largest differences, each image in at most two of them.
 
-    Where there are methods that rectify and others that do not, the best of the one kind is
-    compared with the best of the other; else the best method with the worst.
-
-    Args:
-        methods: those that finished.
-        rectifying: names of the methods that warp photographs.
+    Where some methods warp photographs (``rectifying``) and others do not, the best of the one kind
+    is compared with the best of the other; else the best method with the worst.
     """
     warped = [method for method in methods if method.name in rectifying]
     plain = [method for method in methods if method.name not in rectifying]
@@ -99,13 +94,7 @@ class PairPlots:
 def plot_pairs(
     chosen: Sequence[ChosenPair], pictures: Mapping[str, Picture], output_path: Path
 ) -> list[PairPlots]:
-    """Draw the inliers of pairs whose photographs can be shown.
-
-    Args:
-        chosen: what to draw.
-        pictures: of the photographs by name.
-        output_path: folder of the comparison.
-    """
+    """Draw the inliers of pairs whose photographs are among the pictures."""
     sides = {
         item.names: SideBySide.of(item.names, pictures)
         for item in chosen

@@ -56,8 +56,6 @@ class Row:
 
     Attributes:
         key: for programs, as in ``comparison.json``.
-        title: what is counted.
-        cells: one text per method.
     """
 
     key: str

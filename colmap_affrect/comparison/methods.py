@@ -50,13 +50,8 @@ def parse_methods(
 ) -> tuple[Method, ...]:
     """Read methods, each as :func:`parse_method` takes them, several separated by commas.
 
-    What follows a colon belongs to the last method of its text. Methods stay as they are.
-
-    >>> [method.label for method in parse_methods(["sift,a=default:matching.max_ratio=0.8"])]
-    ['sift', 'a']
-
-    Raises:
-        OptionError: for an unknown method or option, no method, or two with one name.
+    What follows a colon belongs to the last method of its text. Methods stay as they are. Raises
+    OptionError for an unknown method or option, no method, or two with one name.
     """
     methods: list[Method] = []
     for text in given:
@@ -83,14 +78,9 @@ def parse_methods(
 def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
     """Read ``sift``, ``sift-affine-dsp`` or ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``.
 
-    Commas inside of brackets belong to a value. The recipe is a name or the path of a TOML file.
-
-    Args:
-        text: the method.
-        depth_settings: settings for recipes that use depth only.
-
-    Raises:
-        OptionError: for an unknown method or option.
+    Commas inside of brackets belong to a value. The recipe is a name or the path of a TOML file;
+    one that uses depth gets the ``depth_settings`` too. Raises OptionError for an unknown method or
+    option.
     """
     if text in SIFT_SUMMARIES:
         return Method(text, None)

@@ -37,22 +37,11 @@ def write_page(
     progress: Progress = SILENT,
     resources: Resources | None = None,
 ) -> Path:
-    """Write ``report.html`` into the folder of a comparison.
+    """Write ``report.html`` into the folder of a comparison, and return its path.
 
-    It is one file that loads nothing. Whatever is missing, such as a photograph that cannot be
-    read or a model that is not there, is said in its place.
-
-    Args:
-        comparison: the results; their paths are relative to ``output_path``.
-        output_path: folder of the comparison.
-        progress: where to show it.
-        resources: weights and device of the methods that have networks, to draw their warps.
-
-    Returns:
-        The path of the page.
-
-    Raises:
-        WorkspaceError: when it cannot be written.
+    It is one file that loads nothing. Whatever is missing, such as a photograph that cannot be read
+    or a model that is not there, is said in its place. ``resources`` are those of methods with
+    networks, to draw their warps. Raises WorkspaceError when it cannot be written.
     """
     columns = columns_of(comparison)
     folder = Path(comparison.image_path)

@@ -31,7 +31,6 @@ class Layout:
         database: cameras and images, no features.
         cameras: what is known of the cameras.
         images: names of the images that COLMAP can read, one a line.
-        pairs: the pairs to match.
         methods: folder of the folders of the methods.
     """
 
@@ -55,16 +54,10 @@ class Request:
     """What one process is to do.
 
     Attributes:
-        method: the method.
-        output_path: folder of the comparison.
-        image_path: folder of the photographs.
-        masks: where features may be.
-        verification: options of two-view geometry.
         mapping: checked.
         focal_vote: whether verified pairs vote on cameras that nobody knows.
         may_share: whether cameras of images of one size may then turn out to be the same.
         seeds: of verification and mapping; recipes that climb do it with the first.
-        resources: weights and device of networks.
     """
 
     method: Method

@@ -58,13 +58,11 @@ class SeedResult:
     """Verification and mapping of one method with one seed.
 
     Attributes:
-        seed: random seed.
         model_names: image names of each model, largest model first; empty if there is none.
         model_path: largest model, relative to the folder of the comparison; empty if none.
         num_points3D: of the largest model, as the next three.
         mean_track_length: images per point.
         mean_observations: observed points per registered image.
-        mean_reprojection_error_px: over all observations.
         num_observations: observed points of each image of the largest model.
         pair_inliers: verified pairs and their numbers of inliers.
         scores: against ground truth; None where there is none.
@@ -130,15 +128,12 @@ class MethodResult:
         name: ``sift``, ``sift-affine-dsp`` or the name of a recipe.
         failed: why it failed as a whole; empty if it did not.
         wall_s: seconds of ``extract``, ``match`` and, for recipes that climb, ``escalate``.
-        peak_memory_bytes: of the process that ran the method.
         unstable_names: images whose poses contradict each other from seed to seed.
         disagreements: by the name of another method, the images that both register with the
             first seed in poses that contradict each other.
         num_keypoints: by image name; images that could not be read are missing.
         raw_matches: number of matches before verification of each pair.
-        summary: one line for people.
         failures: images that could not be used, with the reason.
-        options: all options of the method.
         folder: its results, relative to the folder of the comparison.
         seeds: one result per seed, in the order asked for; empty if the method failed.
     """
@@ -186,10 +181,7 @@ class MethodResult:
 
     @property
     def usually_correct(self) -> frozenset[str]:
-        """Images that more than half of the seeds register correctly.
-
-        Without ground truth, register.
-        """
+        """Images that more than half of the seeds register correctly (without truth: register)."""
         return in_most([seed.correct_names for seed in self.seeds])
 
     @property
@@ -254,12 +246,8 @@ class Comparison:
 
     Attributes:
         image_names: all images given, sorted.
-        image_path: their folder.
-        methods: in the order asked for.
-        seeds: random seeds.
         num_pairs: pairs that were to be matched.
         settings: cameras, masks, pair list, preset and mapper that all methods had.
-        versions: of the programs.
     """
 
     image_names: tuple[str, ...]
@@ -276,11 +264,7 @@ class Comparison:
         return tuple(method for method in self.methods if not method.failed)
 
     def model_paths(self, output_path: Path) -> dict[str, Path | None]:
-        """Return the folder of the first model of each finished method; None where there is none.
-
-        Args:
-            output_path: folder of the comparison.
-        """
+        """Return the folder of the first model of each finished method; None for none."""
         shown = {method.name: method.shown_seed for method in self.finished}
         return {
             name: output_path / seed.model_path if seed else None for name, seed in shown.items()
@@ -323,11 +307,7 @@ class Comparison:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Read ``comparison.json``.
-
-        Raises:
-            StoreError: when it is damaged or something else.
-        """
+        """Read ``comparison.json``; StoreError when it is damaged or something else."""
         try:
             values = json.loads(text)
             methods = tuple(MethodResult.from_mapping(*item) for item in values["methods"].items())

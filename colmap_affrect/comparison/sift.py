@@ -45,15 +45,7 @@ def extract_sift(
 ) -> dict[str, str]:
     """Extract SIFT features of images that the database has; those with features are kept.
 
-    Args:
-        database_path: with cameras and images.
-        image_path: folder of the images.
-        image_names: the images to look at.
-        masks: where features may be.
-        affine: with affine shapes and domain-size pooling.
-
-    Returns:
-        Images that have no features now, with the reason.
+    Returns the images that have no features now, with the reason.
     """
     require_database_space(database_path, len(image_names) * ROWS_PER_IMAGE)
     reader = pycolmap.ImageReaderOptions()
@@ -77,13 +69,9 @@ def extract_sift(
 def match_sift(database_path: Path, pairs: Sequence[Pair], list_path: Path) -> None:
     """Match pairs of images by COLMAP's defaults, without verification; matched ones are kept.
 
-    COLMAP's lists of pairs cannot hold names with spaces: while it matches, the images have
-    other ones. If the process is killed then, :func:`rename_images` brings the names back.
-
-    Args:
-        database_path: with SIFT features.
-        pairs: names of the images to match.
-        list_path: file for the time of the call.
+    COLMAP's lists of pairs cannot hold names with spaces: while it matches, the images have other
+    ones. If the process is killed then, :func:`rename_images` brings the names back. ``list_path``
+    is a file for the time of the call.
     """
     ids = image_ids(database_path)
     temporary = {image_id: TEMPORARY_NAME.format(image_id) for image_id in ids.values()}

@@ -25,10 +25,7 @@ def require_viewer() -> None:
 def log_comparison(comparison: Comparison, output_path: Path) -> Path:
     """Write ``comparison.rrd``: points, cameras and photographs of each method, in one frame.
 
-    Open it with ``rerun comparison.rrd``.
-
-    Raises:
-        ComparisonError: when rerun is not installed.
+    Open it with ``rerun comparison.rrd``. Raises ComparisonError when rerun is not installed.
     """
     require_viewer()
     import rerun

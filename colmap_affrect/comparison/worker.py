@@ -263,7 +263,6 @@ class _Costs:
     """Seconds and memory that a method has taken, over all processes that worked on it.
 
     Attributes:
-        wall_s: seconds by stage.
         failures: images that could not be used, with the reason.
     """
 

@@ -32,13 +32,10 @@ def diagnose(
     """Examine the installation and, if a path is given, an output folder or a COLMAP database.
 
     Args:
-        path: output folder of colmap-affrect, or any COLMAP database.
+        path: output folder of colmap-affrect, or any COLMAP database; damaged ones too.
         image_path: folder of the photographs, whose sizes are compared with the cameras.
         weights_path: folder in which weights of networks are looked for first.
         progress: where the reading of photographs is shown.
-
-    Returns:
-        The findings; also for files that are damaged or something else.
     """
     findings = Findings(progress)
     if image_path is not None and not image_path.is_dir():

@@ -35,11 +35,8 @@ def examined_copy(
 ) -> Iterator[tuple[Path, Tables] | None]:
     """Examine a copy of a database and yield it with its tables, None if it cannot be used.
 
-    Args:
-        findings: to which those of the database are added.
-        path: of the database.
-        image_path: folder of the photographs, if their sizes are compared too.
-        own_advice: what to do about a problem by its kind, where it is not what ``TEXTS`` says.
+    The sizes of photographs are compared if their folder is given; ``own_advice`` says what to do
+    about a problem by its kind, where it is not what ``TEXTS`` says.
     """
     with tempfile.TemporaryDirectory() as temporary:
         copy = Path(temporary) / "database.db"

@@ -129,8 +129,6 @@ class Finding:
         severity: ``error`` (a program will fail, or results are wrong), ``warning`` (something
             is missing from the results), or ``note`` (worth knowing).
         where: file, folder or part of the installation.
-        what: what is wrong there.
-        advice: what to do about it.
     """
 
     severity: Severity
@@ -197,14 +195,11 @@ class Findings:
         advice: str = "",
         **values: object,
     ) -> None:
-        """Add a finding.
+        """Add a finding of a kind of ``TEXTS`` about a file, folder or part of the installation.
 
-        Args:
-            kind: of ``TEXTS``.
-            where: file, folder or part of the installation.
-            items: what it concerns: how many and the first ones are named.
-            advice: what to do, where it is not what ``TEXTS`` says.
-            values: for the placeholders in the texts; paths are quoted for a shell.
+        Of ``items`` it says how many there are, and the first ones. ``advice`` is what to do, where
+        it is not what ``TEXTS`` says; ``values`` are for the placeholders in both, paths quoted for
+        a shell.
         """
         severity, what, usual_advice = TEXTS[kind]
         values = {k: shlex.quote(str(v)) if isinstance(v, Path) else v for k, v in values.items()}

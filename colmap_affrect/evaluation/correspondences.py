@@ -34,7 +34,7 @@ class CorrespondenceProtocol(RansacSettings):
     ) -> PairScore:
         """Score matches of a pair whose truth is (N, 4) correspondences x1, y1, x2, y2.
 
-        ``error`` is the median of their symmetric epipolar distances from the estimate. Details:
+        ``error`` is the median of their symmetric epipolar distances in px. Details:
         ``wxbs_score``, and ``recall_Kpx``, the share of them within K px.
         """
         ransac = self.ransac(cv2.USAC_MAGSAC, self.threshold_px, random_seed)

@@ -31,7 +31,6 @@ class ImageCost:
         area_mpx: area of all warps in megapixels, the image itself not counted.
         num_keypoints: features of the image and of its warps.
         num_regions: different parts of the image that are warped.
-        num_warps: warps.
         plan_s, warp_s, detect_s, describe_s: seconds.
     """
 

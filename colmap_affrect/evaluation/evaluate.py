@@ -74,7 +74,6 @@ class EvaluateOptions:
         max_num_keypoints: budget: of each image the strongest of all its features are matched; None
             for all.
         random_seed: of the estimators and the statistics.
-        resources: weights and device of networks.
     """
 
     recipes: Sequence[str | Method] = DEFAULT_RECIPES
@@ -93,23 +92,13 @@ def evaluate(
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> Evaluation:
-    """Score recipes on a dataset; go on after a stop.
+    """Score recipes on a dataset by a protocol (its name, or one with changed settings).
 
-    An image or pair that cannot be used counts as failed, and the others go on.
-
-    Args:
-        protocol: its name, or one with changed settings.
-        dataset_path: folder of the dataset, in the layout of the protocol.
-        output_path: folder for all results, made if missing.
-        options: see :class:`EvaluateOptions`.
-        overwrite: discard features and scores of these recipes first.
-        progress: where to show progress.
-
-    Returns:
-        What is also written to ``evaluation.json``, ``evaluation.csv`` and the plots.
-
-    Raises:
-        AffrectError: for anything that the caller can mend, before any image is worked on.
+    An image or pair that cannot be used counts as failed, and the others go on; so does an
+    evaluation that was stopped, unless ``overwrite`` discards features and scores of these recipes
+    first. What is returned is also written to ``evaluation.json``, ``evaluation.csv`` and plots in
+    the output folder, which is made if missing. Raises AffrectError for anything that the caller
+    can mend, before any image is worked on.
     """
     require_png()
     options = options or EvaluateOptions()

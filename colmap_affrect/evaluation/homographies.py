@@ -61,10 +61,9 @@ class TrueHomography:
         return visible_points(self.matrix, self.size1, self.size2)
 
     def error_px(self, estimate: Homography | None) -> float:
-        """Return the mean Euclidean distance in image 2 between truth and estimate.
+        """Return the mean distance in image 2 between truth and estimate, over the visible part.
 
-        The mean is over what image 2 shows of image 1. Without an estimate, or when its horizon
-        runs through that part, the error is infinite.
+        It is infinite without an estimate, or when its horizon runs through that part.
         """
         if estimate is None or not len(self.visible):
             return math.inf
@@ -151,15 +150,9 @@ def third_coordinates(
 
 
 def visible_points(truth: NDArray[np.floating], size1: Size, size2: Size) -> Points:
-    """Return the points of image 1 that image 2 shows.
+    """Return the (N, 2) points of image 1 that image 2 shows by a true homography.
 
-    Args:
-        truth: (3, 3) true homography.
-        size1: (width, height) of image 1 in px.
-        size2: (width, height) of image 2 in px.
-
-    Returns:
-        (N, 2) pixel centres, every ``GRID_STEP_PX``-th in x and y.
+    They are every ``GRID_STEP_PX``-th pixel centre in x and y; sizes are (width, height) in px.
     """
     columns, rows = (np.arange(0, extent, GRID_STEP_PX) for extent in size1)
     points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
@@ -173,11 +166,7 @@ def oriented(matrix: Homography, size1: Size, size2: Size) -> Homography:
 
 
 def checked_homography(given: Any, what: str) -> Homography:
-    """Return a (3, 3) homography if it is one.
-
-    Raises:
-        EvaluationError: saying what is wrong.
-    """
+    """Return a (3, 3) homography; EvaluationError says why it is none."""
     matrix = finite_numbers(given, (3, 3), what)
     if np.linalg.matrix_rank(matrix) < 3:
         raise EvaluationError(f"{what} is singular")

@@ -113,10 +113,7 @@ class Calibration(NamedTuple):
 
 
 def disjoint_bins(lists: Mapping[int, list[str]]) -> dict[str, int]:
-    """Turn cumulative lists into the category of each of their pairs: the largest one.
-
-    Args:
-        lists: pairs by the lower limit of their covisibility, in tenths.
+    """Turn cumulative lists, by their lower limits, into the largest limit of each pair.
 
     >>> disjoint_bins({1: ["a-b", "a-c"], 2: ["a-c"]})
     {'a-b': 1, 'a-c': 2}
@@ -125,11 +122,7 @@ def disjoint_bins(lists: Mapping[int, list[str]]) -> dict[str, int]:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read and check a calibration file.
-
-    Raises:
-        EvaluationError: when it cannot be used, saying why but not of which file.
-    """
+    """Read and check a calibration file; EvaluationError says what is wrong with it."""
     try:
         with h5py.File(path) as file:
             values = {

@@ -41,7 +41,6 @@ class MatchedPair:
     """The matches of a pair.
 
     Attributes:
-        pair: the pair.
         points: (M, 2) pixel-centre px of the matches in each image.
         num_keypoints: features of the two images that were matched.
         level: rectifier of the level of escalation that counts, ``none`` when no level was
@@ -72,11 +71,7 @@ class PairMatcher:
     """Matches pairs by the features of a recipe.
 
     Attributes:
-        recipe: how to match.
-        features: of the recipe.
         max_num_keypoints: of each image, the strongest of all its features; None for all.
-        title: of the recipe, for progress.
-        progress: where to show progress.
     """
 
     recipe: Recipe
@@ -173,8 +168,7 @@ def verified_inliers(
     """Return the inliers of COLMAP's two-view geometry; 0 if a run would not take it.
 
     Args:
-        frames: (M, 2, 3) local affine frames of image 1, in pixel-centre px, and those of image 2
-            that match them.
+        frames: of both images, (M, 2, 3) local affine frames that match, pixel-centre px.
         sizes: (width, height) of both images in px.
         extracted_px: longest side that photographs were shrunk to before extraction.
     """

@@ -250,8 +250,6 @@ class _Entry:
     """An entry of the list.
 
     Attributes:
-        values: by key.
-        folder: of the images.
         offset_px: what must be added to coordinates for pixel centres.
         check: see whether the images confirm the truth.
     """

@@ -31,12 +31,7 @@ class PosedScenes(RelativePoseProtocol):
     dataset_title: ClassVar[str]
 
     def load(self, dataset_path: Path) -> Dataset:
-        """Read a scene, or all scenes in a folder.
-
-        Raises:
-            EvaluationError: when there is no scene, its files cannot be read or no pair can be
-                evaluated.
-        """
+        """Read a scene, or all in a folder; EvaluationError when no pair can be evaluated."""
         folders = [dataset_path, *sorted(dataset_path.glob("*/"))]
         paths = [path for folder in folders for path in sorted(folder.glob(self.scene_pattern))]
         if not paths:
@@ -93,14 +88,9 @@ def missing_notes(
     lacking: Mapping[str, str],
     what: str,
 ) -> list[str]:
-    """Count what is listed and not there.
+    """Count listed pairs, and the names of their images, without a file or a truth (``what``).
 
-    Args:
-        listed: pairs.
-        names: of all of their images.
-        files: of images by name.
-        lacking: why images have no truth, by name.
-        what: that truth.
+    ``files`` has the files by name, ``lacking`` the reasons why there is no truth.
     """
     lost = [pair for pair in listed if any(n not in files or n in lacking for n in pair)]
     without_file = [name for name in names if name not in files]

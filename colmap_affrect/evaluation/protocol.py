@@ -27,7 +27,6 @@ class EvaluationImage:
 
     Attributes:
         name: unique in the dataset, the key of its features and depth map.
-        path: the file.
         intrinsics: (3, 3) camera matrix in pixel-centre px; None where the dataset has none.
     """
 
@@ -42,7 +41,6 @@ class EvaluationPair:
 
     Attributes:
         name: unique in the dataset.
-        images: the two.
         category: of difficulty, as the protocol's tables group pairs; empty where it does not.
         truth: what the score needs; known to the protocol only.
         problem: why it cannot be scored (a file that is missing, a truth that is not finite); such
@@ -78,11 +76,8 @@ class PairResult(PairScore):
     """The score of one pair by one recipe: what ``evaluation.json`` lists.
 
     Attributes:
-        name: of the pair.
-        category: of the pair.
         num_matches: before the estimation.
         num_keypoints: features of the two images that were matched.
-        seconds: matching and estimation.
         seconds_by_step: the same by step, ``match`` and ``estimate``.
         level: rectifier of the level of escalation that decided; empty without escalation.
         num_levels: levels whose features were extracted for the pair, 1 without escalation.
@@ -106,7 +101,6 @@ class Dataset:
     """The pairs of a dataset that can be evaluated.
 
     Attributes:
-        pairs: in a fixed order.
         notes: what is missing or odd, in words: files that are not there (counted), truth that
             failed its sanity check (named).
     """
@@ -141,11 +135,7 @@ class EvaluationProtocol(Protocol):
     category_title: str
 
     def load(self, dataset_path: Path) -> Dataset:
-        """Find the pairs of a dataset.
-
-        Raises:
-            EvaluationError: when the layout is not that of the protocol.
-        """
+        """Find the pairs of a dataset; EvaluationError when the layout is another one."""
 
     def score(
         self,
@@ -159,8 +149,7 @@ class EvaluationProtocol(Protocol):
     def success(self, score: PairScore) -> float:
         """Return how far a pair counts as matched, in [0, 1]: 1 or 0 where there is a threshold.
 
-        Plots over categories show its mean, intervals are those of its mean, and the paired test
-        against the baseline compares it pair by pair.
+        Plots and intervals are of its mean; the test against the baseline compares it pair by pair.
         """
 
     def summarize(self, results: Sequence[PairResult]) -> dict[str, float]:
@@ -184,10 +173,7 @@ def with_truth(
 ) -> Dataset:
     """Return a pair with its truth; one that cannot be used with its problem, which is a note too.
 
-    Args:
-        pair: without truth.
-        paths: of files that must be there.
-        read: returns the pair with its truth, and what is odd about it: texts, or empty ones.
+    ``paths`` must be there; ``read`` returns the pair with its truth, and what is odd about it.
     """
     try:
         for path in paths:
@@ -201,11 +187,7 @@ def with_truth(
 
 
 def read_numbers(path: Path) -> NDArray[np.float64]:
-    """Read a table of numbers from text.
-
-    Raises:
-        EvaluationError: when it is none.
-    """
+    """Read a table of numbers from text; EvaluationError when it is none."""
     try:
         return np.loadtxt(path, dtype=np.float64, ndmin=2)
     except (OSError, ValueError) as error:
@@ -215,8 +197,7 @@ def read_numbers(path: Path) -> NDArray[np.float64]:
 def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
     """Return an array of some shape, -1 in it for any number of rows but none.
 
-    Raises:
-        EvaluationError: saying what is wrong.
+    EvaluationError says what is wrong with ``what``.
     """
     try:
         values = np.asarray(given, dtype=np.float64)

@@ -32,7 +32,6 @@ class RecipeFeatures:
     Attributes:
         store: the features; other options than those on record are refused.
         settings: what the features depend on.
-        resources: weights and device.
         failures: images that could not be used in this run, with the reason.
     """
 
@@ -48,17 +47,9 @@ class RecipeFeatures:
     ) -> None:
         """Find everything that the recipe needs.
 
-        Args:
-            path: of the files, without suffix.
-            options: what to extract.
-            images: of the dataset, by name.
-            inputs: what the images depend on, for the record.
-            resources: weights and device of networks.
-            overwrite: discard what is there.
-
-        Raises:
-            StaleStoreError: when features of other options are there.
-            AffrectError: when weights, a device or all depth maps are missing.
+        ``path`` is that of the files, without suffix; ``inputs`` is what the images depend on, for
+        the record; ``overwrite`` discards what is there, which is refused if it is of other
+        options.
         """
         self._images, self.resources = images, resources
         self._extractor = prepare(options, resources, list(images))

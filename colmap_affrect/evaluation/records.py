@@ -22,12 +22,7 @@ class RecordFile:
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
-        """Read the file, or begin it.
-
-        Raises:
-            StaleStoreError: when its records were made with other settings.
-            WorkspaceError: when it cannot be written.
-        """
+        """Read the file, or begin it; StaleStoreError when it has records of other settings."""
         self._path = path
         header = json.loads(json.dumps(settings))
         content = path.read_bytes() if path.exists() else b""
@@ -46,11 +41,7 @@ class RecordFile:
         self.records: list[dict[str, Any]] = lines[1:]
 
     def append(self, record: Mapping[str, Any]) -> None:
-        """Add a record.
-
-        Raises:
-            WorkspaceError: when it cannot be written.
-        """
+        """Add a record; WorkspaceError when it cannot be written."""
         try:
             with self._path.open("ab") as file:
                 file.write(_line(record))

@@ -23,14 +23,9 @@ PROTOCOLS: Mapping[str, Callable[..., EvaluationProtocol]] = {
 
 
 def make_protocol(name: str, settings: Sequence[str] = ()) -> EvaluationProtocol:
-    """Return a protocol with changed settings.
+    """Return a protocol, some of its fields changed by ``KEY=VALUE``.
 
-    Args:
-        name: one of ``PROTOCOLS``.
-        settings: ``KEY=VALUE``, of the fields of its class.
-
-    Raises:
-        OptionError: for an unknown protocol or setting, or a value of the wrong type.
+    Raises OptionError for an unknown protocol or setting, or a value of the wrong type.
     """
     if name not in PROTOCOLS:
         raise OptionError(f"unknown protocol '{name}': known are {', '.join(PROTOCOLS)}")

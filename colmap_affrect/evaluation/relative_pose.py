@@ -42,7 +42,6 @@ class PosedImage:
     """An image with the truth about its camera.
 
     Attributes:
-        image: the file.
         camera: intrinsics with distortion.
         pose: cam_from_world, (3, 3) rotation and (3,) translation.
     """
@@ -112,9 +111,9 @@ class RelativePoseProtocol(RansacSettings):
         """Score (M, 2) and (M, 2) matched points, pixel-centre px of the stored images.
 
         The error is that of the rotation by the paper's RANSAC, in degrees. Details:
-        ``direction_error_deg``, the angle between the directions of the translations, and both
-        errors and the number of inliers by GC-RANSAC, ``gc_...``. ``num_correct`` are the matches
-        within ``CORRECT_PX`` of the true epipolar lines: wrong ones may be among them by chance.
+        ``direction_error_deg``, the angle between the directions of the translations, and the same
+        by GC-RANSAC, ``gc_...``. ``num_correct`` matches are within ``CORRECT_PX`` of the true
+        epipolar lines, wrong ones by chance among them.
         """
         cameras = (pair.truth[0].camera, pair.truth[1].camera)
         truth = true_pose(pair)
@@ -155,8 +154,8 @@ class RelativePoseProtocol(RansacSettings):
     def summarize(self, results: Sequence[PairResult]) -> dict[str, float]:
         """Return shares of pairs with a rotation error below the limit, by category and of all.
 
-        Also shares under 10 and 20 degrees, and the area under the curve of the larger of
-        rotation and direction error up to 10 degrees; then the same by GC-RANSAC.
+        Also below 10 and 20 degrees, and the area under the curve of the larger of rotation and
+        direction error up to 10 degrees; then the same by GC-RANSAC.
         """
         by_category: dict[str, list[PairResult]] = {}
         for result in sorted(results, key=lambda result: category_start(result.category)):
@@ -216,10 +215,7 @@ def mean_focal_px(cameras: Sequence[pycolmap.Camera]) -> float:
 def rays(
     camera: pycolmap.Camera, points: NDArray[np.floating], *, use_distortion: bool = True
 ) -> Points:
-    """Turn (N, 2) pixel-centre points into (N, 2) x/z, y/z in front of the camera.
-
-    Points that a lens cannot have produced become NaN.
-    """
+    """Turn (N, 2) pixel-centre points into (N, 2) x/z, y/z; NaN for what a lens cannot produce."""
     pixels = colmap_from_pixel(np.asarray(points, dtype=np.float64).reshape(-1, 2))
     if use_distortion:
         return np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)

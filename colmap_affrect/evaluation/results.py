@@ -44,7 +44,6 @@ class RecipeResult:
 
     Attributes:
         name: label of the recipe.
-        description: one line for people.
         summary: columns of the protocol's table by name, and ``seconds``, of all steps of all
             images and pairs together.
         intervals: bootstrap intervals (95 %) over pairs of the columns, where there are any.
@@ -84,17 +83,13 @@ class Evaluation:
     """Results of several recipes on one dataset.
 
     Attributes:
-        protocol: its name.
         error_title: what the errors are, with the unit.
         category_title: what the categories are; empty without.
-        dataset_path: the dataset.
         settings: everything that decides scores.
         baseline: label of the recipe that the others are tested against; empty for none.
         notes: what is missing or odd in the dataset.
-        recipes: in the order given.
         published: rows of the paper's tables for the same protocol.
         published_complexity: those of its table of complexity.
-        versions: of libraries.
     """
 
     protocol: str

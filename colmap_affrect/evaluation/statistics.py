@@ -20,18 +20,10 @@ NUM_RANDOM_SIGNS = 9999
 def bootstrap_intervals(
     count: int, statistics: Callable[[NDArray[np.int64]], Sequence[float]], seed: int
 ) -> list[tuple[float, float]]:
-    """Compute the percentile bootstrap intervals of statistics of some items.
+    """Compute percentile bootstrap intervals of statistics of ``count`` items, at least one.
 
-    Args:
-        count: of the items, at least one.
-        statistics: of some of them, given as (count,) indices, which may repeat.
-        seed: of the resamples.
-
-    Returns:
-        For each statistic the limits that hold ``CONFIDENCE`` of its values on resampled items.
-
-    Raises:
-        ValueError: without items.
+    ``statistics`` is given (count,) indices of items, which may repeat. Of each one the limits are
+    returned that hold ``CONFIDENCE`` of its values.
     """
     if not count:
         raise ValueError("no values to resample")
@@ -44,23 +36,12 @@ def bootstrap_intervals(
 def paired_test(
     a: Sequence[float] | NDArray[np.float64], b: Sequence[float] | NDArray[np.float64], seed: int
 ) -> float:
-    """Test whether two methods differ, by their values of the same pairs.
+    """Return the two-sided p-value of a difference of two methods, by their values pair by pair.
 
     Sign-flip permutation test on signed ranks (Wilcoxon's statistic): if the methods did not
-    differ, each difference would have either sign with equal chance. Ranks let infinite errors
-    take part as the largest of all. Of zeros and ones it is the exact sign test of the pairs that
-    only one method solved.
-
-    Args:
-        a: values of one method, may be infinite.
-        b: those of the other, pair by pair.
-        seed: of the random signs, where there are too many differences to try all.
-
-    Returns:
-        The two-sided p-value: the chance of a difference at least as large if there were none.
-
-    Raises:
-        ValueError: when the numbers of values differ.
+    differ, each difference would have either sign with equal chance. Ranks let infinite errors take
+    part as the largest of all. Of zeros and ones it is the exact sign test. The seed is that of the
+    random signs, where there are too many differences to try all.
     """
     if len(a) != len(b):
         raise ValueError(f"{len(a)} values against {len(b)}: pairs must be the same")

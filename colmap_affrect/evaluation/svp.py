@@ -119,13 +119,10 @@ def read_pair_list(path: Path) -> tuple[list[ListedPair], list[int]]:
 def read_camera_poses(
     model_path: Path,
 ) -> tuple[dict[str, tuple[pycolmap.Camera, Pose]], dict[str, str]]:
-    """Read ``images.txt`` and ``cameras.txt`` of a folder.
+    """Read ``images.txt`` and ``cameras.txt``; EvaluationError when that cannot be done.
 
-    Returns:
-        Cameras and cam_from_world poses by image name without suffix; why others are not usable.
-
-    Raises:
-        EvaluationError: when one of the files cannot be read.
+    Returns cameras and cam_from_world poses by image name without suffix, and why others are not
+    usable.
     """
     lines = (line.split() for _, line in _lines(model_path / "cameras.txt"))
     cameras = {camera_id: words for camera_id, *words in lines}
@@ -214,11 +211,7 @@ def _empty_notes(listed: Sequence[ListedPair], pairs: Sequence[EvaluationPair]) 
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """Return the lines of a text file that are not empty or comments, with their numbers.
-
-    Raises:
-        EvaluationError: when it cannot be read.
-    """
+    """Return the numbered lines of a text file that are not empty or comments."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:

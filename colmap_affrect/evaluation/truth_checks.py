@@ -159,13 +159,8 @@ def true_homography(
 ) -> tuple[TrueHomography, str]:
     """Return the truth of two images, and what speaks against it (:func:`homography_doubts`).
 
-    Args:
-        matrix: (3, 3) image2_from_image1 of any scale and sign.
-        paths: of the two images.
-        check: look for doubts.
-
-    Raises:
-        ImageError: when an image cannot be read.
+    ``matrix`` is (3, 3) image2_from_image1 of any scale and sign; ``check`` says whether to look
+    for doubts. Raises ImageError when an image cannot be read.
     """
     image1, image2 = (read_gray(path) for path in paths)
     size1, size2 = size_of(image1), size_of(image2)
@@ -174,16 +169,11 @@ def true_homography(
 
 
 def homography_doubts(matrix: Homography, image1: GrayImage, image2: GrayImage) -> str:
-    """Say what speaks against a true homography; empty if the images confirm it.
+    """Say what speaks against a true homography of two (H, W) images; empty if they confirm it.
 
     Image 1 is warped by it, so that even extreme views become easy to match: if it is right,
     features of the warp and of image 2 agree in their places. If they do not, the same is tried
     with what people confuse it with.
-
-    Args:
-        matrix: (3, 3) finite.
-        image1: (H, W) uint8.
-        image2: (H, W) uint8.
     """
     size1, size2 = size_of(image1), size_of(image2)
     features2 = plain_features(image2)
@@ -227,10 +217,8 @@ def correspondence_doubts(correspondences: Points, paths: Sequence[Path]) -> str
     """Say what speaks against (N, 4) correspondences of two images; empty if nothing does.
 
     They must lie in the images. Where plain features match beyond doubt, they must agree with the
-    epipolar geometry of these; pairs that are too hard for them cannot be checked.
-
-    Raises:
-        ImageError: when an image cannot be read.
+    epipolar geometry of these; pairs that are too hard for them cannot be checked. Raises
+    ImageError when an image cannot be read.
     """
     images = [read_gray(path) for path in paths]
     sides = np.hsplit(correspondences, 2)
@@ -261,13 +249,10 @@ def correspondence_doubts(correspondences: Points, paths: Sequence[Path]) -> str
 
 
 def pose_contradictions(pairs: Sequence[EvaluationPair]) -> list[str]:
-    """Match a few pairs and name those whose matches are plainly right and not of the true pose.
+    """Match a few pairs, easy ones first, and name those whose matches contradict the true pose.
 
-    Args:
-        pairs: of one scene, the easy ones first; their truth is two :class:`PosedImage`.
-
-    Returns:
-        One note for every way in which the truth seems wrong.
+    The truth of each is two :class:`PosedImage`. There is a note for every way in which it seems
+    wrong.
     """
     chosen: list[EvaluationPair] = []
     seen: dict[str, Path] = {}

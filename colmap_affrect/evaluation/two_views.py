@@ -84,14 +84,9 @@ class Ransac:
         return np.asarray(matrix, dtype=np.float64), int(np.count_nonzero(inliers))
 
     def relative_pose(self, rays1: Points, rays2: Points) -> tuple[Pose | None, NDArray[np.bool_]]:
-        """Estimate camera2_from_camera1 from five-point samples.
+        """Estimate camera2_from_camera1, |t| = 1 (None if there is none), and its (N,) inliers.
 
-        Args:
-            rays1: (N, 2) x/z, y/z in front of camera 1; matches with NaN are never inliers.
-            rays2: (N, 2) of camera 2.
-
-        Returns:
-            The pose, its translation of length 1, None if there is none; and the (N,) inliers.
+        From five-point samples of (N, 2) x/z, y/z in front of each camera; NaN are never inliers.
         """
         inliers = np.zeros(len(rays1), dtype=bool)
         usable = np.flatnonzero(np.isfinite(rays1).all(axis=1) & np.isfinite(rays2).all(axis=1))
@@ -143,10 +138,9 @@ class RansacSettings:
 def symmetric_epipolar_distances(
     matrix: Matrix | None, points1: Points, points2: Points
 ) -> NDArray[np.float64]:
-    """Return the (N,) distances of matches from a fundamental matrix, in px.
+    """Return (N,) sqrt(d1^2 + d2^2) of points from their epipolar lines, px, as WxBS has it.
 
-    The distance is sqrt(d1^2 + d2^2), of the points from their epipolar lines in images 1 and 2,
-    as WxBS has it. Without a matrix, and where a line is not defined, it is infinite.
+    Infinite without a matrix, and where a line is not defined.
     """
     if matrix is None:
         return np.full(len(points1), np.inf)
@@ -157,15 +151,9 @@ def symmetric_epipolar_distances(
 
 
 def sampson_distances(pose: Pose, rays1: Points, rays2: Points) -> NDArray[np.float64]:
-    """Return the (N,) first-order distances of matches from a relative pose.
+    """Return (N,) first-order distances of (N, 2) x/z, y/z from a camera2_from_camera1.
 
-    Args:
-        pose: camera2_from_camera1.
-        rays1: (N, 2) x/z, y/z in front of camera 1.
-        rays2: (N, 2) of camera 2.
-
-    Returns:
-        Distances in units of the focal length; infinite where they are not defined.
+    In units of the focal length; infinite where they are not defined.
     """
     rotation, (x, y, z) = pose
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation

@@ -82,13 +82,8 @@ class AffNetHardNet:
     def __init__(self, options: AffNetHardNetOptions, network: NetworkContext) -> None:
         """Load the networks.
 
-        Args:
-            options: detector, descriptor and how they run.
-            network: files of weights, and the device.
-
-        Raises:
-            WeightsError: when a file is damaged or belongs to another network.
-            DeviceError: when the device is not there.
+        Raises WeightsError when a file is damaged or belongs to another network, DeviceError when
+        the device is not there.
         """
         from colmap_affrect.features.networks import (
             AffineShapes,
@@ -109,11 +104,9 @@ class AffNetHardNet:
         self.detector = _detector(options, weights, device)
 
     def detect(self, view: View) -> LocalFeatures:
-        """Detect keypoints.
+        """Detect keypoints, by falling response: upright circles of 6 sigma, descriptors (N, 0).
 
-        Returns:
-            Features by falling response, frames upright circles of 6 sigma, descriptors (N, 0).
-            For ``keynet`` and ``hessian`` kornia's frames count as those of 6 sigma.
+        For ``keynet`` and ``hessian`` kornia's frames count as those of 6 sigma.
         """
         image, mask = view
         if self.detector is None:
@@ -144,15 +137,9 @@ class AffNetHardNet:
     ) -> list[LocalFeatures]:
         """Estimate shape, orientation and descriptor of features, a list element for each image.
 
-        Patches of all images share batches. Of the frames given, centre and scale count.
-
-        Args:
-            images: (H, W) uint8 each.
-            detected: their features, frames in px of the image.
-
-        Returns:
-            The features with full frames and descriptors, in the order given; those whose shape
-            is degenerate or whose descriptor is not finite are left out.
+        Patches of all (H, W) uint8 images share batches. Of the frames given, in px of the image,
+        centre and scale count. Features whose shape is degenerate or whose descriptor is not finite
+        are left out; the others keep their order.
         """
         counts = [len(features) for features in detected]
         if not sum(counts):
@@ -177,10 +164,7 @@ class AffNetHardNet:
     def _describe(
         self, patches: _Patches, found: LocalFeatures
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Return (N, 2, 2) shapes of determinant 1 with orientation, and (N, 128) descriptors.
-
-        The descriptors are of any length.
-        """
+        """Return (N, 2, 2) shapes of determinant 1, and (N, 128) descriptors of any length."""
         half_widths_px = self.options.patch_sigmas / MEASUREMENT_SIGMAS * found.scales
         shapes = np.tile(np.eye(2), (len(found), 1, 1))
         if self.affine_shapes is not None:

@@ -29,13 +29,9 @@ DESCRIPTOR_SIZE = 128
 
 
 def resolve_device(name: str) -> torch.device:
-    """Turn the name of a device into one that is there.
+    """Turn ``auto`` (CUDA if there is any, else the CPU), ``cpu``, ``cuda:1``, ``mps`` to a device.
 
-    Args:
-        name: ``auto`` (CUDA if there is any, else the CPU), ``cpu``, ``cuda``, ``cuda:1``, ``mps``.
-
-    Raises:
-        DeviceError: for another name, or when the device is not there.
+    Raises DeviceError for another name, or when the device is not there.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -81,9 +77,8 @@ class AffineShapes(nn.Module):
 def load_orinet(path: Path, device: str) -> feature.OriNet:
     """Build OriNet: (B, 1, 32, 32) patches to (B,) angles in radians.
 
-    Convention:
-        kornia's: an orientation a is a frame turned by [[cos a, sin a], [-sin a, cos a]], which
-        is R(-a) here.
+    kornia's convention: an orientation a is a frame turned by [[cos a, sin a], [-sin a, cos a]],
+    which is R(-a) here.
     """
     network = feature.OriNet(pretrained=False)
     _load(network, path, "OriNet")
@@ -99,15 +94,9 @@ def load_keynet(path: Path, device: str) -> feature.KeyNet:
 
 
 def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
-    """Build a descriptor: (B, 1, 32, 32) patches in [0, 1] to (B, 128) rows.
+    """Build a descriptor by its name in the options.
 
-    Args:
-        name: one of :data:`colmap_affrect.options.DESCRIPTORS`.
-        path: file with its parameters.
-        device: as in :func:`resolve_device`.
-
-    Returns:
-        The network; not all of them return rows of unit length.
+    From (B, 1, 32, 32) patches in [0, 1] to (B, 128) rows, not of all networks of unit length.
     """
     if name == "mkd":
         return _ready(_load_mkd(path), device)
@@ -199,11 +188,7 @@ def _load_mkd(path: Path) -> nn.Module:
 
 
 def _load(network: nn.Module, path: Path, name: str) -> None:
-    """Give a network the parameters in a file.
-
-    Raises:
-        WeightsError: when they are not exactly those of the network.
-    """
+    """Give a network the parameters in a file; WeightsError when they are not exactly its own."""
     state = load_state_dict(path)
     if isinstance(network, HardTFeat):  # the file also holds a SIFT that helped in its training
         state = {key: value for key, value in state.items() if not key.startswith("SIFT.")}

@@ -50,14 +50,12 @@ class RootSift:
         self.options = options
 
     def detect(self, view: View) -> LocalFeatures:
-        """Detect and describe in one pass over the scale space.
+        """Detect and describe in one pass over the scale space; none for images under 8 px.
 
-        A location with several dominant orientations yields one feature for each: their
-        descriptors differ, and the matcher's second neighbour never lies at the same location,
-        so none of them is lost. Of too many the strongest are kept, by response times sigma.
-
-        Returns:
-            Described features by falling response; none for images under 8 px.
+        A location with several dominant orientations yields one feature for each: their descriptors
+        differ, and the matcher's second neighbour never lies at the same location, so none of them
+        is lost. Of too many the strongest are kept, by response times sigma; they are returned by
+        falling response.
         """
         image, mask = view
         if not is_searchable(image, mask):
@@ -117,9 +115,8 @@ def by_falling_response(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
     """Sort keypoints by falling response; those of equal response keep their order.
 
-    Returns:
-        (N,) index of the sorted keypoints in the given ones; their (N, 4) x, y in pixel-centre
-        px, sigma in px and angle in radians (from x towards y); their (N,) responses.
+    Returns the (N,) index of the sorted keypoints in the given ones; their (N, 4) x, y in
+    pixel-centre px, sigma in px and angle in radians (from x towards y); their (N,) responses.
     """
     responses = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
     order = np.argsort(-responses, kind="stable")
@@ -134,17 +131,11 @@ def detect_dog(
     """Detect DoG keypoints for descriptors that assign orientations themselves.
 
     OpenCV returns a location once for each of its dominant orientations, 15 to 18 % of them more
-    than once. With another orientation put in their place these would be equal features, which
-    no ratio test tells apart; so there is one keypoint per centre and scale.
+    than once. With another orientation put in their place these would be equal features, which no
+    ratio test tells apart; so there is one keypoint per centre and scale.
 
-    Args:
-        image: (H, W) uint8.
-        options: detector thresholds and the cap on the number of features.
-        mask: (H, W) uint8, keypoints are kept only where it is not 0.
-
-    Returns:
-        Features by falling response, frames upright circles of 6 sigma, descriptors (N, 0); none
-        for images under 8 px.
+    The (H, W) uint8 mask is 0 where none are wanted. Returns features by falling response, frames
+    upright circles of 6 sigma, descriptors (N, 0); none for images under 8 px.
     """
     if not is_searchable(image, mask):
         return LocalFeatures.empty()

@@ -86,18 +86,10 @@ HARDTFEAT_URL = "https://github.com/ducha-aiki/affnet/raw/789419aa70cc4419284a23
 def resolve(
     keys: Iterable[str], weights_path: Path | None = None, *, progress: Progress = SILENT
 ) -> dict[str, Path]:
-    """Find files of weights, or download them into torch's cache.
+    """Find files of weights, or download them into torch's cache; return their paths by key.
 
-    Args:
-        keys: of :data:`WEIGHT_FILES`.
-        weights_path: folder to look into first.
-        progress: where the progress of downloads goes.
-
-    Returns:
-        The path of each key.
-
-    Raises:
-        WeightsError: one for all files that are missing and cannot be downloaded.
+    They are looked for in ``weights_path`` first. Raises one WeightsError for all files that are
+    missing and cannot be downloaded.
     """
     if weights_path is not None and not weights_path.is_dir():
         raise WeightsError(f"--weights {weights_path}: not a folder")
@@ -121,8 +113,7 @@ def fetch(
 ) -> dict[str, Path]:
     """Download files into a folder, torch's cache by default; those already there stay.
 
-    Raises:
-        WeightsError: for an unknown key, or when a download fails.
+    Raises WeightsError for an unknown key, or when a download fails.
     """
     keys, folder = list(keys), folder or cache_folder()
     for key in keys:
@@ -140,8 +131,6 @@ class WeightStatus:
     """What is known of one file of weights.
 
     Attributes:
-        key: of :data:`WEIGHT_FILES`.
-        published: the file as it should be.
         path: where it was found; None if nowhere.
         verified: whether its sha256 is that of the published file; None if there is no file
             or no sha256 to compare with.
@@ -170,14 +159,10 @@ def file_sha256(path: Path) -> str:
 
 
 def load_state_dict(path: Path) -> dict[str, Any]:
-    """Read the parameters of a network; objects that would run code are not loaded.
+    """Read the parameters of a network by name; objects that would run code are not loaded.
 
-    Returns:
-        What the file holds by name, in general tensors on the CPU. Of a checkpoint with an
-        entry ``state_dict`` only that.
-
-    Raises:
-        WeightsError: when the file cannot be read or holds other things.
+    Of a checkpoint with an entry ``state_dict`` only that. Raises WeightsError when the file cannot
+    be read or holds other things.
     """
     import torch
 

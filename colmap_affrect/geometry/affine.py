@@ -57,6 +57,26 @@ def transform_frames(
     return np.concatenate([jacobians @ lafs[:, :, :2], target[:, :, None]], axis=2)
 
 
+def homography_errors(
+    homography: NDArray[np.floating],
+    points1: NDArray[np.floating],
+    points2: NDArray[np.floating],
+) -> NDArray[np.float64]:
+    """Return (N,) distances of matches from a homography, px, to first order (Sampson).
+
+    Both points may be off: where image 2 is stretched, so is the error of the point in image 1.
+    The same for the inverse homography and swapped images.
+    """
+    frames = np.broadcast_to(np.eye(2, 3), (len(points1), 2, 3)).copy()
+    frames[:, :, 2] = points1
+    carried = transform_frames(homography, frames)
+    x, y = (carried[:, :, 2] - points2).T
+    jacobians = carried[:, :, :2]
+    covariances = np.eye(2) + jacobians @ jacobians.transpose(0, 2, 1)
+    a, b, d = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
+    return np.asarray(np.sqrt((d * x**2 - 2.0 * b * x * y + a * y**2) / (a * d - b**2)))
+
+
 def lafs_from_keypoints(
     points: NDArray[np.floating], radii_px: NDArray[np.floating], angles_rad: NDArray[np.floating]
 ) -> NDArray[np.float64]:

@@ -31,9 +31,12 @@ FOCALS = np.geomspace(0.3, 10.0, 41)
 STEP = 2
 """Where two cameras are asked for at once every second candidate will do."""
 
-MIN_PROMISE = -12.0
+MIN_PROMISE = -30.0
 """Tables of two cameras are made at every second of these candidates first; the others are looked
 at beside those that fall short of the best one by less."""
+
+MAX_LOSS = 2.0
+"""Of log-evidence, at most, between two candidates of such a table."""
 
 PRIOR_FOCAL, PRIOR_SIGMA = 1.1, 0.6
 """Lenses of photographs: most between .6 and 2 longer sides (logarithmic)."""
@@ -128,8 +131,23 @@ def _table(pair: MatchedPair, focals: Array) -> Array:
         promising = cv2.dilate((table > MIN_PROMISE).astype(np.uint8), np.ones((3, 3))) > 0
         table[promising] = log_evidence(pair, *grid[promising].T)
         if table[promising].any():
-            return np.where(promising, table, MIN_PROMISE)
+            return _softened(np.where(promising, table, MIN_PROMISE))
     return np.zeros_like(table)  # the pair fits no camera
+
+
+def _softened(table: Array) -> Array:
+    """Widen a table so that no peak is lost between candidates.
+
+    Evidence is a parabola about its best candidate: halfway to the next one it falls by a quarter
+    of the second difference.
+    """
+    row, column = np.unravel_index(table.argmax(), table.shape)
+    lines = (np.pad(table[row], 1, "edge"), np.pad(table[:, column], 1, "edge"))
+    bends = [
+        line[at + 1] - 0.5 * (line[at] + line[at + 2])
+        for line, at in zip(lines, (column, row), strict=True)
+    ]
+    return np.asarray(table * min(1.0, 4.0 * MAX_LOSS / max(*bends, 1e-9)))
 
 
 def evidence_for_one(ballots: Sequence[Ballot]) -> float:

@@ -50,8 +50,7 @@ class DepthSource(Protocol):
     def depth(self, photograph: Photograph) -> NDArray[np.float32]:
         """Return (h, w) z-depth > 0, NaN where unknown, of any resolution over the whole image.
 
-        Raises:
-            DepthError: when there is no usable map.
+        Raises DepthError when there is no usable map.
         """
 
     def require_some(self, names: Sequence[str]) -> None:
@@ -150,11 +149,7 @@ class DepthFiles:
         self._path = Path(options.path)
 
     def require_some(self, names: Sequence[str]) -> None:
-        """Check, before any image is processed, that there is a map of at least one.
-
-        Raises:
-            DepthError: if the folder does not exist or has a map of none of the images.
-        """
+        """Check, before any image is processed, that at least one has a map; else DepthError."""
         if not self._path.is_dir():
             raise DepthError(f"{self._path}: no such folder; give the folder of the depth maps")
         if not any(self._find(name) for name in names):
@@ -166,8 +161,7 @@ class DepthFiles:
     def depth(self, photograph: Photograph) -> NDArray[np.float32]:
         """Read the (h, w) float32 z-depth of a photograph, NaN where it is unknown.
 
-        Raises:
-            DepthError: if there is none, or it is damaged or not of this photograph.
+        Raises DepthError if there is none, or it is damaged or not of this photograph.
         """
         path = self._find(photograph.name)
         if path is None:
@@ -235,8 +229,7 @@ class MonocularDepth:
     def require_some(self, names: Sequence[str]) -> None:
         """Load the network now, before any image is processed, unless all predictions are kept.
 
-        Raises:
-            DepthError: if transformers is not installed or the model cannot be loaded.
+        Raises DepthError if transformers is not installed or the model cannot be loaded.
         """
         files = [self._cache_file(name) for name in names]
         if not all(file is not None and file.exists() for file in files):
@@ -246,9 +239,8 @@ class MonocularDepth:
     def depth(self, photograph: Photograph) -> NDArray[np.float32]:
         """Predict the (h, w) float32 z-depth of a photograph, NaN where it is unknown.
 
-        Raises:
-            DepthError: if the network cannot be loaded, or predicts no depth.
-            ImageError: if the photograph cannot be read.
+        Raises DepthError if the network cannot be loaded or predicts no depth, ImageError if the
+        photograph cannot be read.
         """
         prediction = self._prediction(photograph)
         kind = "inverse" if self._kind == "z" and prediction.inverse else self._kind

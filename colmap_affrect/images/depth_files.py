@@ -31,11 +31,7 @@ class UnusableMap(Exception):
 
 
 def read_map(path: Path) -> NDArray[np.float64]:
-    """Read the (h, w) values of a file, whose suffix is one of ``SUFFIXES``.
-
-    Raises:
-        UnusableMap: when it cannot be read or holds no map.
-    """
+    """Read the (h, w) values of a file with one of ``SUFFIXES``; UnusableMap if it holds no map."""
     try:
         values = _READERS[path.suffix](path)
     except UnusableMap:

@@ -13,11 +13,7 @@ from colmap_affrect.images.reading import decode
 
 
 def read_mask(path: Path) -> Mask:
-    """Read a mask: black pixels are False, all others True (COLMAP's convention).
-
-    Raises:
-        ImageError: when the file is missing, empty, or not an image.
-    """
+    """Read a mask, black pixels False (COLMAP's convention); ImageError when that fails."""
     return np.asarray(decode(path) != 0)
 
 
@@ -35,8 +31,7 @@ def mask_values(mask: Mask) -> NDArray[np.uint8]:
 def connected_regions(mask: Mask, min_area_px: float) -> list[tuple[Mask, tuple[int, int]]]:
     """Find the 4-connected regions of an (H, W) mask that have enough pixels.
 
-    Returns:
-        For each its (h, w) mask, cropped to it, and the (x, y) of the mask's first pixel.
+    Each is an (h, w) mask, cropped to it, and the (x, y) of the mask's first pixel.
     """
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     regions = []

@@ -39,8 +39,7 @@ wheel does not."""
 def read_gray(path: Path) -> GrayImage:
     """Read an image as gray, as stored: EXIF orientation is not applied, 16 bit becomes 8.
 
-    Raises:
-        ImageError: when the file is missing, empty, or not an image.
+    Raises ImageError when the file is missing, empty, or not an image.
     """
     image = decode(path)
     if image.dtype == np.uint16:
@@ -53,10 +52,7 @@ def read_gray(path: Path) -> GrayImage:
 def read_color(path: Path, max_size_px: int) -> ColorImage:
     """Read an image in colour, as stored, its longer side shrunk to at most ``max_size_px``.
 
-    EXIF orientation is not applied.
-
-    Raises:
-        ImageError: when the file is missing, empty, or not an image.
+    EXIF orientation is not applied. Raises ImageError as :func:`read_gray`.
     """
     image = decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return shrink_to(np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8), max_size_px)
@@ -70,8 +66,7 @@ def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
 def require_png() -> None:
     """Check that this process can write PNG, before work that ends with pictures.
 
-    Raises:
-        ImageError: when it imported pycolmap before this package: compressing would kill it.
+    ImageError when it imported pycolmap before this package: compressing would kill it.
     """
     if PYCOLMAP_CAME_FIRST:
         raise ImageError(
@@ -96,11 +91,7 @@ GRAY_AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_
 
 
 def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[np.generic]:
-    """Read an image, by default as gray in the type it is stored in.
-
-    Raises:
-        ImageError: when the file is missing, empty, or not an image.
-    """
+    """Read an image, by default as gray in the type it is stored in; ImageError if it is none."""
     if path.exists() and not path.is_file():
         raise ImageError(f"{path}: is not a file")
     try:

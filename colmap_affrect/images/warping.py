@@ -29,10 +29,7 @@ MAX_DENSITY = 16
 
 
 def halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return an (H, W) image blurred and resampled to (H // 2, W // 2) px, borders reflected.
-
-    As ``kornia.geometry.transform.pyrdown``, but much faster.
-    """
+    """Return an (H, W) image blurred and resampled to half its size, as kornia's ``pyrdown``."""
     kernel = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
     smooth = cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
     size = (image.shape[1] // 2, image.shape[0] // 2)
@@ -44,18 +41,13 @@ def warp(
 ) -> NDArray[np.uint8]:
     """Render a rectification: one exact resampling, free of aliasing where it compresses.
 
-    The image is resampled once, on a grid that is denser than the warp by integer factors,
-    blurred, and decimated by them. So pixels are picked, never interpolated again, and the map
-    is exact. Outside the image its border is reflected.
+    The image is resampled once, on a grid that is denser than the warp by integer factors, blurred,
+    and decimated by them. So pixels are picked, never interpolated again, and the map is exact.
+    Outside the image its border is reflected.
 
-    Args:
-        image: (H, W) or (H, W, 3) of levels 0 to 255; float32 saves a conversion for each warp.
-        rectification: an affine map diag(sx, sy) R(phi) + translation with sx >= 1 >= sy, or
-            any homography.
-
-    Returns:
-        (height, width) or (height, width, 3) uint8 warp; what lies behind the camera has no
-        meaning.
+    From (H, W) or (H, W, 3) levels 0 to 255 (float32 saves a conversion for each warp), by an
+    affine map diag(sx, sy) R(phi) + translation with sx >= 1 >= sy or any homography, to (height,
+    width) or (height, width, 3) uint8; what lies behind the camera has no meaning.
     """
     # Rounding to 8 bits between the steps would shift edges by up to 0.1 px.
     source = np.asarray(image, dtype=np.float32)
@@ -158,12 +150,8 @@ def _source_points(
 def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> NDArray[np.uint8]:
     """Carry the region of a rectification into its warp (nearest; 255 inside, 0 outside).
 
-    Args:
-        rectification: a region of None is the whole image.
-        image_size: (width, height) of the image in px.
-
-    Returns:
-        (height, width) uint8 of the canvas; what lies behind the camera is outside.
+    Of an image of (width, height) px, all of it where the region is None, to (height, width) uint8
+    of the canvas; what lies behind the camera is outside.
     """
     region = rectification.region
     if region is None:

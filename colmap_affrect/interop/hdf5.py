@@ -102,25 +102,14 @@ def import_h5(
     """Make a new COLMAP database from the features and matches of another program.
 
     Keypoints get 6 columns where the file has ``lafs``, 4 where it has ``scales`` and ``oris``,
-    else 2. All images of the folder are imported, with or without features. The database appears
-    when it is complete; nothing else is written.
+    else 2. All images of the folder are imported, with or without features. The database, which
+    must not be there (DatabaseError), appears when it is complete; nothing else is written. Files
+    that cannot be read, or contradict the photographs or each other, are a StoreError.
 
-    Args:
-        image_path: folder of the photographs, searched with its sub-folders.
-        features_path: HDF5 file of keypoints.
-        matches_path: HDF5 file of matches.
-        database_path: where the database is made.
-        cameras: which images share a camera, and known intrinsics.
-        layout: ``hloc``, ``dim``, or ``auto``: as the matches are stored.
-        pixel_origin: where (0, 0) is, the ``center`` of the first pixel (both programs) or its
-            ``corner``, which is COLMAP's.
-        skip_verification: leave the database without two-view geometries.
-        random_seed: of the verification, by :func:`colmap_affrect.colmap.verification.verify`.
-        progress: where to show progress.
-
-    Raises:
-        StoreError: when a file cannot be read, or contradicts the photographs or the other file.
-        DatabaseError: when the database exists already.
+    ``layout`` is ``hloc``, ``dim``, or ``auto``: as the matches are stored. ``pixel_origin`` is
+    where (0, 0) is, the ``center`` of the first pixel (both programs) or its ``corner``, which is
+    COLMAP's. Pairs are verified by :func:`colmap_affrect.colmap.verification.verify` with
+    ``random_seed``.
     """
     _check_choice("layout", layout, ("auto", *LAYOUTS))
     _check_choice("pixel_origin", pixel_origin, PIXEL_ORIGINS)
@@ -197,24 +186,15 @@ def export_h5(
     half: bool = False,
     progress: Progress = SILENT,
 ) -> InterchangeReport:
-    """Write features and raw matches of an output folder or a database for another program.
+    """Write features and raw matches of an output folder of ours or a database.
 
-    Features keep their indices. ``scales`` and ``oris`` are those of hloc: sigma in px, and
-    degrees from x towards y. Descriptors are of unit length. Scores, which a database does not
-    have, are 1 then.
+    Features keep their indices. ``scales`` and ``oris`` are those of hloc: sigma in px, and degrees
+    from x towards y. Descriptors are of unit length. Scores, which a database does not have, are 1
+    then. The database is copied first and stays as it is.
 
-    Args:
-        features_path: new HDF5 file of features.
-        matches_path: new HDF5 file of matches.
-        output_path: an output folder of ours in which matching is done; or
-        database_path: any COLMAP database, which is copied first and stays as it is.
-        layout: ``hloc`` or ``dim``.
-        half: write all real numbers as float16, coordinates too.
-        progress: where to show progress.
-
-    Raises:
-        StoreError: when a file exists, cannot be written, or its layout cannot hold the content.
-        DatabaseError: when the database cannot be used.
+    ``layout`` is ``hloc`` or ``dim``; with ``half`` all real numbers are float16, coordinates too.
+    Raises StoreError when a file exists, cannot be written, or its layout cannot hold the content,
+    DatabaseError when the database cannot be used.
     """
     _check_choice("layout", layout, LAYOUTS)
     if features_path.resolve() == matches_path.resolve():
@@ -305,10 +285,7 @@ class _WorkspaceContent:
     """Features and matches of an output folder, to be exported.
 
     Attributes:
-        where: they are, for messages.
-        names: of the images with features.
         num_pairs: number of pairs that :meth:`matches` yields.
-        notes: what is left out.
     """
 
     def __init__(self, workspace: Workspace) -> None:

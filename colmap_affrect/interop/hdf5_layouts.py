@@ -73,10 +73,8 @@ class Source:
     def read(self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu") -> NDArray[Any]:
         """Read a dataset of finite numbers once its shape has been checked.
 
-        Args:
-            key: path of the dataset.
-            shape: expected shape; None stands for any size.
-            kinds: numpy's kinds of types that are accepted.
+        None in the shape stands for any size; ``kinds`` are numpy's kinds of types that are
+        accepted.
         """
         found = self.shapes[key]
         same = [size in (expected, None) for size, expected in zip(shape, found, strict=False)]

@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database, refuse_wrong_matches
 from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.native_options import differences, flat_values
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.colmap.verification import verify as verify_database
@@ -37,6 +38,7 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
+from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import Inputs, extract, recorded_extraction, write_descriptors
@@ -67,11 +69,10 @@ def extract_features(
     """Extract rectified features of photographs into a COLMAP database.
 
     Images that have features already are passed over. One that cannot be read is named in the
-    report, and the others go on.
+    report, and the others go on. Raises AffrectError for anything that the caller can mend.
 
     Args:
-        database_path: database, made if it is missing. One that has features of another program
-            is refused; see ``from_database``.
+        database_path: made if it is missing; one that has features of another program is refused.
         image_path: folder of the photographs.
         image_names: names below it; all images by default.
         camera_mode: which images share a camera, as in pycolmap.
@@ -83,9 +84,6 @@ def extract_features(
         weights_path: folder with the weights of networks.
         database_descriptors: write descriptors too, as COLMAP's matchers need them.
         progress: where to show progress.
-
-    Raises:
-        AffrectError: for anything that the caller can mend; what is done stays.
     """
     cameras, masks = _reader_options(reader_options, camera_mode)
     inputs = Inputs.of(
@@ -114,15 +112,11 @@ def match_exhaustive(
 ) -> tuple[StageReport, ...]:
     """Match and verify all pairs of the images that :func:`extract_features` was given.
 
-    Args:
-        database_path: that of :func:`extract_features`.
-        matching_options: by default those of the recipe.
-        pairing_options: accepted for pycolmap's sake; the size of blocks does not change results.
-        verification_options: ours, or those of pycolmap that have a counterpart.
-        device: where matching and, for recipes that escalate, networks run.
-        random_seed: of verification; by default that of its options, which is 0.
-        weights_path: folder with the weights of networks, for recipes that escalate.
-        progress: where to show progress.
+    ``matching_options`` are by default those of the recipe; ``verification_options`` are ours, or
+    those of pycolmap that have a counterpart, and ``random_seed`` wins over theirs.
+    ``pairing_options`` are accepted for pycolmap's sake: the size of blocks does not change
+    results. For recipes that escalate, ``device`` is that of networks too, and ``weights_path`` has
+    their weights.
     """
     verification = _verification_options(verification_options, random_seed)
     with _context(database_path, device, weights_path, progress) as context:
@@ -144,9 +138,7 @@ def match_image_pairs(
     """Match and verify the pairs of a list; arguments are those of :func:`match_exhaustive`.
 
     But ``pairing_options`` are needed, with ``match_list_path``, a file of two names per line.
-
-    Raises:
-        PairListError: without a list, or when it names images without features.
+    Raises PairListError without one, or when it names images without features.
     """
     verification = _verification_options(verification_options, random_seed)
     list_path = _match_list_path(pairing_options)
@@ -160,21 +152,16 @@ def verify(
     options: GivenVerification = None,
     *,
     pairs_path: PathLike | None = None,
+    check_cameras: bool = False,
     random_seed: int | None = None,
 ) -> None:
     """Estimate the two-view geometries of the matched pairs of any database that lack one.
 
-    As ``pycolmap.geometric_verification``, with the preset for sparse sets; every match is
-    checked first, because one that points at no keypoint ends the process inside COLMAP.
-
-    Args:
-        database_path: any COLMAP database.
-        options: ours, or those of pycolmap that have a counterpart.
-        pairs_path: verify these pairs only, two names per line.
-        random_seed: by default that of the options, which is 0.
-
-    Raises:
-        DatabaseError: when the database cannot be used, or has such matches.
+    As ``pycolmap.geometric_verification``, with the preset for sparse sets (or ``options``, ours or
+    those of pycolmap that have a counterpart). Every match is checked first, because one that
+    points at no keypoint ends the process inside COLMAP: DatabaseError. ``pairs_path`` lists the
+    pairs to verify, two names per line; all by default. With ``check_cameras`` all verified pairs
+    vote on cameras whose focal length is no prior; those that they know become priors.
     """
     path = Path(database_path)
     verification = _verification_options(options, random_seed)
@@ -183,6 +170,11 @@ def verify(
         verify_database(path, verification)
     else:
         _verify_pairs(path, read_pairs(Path(pairs_path), list(image_ids(path))), verification)
+    if check_cameras:
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            records = Path(folder) / "cameras.json"
+            record_cameras(path, records)
+            hold_vote(path, records, verification, may_share=False)
 
 
 def _verify_pairs(path: Path, pairs: Sequence[Pair], verification: VerificationOptions) -> None:
@@ -224,18 +216,13 @@ def incremental_mapping(
         image_path: folder of the photographs, for the colours of the points; empty for none.
         output_path: models are written to 0, 1, ... in it, or, with ``input_path``, into it.
         options: what differs from pycolmap's defaults wins over our preset for sparse sets.
-        input_path: a model to be extended. Its poses and cameras stay with
-            ``fix_existing_frames``.
+        input_path: a model to be extended. Its poses and cameras stay with ``fix_existing_frames``.
         initial_image_pair_callback: called when a first pair is registered.
         next_image_callback: called for every further image.
-        cancellation_token: stops mapping when it is cancelled.
+        cancellation_token: stops mapping when it is cancelled, by InterruptedError as in pycolmap.
 
     Returns:
         The models by the number of their folder, largest first.
-
-    Raises:
-        AffrectError: for anything that the caller can mend.
-        InterruptedError: when mapping was cancelled, as by pycolmap.
     """
     native = _pipeline_options(options)
     mapper = MAPPERS.make(_mapper_options(native))

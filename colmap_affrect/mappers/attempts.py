@@ -19,7 +19,7 @@ from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.last_adjustment import adjust_last
 from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
-from colmap_affrect.mappers.starts import focal_starts, runaways, started
+from colmap_affrect.mappers.starts import Start, runaways, started, starts
 from colmap_affrect.project.report import ModelSummary
 
 ATTEMPT_SEED_STEP = 1_000_003
@@ -105,7 +105,7 @@ class _Attempts:
     def __init__(self, mapper: Mapper, task: MappingTask, num_images: int) -> None:
         self._mapper, self._task, self._num_images = mapper, task, num_images
         is_large = num_images >= LARGE_MODEL
-        self._starts = [{}] if task.extend or is_large else focal_starts(task)
+        self._starts = [Start()] if task.extend or is_large else starts(task)
         num = 1 if task.extend else mapper.options.max_num_attempts
         self._limit = max(num, len(self._starts))
         self._most = self._limit + MAX_HOLDING_ATTEMPTS
@@ -189,4 +189,8 @@ def summarize(mapped: MappedModel, task: MappingTask) -> ModelSummary:
         doubts=doubts.model,
         arrivals=arrivals(mapped, task),
         taken_out=dict(mapped.taken_out),
+        focals_px={
+            key: model.cameras[key].mean_focal_length()
+            for key in {model.images[image_id].camera_id for image_id in model.reg_image_ids()}
+        },
     )

@@ -66,6 +66,11 @@ class MapperOptions(PartOptions):
         return next((name for name in PRESETS if self == self.preset(name, **free)), CUSTOM)
 
 
+DepthLookup = Callable[[str, NDArray[np.floating]], NDArray[np.float64]]
+"""Returns what the depth map of an image, by its name, has at (N, 2) px of COLMAP: (N,) depths in
+any unit, inverse depths in any unit and with any shift; NaN where it has none."""
+
+
 @dataclass(frozen=True, eq=False)
 class MappingTask:
     """What to map.
@@ -80,6 +85,8 @@ class MappingTask:
         guided: (M, 2) features of pairs of image ids that only guided matching has matched.
         cameras: what is known of the cameras, by id.
         held: ids of cameras whose parameters stay as they are in the database.
+        distortion_held: only focal lengths are refined.
+        depth_at: depth maps of the images, where there are any.
     """
 
     database_path: Path
@@ -91,6 +98,8 @@ class MappingTask:
     guided: Mapping[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
     held: frozenset[int] = frozenset()
+    distortion_held: bool = False
+    depth_at: DepthLookup | None = None
 
     @property
     def colors_path(self) -> Path:

@@ -5,6 +5,7 @@ Doubts have two degrees: what is certainly wrong leaves the model, the rest is t
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -240,15 +241,20 @@ def _angles_deg(model: pycolmap.Reconstruction) -> dict[int, list[tuple[float, f
     """Return, of some points of each image, the angles to the next and to the farthest ray."""
     ids = sorted(model.point3D_ids())
     found: dict[int, list[tuple[float, float]]] = {i: [] for i in model.reg_image_ids()}
+    centers = {i: model.images[i].projection_center() for i in found}
+    seen: dict[int, list[tuple[Points, list[int]]]] = defaultdict(list)
     for point_id in ids[:: max(1, len(ids) // MAX_POINTS_FOR_ANGLES)]:
         point = model.point3D(point_id)
         seen_by = sorted({element.image_id for element in point.track.elements})
-        rays = np.array([model.images[i].projection_center() - point.xyz for i in seen_by])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        angles = np.rad2deg(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)))
-        np.fill_diagonal(angles, 0.0)
-        farthest = angles.max(axis=1)
-        np.fill_diagonal(angles, 180.0)
-        for image_id, *both in zip(seen_by, angles.min(axis=1), farthest, strict=True):
-            found[image_id].append((float(both[0]), float(both[1])))
+        seen[len(seen_by)].append((point.xyz, seen_by))
+    for num, tracks in seen.items():  # those of one length at once
+        rays = np.array([[centers[i] - xyz for i in seen_by] for xyz, seen_by in tracks])
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        angles = np.rad2deg(np.arccos(np.clip(rays @ np.swapaxes(rays, 1, 2), -1.0, 1.0)))
+        same = np.eye(num, dtype=bool)
+        nearest = np.where(same, 180.0, angles).min(axis=2).ravel().tolist()
+        farthest = np.where(same, 0.0, angles).max(axis=2).ravel().tolist()
+        images = [image_id for _, seen_by in tracks for image_id in seen_by]
+        for image_id, *both in zip(images, nearest, farthest, strict=True):
+            found[image_id].append((both[0], both[1]))
     return found

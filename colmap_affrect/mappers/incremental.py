@@ -75,8 +75,7 @@ class IncrementalMapper:
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
-        native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
-        constrain(native, task, self.options)
+        native = self.native_of(task, random_seed)
         if task.image_path is None:
             native.extract_colors = False
         call = _Call(task, native, output_path, show)
@@ -88,6 +87,18 @@ class IncrementalMapper:
             reason = " ".join(str(error).split())
             raise MappingError(f"COLMAP's incremental mapper failed: {reason}") from error
         return [MappedModel(model) for model in models]
+
+    def native_of(self, task: MappingTask, random_seed: int) -> pycolmap.IncrementalPipelineOptions:
+        """Return pycolmap's options for a task, with what is not to be refined of its cameras."""
+        native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
+        native.constant_cameras = task.constant_cameras(self.options)
+        kept = []
+        if task.keeps_focal_lengths(self.options):
+            kept += ["ba_refine_focal_length", "mapper.abs_pose_refine_focal_length"]
+        if task.distortion_held:
+            kept += ["ba_refine_extra_params", "mapper.abs_pose_refine_extra_params"]
+        set_values(native, dict.fromkeys(kept, False) | self.options.mapper_options)
+        return native
 
     def native(
         self, random_seed: int, *, intrinsics_given: bool
@@ -121,18 +132,6 @@ class IncrementalMapper:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
         native = self.native(self.options.random_seed, intrinsics_given=intrinsics_given)
         return differences(native, pycolmap.IncrementalPipelineOptions())
-
-
-def constrain(
-    native: pycolmap.IncrementalPipelineOptions, task: MappingTask, options: MapperOptions
-) -> None:
-    """Have pycolmap's mapper keep what is given or held of the cameras of a task."""
-    native.constant_cameras = task.constant_cameras(options)
-    if task.keeps_focal_lengths(options):
-        kept = dict.fromkeys(
-            ("ba_refine_focal_length", "mapper.abs_pose_refine_focal_length"), False
-        )
-        set_values(native, kept | options.mapper_options)
 
 
 @dataclass

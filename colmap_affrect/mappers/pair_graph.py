@@ -22,7 +22,7 @@ from colmap_affrect.geometry.two_views import (
     essential_matrix,
     triangulated_depths,
 )
-from colmap_affrect.mappers.base import MappingTask
+from colmap_affrect.mappers.base import DepthLookup, MappingTask
 
 PoseById = Mapping[int, Pose]
 CameraById = Mapping[int, pycolmap.Camera]
@@ -99,6 +99,7 @@ class PairGraph:
         cameras: by image id, as in the database.
         keypoints: (N, 2) px by image id.
         pairs: sorted by ids.
+        depth_at: depth maps of the images, where there are any.
     """
 
     cache: pycolmap.DatabaseCache
@@ -106,9 +107,15 @@ class PairGraph:
     cameras: CameraById
     keypoints: Mapping[int, NDArray[np.float32]]
     pairs: tuple[VerifiedPair, ...]
+    depth_at: DepthLookup | None = None
 
     @classmethod
-    def read(cls, path: Path, min_num_matches: int = MIN_NUM_MATCHES) -> PairGraph:
+    def read(
+        cls,
+        path: Path,
+        min_num_matches: int = MIN_NUM_MATCHES,
+        depth_at: DepthLookup | None = None,
+    ) -> PairGraph:
         """Read the pairs with at least as many inliers."""
         with open_database(path) as database:
             images = {image.image_id: image for image in database.read_all_images()}
@@ -132,6 +139,7 @@ class PairGraph:
             {image_id: cameras[images[image_id].camera_id] for image_id in images},
             keypoints,
             tuple(sorted(pairs, key=lambda pair: pair.ids)),
+            depth_at,
         )
 
     def without(self, ids: Collection[tuple[int, int]]) -> PairGraph:
@@ -233,7 +241,7 @@ class PairGraph:
 @lru_cache(maxsize=1)
 def graph_of(task: MappingTask, min_num_matches: int = MIN_NUM_MATCHES) -> PairGraph:
     """Return the graph of what is to be mapped, read once for all attempts."""
-    return PairGraph.read(task.database_path, min_num_matches)
+    return PairGraph.read(task.database_path, min_num_matches, task.depth_at)
 
 
 def poses_of(model: pycolmap.Reconstruction) -> dict[int, Pose]:

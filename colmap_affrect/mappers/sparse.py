@@ -15,7 +15,7 @@ from colmap_affrect.colmap.database_copy import copy_without_pairs
 from colmap_affrect.colmap.native_options import Plain
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 from colmap_affrect.mappers.bridging import Bridges, Hypothesis, Part
-from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions, constrain
+from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.loops import check_loops
 from colmap_affrect.mappers.pair_graph import PairGraph, graph_of
 
@@ -48,8 +48,7 @@ class SparseMapper:
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
         models = self._mapped(task, output_path / "all", random_seed, show)
-        native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
-        constrain(native, task, self.options)
+        native = self._incremental.native_of(task, random_seed)
         graph = graph_of(task, native.min_num_matches)
         if models and graph.is_explained_by(models[0]):
             return [MappedModel(model) for model in models]

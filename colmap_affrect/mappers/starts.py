@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
@@ -20,17 +20,37 @@ MAX_EXCESS = 1.5
 anywhere."""
 
 
-def focal_starts(task: MappingTask) -> list[dict[int, float]]:
-    """Return focal lengths by camera id to start from, px; the first start has those of the task.
+@dataclass(frozen=True)
+class Start:
+    """Where an attempt starts from.
 
-    The others are halfway to both ends of what the pairs allow, for all unknown cameras at once.
+    Attributes:
+        focals_px: focal lengths by camera id; others are as in the database.
+        distortion_held: few points of long lenses take any distortion for focal length.
     """
-    unknown = {key: record for key, record in task.cameras.items() if record.source == "guess"}
-    found: list[dict[int, float]] = [{}]
+
+    focals_px: Mapping[int, float] = field(default_factory=dict)
+    distortion_held: bool = False
+
+
+def starts(task: MappingTask) -> list[Start]:
+    """Return where to start from: as the task is, and where cameras are unknown from elsewhere.
+
+    That is: without distortion, and from focal lengths halfway to both ends of what the pairs
+    allow, for all unknown cameras at once.
+    """
+    unknown = {
+        key: record
+        for key, record in task.cameras.items()
+        if record.source == "guess" and record.low_px is not None
+    }
+    found = [Start()]
+    if unknown:
+        found.append(Start(distortion_held=True))
     for side in ("low_px", "high_px"):
         moved = dict(_halfway(unknown, side))
         if moved:
-            found.append(moved)
+            found.append(Start(moved, distortion_held=True))
     return found
 
 
@@ -43,14 +63,16 @@ def _halfway(records: Mapping[int, CameraRecord], side: str) -> Iterator[tuple[i
                 yield key, focal
 
 
-def started(task: MappingTask, focals: Mapping[int, float], path: Path) -> MappingTask:
-    """Return a task that starts from other focal lengths, with a database of its own.
+def started(task: MappingTask, start: Start, path: Path) -> MappingTask:
+    """Return a task that starts from elsewhere, with a database of its own where that needs one.
 
     Args:
         task: as it is.
-        focals: px, by camera id.
+        start: from where.
         path: where the database goes; one that is there is replaced.
     """
+    task = replace(task, distortion_held=start.distortion_held)
+    focals = start.focals_px
     if not focals:
         return task
     path.unlink(missing_ok=True)

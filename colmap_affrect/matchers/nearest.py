@@ -151,13 +151,9 @@ def matchable(
     options: NearestOptions,
     make_coarse: MakeCoarse | None = None,
 ) -> MatchableImage:
-    """Prepare the features of one image for matching.
+    """Prepare (N, D) descriptors of unit length and (N, 2) keypoints, px, for matching.
 
-    Args:
-        descriptors: (N, D) rows of unit length.
-        keypoints: (N, 2) pixel-centre px.
-        options: of matching.
-        make_coarse: the same for all images that are matched with each other.
+    ``make_coarse`` is the same for all images that are matched with each other.
     """
     descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
     return MatchableImage(

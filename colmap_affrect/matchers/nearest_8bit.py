@@ -76,13 +76,10 @@ class CoarseDescriptors(Protocol):
         rivals: NeighborLists,
         max_ratio: float,
     ) -> ShortList:
-        """Compare some features with all of another image.
+        """Compare some features (``rows``, rising) with all of another image of the same kind.
 
-        Args:
-            rows: features of this image, rising.
-            other: descriptors of the other image, of the same kind.
-            rivals: for each feature of the other image those too close to be its second neighbour.
-            max_ratio: limit of the distances to the first and second neighbour.
+        ``rivals`` has for each feature of the other image those too close to be its second
+        neighbour, ``max_ratio`` limits the ratio of the distances to the first and the second one.
         """
 
 
@@ -93,10 +90,8 @@ MakeCoarse = Callable[[NDArray[np.float32]], CoarseDescriptors]
 def coarse_descriptors(num_similarities: float, device: str = "auto") -> MakeCoarse | None:
     """Return what makes coarse descriptors; None where they do not pay.
 
-    Args:
-        num_similarities: of all pairs of features to come.
-        device: as in :func:`colmap_affrect.features.networks.resolve_device`; ``auto`` asks for a
-            GPU only when there is enough to do.
+    ``num_similarities`` are those of all pairs of features to come; the device ``auto`` asks for a
+    GPU only when there is enough to do.
     """
     enough = MIN_SIMILARITIES_PER_CORE * available_cores()
     if device in ("auto", "cpu") and num_similarities < enough:
@@ -347,15 +342,11 @@ def _filled_up(codes: NDArray[np.int8]) -> NDArray[np.int8]:
 
 
 def _similarity_codes(codes: NDArray[np.int8], packed: Any, unit: float) -> NDArray[np.uint8]:
-    """Return similarities over ``CODE_STEP``, rounded, 0...255: (R, N or more).
+    """Return similarities over ``CODE_STEP`` of (R, D) and (N, D) codes, rounded: 0...255.
 
     The columns that ``packed`` has been filled up with are 0. They stay: without them rows would
     not follow each other in memory, and numpy would make a copy before it looks for maxima.
-
-    Args:
-        codes: (R, D).
-        packed: (N, D).
-        unit: similarity of the codes 1 and 1.
+    ``unit`` is the similarity of the codes 1 and 1.
     """
     import torch
 

@@ -13,8 +13,7 @@ from colmap_affrect.pairs.lists import sequence_pairs
 def pairs_by_place(names: Sequence[str], database_path: Path, options: PairOptions) -> set[Pair]:
     """Return the pairs of the methods ``gps`` and ``sequence``, where they are asked for.
 
-    Raises:
-        DatabaseError: when gps is asked for and there are no positions.
+    Raises DatabaseError when gps is asked for and there are no positions.
     """
     pairs: set[Pair] = set()
     if "sequence" in options.methods:

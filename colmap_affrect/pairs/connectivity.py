@@ -13,14 +13,11 @@ from colmap_affrect.pairs.base import Pair
 def weakly_connected_images(
     matches: Mapping[Pair, NDArray[np.int64]], min_num_features: int
 ) -> set[str]:
-    """Return the images with too few features in tracks through three images or more.
+    """Return the images with fewer features than that in tracks through three images or more.
 
     A mapper registers an image by features whose matches it has triangulated already. That takes
-    two other images, so a strong pair alone ties an image to nothing.
-
-    Args:
-        matches: (M, 2) features of the first and the second image, of each verified pair.
-        min_num_features: fewer are too few.
+    two other images, so a strong pair alone ties an image to nothing. ``matches`` has (M, 2)
+    features of the first and the second image of each verified pair.
     """
     names = sorted({name for pair in matches for name in pair})
     number = {name: index for index, name in enumerate(names)}

@@ -47,18 +47,13 @@ def _by_numbers(name: str) -> tuple[list[str | int], str]:
 def most_similar_pairs(
     names: Sequence[str], similarities: Iterable[NDArray[np.number]], num_neighbors: int
 ) -> list[Pair]:
-    """Choose pairs so that images have ``num_neighbors`` neighbours on average.
+    """Choose pairs so that images have ``num_neighbors`` (1 or more) neighbours on average.
 
     Each image is paired with half as many that are most similar to it. The rest goes to the pairs
-    that are the most similar of all: of some places there are many photographs, of others few.
-
-    Args:
-        names: of N different images.
-        similarities: for each image its (N,) similarities with all, larger is more similar.
-        num_neighbors: 1 or more.
-
-    Returns:
-        ``num_neighbors * N / 2`` pairs, sorted; more if the nearest of each image are more.
+    that are the most similar of all: of some places there are many photographs, of others few. So
+    the sorted pairs are ``num_neighbors * N / 2``, or more if the nearest of each image are more.
+    ``similarities`` has for each of N images its (N,) similarities with all, larger is more
+    similar.
     """
     half, count = -(-num_neighbors // 2), len(names)
     candidates = [
@@ -129,12 +124,10 @@ def _breadth_first(pairs: Sequence[Pair]) -> dict[str, int]:
 def read_pairs(path: Path, names: Sequence[str]) -> list[Pair]:
     """Read a pair list as COLMAP and hloc write it: two names per line.
 
-    Names may be separated by spaces, a tab or a comma, and may contain spaces. Empty
-    lines and lines that begin with # are skipped; pairs given twice, in either order,
-    count once; pairs of an image with itself are dropped.
-
-    Raises:
-        PairListError: when the file is unreadable or a name is not among ``names``.
+    Names may be separated by spaces, a tab or a comma, and may contain spaces. Empty lines and
+    lines that begin with # are skipped; pairs given twice, in either order, count once; pairs of an
+    image with itself are dropped. Raises PairListError when the file is unreadable or a name is not
+    among ``names``.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()

@@ -27,12 +27,8 @@ def low_resolution_pairs(
 ) -> list[Pair]:
     """Return the pairs of images of which the strongest features have the most matches.
 
-    Args:
-        names: of images that have features.
-        match: matches the strongest features of two images; best if it keeps
-            ``2 * IMAGES_AT_ONCE`` images in memory.
-        num_neighbors: on average.
-        progress: where to show progress.
+    ``match`` matches the strongest features of two images, best if it keeps ``2 * IMAGES_AT_ONCE``
+    images in memory; ``num_neighbors`` is that of an image on average.
     """
     counts = np.zeros((len(names), len(names)), np.uint16)
 

@@ -33,15 +33,7 @@ VECTORS_AT_ONCE = 512
 def build_vocabulary(
     samples: NDArray[np.float32], random: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Find words by k-means.
-
-    Args:
-        samples: (M, D) descriptors of many images.
-        random: chooses where k-means begins.
-
-    Returns:
-        (K, D) words, ``NUM_WORDS`` or as many as there are samples.
-    """
+    """Find (K, D) words of (M, D) descriptors by k-means, ``NUM_WORDS`` or as many as there are."""
     words = random.permutation(samples)[:NUM_WORDS]
     if len(samples) <= len(words):
         return words
@@ -62,14 +54,9 @@ def nearest_words(
 def image_vector(
     descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]
 ) -> NDArray[np.float16]:
-    """Describe an image by one vector of unit length; zeros without descriptors.
+    """Describe an image by one (K * D,) vector of unit length; zeros without descriptors.
 
-    Args:
-        descriptors: (N, D) of the image.
-        vocabulary: (K, D) words.
-
-    Returns:
-        (K * D,) vector.
+    From its (N, D) descriptors and (K, D) words.
     """
     words = nearest_words(descriptors, vocabulary)
     sums = _unit_rows(_sums(descriptors - vocabulary[words], words, len(vocabulary)))
@@ -119,13 +106,8 @@ def retrieved_pairs(
 ) -> list[Pair]:
     """Return the pairs of images whose descriptors are alike as a whole.
 
-    None if all features are those of warps.
-
-    Args:
-        names: of images that have features.
-        read: returns the features of an image; those of warps are not looked at.
-        num_neighbors: on average.
-        progress: where to show progress.
+    None if all features are those of warps, which are not looked at. ``num_neighbors`` is that of
+    an image on average.
     """
     random = np.random.default_rng(0)
     sampled = random.permutation(len(names))[:NUM_SAMPLED_IMAGES]

@@ -54,7 +54,6 @@ class WorkerEnvironment:
     """What results depend on besides the task.
 
     Attributes:
-        host: name of the machine.
         versions: (package, version) of ``PACKAGES``.
         files: (path, fingerprint) of files and folders, '' for a missing one.
     """
@@ -73,11 +72,7 @@ class WorkerEnvironment:
         )
 
     def require_same(self, worker: WorkerEnvironment) -> None:
-        """Refuse a worker that would give other results.
-
-        Raises:
-            ClusterError: naming its machine and the first difference.
-        """
+        """Refuse a worker that would give other results: ClusterError with the first reason."""
         for (name, here), (_, there) in zip(self.versions, worker.versions, strict=True):
             if here != there:
                 raise ClusterError(
@@ -149,9 +144,8 @@ def _forget() -> None:
 def connected(address: str) -> Iterator[Cluster]:
     """Use the cluster of a scheduler, such as ``tcp://10.0.0.1:8786``, and leave it running.
 
-    Raises:
-        ClusterError: when distributed is not installed, the scheduler does not answer, there are
-            no workers, or they differ from this machine.
+    Raises ClusterError when distributed is not installed, the scheduler does not answer, there are
+    no workers, or they differ from this machine.
     """
     try:
         from dask import config
@@ -213,11 +207,7 @@ class Cluster:
         self._num_threads, self._asked_at = 0, -POLL_S
 
     def require_workers(self) -> None:
-        """Refuse a cluster that cannot do the work.
-
-        Raises:
-            ClusterError: when there are no workers, or they would give other results.
-        """
+        """Refuse, by a ClusterError, a cluster without workers or whose results would differ."""
         with suppress(TimeoutError):
             self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
         workers = self._ask([])
@@ -258,9 +248,8 @@ class Cluster:
     ) -> Iterator[Result]:
         """See :class:`~colmap_affrect.parallel.executor.Executor`.
 
-        Raises:
-            ClusterError: when the scheduler is lost, several workers are lost with one task, or a
-                worker that joins later differs.
+        Raises ClusterError when the scheduler is lost, several workers are lost with one task, or a
+        worker that joins later differs.
         """
         job = _Job(pickle.dumps(function), WorkerEnvironment.of([str(path) for path in files]))
         name = f"{type(function).__name__}-{uuid.uuid4().hex}"

@@ -41,15 +41,10 @@ class Executor(Protocol):
         tasks: Iterable[Task],
         files: Sequence[Path] = (),
     ) -> Iterator[Result]:
-        """Yield ``function(task)`` in task order; few tasks are in flight.
+        """Yield ``function(task)`` in task order, or raise what it raises; few tasks are in flight.
 
-        Args:
-            function: does not change its state; it and the tasks can be pickled.
-            tasks: taken from the iterable when their turn comes.
-            files: that the function reads.
-
-        Raises:
-            Exception: whatever the function raises, at the place of its task.
+        The function does not change its state; it and the tasks, which are taken from the iterable
+        when their turn comes, can be pickled. ``files`` are what it reads.
         """
 
 

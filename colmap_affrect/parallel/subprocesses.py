@@ -21,13 +21,8 @@ def child(
 ) -> Iterator[subprocess.Popen[str]]:
     """Run a module of this package with one argument; its stdout is piped.
 
-    If the block raises, also for Ctrl-C, the child is killed; otherwise it is waited for.
-    The module must call :func:`end_with_parent` first.
-
-    Args:
-        module: full name.
-        argument: its only argument.
-        stderr: where its stderr goes; that of this process by default.
+    If the block raises, also for Ctrl-C, the child is killed; otherwise it is waited for. The
+    module must call :func:`end_with_parent` first.
     """
     # -P and the path: the package is found as it was here, and nothing in the current folder.
     search_path = os.pathsep.join(filter(None, sys.path))

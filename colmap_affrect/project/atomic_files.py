@@ -26,11 +26,7 @@ def replace_text(path: Path, text: str) -> None:
 
 
 def replace_bytes(path: Path, content: bytes) -> None:
-    """Write a file, or replace an existing one.
-
-    Raises:
-        WorkspaceError: when it cannot be written; an existing file stays as it is.
-    """
+    """Write or replace a file; WorkspaceError when that fails, and an old one stays as it is."""
     new = path.with_name(path.name + ".new")
     try:
         new.write_bytes(content)
@@ -44,10 +40,7 @@ def replace_bytes(path: Path, content: bytes) -> None:
 def require_space(path: Path, num_bytes: int) -> None:
     """Make sure that there is room for a file of so many bytes beside ``path``.
 
-    For files that are written by libraries which do not survive a full disk.
-
-    Raises:
-        WorkspaceError: when there is no room.
+    For files that are written by libraries which do not survive a full disk: else WorkspaceError.
     """
     scratch = path.with_name(path.name + ".new")
     try:
@@ -162,11 +155,7 @@ class FileTransaction(io.RawIOBase):
         super().close()
 
     def commit(self) -> None:
-        """Make all changes.
-
-        Raises:
-            OSError: when they cannot be written; the file stays as it was.
-        """
+        """Make all changes; OSError when they cannot be written; the file stays as it was."""
         journal = journal_of(self._path)
         new = journal.with_name(journal.name + ".new")
         for number in range(

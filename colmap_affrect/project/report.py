@@ -111,6 +111,7 @@ class ModelSummary:
         doubts: reasons to doubt the model as a whole.
         arrivals: how each image came in.
         taken_out: images that were certainly wrong, with the reason.
+        focals_px: focal length of each camera by its id.
     """
 
     registered_names: tuple[str, ...]
@@ -121,6 +122,7 @@ class ModelSummary:
     doubts: tuple[str, ...] = ()
     arrivals: dict[str, Arrival] = dataclasses.field(default_factory=dict)
     taken_out: dict[str, str] = dataclasses.field(default_factory=dict)
+    focals_px: dict[int, float] = dataclasses.field(default_factory=dict)
 
     @property
     def is_trustworthy(self) -> bool:

@@ -224,11 +224,7 @@ class FeatureStore(_Store):
         )
 
     def read(self, name: str) -> LocalFeatures:
-        """Read all features of one image.
-
-        Raises:
-            StoreError: if they are missing or incomplete.
-        """
+        """Read all features of one image; StoreError if they are missing or incomplete."""
         with self._open("r") as file:
             group = self._group(file, name)
             return self._features(group, group["level_ends"][()].tolist()[-1])
@@ -346,11 +342,7 @@ class MatchStore(_Store):
             return {pair: int(file[pair_key(*pair)].attrs[name]) for pair in pairs}
 
     def read(self, pairs: Sequence[tuple[str, str]]) -> Iterator[PairMatches]:
-        """Yield the matches of each pair.
-
-        Raises:
-            StoreError: at a pair without matches.
-        """
+        """Yield the matches of each pair; StoreError at a pair without matches."""
         with self._open("r") as file:
             for name1, name2 in pairs:
                 key = pair_key(name1, name2)

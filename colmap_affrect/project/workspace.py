@@ -10,7 +10,6 @@ import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -32,7 +31,6 @@ FORMAT_VERSION = 5
 """Of ``config.toml``: counts up when a stage records other options than before."""
 
 
-@dataclass(frozen=True)
 class Workspace:
     """Paths below an output folder.
 
@@ -45,13 +43,31 @@ class Workspace:
     A folder begins with ``extract``, or with ``copy`` of another program's database to be mapped.
 
     Attributes:
-        path: the folder.
         users_database: database of the user that results go to instead of one in the folder;
             never removed.
+        features: by image (HDF5).
+        pairs: list of the pairs to match (text).
+        matches: raw matches by pair (HDF5).
+        guided: what guided matching found, by pair (HDF5).
+        sparse: folder of the COLMAP models 0, 1, ...
+        aside: models that wait to be compared with those of guided matches.
+        snapshots: folder of what a mapping that was interrupted goes on from.
+        report: of the last run (JSON).
+        cameras: what is known of the cameras of the database, and from where (JSON).
+        depth: folder of the depth maps that a network made.
+        config: record of the options (TOML).
+        log: of all runs.
     """
 
-    path: Path
-    users_database: Path | None = None
+    def __init__(self, path: Path, users_database: Path | None = None) -> None:
+        self.path, self.users_database = path, users_database
+        self.database = users_database or path / "database.db"
+        self.features, self.matches = path / "features.h5", path / "matches.h5"
+        self.guided, self.pairs = path / "guided.h5", path / "pairs.txt"
+        self.sparse, self.aside = path / "sparse", path / "sparse.aside"
+        self.snapshots, self.depth = path / "sparse.snapshots", path / "depth"
+        self.config, self.log = path / "config.toml", path / "run.log"
+        self.report, self.cameras = path / "report.json", path / "cameras.json"
 
     @classmethod
     def beside(cls, database_path: Path) -> Self:
@@ -77,78 +93,9 @@ class Workspace:
         replace_text(path / self.config.name, text)
         return Workspace(path)
 
-    @property
-    def features(self) -> Path:
-        """Features by image (HDF5)."""
-        return self.path / "features.h5"
-
-    @property
-    def pairs(self) -> Path:
-        """List of the pairs to match (text)."""
-        return self.path / "pairs.txt"
-
-    @property
-    def matches(self) -> Path:
-        """Raw matches by pair (HDF5)."""
-        return self.path / "matches.h5"
-
-    @property
-    def guided(self) -> Path:
-        """What guided matching found, by pair (HDF5)."""
-        return self.path / "guided.h5"
-
-    @property
-    def database(self) -> Path:
-        """COLMAP database."""
-        return self.users_database or self.path / "database.db"
-
-    @property
-    def cameras(self) -> Path:
-        """What is known of the cameras of the database, and from where (JSON)."""
-        return self.path / "cameras.json"
-
-    @property
-    def sparse(self) -> Path:
-        """Folder of the COLMAP models 0, 1, ..."""
-        return self.path / "sparse"
-
-    @property
-    def aside(self) -> Path:
-        """Models that wait to be compared with those of guided matches."""
-        return self.path / "sparse.aside"
-
-    @property
-    def snapshots(self) -> Path:
-        """Folder of what a mapping that was interrupted goes on from."""
-        return self.path / "sparse.snapshots"
-
-    @property
-    def report(self) -> Path:
-        """Report of the last run (JSON)."""
-        return self.path / "report.json"
-
-    @property
-    def depth(self) -> Path:
-        """Folder of the depth maps that a network made."""
-        return self.path / "depth"
-
-    @property
-    def config(self) -> Path:
-        """Record of the options (TOML)."""
-        return self.path / "config.toml"
-
-    @property
-    def log(self) -> Path:
-        """Log of all runs."""
-        return self.path / "run.log"
-
     @contextmanager
     def locked(self) -> Iterator[Workspace]:
-        """Create the folder and keep other runs out of it.
-
-        Raises:
-            WorkspaceError: when it cannot be written or another run uses it.
-        """
+        """Create the folder and keep other runs out; WorkspaceError when that cannot be done."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             lock = FileLock(self.path / ".lock")
@@ -170,8 +117,7 @@ class Workspace:
     def recorded(self) -> dict[str, Any]:
         """Return the options on record by stage; empty where there are none.
 
-        Raises:
-            WorkspaceError: when the record is damaged or of another version of this package.
+        Raises WorkspaceError when the record is damaged or of another version of this package.
         """
         if not self.config.exists():
             return {}
@@ -204,18 +150,12 @@ class Workspace:
         recipe: str = "",
         overwrite: bool = False,
     ) -> None:
-        """Put the options of a stage on record before it begins.
+        """Put the options of a stage, nested mappings of plain values, on record before it begins.
 
-        Args:
-            stage: one of ``STAGES``.
-            options: what the results depend on; nested mappings of plain values.
-            plan: options of later stages; those of stages that have begun stay as they are.
-            recipe: name of the recipe, for the record only; by default that on record.
-            overwrite: discard the results of this stage and the later ones first. With the first
-                stage their options are forgotten, too.
-
-        Raises:
-            StaleStoreError: when other options made the results that are there.
+        ``plan`` has options of later stages, those of stages that have begun stay as they are;
+        ``recipe`` is a name for the record only. ``overwrite`` discards the results of this stage
+        and the later ones first; with the first stage their options are forgotten, too. Raises
+        StaleStoreError when other options made the results that are there.
         """
         record = self.recorded()
         self._refuse_foreign_results(record, stage)
@@ -259,11 +199,7 @@ class Workspace:
         return hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()
 
     def require(self, stage: str) -> dict[str, Any]:
-        """Return the recorded options of an earlier stage.
-
-        Raises:
-            WorkspaceError: when it has not been run.
-        """
+        """Return the recorded options of an earlier stage; WorkspaceError when it was not run."""
         record = self.recorded()
         if stage not in record.get("begun", []):
             raise WorkspaceError(

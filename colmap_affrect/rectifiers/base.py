@@ -39,21 +39,13 @@ class RectifierInputs:
     depth: DepthSource | None = None
 
     def required_shapes(self) -> ShapeSource:
-        """Return the shape source.
-
-        Raises:
-            OptionError: when there is none.
-        """
+        """Return the shape source; OptionError when there is none."""
         if self.shapes is None:
             raise OptionError("the rectifier needs affine shapes: name a shape_source")
         return self.shapes
 
     def required_depth(self) -> DepthSource:
-        """Return the depth source.
-
-        Raises:
-            OptionError: when there is none.
-        """
+        """Return the depth source; OptionError when there is none."""
         if self.depth is None:
             raise OptionError("the rectifier needs depth maps: give a folder or a depth network")
         return self.depth

@@ -51,10 +51,7 @@ def plan_dense_shapes(
 ) -> RectificationPlan:
     """Turn a grid of shapes into disjoint regions with one affine warp each.
 
-    Args:
-        grid: shapes of the rectifying maps; blocks that are not textured count as identity.
-        image_size: (width, height) in px.
-        options: radius of the balls, largest tilt, share to cover, smallest region.
+    Blocks that are not textured count as identity; ``image_size`` is (width, height) in px.
     """
     metrics = grid.metrics.reshape(-1, 3)
     textured = grid.textured.ravel()

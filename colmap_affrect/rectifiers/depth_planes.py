@@ -36,7 +36,6 @@ class PlanarSegment:
     """Connected part of an image that shows surfaces of about the same orientation.
 
     Attributes:
-        region: the part of the image.
         normal: (3,) unit normal in camera coordinates, facing the camera.
     """
 
@@ -88,11 +87,7 @@ class DepthPlanes:
         self.source = sources.required_depth()
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
-        """Plan one warp for each segment.
-
-        Raises:
-            DepthError: when there is no usable depth map.
-        """
+        """Plan one warp for each segment; DepthError when there is no usable depth map."""
         segments = planar_segments(photograph, self.source.depth(photograph), self.options.planes)
         items = tuple(
             homography_rectification(
@@ -113,16 +108,13 @@ def planar_segments(
 ) -> list[PlanarSegment]:
     """Segment a photograph into connected parts of planes.
 
-    A pixel belongs to a plane if its normal is nearest to that of the plane and near enough,
-    and if it sees the plane at no more than ``max_angle_deg``, the angle between the plane's
-    normal and the pixel's ray. (The authors compare the normal with the optical axis, and leave
-    out or keep a plane as a whole.) In the view from the front an area grows by 1 / cos^3 of
-    that angle, so the far end of a plane, where the view would explode, is left out.
+    A pixel belongs to a plane if its normal is nearest to that of the plane and near enough, and if
+    it sees the plane at no more than ``max_angle_deg``, the angle between the plane's normal and
+    the pixel's ray. (The authors compare the normal with the optical axis, and leave out or keep a
+    plane as a whole.) In the view from the front an area grows by 1 / cos^3 of that angle, so the
+    far end of a plane, where the view would explode, is left out.
 
-    Args:
-        photograph: with its intrinsics.
-        depth: (h, w) z-depth of the whole photograph, of any resolution; NaN where unknown.
-        options: how planes are found, and the smallest segment.
+    ``depth`` is (h, w) z-depth of the whole photograph, of any resolution; NaN where unknown.
     """
     size_of_depth = (depth.shape[1], depth.shape[0])
     depth, shrunk_from_depth = shrink_depth(depth, MAX_DEPTH_SIZE_PX)

@@ -42,16 +42,10 @@ def extract_rectified(
 ) -> LocalFeatures:
     """Return the features of the image and of all planned warps, frames in image px.
 
-    Of the features in warps the ``max_num_rectified`` strongest are kept. Only what stays is
-    described, and all of it in one call.
-
-    Args:
-        image: (H, W) uint8, or (H, W, 3) for extractors that ask for colour.
-        plan: warps of this image.
-        extractor: detector and descriptor.
-        max_num_rectified: bound on the features of all warps together.
-        with_original: False leaves out the features of the image itself.
-        mask: (H, W) bool, where features may be; None means everywhere.
+    Of the features in warps the ``max_num_rectified`` strongest are kept, and those of the image
+    itself only ``with_original``. Only what stays is described, and all of it in one call. The
+    image is (H, W) uint8, or (H, W, 3) for extractors that ask for colour; the mask (H, W) bool,
+    where features may be.
     """
     rectifications: list[Rectification | None] = [None] if with_original else []
     rectifications += plan.items

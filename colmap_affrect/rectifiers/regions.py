@@ -72,11 +72,7 @@ def homography_rectification(
 ) -> Rectification:
     """Show a region by a homography, scaled so that the canvas has twice the region's area.
 
-    Args:
-        region: the part of the image.
-        homography: (3, 3) with positive determinant, and positive third coordinates all over
-            the region.
-        segment_id: its number in the plan.
+    It has a positive determinant, and positive third coordinates all over the region.
     """
     outline = project(homography, region.outline())
     box_area = float(np.prod(np.ptp(outline, axis=0) + 1.0))

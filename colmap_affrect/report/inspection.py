@@ -14,24 +14,13 @@ from colmap_affrect.stages.one_image import ImageExtractor
 def inspect_image(
     extractor: ImageExtractor, path: Path, output_path: Path, mask: Mask | None = None
 ) -> str:
-    """Carry out a recipe on one image and draw every step.
+    """Carry out a recipe on one image, draw every step, and return a summary for people.
 
     Each level has a sheet: ``<stem>-inspection.png`` is that of every image,
     ``<stem>-inspection-level-<k>.png`` is level k of escalation. ``<stem>-plan.json`` lists the
-    levels (:func:`colmap_affrect.report.levels.describe_level`). Where a depth map cannot be
-    used the level has no warps and a ``warning``, as in extraction.
-
-    Args:
-        extractor: the recipe.
-        path: the image file.
-        output_path: folder of the results, made if it is not there.
-        mask: (H, W) bool of the stored image, where features may be; None means everywhere.
-
-    Returns:
-        A line about each level and the paths of the files, for people.
-
-    Raises:
-        ImageError: when the file cannot be read.
+    levels (:func:`colmap_affrect.report.levels.describe_level`). Where a depth map cannot be used
+    the level has no warps and a ``warning``, as in extraction. ``mask`` is (H, W) bool of the
+    stored image. Raises ImageError when the file cannot be read.
     """
     photograph, stored_size = extractor.photograph(path, mask=mask)
     output_path.mkdir(parents=True, exist_ok=True)

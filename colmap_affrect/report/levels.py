@@ -35,17 +35,13 @@ class InspectedLevel:
 
     Attributes:
         number: 0 for the level that every image gets.
-        options: of its rectifier.
-        extractor_name: of the features.
         photograph: at the size of processing; coordinates are px of it where nothing else is said.
-        plan: of the rectifier.
         warning: why it was not rectified though it was to be; empty if all went well.
         views: what features were looked for in, by rectification id; 0 is the photograph itself.
         found: all features detected there, frames in px of the view.
         features: those of all views that were kept.
         shapes: what the rectifier read; None if it reads no shapes.
         depth: (h, w) z-depth that it read; None if it reads no depth.
-        seconds: by step.
     """
 
     number: int

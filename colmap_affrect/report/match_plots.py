@@ -26,7 +26,6 @@ class SideBySide:
     """Two photographs side by side.
 
     Attributes:
-        names: of the images.
         widths: of the two photographs; both are ``PLOT_HEIGHT`` high.
     """
 
@@ -74,13 +73,9 @@ def plot_inliers(
     database_path: Path,
     features_path: Path,
 ) -> dict[Pair, MatchPlot]:
-    """Draw the inliers of pairs.
+    """Draw the inliers of pairs; ``database_path`` has keypoints and two-view geometries.
 
-    Args:
-        shown: the pairs.
-        pair_inliers: inliers of the verified pairs.
-        database_path: with the keypoints and two-view geometries.
-        features_path: the store that tells which features are from warps; none are without it.
+    The feature store, if it exists, tells which features are from warps.
     """
     plots = {item.names: MatchPlot(pair_inliers.get(item.names, 0)) for item in shown}
     verified = [item for item in shown if plots[item.names].num_inliers]
@@ -99,9 +94,8 @@ def _read_inliers(
 ) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
     """Read the inliers of pairs.
 
-    Returns:
-        For each pair (M, 2, 2) ends of its inliers, (x, y) in both images as shares of their
-        sides, and (M,) whether one of the two features is from a warp.
+    For each pair: (M, 2, 2) ends of its inliers, (x, y) in both images as shares of their sides,
+    and (M,) whether one of the two features is from a warp.
     """
     if not pairs:
         return []

@@ -17,19 +17,11 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 def write_page(path: Path, template: Path, content: Mapping[str, Any]) -> Path:
-    """Fill a template and write it as one file that loads nothing.
+    """Fill a template and write it as one file that loads nothing; return its path.
 
-    Args:
-        path: of the page.
-        template: extends ``base.html`` and may use the macros of ``parts.html``, which say what
-            they look for in the content.
-        content: what the template shows, and ``script_data`` for ``page.js``.
-
-    Returns:
-        ``path``.
-
-    Raises:
-        WorkspaceError: when it cannot be written.
+    The template extends ``base.html`` and may use the macros of ``parts.html``, which say what they
+    look for in the content; ``script_data`` of the content is for ``page.js``. Raises
+    WorkspaceError when the page cannot be written.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([template.parent, TEMPLATES], encoding="utf-8"),

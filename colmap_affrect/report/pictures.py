@@ -57,14 +57,7 @@ def base64_text(data: bytes) -> str:
 def photograph_pictures(
     folder: Path, names: Sequence[str], max_size_px: int, progress: Progress = SILENT
 ) -> dict[str, Picture]:
-    """Read and shrink photographs, as stored; those that cannot be read are left out.
-
-    Args:
-        folder: of the photographs.
-        names: relative to it.
-        max_size_px: of the longer side.
-        progress: where to show it.
-    """
+    """Read photographs as stored, shrunk to a longer side; unreadable ones are left out."""
 
     def picture(name: str) -> Picture | None:
         try:

@@ -26,8 +26,8 @@ UNIT_CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)])
 def warp_colors(plan: RectificationPlan) -> list[Color]:
     """Choose a colour for each warp of a plan.
 
-    Warps of one segment have the same, and so have warps of one class that show the whole
-    image. Where that is more than the palette has, the tilt angle decides.
+    Warps of one segment, or of one class that shows the whole image, have the same. Where that is
+    more than the palette has, the tilt angle decides.
     """
     keys = [
         (item.tilt, item.tilt_angle_rad) if item.region is None else item.segment_id
@@ -75,7 +75,7 @@ def region_middle(region: Mask, origin: tuple[int, int]) -> NDArray[np.float64]:
 def circle_origin(
     item: Rectification, middle: NDArray[np.float64], radius_px: float
 ) -> NDArray[np.float64]:
-    """Return the (2, N) ellipse around a point, in image px, that a warp turns into a circle.
+    """Return the (2, N) ellipse round a point, image px, that a warp turns into a circle.
 
     Its area is that of a circle of ``radius_px``.
     """

@@ -60,7 +60,6 @@ class Scene:
     """Models to be shown side by side.
 
     Attributes:
-        views: one per model.
         zoom: with which they fill the view from above.
     """
 
@@ -88,7 +87,6 @@ class Model:
     """A model as arrays.
 
     Attributes:
-        names: of the registered images.
         centers: (M, 3) of the cameras.
         axes: (M, 3, 3) rotations world_from_camera.
         half_sizes: (M, 2) half width and height of the view at depth 1.
@@ -115,8 +113,7 @@ class Model:
 def read_scene(paths: Mapping[str, Path | None]) -> Scene:
     """Read models, bring them into the frame of the largest, and prepare them for the page.
 
-    Args:
-        paths: folders of the models by the names that they have on the page; None for no model.
+    ``paths`` are the folders by the names that the page has for the models; None for no model.
     """
     models, notes = read_models(paths)
     zoom = _zoom_from_above(list(models.values()))
@@ -127,11 +124,7 @@ def read_scene(paths: Mapping[str, Path | None]) -> Scene:
 def read_models(paths: Mapping[str, Path | None]) -> tuple[dict[str, Model], dict[str, str]]:
     """Read models and bring them into the frame of the largest.
 
-    Args:
-        paths: folders of the models by name; None for no model.
-
-    Returns:
-        The models, and what is special about them or why they are missing, by name.
+    Returns the models, and what is special about them or why they are missing, by name.
     """
     models: dict[str, Model] = {}
     notes: dict[str, str] = {}

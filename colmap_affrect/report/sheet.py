@@ -82,13 +82,9 @@ OUTLINED = [withStroke(linewidth=2.5, foreground="white")]
 def draw_sheet(level: InspectedLevel, stored_size: Size, path: Path) -> None:
     """Draw one level and write it as PNG, ``WIDTH_PX`` wide and as high as it takes.
 
-    From top to bottom: the regions over the photograph and the shapes in the space of tilts;
-    depth and normals, where there are any; the warps with their features; all features.
-
-    Args:
-        level: what to draw.
-        stored_size: (width, height) of the image file in px.
-        path: of the PNG.
+    From top to bottom: the regions over the photograph and the shapes in the space of tilts; depth
+    and normals, where there are any; the warps with their features; all features. ``stored_size``
+    is (width, height) of the image file in px.
     """
     colors = warp_colors(level.plan)
     with figure_page(path) as page:

@@ -48,7 +48,6 @@ class TiltClass:
     Attributes:
         tilt, angle_rad: its coordinates.
         label: text beside the mark; may be empty.
-        color: of mark and ball.
     """
 
     tilt: float
@@ -96,11 +95,8 @@ def draw_tilt_space(
 ) -> None:
     """Draw the shapes and maps of a level, and the balls of its cover, if it has one.
 
-    Args:
-        axes: empty ones of ``HEIGHT_PER_WIDTH``.
-        level: its shapes are drawn as points.
-        classes: maps to mark.
-        colors: of the warps.
+    ``axes`` are empty, of ``HEIGHT_PER_WIDTH``; ``classes`` are marked; ``colors`` are those of the
+    warps.
     """
     cover = level.options if isinstance(level.options, CoverOptions) else None
     edge = np.log(1.2 * max([cover.max_tilt if cover else 2.0, *(item.tilt for item in classes)]))

@@ -61,7 +61,6 @@ class Node:
 
     Attributes:
         number: from 1, the same everywhere on the page.
-        name: of the image.
         state: ``always``, ``sometimes`` or ``never`` registered, over the seeds.
         is_wrong: registered, but at a wrong place with some seed.
         text: the same in words.

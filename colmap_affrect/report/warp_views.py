@@ -28,7 +28,6 @@ class WarpView:
     """One warp.
 
     Attributes:
-        picture: of it.
         color: of its region, as #rrggbb.
         tilt: that it undoes.
         angle_deg: direction in which it stretches.
@@ -45,9 +44,7 @@ class WarpedPhotograph:
     """What one level of a recipe does with a photograph.
 
     Attributes:
-        name: of the photograph.
         level: of escalation; 0 is what every photograph gets.
-        rectifier: its name.
         num_warps: all that were planned.
         regions: the photograph with the regions of the warps in colour.
         warps: the largest.
@@ -68,13 +65,8 @@ def warped_photographs(
 ) -> list[WarpedPhotograph]:
     """Plan the warps of photographs again, of each those of the first level that has any.
 
-    Args:
-        workspace: where the photographs were extracted.
-        names: of the photographs.
-        resources: weights and device; depth maps of networks are taken from the workspace.
-
-    Raises:
-        AffrectError: when what the recipe needs, or a photograph, cannot be used.
+    Depth maps of networks are taken from the workspace. Raises AffrectError when what the recipe
+    needs, or a photograph, cannot be used.
     """
     resources = resources or Resources(depth_cache_path=workspace.depth)
     extractor = prepare(recorded_extraction(workspace), resources)

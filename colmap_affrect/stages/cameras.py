@@ -29,18 +29,20 @@ from colmap_affrect.stages.verify import recorded_verification
 logger = logging.getLogger(__name__)
 
 
-def choose_cameras(context: Context) -> StageReport:
+def choose_cameras(context: Context, *, may_share: bool = True) -> StageReport:
     """Hold a vote over cameras that nobody knows, unless it was held; verify pairs again by it.
 
     Args:
         context: with verified pairs.
+        may_share: whether cameras of images of one size may turn out to be the same, where
+            nothing is said of who shares one.
     """
     start = time.perf_counter()
     workspace = context.workspace
     workspace.require("verify")
     copied = is_copy(workspace)
     extracted_px = None if copied else recorded_extraction(workspace).max_image_size_px
-    may_share = not copied and Inputs.recorded(workspace).cameras.mode == "auto"
+    may_share = may_share and not copied and Inputs.recorded(workspace).cameras.mode == "auto"
     records = read_camera_records(workspace.cameras)
     num = sum(record.source == "guess" for record in records.values())
     with context.progress.stage("cameras", num, "cameras") as advance:

@@ -28,8 +28,7 @@ class Resources:
     def require_device(self) -> None:
         """Refuse a device that is not there; torch is loaded only when one is named.
 
-        Raises:
-            DeviceError: naming those there are.
+        Raises DeviceError.
         """
         if self.device not in ("auto", "cpu"):
             from colmap_affrect.features.networks import resolve_device

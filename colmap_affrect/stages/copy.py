@@ -28,17 +28,8 @@ def copy_verified(
 ) -> StageReport:
     """Copy a database, and verify its matched pairs that have no two-view geometry.
 
-    The copy is made anew when the original has changed since.
-
-    Args:
-        context: of a folder without a run of its own.
-        source: any COLMAP database; it stays as it is.
-        image_path: folder of the photographs; None if they are not at hand.
-        verification: of the pairs that are not verified.
-        overwrite: discard what is in the folder first.
-
-    Raises:
-        DatabaseError: when it cannot be used, or has no matches.
+    The copy is made anew when the original has changed since, or with ``overwrite``. Raises
+    DatabaseError when it cannot be used, or has no matches.
     """
     start = time.perf_counter()
     workspace = context.workspace

@@ -72,13 +72,9 @@ def escalate(
 ) -> StageReport:
     """Climb the levels of the recipe; nothing happens when it has none.
 
-    Args:
-        context: with verified pairs.
-        options: which pairs climb; by default those on record.
-        overwrite: bring all pairs back to level 0 first; features that are there are kept.
-
-    Returns:
-        ``num_done`` counts the pairs that were matched again now.
+    ``options`` are by default those on record; ``overwrite`` brings all pairs back to level 0
+    first, features that are there are kept. ``num_done`` counts the pairs that were matched again
+    now.
     """
     start = time.perf_counter()
     context.resources.require_device()

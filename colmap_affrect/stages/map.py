@@ -30,6 +30,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.climbing import connected_parts
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copied_image_path, is_copy
+from colmap_affrect.stages.depth_lookup import depth_lookup
 from colmap_affrect.stages.escalate import first_level_database
 from colmap_affrect.stages.extract import Inputs
 from colmap_affrect.stages.guide import guided_matches
@@ -89,6 +90,7 @@ def map_images(
         existing,
         guided={} if is_copy(workspace) else guided_matches(context),
         cameras=read_camera_records(workspace.cameras),
+        depth_at=None if is_copy(workspace) else depth_lookup(context),
     )
     if known == inputs:
         models = read_models(workspace.sparse, task)
@@ -136,7 +138,8 @@ def _or_first_level(
 ) -> list[ModelSummary]:
     """Keep the models of the pairs as they were before they climbed, where those have more images.
 
-    So escalation never loses an image.
+    So escalation never loses an image; but a model that is doubtful as a whole does not take the
+    place of one that is not.
     """
     min_num_inliers = recorded_verification(context.workspace).min_num_inliers
     with first_level_database(context) as path:
@@ -145,7 +148,7 @@ def _or_first_level(
             return models
         sparse = path.with_name("sparse")
         firsts = map_database(mapper, replace(task, database_path=path), sparse, _ignore)
-        if _num_registered(firsts) <= _num_registered(models):
+        if _rank(firsts) <= _rank(models):
             return models
         logger.info("the model of the pairs before they climbed has more images and is kept")
         rmtree(context.workspace.sparse)
@@ -155,6 +158,10 @@ def _or_first_level(
 
 def _num_registered(models: Sequence[ModelSummary]) -> int:
     return len(models[0].registered_names) if models else 0
+
+
+def _rank(models: Sequence[ModelSummary]) -> tuple[bool, int]:
+    return bool(models) and models[0].is_trustworthy, _num_registered(models)
 
 
 def _ignore(_: int) -> None:

@@ -31,10 +31,8 @@ def match(
 ) -> StageReport:
     """Match the listed pairs and put the raw matches into the database.
 
-    Args:
-        context: with features and a list of pairs.
-        options: of the matcher; by default those on record.
-        overwrite: discard the results of this and later stages first.
+    ``options`` are by default those on record; ``overwrite`` discards what is there, and later
+    stages.
     """
     start = time.perf_counter()
     context.resources.require_device()

@@ -184,15 +184,10 @@ class ImageExtractor:
     ) -> ExtractedImage:
         """Read an image and extract its features.
 
-        Args:
-            path: the image file.
-            name: key of its depth map; the file's name by default.
-            intrinsics: see :class:`ImageTask`.
-            level: see :class:`ImageTask`.
-            mask: (H, W) bool of the stored image, where features may be; None means everywhere.
-
-        Raises:
-            ImageError: when the file cannot be read, or its mask has another size.
+        ``name`` is the key of its depth map, the file's name by default; for ``intrinsics`` and
+        ``level`` see :class:`ImageTask`; ``mask`` is (H, W) bool of the stored image, where
+        features may be. Raises ImageError when the file cannot be read, or its mask has another
+        size.
         """
         photograph, original_size = self.photograph(path, name, intrinsics, mask)
         with self.network_lock, SHARED_OPENCV_THREADS:
@@ -251,11 +246,7 @@ class ImageExtractor:
         return Photograph(gray, name or path.name, path, camera, mask, color), original_size
 
     def plan(self, photograph: Photograph, level: int = 0) -> RectificationPlan:
-        """Decide which warps of a photograph to look at.
-
-        Raises:
-            DepthError: when the rectifier needs a depth map and it cannot be used.
-        """
+        """Decide which warps to look at; DepthError when a depth map is needed and unusable."""
         if min(photograph.size) < MIN_RECTIFIABLE_PX:
             return RectificationPlan(photograph.size)
         return self.rectifiers[level].plan(photograph)
@@ -322,17 +313,10 @@ def prepare(
 ) -> ImageExtractor:
     """Find everything a recipe needs, before any image is touched, and build its parts.
 
-    Args:
-        options: of the recipe.
-        resources: weights, device, cache.
-        image_names: the images to come, to see whether there are depth maps for them.
-        progress: where to show downloads.
-
-    Raises:
-        WeightsError: when a file of weights is neither found nor downloaded.
-        DeviceError: when the device is not there.
-        OptionError: when depth maps are needed and no source is given.
-        DepthError: when the folder of depth maps has none of the images.
+    ``image_names`` are those to come, to see whether there are depth maps for them. Raises
+    WeightsError when a file of weights is neither found nor downloaded, DeviceError when the device
+    is not there, OptionError when depth maps are needed and no source is given, DepthError when the
+    folder of depth maps has none of the images.
     """
     resources = resources or Resources()
     weights = resolve(options.weights, resources.weights_path, progress=progress)

@@ -49,15 +49,8 @@ def iterate_matches(
     """Match pairs by the features of the images themselves and those of one level.
 
     Pairs come in an order in which an image, once read, stays in memory for most of its pairs.
-
-    Args:
-        pairs: names of images.
-        features: of the images; workers that do not see the file get those of each pair.
-        options: of the matcher.
-        level: of escalation.
-        resources: weights and device.
-        executor: where to match; by default in a thread for each core.
-        extractor: name of the feature extractor.
+    Workers that do not see the file of features get those of each pair; ``extractor`` is the name
+    of the feature extractor. By default there is a thread for each core.
     """
     if not pairs:
         return
@@ -206,15 +199,9 @@ class CachedMatcher:
     ) -> None:
         """Name the features and build the matcher.
 
-        Args:
-            store: where they are.
-            options: of the matcher.
-            level: of escalation; its features come together with those of level 0.
-            max_num_features: of the features of an image, those of the largest responses; None
-                takes all.
-            num_similarities: about how many pairs of features there will be to compare.
-            resources: weights and device.
-            extractor: name of the feature extractor.
+        The features of a level come together with those of level 0; ``max_num_features`` are those
+        of the largest responses, None takes all. ``num_similarities`` is about how many pairs of
+        features there will be to compare.
         """
         resources = resources or Resources()
         self._store, self._options, self._level = store, options, level

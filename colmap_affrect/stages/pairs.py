@@ -34,17 +34,10 @@ def choose_pairs(
 ) -> StageReport:
     """Write the list of the pairs to match: by default every pair of images.
 
-    When images are added, pairs that were chosen by other options than these stay.
-
-    Args:
-        context: with features.
-        options: how pairs are chosen; by default those on record.
-        overwrite: discard the pairs that are there, and what was made of them, first.
-
-    Raises:
-        PairListError: when the list cannot be used.
-        DatabaseError: when there are no positions to choose by.
-        StaleStoreError: when earlier pairs are missing in the list, or other options made them.
+    When images are added, pairs that were chosen by other options than these, which are by default
+    those on record, stay; ``overwrite`` discards them first, and what was made of them. Raises
+    PairListError when the list cannot be used, DatabaseError when there are no positions to choose
+    by, StaleStoreError when earlier pairs are missing in the list, or other options made them.
     """
     start = time.perf_counter()
     workspace = context.workspace

@@ -21,7 +21,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -67,6 +67,11 @@ SUBSETS = {
     "nadar all": Subset("nadar", 1, False),
     "sceaux all": Subset("sceaux", 1, False),
     "herz all": Subset("strecha_herz_jesus_p25", 1, True),
+}
+SUBSETS |= {
+    f"{name} (unknown)": replace(subset, calibrated=False)
+    for name, subset in SUBSETS.items()
+    if subset.calibrated
 }
 
 

@@ -36,11 +36,11 @@ def test_damaged_records_are_one_clear_line(tmp_path: Path, text: str) -> None:
 
 
 def test_report_has_the_focal_length_in_longer_sides_and_the_spread() -> None:
-    entry = VOTED.to_report(12)
+    entry = VOTED.to_report(12, 1450.0)
     assert (entry["id"], entry["num_images"], entry["source"]) == (12, 1, "pairs")
     assert entry["focal_longer_sides"] == pytest.approx(1.25)
     assert entry["spread_px"] == [480.0, 530.0]
-    assert FROM_EXIF.to_report(3)["spread_px"] is None
+    assert FROM_EXIF.to_report(3, None)["spread_px"] is None
 
 
 def test_only_cameras_with_a_story_are_named_and_not_all() -> None:

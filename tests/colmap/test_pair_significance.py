@@ -108,6 +108,38 @@ def test_frames_decide_where_positions_do_not(planar: bool) -> None:
     assert num_inliers(wrong, min_significance=limit) == 0
 
 
+@pytest.mark.parametrize("frames_agree", [True, False])
+def test_homography_is_judged_where_epipolar_lines_are_not_significant(frames_agree: bool) -> None:
+    # Lines through 22 matches of a strongly tilted plane hold others of the 180 by chance.
+    tilted = np.array([[0.33, 0.12, 180.0], [-0.1, 0.95, 40.0], [-5e-4, 1e-4, 1.0]])
+    first, second = frames_of([tilted], 22, 11)
+    other1, other2 = frames_of([tilted], 158, 12)
+    rng = np.random.default_rng(13)
+    other2[:, :, 2] = rng.uniform((0, 0), SIZE, (158, 2))
+    other2[:, :, :2] = rotation(rng.uniform(0, 2 * np.pi, 158)) @ other2[:, :, :2]
+    second[:, :, 2] += rng.normal(0.0, 0.7, (22, 2))
+    if not frames_agree:
+        second[:, :, :2] = rotation(rng.uniform(0, 2 * np.pi, 22)) @ second[:, :, :2]
+    frames = np.concatenate([first, other1]), np.concatenate([second, other2])
+    sides = [Side(camera(i), rows(lafs)) for i, lafs in enumerate(frames, 1)]
+    same = np.stack([np.arange(180)] * 2, axis=1)
+
+    def estimated(**options: float) -> pycolmap.TwoViewGeometry:
+        return estimate_geometry((sides[0], sides[1]), same, VerificationOptions(**options))
+
+    lines, plane = estimated(min_significance=0.0), estimated(min_significance=30.0)
+    assert lines.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+    if not frames_agree:
+        assert len(plane.inlier_matches) == 0
+        return
+    assert plane.config == pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC
+    inliers = np.asarray(plane.inlier_matches, np.int64)
+    assert len(lines.inlier_matches) > len(inliers) >= 20
+    assert (inliers < 22).all()
+    np.testing.assert_allclose(project(plane.H, first[:, :, 2]), second[:, :, 2], atol=6.0)
+    assert len(estimated(min_significance=30.0, min_inlier_ratio=0.13).inlier_matches) == 0
+
+
 def test_database_without_shapes_needs_more_inliers() -> None:
     frames = weak_pair(frames_agree=True)
     assert num_inliers(frames, min_significance=5.0) > 0

@@ -45,7 +45,7 @@ from colmap_affrect.stages.guide import guided_counts
 CAMERAS = CameraOptions(mode="per-image", model="PINHOLE", params=INTRINSICS)
 NUM_IMAGES = 3
 GIVEN = (*NAMES[:NUM_IMAGES], "broken.png")
-METHODS = ("sift", "unrectified-rootsift", "default", "depth-planes-recommended")
+METHODS = ("sift", "unrectified-rootsift", "depth-planes-recommended")
 MIN_NUM_INLIERS = 20
 
 
@@ -182,7 +182,7 @@ def test_methods_had_the_same_cameras_images_and_pairs(compared) -> None:
                     [list(camera.params) for camera in database.read_all_cameras()],
                 )
             )
-    assert shared[0] == shared[1] == shared[2]
+    assert shared[0] == shared[1]
     assert len({tuple(sorted(method.raw_matches)) for method in comparison.finished}) == 1
 
 
@@ -197,10 +197,10 @@ def test_json_and_csv_hold_the_same_figures(compared) -> None:
     with (out / "comparison.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["method"], row["seed"]) for row in rows] == [
-        *((name, seed) for name in METHODS[:3] for seed in "01"),
-        (METHODS[3], ""),
+        *((name, seed) for name in METHODS[:2] for seed in "01"),
+        (METHODS[2], ""),
     ]
-    for name in METHODS[:3]:
+    for name in METHODS[:2]:
         method, mine = values["methods"][name], [row for row in rows if row["method"] == name]
         for key in MEASURES:
             numbers = [float(row[key]) for row in mine]
@@ -227,8 +227,8 @@ def test_summary_shows_every_method_and_the_verdict(compared) -> None:
 def test_finished_methods_are_not_run_again(scene, options, compared) -> None:
     """Without the one that failed, which would be."""
     comparison, out = compared
-    again = compare(scene / "images", out, replace(options, methods=METHODS[:3]))
-    assert again.methods == tuple(replace(m) for m in comparison.methods[:3])
+    again = compare(scene / "images", out, replace(options, methods=METHODS[:2]))
+    assert again.methods == tuple(replace(m) for m in comparison.methods[:2])
 
 
 @pytest.mark.usefixtures("no_processes")
@@ -241,8 +241,8 @@ def test_finished_methods_are_not_run_again(scene, options, compared) -> None:
             "mapping.min_model_size=2, and it is 3",
         ),
         (
-            {"methods": ["default=unrectified-rootsift"]},
-            r"default was run there with recipe.rectifier.name='dense-shapes', and it is",
+            {"methods": ["unrectified-rootsift=default"]},
+            r"unrectified-rootsift was run there with recipe.rectifier.name='identity', and it is",
         ),
     ],
 )
@@ -337,7 +337,7 @@ def test_recipes_are_guided_seed_by_seed(
     out, names = tmp_path / "out", Names()
     options = replace(options, methods=["guided=unrectified-rootsift:guided.enabled=always"])
     (method,) = compare(scene / "images", out, options, progress=names).methods
-    plain = compared[0].methods[METHODS.index("unrectified-rootsift")]
+    plain = compared[0].methods[1]
     assert method.raw_matches == plain.raw_matches
     for seed, found, before in zip((0, 1), method.seeds, plain.seeds, strict=True):
         stages = [name for name in names.told if name.endswith(f", seed {seed}")]
@@ -388,9 +388,9 @@ def killed(scene: Path, tmp_path: Path) -> Iterator[Path]:
     out = tmp_path / "out"
     arguments = [
         "compare", "--image-path", scene / "images", "--output-path", out,
-        "--methods", "default", "--seeds", "0", *FAST[2:],
+        "--methods", METHODS[1], "--seeds", "0", *FAST[2:],
     ]  # fmt: skip
-    features = out / "methods" / "default" / "features.h5"
+    features = out / "methods" / METHODS[1] / "features.h5"
     with start(*arguments) as process:
         while not features.exists() and process.poll() is None:
             time.sleep(0.01)
@@ -405,9 +405,9 @@ def killed(scene: Path, tmp_path: Path) -> Iterator[Path]:
 def test_killed_comparison_goes_on_and_ends_as_an_undisturbed_one(
     scene, options, compared, killed
 ) -> None:
-    options = replace(options, methods=["default"], seeds=[0])
+    options = replace(options, methods=[METHODS[1]], seeds=[0])
     (method,) = compare(scene / "images", killed, options).methods
-    expected = compared[0].methods[METHODS.index("default")]
+    expected = compared[0].methods[1]
     assert method.num_keypoints == expected.num_keypoints
     assert method.raw_matches == expected.raw_matches
     assert method.seeds[0].registered_names == expected.seeds[0].registered_names
@@ -418,8 +418,8 @@ def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) 
     """The methods are finished there: it only prints."""
     ended = run_in_process_of_its_own(
         "compare", "--image-path", scene / "images", "--output-path", compared[1],
-        "--ground-truth-path", scene / "truth", "--methods", "sift,default", "--seeds", "0,1",
-        *FAST[2:],
+        "--ground-truth-path", scene / "truth", "--seeds", "0,1", *FAST[2:],
+        "--methods", ",".join(METHODS[:2]),
     )  # fmt: skip
     assert ended.code == 1
     assert ended.errors == ["error: could not read 1 of the images: broken.png"]

@@ -27,7 +27,13 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return write_random_weights(tmp_path_factory.mktemp("weights"))
 
 
-@pytest.mark.parametrize("case", CASES)
+LONG = [f"affnet-hardnet {detector}" for detector in ("keynet", "hessian")]
+"""Detectors of kornia, which take seconds."""
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(name, marks=[pytest.mark.long] * (name in LONG)) for name in CASES]
+)
 class TestExtractors(ExtractorContract):
     @pytest.fixture(autouse=True)
     def _case(self, case: str, weights: dict[str, Path]) -> None:

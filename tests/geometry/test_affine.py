@@ -11,6 +11,7 @@ from colmap_affrect.geometry.affine import (
     compose_affine,
     determinants,
     ellipse_extents,
+    homography_errors,
     lafs_from_keypoints,
     project,
     rotation,
@@ -37,6 +38,23 @@ def test_determinants_have_the_sign_of_the_orientation() -> None:
 def test_compose_affine_multiplies_scale_psi_tilt_phi_in_this_order() -> None:
     expected = 1.5 * rotation(0.7) @ np.diag([3.0, 1.0]) @ rotation(2.1)
     assert_allclose(compose_affine(1.5, 0.7, 3.0, 2.1), expected, atol=ROUNDING)
+
+
+def test_homography_errors_are_distances_from_the_nearest_true_match() -> None:
+    # 6 px off along the stretched axis of image 2 are 2 px in image 1: nearly that is to be moved.
+    stretched = np.array([[3.0, 0.0, 10.0], [0.0, 1.0, -5.0], [0.0, 0.0, 1.0]])
+    points = np.array([[20.0, 30.0], [40.0, -7.0]])
+    offsets = np.array([[6.0, 0.0], [0.0, 6.0]])
+    expected = [6.0 / np.sqrt(10.0), 6.0 / np.sqrt(2.0)]
+    assert_allclose(
+        homography_errors(stretched, points, project(stretched, points) + offsets), expected
+    )
+    tilted = np.array([[0.6, -0.3, 40.0], [0.2, 1.3, -9.0], [1e-3, -4e-4, 1.0]])
+    others = project(tilted, points) + offsets / 6
+    there = homography_errors(tilted, points, others)
+    back = homography_errors(np.linalg.inv(tilted), others, points)
+    assert_allclose(there, back, rtol=0.02)
+    assert (there < np.linalg.norm(offsets / 6, axis=1)).all()
 
 
 def test_project_divides_by_the_third_coordinate() -> None:

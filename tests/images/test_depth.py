@@ -457,6 +457,7 @@ def model(transformers, tmp_path_factory):
 COURT_1 = courtyard_photograph("court_1.jpg")
 
 
+@pytest.mark.long
 class TestMonocularDepth(DepthContract):
     """The contract that every depth source keeps."""
 
@@ -471,6 +472,7 @@ class TestMonocularDepth(DepthContract):
         return COURT_1
 
 
+@pytest.mark.long
 def test_network_of_relative_inverse_depth(transformers, model):
     depth = monocular(model, None).depth(COURT_1)
     assert depth.shape == (540, 720)
@@ -485,6 +487,7 @@ def test_network_of_relative_inverse_depth(transformers, model):
     assert_allclose(depth, disparity.max() / disparity, rtol=1e-5)
 
 
+@pytest.mark.long
 def test_network_stored_in_half_precision_computes_in_float32(transformers, model, tmp_path):
     half = relative_network(transformers, tmp_path, dtype="float16")
     depth = monocular(half, None).depth(COURT_1)
@@ -492,6 +495,7 @@ def test_network_stored_in_half_precision_computes_in_float32(transformers, mode
     assert_allclose(depth, monocular(model, None).depth(COURT_1), rtol=0.05)
 
 
+@pytest.mark.long
 def test_exif_orientation_is_not_applied(model, tmp_path):
     turned = tmp_path / "court_1.jpg"
     turned.write_bytes(with_orientation(COURT_1.path.read_bytes(), 6))
@@ -500,6 +504,7 @@ def test_exif_orientation_is_not_applied(model, tmp_path):
     assert_array_equal(network.depth(replace(COURT_1, path=turned)), network.depth(COURT_1))
 
 
+@pytest.mark.long
 def test_image_without_a_file_goes_to_the_network_in_gray(model, tmp_path):
     path = write_image(tmp_path / "gray.png", COURT_1.gray)
     network = monocular(model, None)
@@ -507,6 +512,7 @@ def test_image_without_a_file_goes_to_the_network_in_gray(model, tmp_path):
     assert_array_equal(in_memory, network.depth(replace(COURT_1, path=path)))
 
 
+@pytest.mark.long
 def test_what_a_model_predicts_is_read_from_its_configuration(transformers):
     inverse = [
         transformers.DPTConfig(),
@@ -523,6 +529,7 @@ def test_what_a_model_predicts_is_read_from_its_configuration(transformers):
     assert not any(predicts_inverse_depth(config) for config in metric)
 
 
+@pytest.mark.long
 def test_model_that_is_no_depth_network_or_not_there_is_one_clear_error(transformers, tmp_path):
     config = transformers.Dinov2Config(hidden_size=16, num_hidden_layers=1, num_attention_heads=1)
     transformers.Dinov2Model(config).save_pretrained(tmp_path / "backbone")

@@ -13,6 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from command import Call
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from small_scene import INTRINSICS, write_photographs
@@ -749,30 +750,23 @@ def test_names_of_all_kinds_come_back(tmp_path: Path, targets: tuple[Path, Path]
 # Command line.
 
 
-def command(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "colmap_affrect", *map(str, arguments)],
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-
-
 def test_commands_export_and_import_and_print_no_more_than_progress(
-    finished: tuple[Path, Path], tmp_path: Path
+    finished: tuple[Path, Path], tmp_path: Path, call: Call
 ) -> None:
     photos, out = finished
     files = (
         "--features-path", tmp_path / "f.h5", "--matches-path", tmp_path / "m.h5",
     )  # fmt: skip
-    done = command("export-h5", "--output-path", out, *files, "--quiet")
-    assert (done.returncode, done.stderr) == (0, "")
+    done = call("export-h5", "--output-path", out, *files, "--quiet")
+    assert (done.code, done.stderr) == (0, [])
     assert done.stdout.startswith("exported (hloc): 4 images, ")
-    done = command(
+    done = call(
         "import-h5", "--image-path", photos, *files, "--database-path", tmp_path / "new.db",
         "--camera-mode", "single", "--camera-model", "PINHOLE", "--camera-params", INTRINSICS,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.stderr
     assert "6 pairs, 6 verified" in done.stdout
-    assert {line.split(":")[0] for line in done.stderr.splitlines()} == {
+    assert {line.split(":")[0] for line in done.stderr} == {
         "keypoints", "matches", "verify"
     }  # fmt: skip
     assert {path.name for path in tmp_path.iterdir()} == {"f.h5", "m.h5", "new.db"}

@@ -280,7 +280,10 @@ def two_places(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     return workspace
 
 
-@pytest.mark.parametrize("mapper", MAPPERS.names())
+@pytest.mark.parametrize(
+    "mapper",
+    [pytest.param(n, marks=[pytest.mark.long] * (n != MAPPERS.default)) for n in MAPPERS.names()],
+)
 def test_two_places_make_two_models_the_largest_first(two_places: Workspace, mapper: str) -> None:
     report = map_and_report(Context(two_places), mapper_of(mapper), overwrite=True)
     large = tuple(sorted(f"there/{name}" for name in NAMES[:3]))

@@ -15,7 +15,14 @@ from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers.attempts import MAX_HOLDING_ATTEMPTS, map_database
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.incremental import IncrementalOptions
-from colmap_affrect.mappers.starts import MAX_EXCESS, focal_starts, is_within, runaways, started
+from colmap_affrect.mappers.starts import (
+    MAX_EXCESS,
+    Start,
+    is_within,
+    runaways,
+    started,
+    starts,
+)
 
 TRUE_FOCAL, NUM_IMAGES = 1280.0, 4
 VAGUE = CameraRecord(("a",), "guess", 1000.0, 500.0, 2000.0, size=(1024, 768))
@@ -55,22 +62,25 @@ def test_vague_cameras_start_from_both_sides_and_known_ones_from_what_is_known()
     wider = replace(VAGUE, focal_px=900.0, low_px=900.0, high_px=1600.0)
     no_vote = replace(VAGUE, low_px=None, high_px=None)
     task = task_of({1: VAGUE, 2: KNOWN, 3: wider, 4: no_vote})
-    first, low, high = focal_starts(task)
-    assert first == {}
-    assert low == {1: pytest.approx(500.0 * 2**0.5)}
-    assert high == {1: pytest.approx(1000.0 * 2**0.5), 3: pytest.approx(1200.0)}
-    assert focal_starts(task_of({2: KNOWN, 4: no_vote})) == [{}]
-    assert focal_starts(task_of({})) == [{}]
+    first, straight, low, high = starts(task)
+    assert (first, straight) == (Start(), Start(distortion_held=True))
+    assert low.focals_px == {1: pytest.approx(500.0 * 2**0.5)}
+    assert high.focals_px == {1: pytest.approx(1000.0 * 2**0.5), 3: pytest.approx(1200.0)}
+    assert low.distortion_held
+    assert high.distortion_held
+    assert starts(task_of({2: KNOWN, 4: no_vote})) == [Start()]
+    assert starts(task_of({})) == [Start()]
 
 
 def test_a_start_changes_a_copy_of_the_database(
     scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
 ) -> None:
     task = MappingTask(scene[0], None, snapshot_path=tmp_path)
-    assert started(task, {}, tmp_path / "started.db") is task
+    straight = started(task, Start(distortion_held=True), tmp_path / "started.db")
+    assert (straight.database_path, straight.distortion_held) == (task.database_path, True)
     before = scene[0].read_bytes()
     for focal in (700.0, 900.0):  # the second one replaces the first
-        moved = started(task, {2: focal}, tmp_path / "started.db")
+        moved = started(task, Start({2: focal}), tmp_path / "started.db")
         assert moved.snapshot_path is None
         with open_database(moved.database_path) as database:
             focals = [camera.focal_length for camera in database.read_all_cameras()]
@@ -137,7 +147,7 @@ def test_unknown_cameras_are_started_from_all_sides_even_if_the_model_is_complet
     cameras = {**records(scene, replace(KNOWN, focal_px=TRUE_FOCAL)), 2: VAGUE}
     mapped(scene, tmp_path, mapper, cameras)
     assert [focals[1] for focals in mapper.focals] == pytest.approx(
-        [1280.0, 707.1, 1414.2], abs=0.1
+        [1280.0, 1280.0, 707.1, 1414.2], abs=0.1
     )
     assert {focals[0] for focals in mapper.focals} == {TRUE_FOCAL}
     known = Recorder(lambda _: without(scene, 0), num=3)

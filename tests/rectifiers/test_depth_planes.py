@@ -19,8 +19,9 @@ from planar_scenes import (
     slanted_wall,
     unit,
 )
+from small_scene import cached_texture
 from strategies import Array
-from synthetic import blobs, texture
+from synthetic import blobs
 
 from colmap_affrect.conventions import camera_matrix
 from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan
@@ -168,6 +169,7 @@ def test_planar_segments_of_unknown_depth_or_a_scattered_surface_are_none() -> N
         assert planar_segments(corner_room().photograph(), depth, PlaneOptions()) == []
 
 
+@pytest.mark.long
 def test_planar_segments_shrink_depth_maps_that_are_too_fine() -> None:
     # In windows of the full size, noise of 0.2 % would hide the plane.
     wall = slanted_wall([0.4, 0.2, -0.9])
@@ -224,7 +226,7 @@ NORMALS = [(0.7, 0.2, -0.68), (-0.85, 0.1, -0.5), (0.1, -0.9, -0.42), (0.02, 0.0
 @pytest.mark.parametrize("normal", NORMALS)
 def test_warp_of_a_slanted_wall_is_its_frontal_view(normal: tuple[float, float, float]) -> None:
     room = slanted_wall(normal)
-    pattern = texture((900, 900), seed=4, finest_sigma_px=5.0)
+    pattern = cached_texture((900, 900), seed=4, finest_sigma_px=5.0)
     image = room.render(pattern, 120.0)
     plan = plan_planes(room.photograph(image), room.depth((180, 130))[0])
     (item,) = plan.items

@@ -285,7 +285,12 @@ PLANS = {
 
 @pytest.mark.parametrize(
     ("kind", "extractor"),
-    [*((kind, GridFeatures()) for kind in PLANS), ("homography", NO_FEATURES)],
+    [
+        ("no warps", GridFeatures()),
+        ("homography", GridFeatures()),
+        ("homography", NO_FEATURES),
+        pytest.param("61 warps", GridFeatures(), marks=pytest.mark.long),
+    ],
 )
 def test_sheet_of_plan(kind: str, extractor: GridFeatures, tmp_path: Path, photo: Path) -> None:
     (level,), _ = inspect(extractor_of(PLANS[kind], extractor=extractor), photo, tmp_path)

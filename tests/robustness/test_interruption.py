@@ -110,6 +110,7 @@ def test_run_ended_again_and_again_has_the_results_of_an_undisturbed_one(
     assert finish(small_photos, out, FAST) == expected
 
 
+@pytest.mark.long
 def test_two_runs_at_once_are_one_that_works_and_one_that_is_refused(
     small_photos: Path, tmp_path: Path, undisturbed: Undisturbed
 ) -> None:

@@ -257,12 +257,23 @@ def test_pairs_that_climbed_can_be_had_as_they_were(
         assert path is None
 
 
-@pytest.mark.parametrize("loses", [True, False])
+@pytest.mark.parametrize(
+    ("num_escalated", "doubts", "mapped_before", "kept"),
+    [
+        (0, (), True, "first"),
+        (2, (), True, "first"),
+        (2, ("pure rotation",), True, "escalated"),
+        (3, (), False, "escalated"),
+    ],
+)
 def test_the_model_before_the_climb_is_kept_where_it_has_more_images(
     climbed: tuple[Workspace, StageReport],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    loses: bool,
+    num_escalated: int,
+    doubts: tuple[str, ...],
+    mapped_before: bool,
+    kept: str,
 ) -> None:
     workspace, mapped = copy(climbed[0], tmp_path), []
 
@@ -271,16 +282,17 @@ def test_the_model_before_the_climb_is_kept_where_it_has_more_images(
         mapped.append(is_first_level)
         (sparse / "0").mkdir(parents=True)
         (sparse / "0" / "which").write_text("first" if is_first_level else "escalated")
-        names = NAMES[:2] if is_first_level or not loses else ()
-        return [ModelSummary(tuple(names), 10, 2.0, 0.5)]
+        names = tuple(NAMES[: 3 if is_first_level else num_escalated])
+        return [ModelSummary(names, 10, 2.0, 0.5, doubts=doubts if is_first_level else ())]
 
+    monkeypatch.setattr(map_stage, "connected_parts", lambda _: [{1, 2, 3}])
     monkeypatch.setattr(map_stage, "map_database", map_database)
     with workspace.locked():
         mapper = MAPPERS.make(IncrementalOptions())
         _, models = map_stage.map_images(Context(workspace), mapper)
-    assert mapped == ([False, True] if loses else [False])
-    assert len(models[0].registered_names) == 2
-    assert (workspace.sparse / "0" / "which").read_text() == ("first" if loses else "escalated")
+    assert mapped == ([False, True] if mapped_before else [False])
+    assert len(models[0].registered_names) == (3 if kept == "first" else num_escalated)
+    assert (workspace.sparse / "0" / "which").read_text() == kept
     assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == ["sparse"]
 
 

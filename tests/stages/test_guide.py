@@ -59,11 +59,26 @@ def before(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     return workspace
 
 
+@pytest.fixture(scope="module")
+def after(before: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """The same with all pairs guided."""
+    workspace = copy_of(before, tmp_path_factory.mktemp("after") / "out")
+    guide(Context(workspace), ALWAYS)
+    return workspace
+
+
+def copy_of(workspace: Workspace, folder: Path) -> Workspace:
+    return Workspace(Path(shutil.copytree(workspace.path, folder)))
+
+
 @pytest.fixture
 def context(before: Workspace, tmp_path: Path) -> Context:
-    folder = tmp_path / "out"
-    shutil.copytree(before.path, folder)
-    return Context(Workspace(folder))
+    return Context(copy_of(before, tmp_path / "out"))
+
+
+@pytest.fixture
+def guided(after: Workspace, tmp_path: Path) -> Context:
+    return Context(copy_of(after, tmp_path / "guided"))
 
 
 def test_pairs_gain_and_what_was_there_stays_on_record(before: Workspace, context: Context) -> None:
@@ -89,11 +104,10 @@ def raw_matches(path: Path) -> list[tuple[int, bytes]]:
     return [(pair, found.tobytes()) for pair, found in zip(pair_ids, matches, strict=True)]
 
 
-def test_guided_matches_are_right(context: Context) -> None:
+def test_guided_matches_are_right(guided: Context) -> None:
     """A geometry of the first inliers explains nearly all that came later."""
-    guide(context, ALWAYS)
-    exact, verified = exact_inliers(context), verified_inliers(context)
-    frames = {name: context.features.read(name).keypoints for name in NAMES}
+    exact, verified = exact_inliers(guided), verified_inliers(guided)
+    frames = {name: guided.features.read(name).keypoints for name in NAMES}
     for pair, indices in verified.items():
         known = {*map(tuple, exact[pair])}
         new = np.array([row for row in indices.tolist() if tuple(row) not in known])
@@ -125,33 +139,27 @@ def test_never(context: Context) -> None:
     assert guide(context, GuidedOptions(enabled="never"), images=NAMES).num_done == 0
 
 
-def test_again_nothing_happens(context: Context) -> None:
-    guide(context, ALWAYS)
-    content = database_content(context.workspace.database)
-    report = guide(context)
+def test_again_nothing_happens(guided: Context) -> None:
+    content = database_content(guided.workspace.database)
+    report = guide(guided)
     assert (report.num_done, report.num_kept) == (0, 6)
-    assert database_content(context.workspace.database) == content
+    assert database_content(guided.workspace.database) == content
 
 
 def test_killed_before_the_geometries_are_written_it_goes_on(
-    context: Context, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    context: Context, guided: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other = tmp_path / "other"
-    shutil.copytree(context.workspace.path, other)
-    guide(context, ALWAYS)
-
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    again = Context(Workspace(other))
     monkeypatch.setattr(stage, "PAIRS_PER_WRITE", 4)
     monkeypatch.setattr(stage.Guiding, "_write_geometries", killed)
     with pytest.raises(KeyboardInterrupt):
-        guide(again, ALWAYS)
+        guide(context, ALWAYS)
     monkeypatch.undo()
-    assert guided_counts(again) == {}
-    guide(again, ALWAYS)
-    same_inliers(context, again)
+    assert guided_counts(context) == {}
+    guide(context, ALWAYS)
+    same_inliers(guided, context)
 
 
 def same_inliers(first: Context, second: Context) -> None:
@@ -161,23 +169,21 @@ def same_inliers(first: Context, second: Context) -> None:
         assert_array_equal(indices, other[pair])
 
 
-def test_what_is_undone_is_as_before(before: Workspace, context: Context) -> None:
-    guide(context, ALWAYS)
-    restore_exact(context, {min(verified_inliers(context))})
-    assert 0 < guided_counts(context)["pairs"] < 6
-    restore_exact(context)
-    assert guided_counts(context) == {}
-    same_inliers(Context(before), context)
-    assert guide(context).num_done == 0  # they were tried
+def test_what_is_undone_is_as_before(before: Workspace, guided: Context) -> None:
+    restore_exact(guided, {min(verified_inliers(guided))})
+    assert 0 < guided_counts(guided)["pairs"] < 6
+    restore_exact(guided)
+    assert guided_counts(guided) == {}
+    same_inliers(Context(before), guided)
+    assert guide(guided).num_done == 0  # they were tried
 
 
-def test_overwrite_undoes_and_guides_again(context: Context) -> None:
-    guide(context, ALWAYS)
-    counts = guided_counts(context)
-    assert guide(context, ALWAYS, overwrite=True).num_done == 6
-    assert guided_counts(context) == counts
-    assert guide(context, GuidedOptions(enabled="never"), overwrite=True).num_done == 0
-    assert guided_counts(context) == {}
+def test_overwrite_undoes_and_guides_again(guided: Context) -> None:
+    counts = guided_counts(guided)
+    assert guide(guided, ALWAYS, overwrite=True).num_done == 6
+    assert guided_counts(guided) == counts
+    assert guide(guided, GuidedOptions(enabled="never"), overwrite=True).num_done == 0
+    assert guided_counts(guided) == {}
 
 
 def test_verification_over_again_forgets_guided_matches(
@@ -205,12 +211,11 @@ def mapper() -> object:
     return MAPPERS.make(IncrementalOptions(max_num_attempts=1))
 
 
-def test_models_of_guided_pairs_are_adjusted_by_exact_matches(context: Context) -> None:
-    guide(context, ALWAYS)
-    map_images(context, mapper())
-    model = pycolmap.Reconstruction(context.workspace.sparse / "0")
+def test_models_of_guided_pairs_are_adjusted_by_exact_matches(guided: Context) -> None:
+    map_images(guided, mapper())
+    model = pycolmap.Reconstruction(guided.workspace.sparse / "0")
     assert model.num_reg_images() == 4
-    exact, verified = exact_inliers(context), verified_inliers(context)
+    exact, verified = exact_inliers(guided), verified_inliers(guided)
     seen = {image.name: [p.point3D_id if p.has_point3D() else -1 for p in image.points2D]
             for image in model.images.values()}  # fmt: skip
     tied = {(name, row[side]) for pair, rows in exact.items() for row in rows.tolist()
@@ -221,18 +226,19 @@ def test_models_of_guided_pairs_are_adjusted_by_exact_matches(context: Context) 
                    for side, name in enumerate(pair)} - tied  # fmt: skip
     # Taken out are all, but one is left again where what fits badly went after the adjustment.
     assert len(guided_only) < 0.002 * len(tied)
-    by_ids = inlier_matches(context.workspace.database, 1)
-    guided = guided_matches(context)
-    assert adjust_last(model, by_ids, guided, refine_intrinsics=False) == len(guided_only)
+    by_ids = inlier_matches(guided.workspace.database, 1)
+    added = guided_matches(guided)
+    assert adjust_last(model, by_ids, added, constant_cameras=model.cameras) == len(guided_only)
 
 
-def test_guided_matches_are_the_inliers_that_came_by_guiding(context: Context) -> None:
+def test_guided_matches_are_the_inliers_that_came_by_guiding(
+    context: Context, guided: Context
+) -> None:
     assert guided_matches(context) == {}
-    guide(context, ALWAYS)
-    ids = image_ids(context.workspace.database)
-    exact, verified = exact_inliers(context), verified_inliers(context)
-    found = guided_matches(context)
-    assert len(found) == guided_counts(context)["pairs"]
+    ids = image_ids(guided.workspace.database)
+    exact, verified = exact_inliers(guided), verified_inliers(guided)
+    found = guided_matches(guided)
+    assert len(found) == guided_counts(guided)["pairs"]
     for pair, inliers in verified.items():
         new = {*map(tuple, inliers.tolist())} - {*map(tuple, exact[pair].tolist())}
         rows = found.get((ids[pair[0]], ids[pair[1]]), np.zeros((0, 2)))

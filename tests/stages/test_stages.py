@@ -131,7 +131,7 @@ def test_report_file_has_the_promised_keys(
         "added", "guided",
     } <= set(read)  # fmt: skip
     assert [stage["name"] for stage in read["stages"]] == [
-        "extract", "pairs", "match", "verify", "guide", "map",
+        "extract", "pairs", "match", "verify", "cameras", "guide", "map",
     ]  # fmt: skip
     assert all(stage["wall_s"] >= 0.0 for stage in read["stages"])
     assert (read["recipe"], read["random_seed"]) == ("default", 3)
@@ -199,8 +199,8 @@ def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
     report = run(photos, copy.path, OPTIONS)
     done = {stage.name: (stage.num_done, stage.num_kept) for stage in report.stages}
     assert done == {
-        "extract": (0, 4), "pairs": (6, 0), "match": (0, 6), "verify": (0, 6), "guide": (0, 0),
-        "map": (0, 1),
+        "extract": (0, 4), "pairs": (6, 0), "match": (0, 6), "verify": (0, 6),
+        "cameras": (0, 1), "guide": (0, 0), "map": (0, 1),
     }  # fmt: skip
     assert report.status == "ok"
     assert {path: path.read_bytes() for path in before} == before

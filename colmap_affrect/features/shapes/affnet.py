@@ -109,13 +109,7 @@ class AffNet:
         network: NetworkContext,
         features: FeatureOptions | None = None,
     ) -> None:
-        """Load the network.
-
-        Args:
-            options: scales and normalisation of dense shapes, number of sparse ones.
-            network: file of weights, and the device.
-            features: of the recipe.
-        """
+        """Load the network; keypoints are found as ``features`` of the recipe if those are DoG."""
         from colmap_affrect.features.networks import load_affnet, resolve_device
 
         self.options = options
@@ -226,9 +220,8 @@ class AffNet:
 def fully_convolutional(network: LAFAffNetShapeEstimator) -> nn.Sequential:
     """Return the layers of AffNet without the final pooling, for inference.
 
-    Batch normalisation is folded into the convolutions. An image of H x W px gives
-    (ceil(H / 4) - 7) x (ceil(W / 4) - 7) cells; cell (i, j) has the patch whose first pixel is
-    (4 j, 4 i).
+    Batch normalisation is folded into the convolutions. An image of H x W px gives (ceil(H / 4) -
+    7) x (ceil(W / 4) - 7) cells; cell (i, j) has the patch whose first pixel is (4 j, 4 i).
     """
     import torch
     from torch import nn
@@ -284,15 +277,10 @@ def _textured(image: GrayImage, min_deviation: float) -> Mask:
 def _read_grid(
     values: NDArray[np.float32], level_from_image: NDArray[np.float64], cells: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Interpolate a grid of a resized image bilinearly at the cells of the image's own grid.
+    """Interpolate a grid of a resized image bilinearly at the (R, C) cells of the image's own.
 
-    Args:
-        values: (r, c, D) at the blocks of the resized image.
-        level_from_image: (3, 3) map of pixel-centre coordinates.
-        cells: (R, C) of the image's grid.
-
-    Returns:
-        (R, C, D); beyond the outermost centres their values count.
+    ``values`` are (r, c, D) at the blocks of the resized image, the map (3, 3) of pixel-centre
+    coordinates. Beyond the outermost centres their values count.
     """
     weights = []
     for axis, (count, length) in enumerate(zip(cells, values.shape[:2], strict=True)):

@@ -1,0 +1,187 @@
+"""What the options of a command mean to the library; what is not given is taken from the record."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from colmap_affrect.errors import OptionError
+from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.workspace import Workspace
+
+if TYPE_CHECKING:
+    from colmap_affrect.colmap.verification import VerificationOptions
+    from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+    from colmap_affrect.mappers.base import MapperOptions
+    from colmap_affrect.mappers.existing import Extension
+    from colmap_affrect.pairs.base import PairOptions
+    from colmap_affrect.parallel.executor import Executor
+    from colmap_affrect.recipes import Recipe
+    from colmap_affrect.stages.context import Context, Resources
+
+
+def inputs(options: argparse.Namespace, recipe: Recipe | None = None) -> dict[str, Any]:
+    """Return the fields of InputOptions, which run and compare have in common."""
+    return {
+        "cameras": cameras(options),
+        "masks": masks(options),
+        "pairs": pair_options(options),
+        "verification": verification(options),
+        "mapping": mapping(options, recipe),
+        "image_list_path": options.image_list_path,
+        "from_database": options.from_database,
+        "resources": resources(options),
+        "focal_vote": options.focal_vote,
+    }
+
+
+def extension(options: argparse.Namespace) -> Extension | None:
+    from colmap_affrect.mappers.existing import Extension
+
+    if options.extend:
+        return Extension(options.extend, options.refine_existing)
+    if options.refine_existing:
+        raise OptionError("--refine-existing: only with --extend MODEL")
+    return None
+
+
+def recipe(options: argparse.Namespace) -> Recipe:
+    from colmap_affrect.recipes import load_recipe
+
+    given = {"matching.name": options.matcher, "guided.enabled": options.guided}
+    settings = [f"{key}={json.dumps(value)}" for key, value in given.items() if value]
+    return load_recipe(options.recipe, [*settings, *options.set, *depth_settings(options)])
+
+
+def depth_settings(options: argparse.Namespace) -> list[str]:
+    path, model = options.depth_path, options.depth_model
+    given = {
+        "name": "monocular" if model else "files" if path else None,
+        "path": str(path.resolve()) if path else None,
+        "model": model,
+        "kind": options.depth_kind,
+    }
+    return [f"depth.{key}={json.dumps(value)}" for key, value in given.items() if value]
+
+
+def resources(options: argparse.Namespace) -> Resources:
+    from colmap_affrect.stages.context import Resources
+
+    return Resources(options.weights, options.device)
+
+
+@contextmanager
+def executor(options: argparse.Namespace) -> Iterator[Executor | None]:
+    """Use the cluster that was named, None if there is none."""
+    if not options.scheduler:
+        yield None
+        return
+    from colmap_affrect.parallel.cluster import connected
+
+    with connected(options.scheduler) as cluster:
+        yield cluster
+
+
+@contextmanager
+def context(options: argparse.Namespace) -> Iterator[Context]:
+    """Lock the output folder and return what the stages work with."""
+    from colmap_affrect.stages.context import Context
+
+    with Workspace(options.output_path).locked() as workspace, executor(options) as where:
+        yield Context(workspace, resources(options), where, progress(options))
+
+
+def cameras(options: argparse.Namespace) -> CameraOptions:
+    from colmap_affrect.images.photographs import CameraOptions
+
+    return CameraOptions(
+        mode=options.camera_mode,
+        model=options.camera_model,
+        params=options.camera_params,
+        ignore_exif=options.ignore_exif,
+        cameras_path=str(options.cameras_path.resolve()) if options.cameras_path else "",
+        focal_length_px=options.focal_length_px,
+        principal_point=options.principal_point,
+    )
+
+
+def masks(options: argparse.Namespace) -> MaskOptions:
+    from colmap_affrect.images.photographs import MaskOptions
+
+    paths = (options.mask_path, options.camera_mask_path)
+    folder, camera = (str(path.resolve()) if path else "" for path in paths)
+    return MaskOptions(path=folder, camera_path=camera)
+
+
+def pair_options(
+    options: argparse.Namespace, recorded: Mapping[str, Any] | None = None
+) -> PairOptions:
+    """Return what is given on the command line, over what is on record."""
+    from colmap_affrect.pairs.base import PairOptions
+
+    listed = options.match_list_path
+    given = {
+        "methods": options.pairs,
+        "num_neighbors": options.num_neighbors,
+        "max_distance_m": options.max_distance_m,
+        "match_list_path": str(listed.resolve()) if listed else None,
+    }
+    chosen = {key: value for key, value in given.items() if value is not None}
+    return PairOptions.from_mapping({**(recorded or {}), **chosen}, "pairs")
+
+
+def verification(
+    options: argparse.Namespace, recorded: Mapping[str, Any] | None = None
+) -> VerificationOptions:
+    """Return the preset that is given, or what is on record."""
+    from colmap_affrect.colmap.verification import VerificationOptions
+
+    if recorded and not options.preset:
+        return VerificationOptions(**{**recorded, **seed(options)})
+    return VerificationOptions.preset(options.preset or "sparse", **seed(options))
+
+
+def seed(options: argparse.Namespace) -> dict[str, int]:
+    return {} if options.random_seed is None else {"random_seed": options.random_seed}
+
+
+def mapping(
+    options: argparse.Namespace,
+    recipe: Recipe | None = None,
+    recorded: Mapping[str, Any] | None = None,
+) -> MapperOptions:
+    """Return the mapper that is given, or what is on record."""
+    from colmap_affrect.mappers.base import MAPPERS
+    from colmap_affrect.recipes import Recipe
+
+    native = {}
+    for setting in options.mapper_options:
+        key, separator, value = setting.partition("=")
+        if not separator or not key.strip():
+            raise OptionError(f"--mapper-options {setting}: expected KEY=VALUE")
+        native[key.strip()] = value
+    given = {**seed(options), **({"mapper_options": native} if native else {})}
+    if recorded and not (options.preset or options.mapper):
+        found: MapperOptions = MAPPERS.options({**recorded, **given})
+        return found
+    recipe = recipe or Recipe("")
+    return recipe.mapper_options(options.preset or "sparse", options.mapper or "", **given)
+
+
+def changed(context: Context, stage: str, section: str, settings: Sequence[str]) -> dict[str, Any]:
+    """Return the options on record of a stage, a section of the recipe, some of them changed."""
+    from colmap_affrect.recipes import with_settings
+
+    values = with_settings({section: context.workspace.planned(stage) or {}}, settings)
+    if len(values) > 1:
+        raise OptionError(f"--set: only options of {section} can be changed here")
+    changed: dict[str, Any] = values[section]
+    return changed
+
+
+def progress(options: argparse.Namespace) -> Progress:
+    return SILENT if options.quiet else Progress(sys.stderr)

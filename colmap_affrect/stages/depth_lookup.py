@@ -1,0 +1,71 @@
+"""Depth maps of the photographs of a workspace, as mapping asks them."""
+
+from __future__ import annotations
+
+import logging
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap.database import read_cameras
+from colmap_affrect.conventions import camera_matrix, pixel_from_colmap, resized_from_original
+from colmap_affrect.data import Photograph
+from colmap_affrect.errors import DepthError, ImageError
+from colmap_affrect.geometry.affine import project
+from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
+from colmap_affrect.images.reading import read_gray
+from colmap_affrect.mappers.base import DepthLookup
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.extract import Inputs, recorded_extraction
+
+logger = logging.getLogger(__name__)
+
+NUM_CACHED_MAPS = 8
+"""One image is asked for each of its pairs."""
+
+
+def depth_lookup(context: Context) -> DepthLookup | None:
+    """Return where mapping finds depths; None when no depth maps were given.
+
+    Images without a usable map have NaN.
+    """
+    workspace = context.workspace
+    options = recorded_extraction(workspace)
+    if not options.depth.is_given:
+        return None
+    device = context.resources.device
+    if options.depth.uses_network:
+        from colmap_affrect.features.networks import resolve_device
+
+        device = str(resolve_device(device))
+    source = DEPTH_SOURCES.make(options.depth, DepthContext(workspace.depth, device))
+    folder, cameras = Path(Inputs.recorded(workspace).image_path), read_cameras(workspace.database)
+
+    @lru_cache(NUM_CACHED_MAPS)
+    def photograph_and_map(name: str) -> tuple[tuple[int, int], NDArray[np.float32]] | None:
+        try:
+            gray = read_gray(folder / name)
+            size = (gray.shape[1], gray.shape[0])
+            matrix = cameras[name].matrix if name in cameras else camera_matrix(size)
+            return size, source.depth(Photograph(gray, name, folder / name, matrix))
+        except (DepthError, ImageError) as error:
+            logger.debug("%s: no depth: %s", name, error)
+            return None
+
+    def depth_at(name: str, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        found = photograph_and_map(name)
+        if found is None:
+            return np.full(len(points), np.nan)
+        size, depth = found
+        height, width = depth.shape
+        places = project(
+            resized_from_original(size, (width, height)),
+            pixel_from_colmap(np.asarray(points, np.float64)),
+        )
+        columns, rows = np.rint(places).astype(int).T
+        nearest = depth[rows.clip(0, height - 1), columns.clip(0, width - 1)]
+        return np.asarray(nearest, np.float64)
+
+    return depth_at
