@@ -7,28 +7,31 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.camera_vote import (
     MIN_LOG_EVIDENCE,
-    CameraVote,
     VotingPair,
     log_evidence_for_sharing,
     voting_pairs,
 )
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.doctor.findings import Findings
-from colmap_affrect.geometry.focal_evidence import fits
+from colmap_affrect.geometry.focal_evidence import log_evidence
+from colmap_affrect.geometry.focal_vote import FOCALS, MAX_VOTE, FocalEstimate, ballot, count
 from colmap_affrect.images.exif import PLAUSIBLE_FOCALS
-from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 MAX_NUM_PAIRS = 48
 """The strongest pairs that are asked, some seconds' worth."""
 
-MAX_DIFFERENCE = 1.15
-"""How far beyond what pairs say a focal length is called contradicted; models move it so far."""
+MAX_SPREAD = 2.5
+"""Ratio of the ends of an interval beyond which pairs say too little to contradict; without them
+it is the usual lenses, 7."""
 
-MIN_CONTRADICTING = 0.5
-"""Share of the pairs of a camera that its focal length does not fit; some pairs are wrong."""
+MAX_DIFFERENCE = 1.15
+"""How far beyond an interval a focal length still is right, half of the interval if that is more:
+mapping refines them, and pairs are a little wrong."""
 
 
 def examine_cameras(findings: Findings, path: Path, copy: Path) -> None:
@@ -94,41 +97,24 @@ class _Examination:
         self._add("implausible-focal", items)
 
     def contradicted(self) -> set[int]:
-        """Find priors that pairs do not fit while they agree on another focal length."""
+        """Find priors that pairs contradict, each as if the others were right."""
         focals = {
             key: record.focal_px / max(record.size)
             for key, record in self._records.items()
             if record.source == "given"
         }
-        known = [pair for pair in self.pairs if set(pair.cameras) <= set(focals)]
-
-        def is_explained(pair: VotingPair) -> bool:
-            return fits(pair.matched, focals[pair.cameras[0]], focals[pair.cameras[1]])
-
-        votes: dict[int, list[bool]] = defaultdict(list)
-        explained = map_ordered(is_explained, known, available_cores())
-        for pair, is_good in zip(known, explained, strict=True):
-            for camera in set(pair.cameras):
-                votes[camera].append(is_good)
-        doubted = {
-            key for key, good in votes.items() if good.count(False) >= MIN_CONTRADICTING * len(good)
-        }
-        if not doubted:
-            return set()
-        asked = {
-            key: replace(record, source="guess") if key in doubted else record
-            for key, record in self._records.items()
-            if key in doubted | set(focals)
-        }
-        pairs = [pair for pair in self.pairs if set(pair.cameras) <= set(asked)]
         items, found = [], set()
-        for key, record in CameraVote(asked, pairs, may_share=False).decide().items():
-            prior = self._records[key].focal_px
-            low, high = record.low_px or 0.0, record.high_px or float("inf")
-            if record.source == "pairs" and not (
-                low / MAX_DIFFERENCE <= prior <= high * MAX_DIFFERENCE
-            ):
-                items.append(f"{_who(record)}: {prior:.0f}, not {low:.0f} to {high:.0f}")
+        for key, prior in focals.items():
+            pairs = [p for p in self.pairs if key in p.cameras and set(p.cameras) <= set(focals)]
+            if sum(_doubt(pair, key, focals) for pair in pairs) < MIN_LOG_EVIDENCE:
+                continue
+            others = {other: focal for other, focal in focals.items() if other != key}
+            ballots = [ballot(pair.matched, pair.cameras, others) for pair in pairs]
+            estimate = count([item for item in ballots if item], [key]).estimates[key]
+            if _contradicts(estimate, prior):
+                record, longer = self._records[key], max(self._records[key].size)
+                low, high = estimate.low * longer, estimate.high * longer
+                items.append(f"{_who(record)}: {record.focal_px:.0f}, not {low:.0f} to {high:.0f}")
                 found.add(key)
         self._add("contradicted-focal", items)
         return found
@@ -153,6 +139,20 @@ class _Examination:
         difference = log_evidence_for_sharing(pairs, images)
         if difference is not None and -difference >= MIN_LOG_EVIDENCE:
             self._add("cameras-shared", self._records[camera_id].names)
+
+
+def _doubt(pair: VotingPair, key: int, focals: Mapping[int, float]) -> float:
+    """Return by how much some focal length of a camera is more likely than what is known of it."""
+    asked = np.append(focals[key], FOCALS[::8])
+    first, second = (
+        asked if camera == key else np.full_like(asked, focals[camera]) for camera in pair.cameras
+    )
+    return float(min(MAX_VOTE, -log_evidence(pair.matched, first, second)[0]))
+
+
+def _contradicts(estimate: FocalEstimate, focal: float) -> bool:
+    beyond = max(estimate.low / focal, focal / estimate.high)
+    return estimate.spread <= MAX_SPREAD and beyond > max(MAX_DIFFERENCE, estimate.spread**0.5)
 
 
 def _who(record: CameraRecord) -> str:

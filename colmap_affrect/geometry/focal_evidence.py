@@ -85,7 +85,7 @@ def log_evidence(
         max_misfit: see :data:`MAX_MISFIT`.
 
     Returns:
-        (N,), all 0 where the pair fits no camera.
+        (N,), all 0 where the pair fits no camera, or its matches leave parameters undetermined.
     """
     essential = _Fit(pair, focals1, focals2, is_essential=True)
     fundamental = _Fit(pair, np.ones(1), np.ones(1), is_essential=False)
@@ -95,17 +95,10 @@ def log_evidence(
         beside = np.stack(np.meshgrid(BESIDE * focals1[best], BESIDE * focals2[best]))
         nearby = _Fit(pair, *beside.reshape(2, -1), is_essential=True)
         misfit = nearby.costs.min() - fundamental.costs[0]
-    if misfit > max_misfit:
-        return np.zeros(len(focals1))
     found = -essential.costs - 0.5 * essential.log_determinants()
+    if misfit > max_misfit or not np.isfinite(found).all():
+        return np.zeros(len(focals1))
     return np.asarray(found - found.max())
-
-
-def fits(pair: MatchedPair, focal1: float, focal2: float) -> bool:
-    """Tell whether cameras of these focal lengths explain a pair; so do those beside them."""
-    essential = _Fit(pair, BESIDE * focal1, BESIDE * focal2, is_essential=True)
-    fundamental = _Fit(pair, np.ones(1), np.ones(1), is_essential=False)
-    return bool(essential.costs.min() <= fundamental.costs[0] + MAX_MISFIT)
 
 
 class _Fit:

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,7 +76,7 @@ def copied(path: Path, folder: Path) -> Path:
     return folder / path.name
 
 
-def content(path: Path) -> tuple[object, ...]:
+def content(path: Path) -> tuple[Any, ...]:
     """Return all that the vote may change."""
     with open_database(path) as database:
         cameras = {
