@@ -101,7 +101,7 @@ class _Attempts:
     """Which attempts there are: with several seeds, and from several focal lengths.
 
     One that has all images, each with enough points of three images, is the last.
-    Cameras that ran away in the best models so far are held in those that follow.
+    Cameras that ran away in the last one are held in those that follow.
     """
 
     def __init__(self, mapper: Mapper, task: MappingTask, num_images: int) -> None:
@@ -112,13 +112,13 @@ class _Attempts:
         self._limit = max(num, len(self._starts))
         self._most = self._limit + MAX_HOLDING_ATTEMPTS
         self._done = 0
+        self._ran: set[int] = set()
 
     def go_on(self, best: list[MappedModel]) -> bool:
         """Tell whether there is another attempt, after the best models so far."""
         task = self._task
-        ran = runaways(best[0].reconstruction, task) - task.held if best else set()
-        if ran and not task.extend and self._done < self._most:
-            self._task = replace(task, held=task.held | ran)
+        if self._ran - task.held and not task.extend and self._done < self._most:
+            self._task = replace(task, held=task.held | self._ran)
             self._limit = max(self._limit, self._done + 1)
             return True
         if self._done >= self._limit:
@@ -135,7 +135,9 @@ class _Attempts:
         start = self._starts[self._done % len(self._starts)]
         self._done += 1
         task = started(self._task, start, database_path)
-        return self._mapper.map(task, output_path, seed, show)
+        found = self._mapper.map(task, output_path, seed, show)
+        self._ran = runaways(max(found, key=_size).reconstruction, self._task) if found else set()
+        return found
 
 
 def _is_well_tied(model: pycolmap.Reconstruction) -> bool:

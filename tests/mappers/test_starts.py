@@ -162,13 +162,6 @@ def test_unknown_cameras_are_started_from_all_sides_unless_all_images_are_tied_w
     assert len(missing.focals) == 3
 
 
-@pytest.fixture
-def _any_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep all images of models with cameras that never saw their points."""
-    monkeypatch.setattr(attempts, "without_impossible", lambda model, _: model)
-
-
-@pytest.mark.usefixtures("_any_model")
 def test_a_camera_that_ran_away_is_held(
     scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
 ) -> None:
@@ -183,7 +176,6 @@ def test_a_camera_that_ran_away_is_held(
     assert model.num_reg_images() == NUM_IMAGES
 
 
-@pytest.mark.usefixtures("_any_model")
 def test_attempts_to_hold_cameras_end(
     scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
 ) -> None:
