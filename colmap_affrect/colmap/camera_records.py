@@ -44,6 +44,8 @@ class CameraRecord:
         why: what was decided and for what reason, one clause.
         size: (width, height) of its images in px.
         given: what of the intrinsics is the user's, to be left as it is.
+        may_be_shared: the pairs do not tell whether other such images of this size have the same
+            camera.
     """
 
     names: tuple[str, ...]
@@ -54,6 +56,7 @@ class CameraRecord:
     why: str = ""
     size: tuple[int, int] = (0, 0)
     given: tuple[Given, ...] = ()
+    may_be_shared: bool = False
 
     def to_report(self, camera_id: int, refined_px: float | None) -> dict[str, Any]:
         """Return the entry of ``report.json``, with the focal length that mapping ended with."""

@@ -41,6 +41,8 @@ MAX_PAIRS_OF_DECISION = 24
 MIN_LOG_EVIDENCE = 3.0
 """For one camera against many: twenty to one."""
 
+UNDECIDED = "pairs do not tell whether images of this size share a camera"
+
 MAX_SPREAD = 1.4
 """Ratio of the ends of an interval that counts as knowledge."""
 
@@ -108,16 +110,14 @@ class CameraVote:
         yield from (keys for keys in sizes.values() if len(keys) > 1)
 
     def _decide_sharing(self, same_size: Sequence[int]) -> None:
-        difference = log_evidence_for_sharing(self.pairs, same_size)
-        if difference is None:
-            return
+        difference = log_evidence_for_sharing(self.pairs, same_size) or 0.0
         if difference >= MIN_LOG_EVIDENCE:
             self.tied |= dict.fromkeys(same_size, min(same_size))
             text = f"one camera for {len(same_size)} images of one size, by the votes of pairs"
         elif -difference >= MIN_LOG_EVIDENCE:
             text = "a camera for each of these images of one size, by the votes of pairs"
         else:
-            text = "pairs do not tell whether images of this size share a camera"
+            text = UNDECIDED
         self.decisions |= dict.fromkeys(same_size, text)
 
     def _record(self, keys: Sequence[int], estimate: FocalEstimate, num_votes: int) -> CameraRecord:
@@ -138,6 +138,7 @@ class CameraVote:
             low_px=estimate.low * longer,
             high_px=estimate.high * longer,
             why="; ".join(text for text in texts if text),
+            may_be_shared=UNDECIDED in texts,
         )
 
 
@@ -187,7 +188,7 @@ def forget_votes(path: Path, records: Mapping[int, CameraRecord]) -> dict[int, C
                     database.update_camera(camera)
             _delete_geometries(database, voted)
     return {
-        key: replace(record, source="guess", low_px=None, high_px=None, why="")
+        key: replace(record, source="guess", low_px=None, high_px=None, why="", may_be_shared=False)
         if record.low_px is not None
         else record
         for key, record in records.items()

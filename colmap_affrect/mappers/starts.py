@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.colmap.camera_vote import apply_records
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.mappers.base import MappingTask
@@ -26,17 +30,20 @@ class Start:
 
     Attributes:
         focals_px: focal lengths by camera id; others are as in the database.
+        records: cameras that images share, in the place of those of the database; empty for these.
         distortion_held: few points of long lenses take any distortion for focal length.
     """
 
     focals_px: Mapping[int, float] = field(default_factory=dict)
+    records: Mapping[int, CameraRecord] = field(default_factory=dict)
     distortion_held: bool = False
 
 
 def starts(task: MappingTask) -> list[Start]:
     """Return where to start from: as the task is, and where cameras are unknown from elsewhere.
 
-    That is: without distortion, and from focal lengths halfway to both ends of what the pairs
+    That is: with one camera for images of one size that may share one, first of all since it is
+    the simplest; without distortion; and from focal lengths halfway to both ends of what the pairs
     allow, for all unknown cameras at once.
     """
     unknown = {
@@ -47,11 +54,31 @@ def starts(task: MappingTask) -> list[Start]:
     found = [Start()]
     if unknown:
         found.append(Start(distortion_held=True))
+    shared = _shared(task.cameras)
+    if shared:
+        found.insert(0, Start(records=shared, distortion_held=True))
     for side in ("low_px", "high_px"):
         moved = dict(_halfway(unknown, side))
         if moved:
             found.append(Start(moved, distortion_held=True))
     return found
+
+
+def _shared(records: Mapping[int, CameraRecord]) -> dict[int, CameraRecord]:
+    """Return the records if images of one size share a camera wherever they may; empty if none."""
+    groups: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for key in sorted(records):
+        if records[key].may_be_shared:
+            groups[records[key].size].append(key)
+    merged = dict(records)
+    for keys in groups.values():
+        same = [merged.pop(key) for key in keys]
+        merged[keys[0]] = replace(
+            same[0],
+            names=tuple(sorted(name for record in same for name in record.names)),
+            focal_px=float(np.exp(np.mean([np.log(record.focal_px) for record in same]))),
+        )
+    return merged if len(merged) < len(records) else {}
 
 
 def _halfway(records: Mapping[int, CameraRecord], side: str) -> Iterator[tuple[int, float]]:
@@ -73,10 +100,12 @@ def started(task: MappingTask, start: Start, path: Path) -> MappingTask:
     """
     task = replace(task, distortion_held=start.distortion_held)
     focals = start.focals_px
-    if not focals:
+    if not focals and not start.records:
         return task
     path.unlink(missing_ok=True)
     copy_database(task.database_path, path)
+    if start.records:
+        apply_records(path, start.records)
     with open_database(path) as database:
         for camera in database.read_all_cameras():
             for index in camera.focal_length_idxs() if camera.camera_id in focals else ():
