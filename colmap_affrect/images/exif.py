@@ -98,6 +98,8 @@ class ExifFocal:
 
 def read_camera_tags(path: Path) -> CameraTags | None:
     """Read the header of a photograph, without its pixels; None if it has no readable one."""
+    if not path.is_file():  # opening a pipe would wait for ever
+        return None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow warns of large photographs and broken EXIF

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -170,3 +171,9 @@ def test_size_is_that_of_the_stored_pixels(tmp_path: Path, suffix: str) -> None:
     bitmap = pycolmap.Bitmap.read(path, as_rgb=False)
     assert found is not None
     assert found.size == (bitmap.width, bitmap.height) == (50, 30)
+
+
+def test_a_pipe_has_no_header_and_is_not_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "pipe.jpg"
+    os.mkfifo(path)
+    assert read_camera_tags(path) is None
