@@ -7,6 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.two_views import PLANAR
+from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES
 from colmap_affrect.geometry.focal_evidence import MatchedPair
 from colmap_affrect.geometry.focal_vote import (
     Ballot,
@@ -224,20 +226,21 @@ def voting_pairs(
             if min(num[image_id] for image_id in pair) < MAX_PAIRS_OF_IMAGE:
                 chosen.append((pair, geometry))
                 num.update(pair)
-        keypoints = {
-            image_id: np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
-            for image_id in num
-        }
-    return [
-        _voting_pair(
-            pair,
-            tuple(cameras[images[image_id]] for image_id in pair),
-            tuple(keypoints[image_id] for image_id in pair),
-            geometry,
-            extracted_px,
-        )
-        for pair, geometry in chosen
-    ]
+
+        @lru_cache(NUM_CACHED_IMAGES)
+        def keypoints(image_id: int) -> NDArray[np.float64]:
+            return np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
+
+        return [
+            _voting_pair(
+                pair,
+                tuple(cameras[images[image_id]] for image_id in pair),
+                tuple(keypoints(image_id) for image_id in pair),
+                geometry,
+                extracted_px,
+            )
+            for pair, geometry in chosen
+        ]
 
 
 def _voting_pair(
