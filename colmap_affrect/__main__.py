@@ -1,8 +1,6 @@
 """``python -m colmap_affrect``."""
 
-import sys
-
-from colmap_affrect.cli import main
+from colmap_affrect.cli import main_of_process
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main_of_process()

@@ -29,7 +29,8 @@ BYTES_OF_EMPTY_DATABASE = 1 << 19
 def open_database(path: Path) -> Iterator[pycolmap.Database]:
     """Open a database and close it again; pycolmap's failures become errors of one line."""
     try:
-        database = pycolmap.Database.open(path)
+        # A Ctrl-C while pycolmap converts a Path would become a TypeError.
+        database = pycolmap.Database.open(str(path))
     except RuntimeError as error:
         raise DatabaseError(
             f"{path}: not a usable COLMAP database, in use by another program, or the disk is "
