@@ -69,6 +69,7 @@ except colmap_affrect.AffrectError as error:
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "call",
     [

@@ -10,6 +10,8 @@ import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -29,6 +31,12 @@ COPY_STAGES = ("copy", "verify", "map")
 """Of a folder in which another program's database is mapped."""
 FORMAT_VERSION = 5
 """Of ``config.toml``: counts up when a stage records other options than before."""
+
+
+@lru_cache(maxsize=2)
+def _parsed(record: str) -> dict[str, Any]:
+    """Parse a record of options, which a run reads many times."""
+    return tomllib.loads(record)
 
 
 class Workspace:
@@ -122,7 +130,7 @@ class Workspace:
         if not self.config.exists():
             return {}
         try:
-            record = tomllib.loads(self.config.read_text(encoding="utf-8"))
+            record = deepcopy(_parsed(self.config.read_text(encoding="utf-8")))
         except (ValueError, RecursionError) as error:
             raise WorkspaceError(f"{self.config}: damaged ({error}); remove it") from error
         if record.pop("format_version", None) != FORMAT_VERSION:

@@ -96,6 +96,7 @@ def num_inliers(
     return len(geometry.inlier_matches)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("planar", [False, True])
 def test_frames_decide_where_positions_do_not(planar: bool) -> None:
     # With a plane the epipolar geometry is arbitrary: only its homography can agree.
@@ -140,6 +141,7 @@ def test_homography_is_judged_where_epipolar_lines_are_not_significant(frames_ag
     assert len(estimated(min_significance=30.0, min_inlier_ratio=0.13).inlier_matches) == 0
 
 
+@pytest.mark.long
 def test_database_without_shapes_needs_more_inliers() -> None:
     frames = weak_pair(frames_agree=True)
     assert num_inliers(frames, min_significance=5.0) > 0

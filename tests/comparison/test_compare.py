@@ -328,6 +328,7 @@ class Names(Progress):
             yield advance
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_page")
 def test_recipes_are_guided_seed_by_seed(
     scene, options, compared, tmp_path, monkeypatch: pytest.MonkeyPatch
@@ -350,6 +351,7 @@ def test_recipes_are_guided_seed_by_seed(
     assert not Workspace(out / method.folder).guided.exists()
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_page")
 def test_device_reaches_matching(scene, options, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By way of the request that a method's process reads."""

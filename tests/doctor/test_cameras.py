@@ -88,6 +88,7 @@ def test_images_with_a_camera_each_that_share_one(tmp_path: Path) -> None:
     assert "--focal-vote always" in found.advice
 
 
+@pytest.mark.long
 def test_images_that_share_a_camera_and_should_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

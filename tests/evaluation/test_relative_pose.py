@@ -112,6 +112,7 @@ def test_threshold_is_in_pixels_of_the_mean_focal_length() -> None:
     assert counts[1] > 280
 
 
+@pytest.mark.long
 def test_hundred_thousand_iterations_find_what_a_thousand_do_not() -> None:
     points1, points2 = matches(120)
     points2[30:] = np.random.default_rng(5).uniform(0, 600, (90, 2))

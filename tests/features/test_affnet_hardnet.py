@@ -302,6 +302,7 @@ def test_hessian_finds_blobs_at_pixel_centres_with_frames_of_six_sigma(
     assert_allclose(found.scales[order], MEASUREMENT_SIGMAS * sigmas_px, rtol=0.12)
 
 
+@pytest.mark.long
 def test_keynet_centres_are_unbiased_on_every_level(weights: dict[str, Path]) -> None:
     rng = np.random.default_rng(3)
     corners = 90.0 * np.stack(np.meshgrid(np.arange(1, 8), np.arange(1, 7)), -1).reshape(-1, 2)

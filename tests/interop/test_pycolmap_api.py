@@ -84,6 +84,7 @@ def test_the_documented_example_of_pycolmap_registers_the_scene(
     assert pycolmap.Reconstruction(output_path).num_reg_images() == len(NAMES)
 
 
+@pytest.mark.long
 def test_database_is_that_of_a_run(photos: Path, tmp_path: Path) -> None:
     colmap_affrect.extract_features(str(tmp_path / "a.db"), str(photos))
     colmap_affrect.match_exhaustive(str(tmp_path / "a.db"))

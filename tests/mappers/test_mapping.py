@@ -108,6 +108,7 @@ def reconstruct(path: Path, mapper: Mapper) -> tuple[list[ModelSummary], int]:
     return found, sum(shown)
 
 
+@pytest.mark.long
 def test_global_mapper_registers_all_images_in_place_and_repeatably(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     truth = synthesize(path, 5)

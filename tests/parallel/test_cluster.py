@@ -119,6 +119,7 @@ def test_cluster_that_loses_a_worker_leaves_what_a_local_run_leaves(
     assert hdf5_contents(tmp_path / "cluster") == hdf5_contents(tmp_path / "local")
 
 
+@pytest.mark.long
 def test_files_that_workers_do_not_see_are_sent(tmp_path: Path, photos: Path, address: str) -> None:
     for name in ("a.png", "b c.png", "side/d.png"):  # side/č.png has none
         mask = np.zeros((240, 320), np.uint8)

@@ -187,6 +187,7 @@ def inspect(extractor: ImageExtractor, path: Path, output_path: Path) -> Inspect
 # --- The plan as data
 
 
+@pytest.mark.long
 def test_json_describes_a_known_plan(tmp_path: Path, photo: Path) -> None:
     first, second = affine_warp(2.5, 0.6, (30, 20, 60, 45), 4), homography_warp(7)
     third = affine_warp(1.9, 1.1, (30, 20, 60, 45), 4)

@@ -216,6 +216,7 @@ def test_two_images_make_a_model(tmp_path, run_images) -> None:
     assert ended.report["points3D"] > 100
 
 
+@pytest.mark.long
 def test_tiny_images_are_no_obstacle(trio, run_images) -> None:
     gray = fifth_photograph()
     sizes = {"1x1": (1, 1), "1 high": (1, 320), "1 wide": (240, 1), "7": (7, 7), "31": (31, 31)}
@@ -279,6 +280,7 @@ def test_same_names_in_folders_are_different_images(tmp_path, run_images) -> Non
     assert len(set(keypoints.values())) == 3
 
 
+@pytest.mark.long
 def test_same_photograph_twice_registers_both(trio, run_images) -> None:
     (trio / "copy.png").write_bytes((trio / "a.png").read_bytes())
     ended = run_images(trio)

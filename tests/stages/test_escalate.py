@@ -351,6 +351,7 @@ def test_again_does_nothing(
     same_state(workspace, climbed[0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("where", ["write_images_and_keypoints", "verify_new"])
 def test_killed_run_goes_on_to_the_same_result(
     before: Workspace,
@@ -372,6 +373,7 @@ def test_killed_run_goes_on_to_the_same_result(
     same_state(workspace, climbed[0])
 
 
+@pytest.mark.long
 def test_overwrite_climbs_anew_to_the_same_result(
     climbed: tuple[Workspace, StageReport], tmp_path: Path
 ) -> None:

@@ -211,6 +211,7 @@ def mapper() -> object:
     return MAPPERS.make(IncrementalOptions(max_num_attempts=1))
 
 
+@pytest.mark.long
 def test_models_of_guided_pairs_are_adjusted_by_exact_matches(guided: Context) -> None:
     map_images(guided, mapper())
     model = pycolmap.Reconstruction(guided.workspace.sparse / "0")
@@ -245,6 +246,7 @@ def test_guided_matches_are_the_inliers_that_came_by_guiding(
         assert {*map(tuple, rows.tolist())} == new
 
 
+@pytest.mark.long
 def test_images_that_are_missing_are_guided_and_the_first_model_may_stay(
     context: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -265,6 +267,7 @@ def test_images_that_are_missing_are_guided_and_the_first_model_may_stay(
     assert not list(context.workspace.path.glob("sparse.*"))
 
 
+@pytest.mark.long
 def test_model_of_guided_pairs_stays_where_it_agrees_better(
     context: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -280,6 +283,7 @@ def test_model_of_guided_pairs_stays_where_it_agrees_better(
     assert not list(context.workspace.path.glob("sparse.*"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("killed", ["guide", "agreement"])
 def test_run_that_is_killed_beside_its_first_models_goes_on_to_compare_them(
     context: Context, monkeypatch: pytest.MonkeyPatch, killed: str

@@ -359,6 +359,7 @@ def test_device_reaches_matching(
     assert devices == ["auto", "cpu"]
 
 
+@pytest.mark.long
 def test_overwrite_redoes_a_stage_and_run_goes_on_from_it(
     finished: tuple[Workspace, ReconstructionReport], copy: Workspace, call: Call
 ) -> None:
