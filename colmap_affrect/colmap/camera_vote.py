@@ -27,6 +27,7 @@ from colmap_affrect.geometry.focal_vote import (
     evidence_for_one,
 )
 from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.progress import SILENT, Advance, Progress
 
 MIN_NUM_INLIERS = 20
 """Of a pair that votes; a fundamental matrix of few more than it needs says nothing else."""
@@ -76,8 +77,8 @@ class CameraVote:
     tied: dict[int, int] = field(default_factory=dict)
     decisions: dict[int, str] = field(default_factory=dict)
 
-    def decide(self) -> dict[int, CameraRecord]:
-        """Return the records as they are after the vote.
+    def decide(self, progress: Progress = SILENT) -> dict[int, CameraRecord]:
+        """Return the records as they are after the vote; progress counts the pairs.
 
         Cameras that turn out to be the same are one record, of the first of them.
         """
@@ -91,7 +92,8 @@ class CameraVote:
             for key, record in self.records.items()
             if key not in self.tied
         }
-        ballots = _ballots(self.pairs, self.tied, known)
+        with progress.stage("cameras", len(self.pairs), "pairs") as advance:
+            ballots = _ballots(self.pairs, self.tied, known, advance)
         num_votes = Counter(camera for item in ballots for camera in set(item.cameras))
         outcome = count(ballots, sorted(set(self.tied.values())))
         records = {key: record for key, record in self.records.items() if key in known}
@@ -160,13 +162,22 @@ def log_evidence_for_sharing(pairs: Sequence[VotingPair], cameras: Collection[in
 
 
 def _ballots(
-    pairs: Sequence[VotingPair], tied: Mapping[int, int], known: Mapping[int, float]
+    pairs: Sequence[VotingPair],
+    tied: Mapping[int, int],
+    known: Mapping[int, float],
+    advance: Advance | None = None,
 ) -> list[Ballot]:
     def ask(pair: VotingPair) -> Ballot | None:
         first, second = (tied.get(camera, camera) for camera in pair.cameras)
         return ballot(pair.matched, (first, second), known)
 
-    return [found for found in map_ordered(ask, pairs, available_cores()) if found]
+    ballots = []
+    for found in map_ordered(ask, pairs, available_cores()):
+        if found:
+            ballots.append(found)
+        if advance:
+            advance(1)
+    return ballots
 
 
 def needs_vote(records: Mapping[int, CameraRecord]) -> bool:

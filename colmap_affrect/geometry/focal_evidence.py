@@ -48,7 +48,7 @@ nuisances of both images."""
 NUM_PARAMETERS = 12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MatchedPair:
     """Inliers of a pair with a fundamental matrix.
 

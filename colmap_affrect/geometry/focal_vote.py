@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -117,11 +118,13 @@ def ballot(
     if second is not None:
         evidence = log_evidence(pair, FOCALS, np.full_like(FOCALS, second))
         return Ballot((cameras[0], cameras[0]), evidence)
-    return Ballot(cameras, _table(pair, FOCALS[::STEP]))
+    return Ballot(cameras, _table(pair))
 
 
-def _table(pair: MatchedPair, focals: Array) -> Array:
+@lru_cache(maxsize=256)  # who shares a camera is asked first
+def _table(pair: MatchedPair) -> Array:
     """Return the evidence for two cameras; hopeless candidates get what the best of them has."""
+    focals = FOCALS[::STEP]
     grid = np.stack(np.meshgrid(focals, focals, indexing="ij"), axis=2)
     table = np.full(grid.shape[:2], np.nan)
     table[::2, ::2] = log_evidence(

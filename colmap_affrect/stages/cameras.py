@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from colmap_affrect.colmap.camera_records import (
@@ -20,6 +19,7 @@ from colmap_affrect.colmap.camera_vote import (
     voting_pairs,
 )
 from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import is_copy
@@ -43,17 +43,14 @@ def choose_cameras(context: Context, *, may_share: bool = True) -> StageReport:
     copied = is_copy(workspace)
     extracted_px = None if copied else recorded_extraction(workspace).max_image_size_px
     may_share = may_share and not copied and Inputs.recorded(workspace).cameras.mode == "auto"
-    records = read_camera_records(workspace.cameras)
-    num = sum(record.source == "guess" for record in records.values())
-    with context.progress.stage("cameras", num, "cameras") as advance:
-        hold_vote(
-            workspace.database,
-            workspace.cameras,
-            recorded_verification(workspace),
-            extracted_px,
-            may_share=may_share,
-            advance=advance,
-        )
+    hold_vote(
+        workspace.database,
+        workspace.cameras,
+        recorded_verification(workspace),
+        extracted_px,
+        may_share=may_share,
+        progress=context.progress,
+    )
     records = read_camera_records(workspace.cameras)
     found = sum(record.source == "pairs" for record in records.values())
     return StageReport("cameras", time.perf_counter() - start, found, len(records) - found)
@@ -66,7 +63,7 @@ def hold_vote(
     extracted_px: int | None = None,
     *,
     may_share: bool,
-    advance: Callable[[int], None] | None = None,
+    progress: Progress = SILENT,
 ) -> None:
     """Vote on the cameras of a database whose pairs are verified, unless that was done.
 
@@ -80,7 +77,7 @@ def hold_vote(
         verification: options.
         extracted_px: longest side that photographs were shrunk to before extraction, if any.
         may_share: whether cameras of images of one size may turn out to be the same.
-        advance: called with the number of cameras that were decided.
+        progress: counts the pairs that vote.
     """
     records = read_camera_records(records_path)
     if needs_vote(records):
@@ -88,12 +85,10 @@ def hold_vote(
         verify(database_path, verification, extracted_px)
         unknown = {key for key, record in records.items() if record.source == "guess"}
         pairs = voting_pairs(database_path, unknown, extracted_px)
-        records = CameraVote(records, pairs, may_share).decide()
+        records = CameraVote(records, pairs, may_share).decide(progress)
         write_camera_records(records_path, records)
         for line in notable_lines(r for r in records.values() if r.low_px is not None):
             logger.info("cameras: %s", line)
-        if advance:
-            advance(len(unknown))
     if any(record.low_px is not None for record in records.values()):
         apply_records(database_path, records)
         verify(database_path, verification, extracted_px)

@@ -167,7 +167,7 @@ def test_a_killed_vote_is_gone_on_with(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(CameraVote, "decide", lambda _: decided)
+        patched.setattr(CameraVote, "decide", lambda *_: decided)
         patched.setattr(stage, "apply_records", killed)
         with pytest.raises(KeyboardInterrupt):
             vote(path)
