@@ -273,7 +273,7 @@ def map_and_report(
         pair_levels={} if copied else pair_levels(context),
         guided=guided_counts(context),
         cameras=tuple(
-            record.to_report(camera_id, models[0].focals_px.get(camera_id) if models else None)
+            record.to_report(camera_id, models[0] if models else None)
             for camera_id, record in read_camera_records(workspace.cameras).items()
         ),
         extended=tuple(before),

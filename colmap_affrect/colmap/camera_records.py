@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from colmap_affrect.errors import WorkspaceError
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.report import ModelSummary
 
 Source = Literal["given", "exif", "exif-rescaled", "pairs", "guess"]
 """By the user; by EXIF as it is, or scaled to a photograph that was shrunk; by the votes of
@@ -58,9 +59,10 @@ class CameraRecord:
     given: tuple[Given, ...] = ()
     may_be_shared: bool = False
 
-    def to_report(self, camera_id: int, refined_px: float | None) -> dict[str, Any]:
-        """Return the entry of ``report.json``, with the focal length that mapping ended with."""
+    def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
+        """Return the entry of ``report.json``, with the focal length that a model ended with."""
         longer = max(self.size)
+        used = next((name for name in self.names if model and name in model.focals_px), None)
         has_spread = self.low_px is not None and self.high_px is not None
         return {
             "id": camera_id,
@@ -69,7 +71,8 @@ class CameraRecord:
             "source": self.source,
             "focal_px": self.focal_px,
             "focal_longer_sides": self.focal_px / longer if longer else None,
-            "refined_px": refined_px,
+            "refined_px": model.focals_px[used] if model and used else None,
+            "rival_px": model.rival_focals_px.get(used) if model and used else None,
             "spread_px": [self.low_px, self.high_px] if has_spread else None,
             "why": self.why,
         }

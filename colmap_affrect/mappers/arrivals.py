@@ -26,9 +26,12 @@ MIN_THREE_VIEW_POINTS = 12
 
 def write_arrivals(model: MappedModel, folder: Path) -> None:
     """Keep what :func:`read_arrivals` needs; nothing where COLMAP's model says it all."""
-    if model.bridges or model.taken_out:
-        bridges = [dataclasses.asdict(bridge) for bridge in model.bridges]
-        values = {"bridges": bridges, "taken_out": dict(model.taken_out)}
+    if model.bridges or model.taken_out or model.rival_focals_px:
+        values = {
+            "bridges": [dataclasses.asdict(bridge) for bridge in model.bridges],
+            "taken_out": dict(model.taken_out),
+            "rival_focals_px": dict(model.rival_focals_px),
+        }
         replace_text(folder / FILE_NAME, json.dumps(values, indent=2, ensure_ascii=False) + "\n")
 
 
@@ -45,9 +48,12 @@ def read_arrivals(reconstruction: pycolmap.Reconstruction, folder: Path) -> Mapp
         values = json.loads(path.read_text(encoding="utf-8"))
         bridges = TypeAdapter(tuple[Bridge, ...]).validate_python(values["bridges"])
         taken_out = TypeAdapter(dict[str, str]).validate_python(values["taken_out"])
+        rivals = TypeAdapter(dict[str, tuple[float, float]]).validate_python(
+            values["rival_focals_px"]
+        )
     except (OSError, ValueError, KeyError, TypeError, ValidationError) as error:
         raise StoreError(f"{path}: damaged") from error
-    return MappedModel(reconstruction, bridges, taken_out)
+    return MappedModel(reconstruction, bridges, taken_out, rivals)
 
 
 def arrivals(model: MappedModel, task: MappingTask) -> dict[str, Arrival]:

@@ -20,7 +20,14 @@ from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.last_adjustment import MIN_NUM_TRACKS, adjust_last
 from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
-from colmap_affrect.mappers.starts import Start, runaways, started, starts
+from colmap_affrect.mappers.starts import (
+    Start,
+    focals_px,
+    rival_focals_px,
+    runaways,
+    started,
+    starts,
+)
 from colmap_affrect.project.report import ModelSummary
 
 ATTEMPT_SEED_STEP = 1_000_003
@@ -83,8 +90,11 @@ def map_database(
                 shutil.rmtree(raw)
                 if not task.extend:  # whose images stay, whatever they are
                     found = [m for m in (without_impossible(model, kept) for model in found) if m]
-                best = better(kept, best, sorted(found, key=_size, reverse=True))
+                found = sorted(found, key=_size, reverse=True)
+                attempts.judge(found)
+                best = better(kept, best, found)
             (partial / "started.db").unlink(missing_ok=True)
+        best = attempts.with_rivals(best)
         if not task.extend:
             _adjust_weak(mapper, task, best)
         shutil.rmtree(sparse_path, ignore_errors=True)
@@ -113,6 +123,7 @@ class _Attempts:
         self._most = self._limit + MAX_HOLDING_ATTEMPTS
         self._done = 0
         self._ran: set[int] = set()
+        self._focals: list[tuple[float, dict[str, float]]] = []
 
     def go_on(self, best: list[MappedModel]) -> bool:
         """Tell whether there is another attempt, after the best models so far."""
@@ -126,6 +137,18 @@ class _Attempts:
         if not best or _size(best[0])[0] < min(self._num_images, LARGE_MODEL):
             return True
         return self._done < len(self._starts) and not _is_well_tied(best[0].reconstruction)
+
+    def judge(self, found: list[MappedModel]) -> None:
+        """Keep how well the largest model of an attempt agrees with the pairs, and its focals."""
+        if found and len(self._starts) > 1:
+            model = found[0].reconstruction
+            self._focals.append((graph_of(self._task).score_of(model), focals_px(model)))
+
+    def with_rivals(self, best: list[MappedModel]) -> list[MappedModel]:
+        """Return models whose largest one knows the focal lengths of those as good as it."""
+        if not self._focals:
+            return best
+        return [replace(best[0], rival_focals_px=rival_focals_px(self._focals)), *best[1:]]
 
     def next(
         self, database_path: Path, output_path: Path, show: Callable[[int], None]
@@ -205,8 +228,6 @@ def summarize(mapped: MappedModel, task: MappingTask) -> ModelSummary:
         doubts=doubts.model,
         arrivals=arrivals(mapped, task),
         taken_out=dict(mapped.taken_out),
-        focals_px={
-            key: model.cameras[key].mean_focal_length()
-            for key in {model.images[image_id].camera_id for image_id in model.reg_image_ids()}
-        },
+        focals_px=focals_px(model),
+        rival_focals_px=dict(mapped.rival_focals_px),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -18,6 +18,9 @@ from colmap_affrect.mappers.base import MappingTask
 
 MIN_STEP = 1.15
 """Starts that are nearer to one another end in the same model."""
+
+MIN_SHARE_OF_RIVAL = 0.97
+"""Of the best attempt's agreement with the pairs; that of two seeds differs by as much."""
 
 MAX_EXCESS = 1.5
 """How far beyond its interval a focal length may be refined; a camera that few points see goes
@@ -122,6 +125,30 @@ def runaways(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:
         for key, record in task.cameras.items()
         if key in used and not is_within(model.cameras[key].mean_focal_length(), record)
     }
+
+
+def focals_px(model: pycolmap.Reconstruction) -> dict[str, float]:
+    """Return the focal length of the camera of each registered image."""
+    images = (model.images[image_id] for image_id in model.reg_image_ids())
+    return {image.name: model.cameras[image.camera_id].mean_focal_length() for image in images}
+
+
+def rival_focals_px(
+    attempts: Sequence[tuple[float, Mapping[str, float]]],
+) -> dict[str, tuple[float, float]]:
+    """Return lowest and highest focal length of images for which the best attempts differ.
+
+    Args:
+        attempts: how well each agrees with the verified pairs, and its focal lengths by image.
+    """
+    least = MIN_SHARE_OF_RIVAL * max(score for score, _ in attempts)
+    rivals: dict[str, list[float]] = defaultdict(list)
+    for score, focals in attempts:
+        if score >= least:
+            for name, focal in focals.items():
+                rivals[name].append(focal)
+    spreads = {name: (min(focals), max(focals)) for name, focals in sorted(rivals.items())}
+    return {name: spread for name, spread in spreads.items() if spread[1] > MIN_STEP * spread[0]}
 
 
 def is_within(focal_px: float, record: CameraRecord) -> bool:

@@ -111,7 +111,9 @@ class ModelSummary:
         doubts: reasons to doubt the model as a whole.
         arrivals: how each image came in.
         taken_out: images that were certainly wrong, with the reason.
-        focals_px: focal length of each camera by its id.
+        focals_px: focal length of each image's camera.
+        rival_focals_px: lowest and highest of models that agree as well with the pairs, of images
+            for which these differ.
     """
 
     registered_names: tuple[str, ...]
@@ -122,7 +124,8 @@ class ModelSummary:
     doubts: tuple[str, ...] = ()
     arrivals: dict[str, Arrival] = dataclasses.field(default_factory=dict)
     taken_out: dict[str, str] = dataclasses.field(default_factory=dict)
-    focals_px: dict[int, float] = dataclasses.field(default_factory=dict)
+    focals_px: dict[str, float] = dataclasses.field(default_factory=dict)
+    rival_focals_px: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
     @property
     def is_trustworthy(self) -> bool:
@@ -276,6 +279,10 @@ class ReconstructionReport:
             lines += [f"cameras     {', '.join(f'{n} {source}' for source, n in sources)}"]
         if self.models:
             model = self.models[0]
+            lines += _some(
+                f"            {name}: focal lengths from {low:.0f} to {high:.0f} px fit as well"
+                for name, (low, high) in model.rival_focals_px.items()
+            )
             lines += _some(
                 f"came in     {name} {item.text()}"
                 for name, item in model.arrivals.items()

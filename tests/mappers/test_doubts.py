@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -208,10 +209,14 @@ def test_how_images_came_in_is_kept_beside_the_model(tmp_path: Path) -> None:
     model, task = scene(tmp_path)
     name = last(model).name
     bridge = Bridge(("a.jpg", name), (name,), 32, 36, 0.031)
-    mapped = MappedModel(model.reconstruction, (bridge,), {"č.jpg": "only 3 points hold it"})
+    mapped = MappedModel(
+        model.reconstruction, (bridge,), {"č.jpg": "only 3 points hold it"}, {name: (700.0, 900.0)}
+    )
     write_arrivals(mapped, tmp_path)
     read = read_arrivals(model.reconstruction, tmp_path)
-    assert (read.bridges, read.taken_out) == (mapped.bridges, mapped.taken_out)
+    assert dataclasses.replace(read, reconstruction=None) == dataclasses.replace(
+        mapped, reconstruction=None
+    )
     found = arrivals(read, task)
     assert found.pop(name) == Arrival("bridged", "a.jpg", 32, 36, 0.031)
     assert set(found.values()) == {Arrival("tracks")}

@@ -12,6 +12,8 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.mappers import attempts
+from colmap_affrect.mappers import starts as module
+from colmap_affrect.mappers.arrivals import read_arrivals
 from colmap_affrect.mappers.attempts import MAX_HOLDING_ATTEMPTS, map_database
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.incremental import IncrementalOptions
@@ -19,6 +21,7 @@ from colmap_affrect.mappers.starts import (
     MAX_EXCESS,
     Start,
     is_within,
+    rival_focals_px,
     runaways,
     started,
     starts,
@@ -160,6 +163,28 @@ def test_unknown_cameras_are_started_from_all_sides_unless_all_images_are_tied_w
     missing = Recorder(lambda _: without(scene, 1), num=3)
     mapped(scene, tmp_path, missing, records(scene, KNOWN))
     assert len(missing.focals) == 3
+
+
+def test_rivals_agree_as_well_with_the_pairs_and_differ_by_more_than_a_step() -> None:
+    best, worse = {"a": 1000.0, "b": 500.0, "c": 800.0}, {"a": 100.0}
+    rival, other = {"a": 1300.0, "b": 550.0}, {"a": 900.0, "b": 500.0}
+    attempts = [(0.96, worse), (1.0, best), (0.98, rival), (0.97, other)]
+    assert rival_focals_px(attempts) == {"a": (900.0, 1300.0)}
+
+
+def test_focal_lengths_that_pairs_cannot_tell_apart_are_kept_beside_the_model(
+    scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(attempts, "MIN_NUM_TRACKS", 1_000)
+    monkeypatch.setattr(module, "MIN_SHARE_OF_RIVAL", 0.0)
+    focals = iter([1280.0, 1360.0, 1150.0, 1200.0])
+    mapper = Recorder(lambda _: without(scene, 0, c2=next(focals)))
+    cameras = {**records(scene, replace(KNOWN, focal_px=TRUE_FOCAL)), 2: VAGUE}
+    mapped(scene, tmp_path, mapper, cameras)
+    folder = tmp_path / "sparse" / "0"
+    (name,) = (image.name for image in scene[1].images.values() if image.camera_id == 2)
+    read = read_arrivals(pycolmap.Reconstruction(folder), folder)
+    assert read.rival_focals_px == {name: (1150.0, 1360.0)}
 
 
 def test_a_camera_that_ran_away_is_held(
