@@ -335,7 +335,7 @@ def recipes(options: argparse.Namespace) -> int:
         return EXIT_OK
     for name in recipe_names():
         recipe = load_recipe(name)
-        needs = list(recipe.extraction.weights)
+        needs = list(recipe.weights)
         needs += ["depth"] if recipe.extraction.uses_depth else []
         print(f"{name:26s} {recipe.summary}")
         print(f"{'':26s} needs {', '.join(needs) or 'nothing'}")
