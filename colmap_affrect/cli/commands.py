@@ -337,8 +337,8 @@ def recipes(options: argparse.Namespace) -> int:
         recipe = load_recipe(name)
         needs = list(recipe.weights)
         needs += ["depth"] if recipe.extraction.uses_depth else []
-        print(f"{name:26s} {recipe.summary}")
-        print(f"{'':26s} needs {', '.join(needs) or 'nothing'}")
+        print(f"{name:28s} {recipe.summary}")
+        print(f"{'':28s} needs {', '.join(needs) or 'nothing'}")
     return EXIT_OK
 
 
