@@ -141,12 +141,21 @@ class Recipe:
             options.guided,
             options.mapping,
         )
+        try:
+            recipe.matching.require_extractor(recipe.extraction.features.name)
+        except OptionError as error:
+            raise OptionError(f"{where}: {error}") from error
         if recipe.mapping:
             try:  # refuses wrong ones now, not when mapping begins
                 recipe.mapper_options("sparse")
             except OptionError as error:
                 raise OptionError(f"{where}: mapping: {error}") from error
         return recipe
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Keys of the files of weights of all parts, sorted."""
+        return tuple(sorted({*self.extraction.weights, *self.matching.weights}))
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all sections with all options, as :meth:`from_mapping` takes them."""

@@ -35,3 +35,20 @@ def write_random_weights(folder: Path) -> dict[str, Path]:
     for name, network in networks.items():
         torch.save({"state_dict": network.state_dict()}, folder / name)
     return {name: folder / name for name in networks}
+
+
+def write_comparing_lightglue(
+    path: Path, kornia_features: str = "sift", sharpness: float = 12.0
+) -> Path:
+    """Write a LightGlue whose layers change nothing: it compares the descriptors it is given."""
+    conf = feature.LightGlue.features[kornia_features]
+    network = feature.LightGlue(features=None, **{**conf, "weights": None})
+    state = {name: torch.zeros_like(value) for name, value in network.state_dict().items()}
+    for name, value in state.items():
+        if name.endswith(("input_proj.weight", "final_proj.weight")):
+            factor = sharpness if "final" in name else 1.0
+            value[: value.shape[1]] = factor * torch.eye(*value.shape)[: value.shape[1]]
+        if name.endswith("matchability.bias"):
+            value.fill_(9.0)
+    torch.save(state, path)
+    return path

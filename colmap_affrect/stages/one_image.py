@@ -27,7 +27,7 @@ from colmap_affrect.data import (
     RectificationPlan,
     in_mask,
 )
-from colmap_affrect.errors import DepthError, ImageError, OptionError, WeightsError
+from colmap_affrect.errors import DepthError, ImageError, OptionError
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
 from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.geometry.affine import transform_frames
@@ -45,7 +45,7 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, Rectifier, RectifierInputs
 from colmap_affrect.rectifiers.execute import extract_rectified
-from colmap_affrect.stages.context import Resources
+from colmap_affrect.stages.context import Resources, require_same_files
 
 MIN_RECTIFIABLE_PX = 32
 """Images with a shorter side are not rectified: no block would see its surroundings."""
@@ -355,12 +355,7 @@ def _prepared_elsewhere(
 ) -> ImageExtractor:
     """Prepare a recipe in another process; depth maps of networks are not kept from there."""
     extractor = prepare(options, replace(resources, depth_cache_path=None))
-    for key, path in extractor.weights.items():
-        if file_sha256(path) != digests[key]:
-            raise WeightsError(
-                f"{path}: is another file than {key} on the machine that leads the work; give "
-                "both the same"
-            )
+    require_same_files(extractor.weights, digests)
     return extractor
 
 

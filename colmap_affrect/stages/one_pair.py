@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.features.weights import resolve
+from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.matchers.base import (
     MATCHERS,
     ImageFeatures,
@@ -28,7 +28,7 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import ordered_for_reuse
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.stores import FeatureStore, PairMatches
-from colmap_affrect.stages.context import Resources
+from colmap_affrect.stages.context import Resources, require_same_files
 
 CACHE_BYTES = 1 << 29
 """Memory that prepared images may take in a process."""
@@ -204,11 +204,13 @@ class CachedMatcher:
         features there will be to compare.
         """
         resources = resources or Resources()
+        options.require_extractor(extractor)
         self._store, self._options, self._level = store, options, level
         self._max_num_features, self._num_similarities = max_num_features, num_similarities
         self._resources, self._extractor = resources, extractor
         weights = resolve(options.weights, resources.weights_path)
         context = MatcherContext(weights, resources.device, num_similarities)
+        self._weights = weights
         self._matcher = MATCHERS.make(options, context)
         self._images = ImageCache(lambda name: self._prepare(self.read(name)))
 
@@ -220,7 +222,8 @@ class CachedMatcher:
             "resources": self._resources,
             "extractor": self._extractor,
         }
-        return _rebuilt, (self._store, self._options, given)
+        digests = {key: file_sha256(path) for key, path in self._weights.items()}
+        return _rebuilt, (self._store, self._options, given, digests)
 
     def __call__(self, task: PairTask) -> PairMatches:
         """Match by the features that came with the task, or by those in the store."""
@@ -259,5 +262,9 @@ class CachedMatcher:
         return self._images.get(name)
 
 
-def _rebuilt(store: FeatureStore, options: MatcherOptions, given: dict[str, Any]) -> CachedMatcher:
-    return CachedMatcher(store, options, **given)
+def _rebuilt(
+    store: FeatureStore, options: MatcherOptions, given: dict[str, Any], digests: Mapping[str, str]
+) -> CachedMatcher:
+    matcher = CachedMatcher(store, options, **given)
+    require_same_files(matcher._weights, digests)
+    return matcher
