@@ -79,8 +79,8 @@ def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> No
 
 
 def test_escalation_climbs_from_no_warps_to_all_tilts() -> None:
-    levels = load_recipe("on-demand").extraction.rectifiers
-    assert [level.name for level in levels] == [
+    levels = load_recipe("on-demand").extraction.levels
+    assert [level.rectifier.name for level in levels] == [
         "identity",
         "dense-shapes",
         "affnet-shapes",

@@ -45,8 +45,9 @@ def iterate_matches(
     resources: Resources | None = None,
     executor: Executor | None = None,
     extractor: str = "",
+    base: int = 0,
 ) -> Generator[PairMatches, None, None]:
-    """Match pairs by the features of the images themselves and those of one level.
+    """Match pairs by the features of one level and those of the images themselves, in its base.
 
     Pairs come in an order in which an image, once read, stays in memory for most of its pairs.
     Workers that do not see the file of features get those of each pair; ``extractor`` is the name
@@ -66,6 +67,7 @@ def iterate_matches(
         num_similarities=num_similarities,
         resources=resources or Resources(),
         extractor=extractor,
+        base=base,
     )
     files = [store.path]
     is_shared = executor.sees(files)
@@ -196,10 +198,11 @@ class CachedMatcher:
         num_similarities: float = 0,
         resources: Resources | None = None,
         extractor: str = "",
+        base: int = 0,
     ) -> None:
         """Name the features and build the matcher.
 
-        The features of a level come together with those of level 0; ``max_num_features`` are those
+        The features of a level come together with those of its base; ``max_num_features`` are those
         of the largest responses, None takes all. ``num_similarities`` is about how many pairs of
         features there will be to compare.
         """
@@ -207,7 +210,7 @@ class CachedMatcher:
         options.require_extractor(extractor)
         self._store, self._options, self._level = store, options, level
         self._max_num_features, self._num_similarities = max_num_features, num_similarities
-        self._resources, self._extractor = resources, extractor
+        self._resources, self._extractor, self._base = resources, extractor, base
         weights = resolve(options.weights, resources.weights_path)
         context = MatcherContext(weights, resources.device, num_similarities)
         self._weights = weights
@@ -221,6 +224,7 @@ class CachedMatcher:
             "num_similarities": self._num_similarities,
             "resources": self._resources,
             "extractor": self._extractor,
+            "base": self._base,
         }
         digests = {key: file_sha256(path) for key, path in self._weights.items()}
         return _rebuilt, (self._store, self._options, given, digests)
@@ -244,7 +248,7 @@ class CachedMatcher:
 
     def read(self, name: str) -> StoredFeatures:
         """Read the features of an image."""
-        indices = self._store.level_indices(name, self._level)
+        indices = self._store.level_indices(name, self._level, self._base)
         features = self._store.read(name).select(indices)
         if self._max_num_features is not None:
             order = np.argsort(-features.responses, kind="stable")
