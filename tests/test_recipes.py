@@ -12,7 +12,13 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.features.shapes.second_moment import SecondMomentOptions
 from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.matchers.nearest import NearestOptions
-from colmap_affrect.recipes import ExtractionOptions, load_recipe, recipe_folder, recipe_names
+from colmap_affrect.recipes import (
+    ExtractionOptions,
+    Recipe,
+    load_recipe,
+    recipe_folder,
+    recipe_names,
+)
 from colmap_affrect.rectifiers.base import CoverOptions
 from colmap_affrect.rectifiers.dense import DenseShapesOptions
 from colmap_affrect.rectifiers.whole_image import AffNetShapesOptions
@@ -86,6 +92,29 @@ def test_escalation_climbs_from_no_warps_to_all_tilts() -> None:
         "affnet-shapes",
         "asift",
     ]
+
+
+def test_levels_build_on_the_lowest_one_with_their_features() -> None:
+    recipe = load_recipe("on-demand-learned")
+    levels = recipe.extraction.levels
+    assert [level.base for level in levels] == [0, 0, 2, 0, 2]
+    assert [level.max_image_size_px for level in levels] == [2400, 2400, 1024, 2400, 1024]
+    assert [level.matching and level.matching.name for level in levels] == [
+        None,
+        None,
+        "lightglue",
+        None,
+        "lightglue",
+    ]
+    assert len({level.name for level in levels}) == len(levels)
+    assert set(recipe.weights) == {"aliked-n16", "lightglue-aliked"}
+    assert load_recipe("on-demand").extraction.levels[3].base == 0
+
+
+def test_matching_of_a_level_must_take_its_features() -> None:
+    values = {"escalation": [{"features": "disk", "matching": {"name": "lightglue"}}]}
+    with pytest.raises(OptionError, match="takes features of aliked, not of disk"):
+        Recipe.from_mapping("mine", values)
 
 
 def test_choosing_a_profile_drops_the_options_of_the_other_one() -> None:
