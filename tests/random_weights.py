@@ -38,7 +38,7 @@ def write_random_weights(folder: Path) -> dict[str, Path]:
 
 
 def write_comparing_lightglue(
-    path: Path, kornia_features: str = "sift", sharpness: float = 12.0
+    path: Path, kornia_features: str = "sift", sharpness: float = 40.0
 ) -> Path:
     """Write a LightGlue whose layers change nothing: it compares the descriptors it is given."""
     conf = feature.LightGlue.features[kornia_features]
