@@ -28,10 +28,6 @@ RADIUS_PX = 12.0
 """Radius of all frames: a sigma of 2 px, within which all three networks find a point again, so
 that a point that warps show again is known as the same."""
 
-N16ROT_OFFSET_PX = (0.0, 0.75)
-"""Where ``n16rot`` finds points, from where they are: compared with the same photographs shrunk by
-a quarter 0.6 to 1.0 px in y, upright and turned, and 0.1 px in x; ``n16`` and ``n32`` 0.05 px."""
-
 MIN_NETWORK_PX = 32
 """Views are filled up to this side: DISK normalises over what is a sixteenth of it."""
 
@@ -141,7 +137,10 @@ class LearnedFeatures(ABC):
 
 
 class Aliked(LearnedFeatures):
-    """ALIKED: maxima of a score map to parts of a pixel, descriptors from places round them."""
+    """ALIKED: maxima of a score map to parts of a pixel, descriptors from places round them.
+
+    ``n16`` and ``n32`` find points where they are; ``n16rot`` up to 1 px below, by what there is.
+    """
 
     Options = AlikedOptions
     descriptor_size = 128
@@ -151,7 +150,6 @@ class Aliked(LearnedFeatures):
         from colmap_affrect.features.networks import load_aliked
 
         super().__init__(options, context)
-        self.offset_px = N16ROT_OFFSET_PX if options.model == "n16rot" else (0.0, 0.0)
         (key,) = options.weights
         self.network: Any = load_aliked(
             key, options.score_threshold, context.weights[key], context.device
@@ -161,7 +159,7 @@ class Aliked(LearnedFeatures):
         features, scores = self.network.extract_dense_map(pixels)
         (places,), (responses,), _ = self.network.dkd(scores)
         size = places.new_tensor([pixels.shape[3] - 1, pixels.shape[2] - 1])
-        points = (places + 1) / 2 * size - places.new_tensor(self.offset_px)
+        points = (places + 1) / 2 * size
         chosen = best(points, responses)
         (descriptors,), _ = self.network.desc_head(features, [places[chosen]])
         return points[chosen], responses[chosen], descriptors
