@@ -27,8 +27,8 @@ SHARED_WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
 ALL = 1_000_000
 PUBLISHED = ["aliked-n16", "aliked-n16rot", "aliked-n32", "disk", "xfeat"]
 
-MOST_OFFSET_PX = 0.35
-"""By what the photographs show; without the half pixels of DISK and XFeat it is 0.4 and more."""
+MOST_OFFSET_PX = 0.45
+"""By what the photographs show; without the half pixels of DISK and XFeat it is 0.5 and more."""
 
 SAME_DESCRIPTOR = 1e-3
 """Sums in another order, where kornia's layout in memory is another."""
@@ -149,7 +149,7 @@ def test_points_are_where_they_are_in_a_shrunk_photograph(key, published) -> Non
         again = (distances.argmin(axis=0)[nearest] == rows) & (distances[rows, nearest] < 4.0)
         again &= (first.descriptors * second.descriptors[nearest]).sum(axis=1) > 0.7
         offsets.append((points[nearest] - first.keypoints)[again] * 3.0)
-    assert np.abs(np.concatenate(offsets).mean(axis=0)).max() < MOST_OFFSET_PX
+    assert np.linalg.norm(np.concatenate(offsets).mean(axis=0)) < MOST_OFFSET_PX
 
 
 @pytest.mark.parametrize("key", ["aliked-n16", "disk", "xfeat"])
