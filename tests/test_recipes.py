@@ -24,10 +24,11 @@ from colmap_affrect.rectifiers.dense import DenseShapesOptions
 from colmap_affrect.rectifiers.whole_image import AffNetShapesOptions
 
 NAMES = [
-    "affnet-shapes", "affnet-shapes-recommended", "asift", "asift-recommended", "default",
-    "dense-affnet", "dense-affnet-recommended", "depth-affnet", "depth-affnet-recommended",
-    "depth-planes", "depth-planes-recommended", "on-demand", "unrectified",
-    "unrectified-rootsift",
+    "affnet-shapes", "affnet-shapes-recommended", "aliked-lightglue", "asift",
+    "asift-recommended", "default", "dense-affnet", "dense-affnet-recommended", "depth-affnet",
+    "depth-affnet-recommended", "depth-planes", "depth-planes-recommended", "disk-lightglue",
+    "dog-affnet-hardnet-lightglue", "on-demand", "sift-lightglue", "unrectified",
+    "unrectified-rootsift", "xfeat-lighterglue",
 ]  # fmt: skip
 
 OF_THE_PAPER = {
@@ -54,6 +55,19 @@ def test_options_of_a_recipe_survive_being_written_down(name: str) -> None:
     options = load_recipe(name).extraction
     written = tomllib.loads(tomli_w.dumps(options.to_mapping()))
     assert ExtractionOptions.from_mapping(written, "config.toml") == options
+
+
+LEARNED = [name for name in NAMES if name.endswith(("lightglue", "lighterglue"))]
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_learned_recipes_match_what_their_authors_match(name: str) -> None:
+    recipe = load_recipe(name)
+    assert recipe.extraction.rectifier.name == "identity"
+    assert recipe.extraction.max_image_size_px == 1024
+    assert recipe.matching.name == "lightglue"
+    assert recipe.matching.max_num_features == recipe.extraction.features.max_num_features == 2048
+    assert set(recipe.weights) == {*recipe.extraction.weights, *recipe.matching.weights}
 
 
 def test_default_recipe_rectifies_with_the_values_of_the_paper() -> None:

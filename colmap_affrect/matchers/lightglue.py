@@ -165,8 +165,10 @@ class LightGlue:
         self.options, self.training = options, TRAININGS[options.trained_for]
         self._path = context.weights[self.training.weights]
         self._device = resolve_device(context.device)
-        self._network = load_network(self._path, options).to(self._device)
-        self._gpu_lock = nullcontext() if self._device.type == "cpu" else threading.Lock()
+        on_gpu = self._device.type != "cpu"
+        network = load_network(self._path, options, mixed=options.half_precision and on_gpu)
+        self._network = network.to(self._device)
+        self._gpu_lock = threading.Lock()
 
     def prepare(self, image: ImageFeatures) -> PreparedViews:
         """Bring the features of each view into its own coordinates, and onto the device."""
@@ -252,10 +254,11 @@ def _cpu() -> torch.device:
     return torch.device("cpu")
 
 
-def load_network(path: Path, options: LightGlueOptions) -> torch.nn.Module:
+def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) -> torch.nn.Module:
     """Build kornia's LightGlue with the parameters in a file; nothing is downloaded.
 
-    Raises WeightsError when the file does not hold all of them in their shapes.
+    With ``mixed`` precision kornia computes in 16 bits where that is safe. Raises WeightsError when
+    the file does not hold all parameters in their shapes.
     """
     from kornia.feature import LightGlue as Network
 
@@ -265,7 +268,7 @@ def load_network(path: Path, options: LightGlueOptions) -> torch.nn.Module:
         "depth_confidence": options.depth_confidence,
         "width_confidence": options.width_confidence,
         "filter_threshold": options.min_score,
-        "mp": options.half_precision,
+        "mp": mixed,
     }
     network = Network(features=None, **configuration)  # type: ignore[arg-type]
     state = {renamed(name): value for name, value in load_state_dict(path).items()}
@@ -327,7 +330,10 @@ def network_inputs(
     Scales are those of images of ``TRAINING_SIZE_PX``, of which only larger ones were shrunk;
     orientations have the range and the sense of training: COLMAP's of SIFT, else kornia's.
     """
-    values = {"keypoints": np.clip(lafs[:, :, 2], 0.0, size), "image_size": size}
+    values: dict[str, NDArray[np.floating[Any]]] = {
+        "keypoints": np.clip(lafs[:, :, 2], 0.0, size),
+        "image_size": size,
+    }
     if kornia == "keynet_affnet_hardnet":
         values["lafs"] = lafs
     if kornia not in ("sift", "dog_affnet_hardnet"):

@@ -171,9 +171,8 @@ def test_one_place_seen_in_two_views_is_one_match(matcher: LightGlue) -> None:
 
 
 def test_threads_find_the_same(matcher: LightGlue) -> None:
-    images = [matcher.prepare(image(features(300, seed))) for seed in range(4)]
-    images += [matcher.prepare(image(features(300, seed))) for seed in range(4)]
-    pairs = [(a, b) for a in images[:4] for b in images[4:]]
+    images = [matcher.prepare(image(features(150, seed % 2))) for seed in range(4)]
+    pairs = [(a, b) for a in images[:2] for b in images[2:]]
     alone = [matcher.match(*pair) for pair in pairs]
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(lambda pair: matcher.match(*pair), pairs))
@@ -195,6 +194,30 @@ def test_gpu_without_memory_leaves_the_work_to_the_cpu(
     monkeypatch.setattr(matcher, "_network", full)
     assert_array_equal(matcher.match(*pair).indices, expected.indices)
     assert len(expected.scores) == 50
+
+
+def test_half_precision_is_for_gpus(matcher: LightGlue, comparing: Path) -> None:
+    weights = {"lightglue-aliked": comparing}
+    half = LightGlue(LightGlueOptions(half_precision=True), MatcherContext(weights, "cpu"))
+    pair = [matcher.prepare(image(features(50, seed))) for seed in (1, 1)]
+    assert_array_equal(half.match(*pair).scores, matcher.match(*pair).scores)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("trained_for", TRAININGS)
+def test_every_kind_of_features_is_matched_and_in_warps(trained_for: str, tmp_path: Path) -> None:
+    training = TRAININGS[trained_for]
+    path = write_comparing_lightglue(tmp_path / "lightglue.pth", training.kornia)
+    options = LightGlueOptions.from_mapping({"trained_for": trained_for}, "")
+    matcher = LightGlue(options, MatcherContext({training.weights: path}, "cpu"))
+    dimension = 64 if trained_for == "xfeat" else 128
+    parts = [features(20, seed, dimension=dimension) for seed in (1, 2)]
+    parts[1] = parts[1].with_rectification_id(1)
+    views = matcher.prepare(image(union(parts), training.extractor))
+    indices = matcher.match(views, views).indices
+    assert_array_equal(indices[:, 0], indices[:, 1])
+    assert set(indices[:, 0] // 20) == {0, 1}
+    assert len(indices) > 35
 
 
 def test_features_of_another_extractor_are_refused_in_one_line(matcher: LightGlue) -> None:
