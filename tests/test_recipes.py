@@ -27,7 +27,8 @@ NAMES = [
     "affnet-shapes", "affnet-shapes-recommended", "aliked-lightglue", "asift",
     "asift-recommended", "default", "dense-affnet", "dense-affnet-recommended", "depth-affnet",
     "depth-affnet-recommended", "depth-planes", "depth-planes-recommended", "disk-lightglue",
-    "dog-affnet-hardnet-lightglue", "on-demand", "sift-lightglue", "unrectified",
+    "dog-affnet-hardnet-lightglue", "on-demand", "on-demand-learned", "sift-lightglue",
+    "unrectified",
     "unrectified-rootsift", "xfeat-lighterglue",
 ]  # fmt: skip
 
