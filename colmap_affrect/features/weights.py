@@ -18,6 +18,7 @@ import pickle
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from http.client import HTTPException
 from importlib import import_module, metadata
 from pathlib import Path
@@ -233,6 +234,12 @@ def describe_weights(weights_path: Path | None = None) -> list[WeightStatus]:
 
 def file_sha256(path: Path) -> str:
     """Return the SHA-256 of a file in hexadecimal digits."""
+    there = path.stat()
+    return _sha256(path, there.st_mtime_ns, there.st_size)
+
+
+@lru_cache(maxsize=64)
+def _sha256(path: Path, _modified_ns: int, _size: int) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
