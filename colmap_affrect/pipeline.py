@@ -15,6 +15,7 @@ from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
+from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
 from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
@@ -171,6 +172,7 @@ def run(
             options.extend.refuse_discarding(output_path)
         require_extends(mapper.options)
         existing_names(options.extend.model_path, names)
+    resolve(options.recipe.weights, options.resources.weights_path, progress=progress)
     later = {"pairs": options.pairs, "verify": options.verification, "map": mapper.options}
     with context.workspace.locked():
         reports = [

@@ -26,8 +26,46 @@ from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.options import Options, Registry, within
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, RectifierOptions
 from colmap_affrect.rectifiers.dense import DenseShapesOptions
+from colmap_affrect.rectifiers.whole_image import IdentityOptions
 
 AnyRectifier = Annotated[SerializeAsAny[RectifierOptions], BeforeValidator(RECTIFIERS.options)]
+AnyFeatures = Annotated[SerializeAsAny[FeatureOptions], BeforeValidator(EXTRACTORS.options)]
+AnyMatcher = Annotated[SerializeAsAny[MatcherOptions], BeforeValidator(MATCHERS.options)]
+ImageSize = Annotated[int, within(16, 1_000_000)]
+
+
+class LevelOptions(Options):
+    """What pairs climb to; what is not given is as it is for all images."""
+
+    rectifier: AnyRectifier = IdentityOptions()
+    features: AnyFeatures | None = None
+    matching: AnyMatcher | None = None
+    max_image_size_px: ImageSize | None = None
+
+
+@dataclass(frozen=True)
+class Level:
+    """One way to look at images and match them, all of it known.
+
+    Attributes:
+        rectifier: which warps.
+        features: of the image and the warps.
+        max_image_size_px: larger images are shrunk to this longer side.
+        matching: how pairs are matched; None as the recipe says.
+        base: the lowest level with such features. It has those of the image itself, which are
+            matched together with those of this level.
+    """
+
+    rectifier: RectifierOptions
+    features: FeatureOptions
+    max_image_size_px: int
+    matching: MatcherOptions | None
+    base: int
+
+    @property
+    def name(self) -> str:
+        """What it is called in reports."""
+        return f"{self.rectifier.name} {self.features.name}" if self.base else self.rectifier.name
 
 
 class ExtractionOptions(Options):
@@ -35,32 +73,38 @@ class ExtractionOptions(Options):
 
     rectifier: AnyRectifier = DenseShapesOptions()
     """Warps that every image gets."""
-    escalation: Annotated[tuple[AnyRectifier, ...], Field(strict=False)] = ()
-    """Rectifiers for pairs that fail verification, one after the other until it succeeds."""
-    features: Annotated[SerializeAsAny[FeatureOptions], BeforeValidator(EXTRACTORS.options)] = (
-        SiftOptions()
-    )
+    escalation: Annotated[tuple[LevelOptions, ...], Field(strict=False)] = ()
+    """For pairs that fail verification, one after the other until it succeeds."""
+    features: AnyFeatures = SiftOptions()
     depth: Annotated[SerializeAsAny[DepthOptions], BeforeValidator(DEPTH_SOURCES.options)] = (
         DepthFilesOptions()
     )
-    max_image_size_px: Annotated[int, within(16, 1_000_000)] = 2400
+    max_image_size_px: ImageSize = 2400
     """Larger images are shrunk to this longer side before extraction, which bounds memory. COLMAP's
     limit for SIFT is 3200."""
 
     @property
-    def rectifiers(self) -> tuple[RectifierOptions, ...]:
-        """The rectifiers of all levels, that of every image first."""
-        return (self.rectifier, *self.escalation)
+    def levels(self) -> tuple[Level, ...]:
+        """All levels, that of every image first."""
+        size, found = self.max_image_size_px, list[Level]()
+        for item in (LevelOptions(rectifier=self.rectifier), *self.escalation):
+            features, limit = item.features or self.features, item.max_image_size_px or size
+            alike = (k for k, level in enumerate(found)
+                     if (level.features, level.max_image_size_px) == (features, limit))  # fmt: skip
+            base = next(alike, len(found))
+            found.append(Level(item.rectifier, features, limit, item.matching, base))
+        return tuple(found)
 
     @property
     def uses_depth(self) -> bool:
         """Whether any rectifier reads depth maps."""
-        return any(rectifier.uses_depth for rectifier in self.rectifiers)
+        return any(level.rectifier.uses_depth for level in self.levels)
 
     @property
     def _network_parts(self) -> tuple[NetworkOptions, ...]:
-        covers = (item for item in self.rectifiers if isinstance(item, CoverOptions))
-        return (self.features, *(cover.shape_source for cover in covers))
+        covers = (level.rectifier for level in self.levels)
+        sources = [item.shape_source for item in covers if isinstance(item, CoverOptions)]
+        return (*(level.features for level in self.levels), *sources)
 
     @property
     def weights(self) -> tuple[str, ...]:
@@ -74,7 +118,7 @@ class ExtractionOptions(Options):
 
 
 class EscalateOptions(Options):
-    """Which pairs climb to the rectifiers of ``escalation``: those of images that hang loosely."""
+    """Which pairs climb to the levels of ``escalation``: those of images that hang loosely."""
 
     strong_num_inliers: Annotated[int, within(0, 1_000_000)] = 100
     """The pairs of an image climb while none of them has as many: an image that hangs on weak
@@ -88,9 +132,6 @@ class EscalateOptions(Options):
     num_best_pairs: Annotated[int, within(0, 1_000_000)] = 2
     """So many pairs of an image that no verified pairs connect to the others, those with the most
     such matches, climb all the same."""
-
-
-AnyMatcher = Annotated[SerializeAsAny[MatcherOptions], BeforeValidator(MATCHERS.options)]
 
 
 class RecipeOptions(ExtractionOptions):
@@ -141,12 +182,25 @@ class Recipe:
             options.guided,
             options.mapping,
         )
+        try:
+            for level in recipe.extraction.levels:
+                (level.matching or recipe.matching).require_extractor(level.features.name)
+        except OptionError as error:
+            raise OptionError(f"{where}: {error}") from error
         if recipe.mapping:
             try:  # refuses wrong ones now, not when mapping begins
                 recipe.mapper_options("sparse")
             except OptionError as error:
                 raise OptionError(f"{where}: mapping: {error}") from error
         return recipe
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Keys of the files of weights of all parts, sorted."""
+        matching = (level.matching or self.matching for level in self.extraction.levels)
+        return tuple(
+            sorted({*self.extraction.weights, *(key for item in matching for key in item.weights)})
+        )
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all sections with all options, as :meth:`from_mapping` takes them."""

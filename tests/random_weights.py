@@ -23,7 +23,7 @@ def randomized(network: nn.Module, seed: int, gain: float = 1.0) -> nn.Module:
 
 
 def write_random_weights(folder: Path) -> dict[str, Path]:
-    """Write files for AffNet, OriNet, Key.Net and two descriptors; return them by key."""
+    """Write files for AffNet, OriNet, Key.Net, descriptors, whole extractors, by key."""
     torch.manual_seed(0)
     networks = {
         "affnet": randomized(feature.LAFAffNetShapeEstimator(pretrained=False), 1),
@@ -31,7 +31,27 @@ def write_random_weights(folder: Path) -> dict[str, Path]:
         "keynet": feature.KeyNet(pretrained=False),
         "hardnet": randomized(DESCRIPTOR_NETWORKS["hardnet"](), 3),
         "tfeat": DESCRIPTOR_NETWORKS["tfeat"](),
+        "aliked-n16": randomized(feature.ALIKED(), 4),
+        "xfeat": randomized(feature.XFeat().net, 5),
     }
     for name, network in networks.items():
         torch.save({"state_dict": network.state_dict()}, folder / name)
-    return {name: folder / name for name in networks}
+    torch.save({"extractor": feature.DISK().state_dict()}, folder / "disk")
+    return {name: folder / name for name in (*networks, "disk")}
+
+
+def write_comparing_lightglue(
+    path: Path, kornia_features: str = "sift", sharpness: float = 40.0
+) -> Path:
+    """Write a LightGlue whose layers change nothing: it compares the descriptors it is given."""
+    conf = feature.LightGlue.features[kornia_features]
+    network = feature.LightGlue(features=None, **{**conf, "weights": None})
+    state = {name: torch.zeros_like(value) for name, value in network.state_dict().items()}
+    for name, value in state.items():
+        if name.endswith(("input_proj.weight", "final_proj.weight")):
+            factor = sharpness if "final" in name else 1.0
+            value[: value.shape[1]] = factor * torch.eye(*value.shape)[: value.shape[1]]
+        if name.endswith("matchability.bias"):
+            value.fill_(9.0)
+    torch.save(state, path)
+    return path

@@ -12,16 +12,24 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.features.shapes.second_moment import SecondMomentOptions
 from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.matchers.nearest import NearestOptions
-from colmap_affrect.recipes import ExtractionOptions, load_recipe, recipe_folder, recipe_names
+from colmap_affrect.recipes import (
+    ExtractionOptions,
+    Recipe,
+    load_recipe,
+    recipe_folder,
+    recipe_names,
+)
 from colmap_affrect.rectifiers.base import CoverOptions
 from colmap_affrect.rectifiers.dense import DenseShapesOptions
 from colmap_affrect.rectifiers.whole_image import AffNetShapesOptions
 
 NAMES = [
-    "affnet-shapes", "affnet-shapes-recommended", "asift", "asift-recommended", "default",
-    "dense-affnet", "dense-affnet-recommended", "depth-affnet", "depth-affnet-recommended",
-    "depth-planes", "depth-planes-recommended", "on-demand", "unrectified",
-    "unrectified-rootsift",
+    "affnet-shapes", "affnet-shapes-recommended", "aliked-lightglue", "asift",
+    "asift-recommended", "default", "dense-affnet", "dense-affnet-recommended", "depth-affnet",
+    "depth-affnet-recommended", "depth-planes", "depth-planes-recommended", "disk-lightglue",
+    "dog-affnet-hardnet-lightglue", "on-demand", "on-demand-learned", "sift-lightglue",
+    "unrectified",
+    "unrectified-rootsift", "xfeat-lighterglue",
 ]  # fmt: skip
 
 OF_THE_PAPER = {
@@ -48,6 +56,19 @@ def test_options_of_a_recipe_survive_being_written_down(name: str) -> None:
     options = load_recipe(name).extraction
     written = tomllib.loads(tomli_w.dumps(options.to_mapping()))
     assert ExtractionOptions.from_mapping(written, "config.toml") == options
+
+
+LEARNED = [name for name in NAMES if name.endswith(("lightglue", "lighterglue"))]
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_learned_recipes_match_what_their_authors_match(name: str) -> None:
+    recipe = load_recipe(name)
+    assert recipe.extraction.rectifier.name == "identity"
+    assert recipe.extraction.max_image_size_px == 1024
+    assert recipe.matching.name == "lightglue"
+    assert recipe.matching.max_num_features == recipe.extraction.features.max_num_features == 2048
+    assert set(recipe.weights) == {*recipe.extraction.weights, *recipe.matching.weights}
 
 
 def test_default_recipe_rectifies_with_the_values_of_the_paper() -> None:
@@ -79,13 +100,36 @@ def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> No
 
 
 def test_escalation_climbs_from_no_warps_to_all_tilts() -> None:
-    levels = load_recipe("on-demand").extraction.rectifiers
-    assert [level.name for level in levels] == [
+    levels = load_recipe("on-demand").extraction.levels
+    assert [level.rectifier.name for level in levels] == [
         "identity",
         "dense-shapes",
         "affnet-shapes",
         "asift",
     ]
+
+
+def test_levels_build_on_the_lowest_one_with_their_features() -> None:
+    recipe = load_recipe("on-demand-learned")
+    levels = recipe.extraction.levels
+    assert [level.base for level in levels] == [0, 0, 2, 0, 2]
+    assert [level.max_image_size_px for level in levels] == [2400, 2400, 1024, 2400, 1024]
+    assert [level.matching and level.matching.name for level in levels] == [
+        None,
+        None,
+        "lightglue",
+        None,
+        "lightglue",
+    ]
+    assert len({level.name for level in levels}) == len(levels)
+    assert set(recipe.weights) == {"aliked-n16", "lightglue-aliked"}
+    assert load_recipe("on-demand").extraction.levels[3].base == 0
+
+
+def test_matching_of_a_level_must_take_its_features() -> None:
+    values = {"escalation": [{"features": "disk", "matching": {"name": "lightglue"}}]}
+    with pytest.raises(OptionError, match="takes features of aliked, not of disk"):
+        Recipe.from_mapping("mine", values)
 
 
 def test_choosing_a_profile_drops_the_options_of_the_other_one() -> None:

@@ -335,15 +335,15 @@ def recipes(options: argparse.Namespace) -> int:
         return EXIT_OK
     for name in recipe_names():
         recipe = load_recipe(name)
-        needs = list(recipe.extraction.weights)
+        needs = list(recipe.weights)
         needs += ["depth"] if recipe.extraction.uses_depth else []
-        print(f"{name:26s} {recipe.summary}")
-        print(f"{'':26s} needs {', '.join(needs) or 'nothing'}")
+        print(f"{name:28s} {recipe.summary}")
+        print(f"{'':28s} needs {', '.join(needs) or 'nothing'}")
     return EXIT_OK
 
 
 def weights(options: argparse.Namespace) -> int:
-    from colmap_affrect.features.weights import describe_weights, fetch
+    from colmap_affrect.features.weights import describe_weights, fetch, install_hint
 
     if options.action == "fetch":
         keys = options.keys or ["affnet", "orinet", "hardnet"]
@@ -353,9 +353,11 @@ def weights(options: argparse.Namespace) -> int:
     checks = {None: "", True: ", verified", False: ", NOT the published file"}
     for row in describe_weights(options.weights):
         file = row.published
-        where = f"{row.path}{checks[row.verified]}" if row.path else "not found"
-        print(f"{row.key:10s} {file.file_name:32s} {file.used_for}")
-        print(f"{'':10s} {where}")
+        where = f"{row.path}{checks[row.verified]}"
+        if not row.path:
+            where = f"not found: {install_hint([file])}colmap-affrect weights fetch {row.key}"
+        print(f"{row.key:32s} {file.used_for}, {file.file_name}")
+        print(f"{'':4s}{where}")
         sha256, licence = file.sha256 or "not known", file.licence or "not stated"
-        print(f"{'':10s} sha256 {sha256}; licence {licence}")
+        print(f"{'':4s}sha256 {sha256}; licence {licence}")
     return EXIT_OK

@@ -17,7 +17,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.two_views import PLANAR
-from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES
+from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES, ExtractedPx, of_pair
 from colmap_affrect.geometry.focal_evidence import MatchedPair
 from colmap_affrect.geometry.focal_vote import (
     Ballot,
@@ -209,14 +209,14 @@ def forget_votes(path: Path, records: Mapping[int, CameraRecord]) -> dict[int, C
 
 
 def voting_pairs(
-    path: Path, unknown: Collection[int], extracted_px: int | None
+    path: Path, unknown: Collection[int], extracted_px: ExtractedPx
 ) -> list[VotingPair]:
     """Read the verified pairs that can say something about cameras, strongest first.
 
     Args:
         path: of the database.
         unknown: ids of the cameras that are asked for.
-        extracted_px: longest side that photographs were shrunk to before extraction, if any.
+        extracted_px: see :data:`~colmap_affrect.colmap.verification.ExtractedPx`.
     """
     with open_database(path) as database:
         images = {image.image_id: image.camera_id for image in database.read_all_images()}
@@ -248,7 +248,7 @@ def voting_pairs(
                 tuple(cameras[images[image_id]] for image_id in pair),
                 tuple(keypoints(image_id) for image_id in pair),
                 geometry,
-                extracted_px,
+                of_pair(extracted_px, pair),
             )
             for pair, geometry in chosen
         ]

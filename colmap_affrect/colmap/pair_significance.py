@@ -18,6 +18,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import PLANAR, epipolar_pair, keypoint_shapes
 from colmap_affrect.geometry.affine import determinants, homography_errors, transform_frames
 from colmap_affrect.geometry.epipolar import common_sign, direction_cosines, sampson_errors
+from colmap_affrect.geometry.shapes import of_unit_area, vary_singly
 from colmap_affrect.geometry.significance import (
     log10_bayes_factor,
     log10_false_alarms,
@@ -120,13 +121,15 @@ def significance(
 
 
 def telling_shapes(keypoints: NDArray[np.floating]) -> Points | None:
-    """Return the shapes of keypoints; None without any, or if they all are circles, or alike."""
+    """Return the shapes of keypoints; None if they tell nothing.
+
+    That is without any, of circles, if all are alike, or only differ from view to view.
+    """
     shapes = keypoint_shapes(keypoints)
     if shapes is None or not len(shapes):
         return None
-    areas = np.maximum(np.abs(determinants(shapes)), np.finfo(float).tiny)
-    alike = np.ptp(shapes / np.sqrt(areas)[:, None, None], axis=0).max() < MIN_VARIETY
-    return None if alike else shapes
+    alike = np.ptp(of_unit_area(shapes), axis=0).max() < MIN_VARIETY
+    return None if alike or not vary_singly(shapes) else shapes
 
 
 def _model(

@@ -184,10 +184,20 @@ def max_error_px(
     return options.max_error_px * float(np.mean(np.maximum(sides, 1.0)))
 
 
+ExtractedPx = int | Mapping[tuple[int, int], int] | None
+"""Longest side that photographs were shrunk to before extraction, if any; or of pairs of image ids,
+the lower one first."""
+
+
+def of_pair(extracted_px: ExtractedPx, ids: tuple[int, int]) -> int | None:
+    """Return what was true of a pair of image ids."""
+    return extracted_px.get(ids) if isinstance(extracted_px, Mapping) else extracted_px
+
+
 def verify(
     path: Path,
     options: VerificationOptions,
-    extracted_px: int | None = None,
+    extracted_px: ExtractedPx = None,
     advance: Callable[[int], None] | None = None,
 ) -> None:
     """Estimate the two-view geometry of every matched pair that has none yet.
@@ -198,7 +208,7 @@ def verify(
     Args:
         path: of the database.
         options: thresholds.
-        extracted_px: longest side that photographs were shrunk to before extraction, if any.
+        extracted_px: see :data:`ExtractedPx`.
         advance: called with the number of pairs that are done.
     """
     todo = unverified_pairs(path)
@@ -211,7 +221,8 @@ def verify(
             reader.warn_of_missing_shapes(todo, path)
 
         def estimate(task: _Task) -> tuple[tuple[int, int], pycolmap.TwoViewGeometry]:
-            return task.ids, estimate_geometry(task.sides, task.matches, options, extracted_px)
+            size_px = of_pair(extracted_px, task.ids)
+            return task.ids, estimate_geometry(task.sides, task.matches, options, size_px)
 
         done: list[tuple[tuple[int, int], pycolmap.TwoViewGeometry]] = []
         tasks = map(reader.task, todo)
@@ -284,7 +295,7 @@ class PairVerifier:
     """
 
     def __init__(
-        self, path: Path, options: VerificationOptions, extracted_px: int | None = None
+        self, path: Path, options: VerificationOptions, extracted_px: ExtractedPx = None
     ) -> None:
         """Read cameras and image ids of a database."""
         self._options, self._extracted_px = options, extracted_px
@@ -317,14 +328,15 @@ class PairVerifier:
 
         Arguments are those of :meth:`num_inliers`; without inliers where there is none.
         """
-        ids = [self._ids[name] for name in names]
+        ids = self._ids[names[0]], self._ids[names[1]]
         first, second = (
             Side(self._cameras[image_id], colmap_keypoints(lafs))
             for image_id, lafs in zip(ids, frames, strict=True)
         )
         if ids[0] > ids[1]:
-            first, second, indices = second, first, indices[:, ::-1]
-        return estimate_geometry((first, second), indices, self._options, self._extracted_px)
+            ids, first, second, indices = ids[::-1], second, first, indices[:, ::-1]
+        size_px = of_pair(self._extracted_px, ids)
+        return estimate_geometry((first, second), indices, self._options, size_px)
 
 
 def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], int]:

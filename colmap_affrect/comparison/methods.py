@@ -94,7 +94,7 @@ def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
         raise OptionError(f"unknown method '{name}': {hint}known are {_known()}")
     changes = re.split(r",(?![^\[\]]*\])", settings) if settings else []
     recipe = load_recipe(name, changes)
-    if any(rectifier.uses_depth for rectifier in recipe.extraction.rectifiers):
+    if recipe.extraction.uses_depth:
         recipe = load_recipe(name, [*changes, *depth_settings])
     default_label = text.replace(name, PurePath(name).stem) if name.endswith(".toml") else text
     return Method(label or default_label, recipe)

@@ -25,7 +25,12 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import all_given, read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database, unverified_pairs
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
+from colmap_affrect.colmap.verification import (
+    ExtractedPx,
+    VerificationOptions,
+    verified_pairs,
+    verify,
+)
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP
 from colmap_affrect.comparison.request import Request
 from colmap_affrect.comparison.results import MethodResult, SeedResult
@@ -52,11 +57,11 @@ from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import escalate
-from colmap_affrect.stages.extract import Inputs, extract, recorded_extraction
+from colmap_affrect.stages.extract import Inputs, extract
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
-from colmap_affrect.stages.verify import verify_matches
+from colmap_affrect.stages.verify import extracted_px, verify_matches
 
 logger = logging.getLogger("colmap_affrect")
 
@@ -199,7 +204,7 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
         context = Context(workspace, request.resources, progress=told)
         with watch.step("verify"):
             verify_matches(context, options)
-            _vote(request, workspace, options, recorded_extraction(workspace).max_image_size_px)
+            _vote(request, workspace, options, extracted_px(context))
         with watch.step("map"):
             guide(context)
             _, models = map_guided(context, mapper)
@@ -246,7 +251,7 @@ def _vote(
     request: Request,
     workspace: Workspace,
     verification: VerificationOptions,
-    extracted_px: int | None = None,
+    size_px: ExtractedPx = None,
 ) -> None:
     """Let the pairs vote on cameras if they are to do that."""
     if request.focal_vote:
@@ -254,7 +259,7 @@ def _vote(
             workspace.database,
             workspace.cameras,
             verification,
-            extracted_px,
+            size_px,
             may_share=request.may_share,
         )
 

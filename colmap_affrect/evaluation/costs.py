@@ -95,11 +95,10 @@ class _TimedExtractor(ImageExtractor):
         self,
         photograph: Photograph,
         plan: RectificationPlan,
-        *,
-        with_original: bool = True,
+        level: int = 0,
     ) -> LocalFeatures:
         with self.watch.step("warp"):
-            return super().execute(photograph, plan, with_original=with_original)
+            return super().execute(photograph, plan, level)
 
 
 def extract_measured(
@@ -113,7 +112,7 @@ def extract_measured(
     watch = Stopwatch(*IMAGE_STEPS)
     timed = _TimedExtractor(
         extractor.options,
-        TimedFeatures(extractor.extractor, watch),
+        tuple(TimedFeatures(item, watch) for item in extractor.extractors),
         extractor.rectifiers,
         extractor.weights,
         extractor.resources,

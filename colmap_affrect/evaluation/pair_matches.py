@@ -88,11 +88,11 @@ class PairMatcher:
         It is called in parallel, as soon as the matches of a pair are decided. Pairs of images that
         cannot be used (``features.failures``) are left out.
         """
-        rectifiers = self.recipe.extraction.rectifiers
+        levels = self.recipe.extraction.levels
         todo, best = list(pairs), dict[str, MatchedPair]()
-        for level, rectifier in enumerate(rectifiers):
+        for level, chosen in enumerate(levels):
             names = sorted({image.name for pair in todo for image in pair.images})
-            title = f"{self.title}, {rectifier.name}" if len(rectifiers) > 1 else self.title
+            title = f"{self.title}, {chosen.name}" if len(levels) > 1 else self.title
             self.features.extract(names, level, title, self.progress)
             lost = [pair for pair in todo if self._is_lost(pair)]
             yield from (finish(best[pair.name]) for pair in lost if pair.name in best)
@@ -119,14 +119,16 @@ class PairMatcher:
         finish: Callable[[MatchedPair], Result],
     ) -> Iterator[tuple[MatchedPair, Result | None]]:
         """Yield the best matches of each pair so far, with a result if it need not climb on."""
-        extraction, matching = self.recipe.extraction, self.recipe.matching
+        extraction = self.recipe.extraction
+        chosen = extraction.levels[level]
         prepared = CachedMatcher(
             self.features.store,
-            matching,
+            chosen.matching or self.recipe.matching,
             level=level,
             max_num_features=self.max_num_keypoints,
             resources=self.features.resources,
-            extractor=extraction.features.name,
+            extractor=chosen.features.name,
+            base=chosen.base,
         )
         sizes = self.features.store.image_sizes()
 
@@ -138,9 +140,9 @@ class PairMatcher:
             frames = (image1.frames[rows1], image2.frames[rows2])
             count, decided = 0, ""
             if extraction.escalation:
-                limit = extraction.max_image_size_px
+                limit = chosen.max_image_size_px
                 count = verified_inliers(frames, (sizes[name1], sizes[name2]), limit)
-                decided = extraction.rectifiers[level].name if count else "none"
+                decided = chosen.name if count else "none"
             found = MatchedPair(
                 pair,
                 (frames[0][:, :, 2], frames[1][:, :, 2]),

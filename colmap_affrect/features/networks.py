@@ -107,6 +107,31 @@ def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
     return _ready(network, device)
 
 
+def load_aliked(name: str, score_threshold: float, path: Path, device: str) -> feature.ALIKED:
+    """Build ALIKED by kornia's name of the model, which keeps all maxima above the threshold."""
+    network = feature.ALIKED(name, detection_threshold=score_threshold)
+    grid = {"dkd.hw_grid": network.dkd.hw_grid}  # derived, and in no file
+    _load_state(network, {**load_state_dict(path), **grid}, path, name)
+    return _ready(network, device)
+
+
+def load_disk(path: Path, device: str) -> feature.DISK:
+    """Build DISK from a checkpoint of its authors."""
+    network = feature.DISK()
+    state = load_state_dict(path).get("extractor")
+    if not isinstance(state, Mapping):
+        raise WeightsError(f"{path}: not the weights of disk (no extractor)")
+    _load_state(network, state, path, "disk")
+    return _ready(network, device)
+
+
+def load_xfeat(score_threshold: float, path: Path, device: str) -> feature.XFeat:
+    """Build XFeat."""
+    network = feature.XFeat(detection_threshold=score_threshold)
+    _load(network.net, path, "xfeat")
+    return _ready(network, device)
+
+
 class HardTFeat(nn.Module):
     """Two convolutions and a fully connected layer, with tanh, as in TFeat (Balntas et al. 2016).
 
@@ -192,6 +217,10 @@ def _load(network: nn.Module, path: Path, name: str) -> None:
     state = load_state_dict(path)
     if isinstance(network, HardTFeat):  # the file also holds a SIFT that helped in its training
         state = {key: value for key, value in state.items() if not key.startswith("SIFT.")}
+    _load_state(network, state, path, name)
+
+
+def _load_state(network: nn.Module, state: Mapping[str, Any], path: Path, name: str) -> None:
     _require_same(state, network.state_dict(), path, name)
     network.load_state_dict(state, strict=False)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.data import GrayImage, LocalFeatures, View
+from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, View
 from colmap_affrect.features.base import FeatureOptions, NetworkContext
 from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.options import within
@@ -104,9 +104,9 @@ def make_sift(options: DogOptions) -> cv2.SIFT:
     )
 
 
-def is_searchable(image: GrayImage, mask: NDArray[np.uint8] | None) -> bool:
+def is_searchable(image: GrayImage | ColorImage, mask: NDArray[np.uint8] | None) -> bool:
     """Tell whether an image is large enough for OpenCV, not flat, and its mask not empty."""
-    large = min(image.shape) >= MIN_IMAGE_SIZE_PX
+    large = min(image.shape[:2]) >= MIN_IMAGE_SIZE_PX
     return large and bool(image.min() < image.max()) and (mask is None or bool(mask.any()))
 
 

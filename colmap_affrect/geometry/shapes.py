@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.tilts import unit_metrics
 
 STEP_PX = 4
@@ -17,6 +18,30 @@ STEP_PX = 4
 
 MAX_TANH = 0.999
 """Where logarithms end: of a metric, tilt 45."""
+
+
+MIN_DISTINCT_SHARE = 0.5
+"""Of frames that were measured one by one nearly all have a shape of their own."""
+
+SHAPE_STEP = 1e-4
+"""Shapes of unit area that are this close are one: above the rounding of 32 bits, and so fine that
+the orientations of all features of an image hardly coincide."""
+
+
+def of_unit_area(shapes: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Divide (N, 2, 2) shapes by the roots of their areas."""
+    areas = np.maximum(np.abs(determinants(shapes)), np.finfo(float).tiny)
+    return np.asarray(shapes / np.sqrt(areas)[:, None, None], np.float64)
+
+
+def vary_singly(shapes: NDArray[np.floating]) -> bool:
+    """Whether (N, 2, 2) shapes of features were measured one by one.
+
+    Those of features without a shape are circles, which a warp turns into one ellipse for all of
+    its features: they repeat what view it was, as often as there are features.
+    """
+    cells = np.rint(of_unit_area(shapes) / SHAPE_STEP).reshape(-1, 4)
+    return len(np.unique(cells, axis=0)) > max(1.0, MIN_DISTINCT_SHARE * len(shapes))
 
 
 def rectifying_metrics(shapes: NDArray[np.floating]) -> NDArray[np.float64]:

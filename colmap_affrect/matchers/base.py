@@ -6,8 +6,12 @@ A matcher of another package becomes known by an entry point of the group
 
 from __future__ import annotations
 
+import logging
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import cache
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +19,24 @@ from numpy.typing import NDArray
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.features.base import NetworkContext, NetworkOptions
 from colmap_affrect.options import Registry
+from colmap_affrect.parallel.executor import unless_gpu_is_full
+
+logger = logging.getLogger(__name__)
+
+_WARNING = threading.Lock()
+"""Held by the thread that warns: ``cache`` alone lets two threads through."""
+
+Found = TypeVar("Found")
 
 
 class MatcherOptions(NetworkOptions):
     """Base of the options of all matchers."""
+
+    def require_extractor(self, extractor: str) -> None:
+        """Raise OptionError for a feature extractor whose features cannot be matched.
+
+        An empty name is that of another program, and passes.
+        """
 
 
 @dataclass(frozen=True)
@@ -78,6 +96,25 @@ class Matcher(Protocol):
 MATCHERS: Registry[Matcher] = Registry(
     kind="matcher",
     group="colmap_affrect.matchers",
-    built_in={"nearest": "colmap_affrect.matchers.nearest:NearestNeighbors"},
+    built_in={
+        "nearest": "colmap_affrect.matchers.nearest:NearestNeighbors",
+        "lightglue": "colmap_affrect.matchers.lightglue:LightGlue",
+    },
     default="nearest",
 )
+
+
+def unless_gpu_is_full_or_say(with_gpu: Callable[[], Found], without: Callable[[], Found]) -> Found:
+    """Return what is done on a GPU, or without it where its memory is full; say so once."""
+
+    def say_once_and_go_on() -> Found:
+        with _WARNING:
+            _warn_that_gpu_is_full()
+        return without()
+
+    return unless_gpu_is_full(with_gpu, say_once_and_go_on)
+
+
+@cache
+def _warn_that_gpu_is_full() -> None:
+    logger.warning("the memory of the GPU is full; the CPU matches the rest")

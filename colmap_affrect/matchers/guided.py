@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.geometry.affine import project, transform_frames
 from colmap_affrect.geometry.epipolar import common_sign, direction_cosines, epipolar_lines
+from colmap_affrect.geometry.shapes import vary_singly
 from colmap_affrect.options import Options, within
 
 Array = NDArray[np.float64]
@@ -79,16 +80,16 @@ class GuidableImage:
 
     @property
     def has_directions(self) -> bool:
-        """Whether frames can tell a direction: circles without orientation cannot.
+        """Whether frames can tell a direction.
+
+        Circles without orientation cannot, nor what warps made of them.
 
         Similarities (COLMAP's SIFT) do: they turn directions as they turn themselves, which is
         right up to what the change of viewpoint adds.
         """
         if self.shapes is None or not len(self.shapes):
             return False
-        size = np.abs(self.shapes[:, 0, 0])
-        shear = np.abs(self.shapes - size[:, None, None] * np.eye(2)).max(axis=(1, 2))
-        return bool((shear > 1e-3 * size).any())
+        return vary_singly(self.shapes)
 
 
 class Guide(Protocol):

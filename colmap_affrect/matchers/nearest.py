@@ -9,18 +9,22 @@ in chunks of bounded memory; long lists coarsely at first, and exactly where tha
 
 from __future__ import annotations
 
-import logging
-import threading
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from typing import Annotated, Literal, TypeVar
+from functools import partial
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.geometry.neighbors import NeighborLists, neighbors_within
-from colmap_affrect.matchers.base import ImageFeatures, MatcherContext, MatcherOptions, Matches
+from colmap_affrect.matchers.base import (
+    ImageFeatures,
+    MatcherContext,
+    MatcherOptions,
+    Matches,
+    unless_gpu_is_full_or_say,
+)
+from colmap_affrect.matchers.duplicates import without_duplicates
 from colmap_affrect.matchers.nearest_8bit import (
     CoarseDescriptors,
     MakeCoarse,
@@ -28,20 +32,12 @@ from colmap_affrect.matchers.nearest_8bit import (
     coarse_descriptors,
 )
 from colmap_affrect.options import within
-from colmap_affrect.parallel.executor import unless_gpu_is_full
 
 CHUNK_ELEMENTS = 1 << 22
 """Similarities held at once, which bounds memory."""
 
 CHUNK_ROWS = 1 << 12
 """Pairs of descriptors held at once, which bounds memory."""
-
-logger = logging.getLogger(__name__)
-
-_WARNING = threading.Lock()
-"""Held by the thread that warns: ``cache`` alone lets two threads through."""
-
-Found = TypeVar("Found")
 
 NO_LIMIT = 2.0
 """No ratio is larger than 1."""
@@ -80,7 +76,7 @@ class NearestNeighbors:
     def prepare(self, image: ImageFeatures) -> MatchableImage:
         """Make the features of an image ready for matching."""
         descriptors, keypoints = image.features.descriptors, image.features.keypoints
-        return _unless_gpu_is_full(
+        return unless_gpu_is_full_or_say(
             partial(matchable, descriptors, keypoints, self.options, self._make_coarse),
             partial(matchable, descriptors, keypoints, self.options),
         )
@@ -88,25 +84,11 @@ class NearestNeighbors:
     def match(self, first: MatchableImage, second: MatchableImage) -> Matches:
         """Match two images; the score is 1 minus the ratio of distances."""
         exact = [replace(image, coarse=None) for image in (first, second)]
-        found = _unless_gpu_is_full(
+        found = unless_gpu_is_full_or_say(
             partial(match_features, first, second, self.options),
             partial(match_features, exact[0], exact[1], self.options),
         )
         return Matches(found.indices, 1.0 - found.ratios)
-
-
-def _unless_gpu_is_full(with_gpu: Callable[[], Found], without: Callable[[], Found]) -> Found:
-    def say_once_and_go_on() -> Found:
-        with _WARNING:
-            _warn_that_gpu_is_full()
-        return without()
-
-    return unless_gpu_is_full(with_gpu, say_once_and_go_on)
-
-
-@cache
-def _warn_that_gpu_is_full() -> None:
-    logger.warning("the memory of the GPU is full; the CPU matches the rest")
 
 
 @dataclass(frozen=True)
@@ -277,16 +259,7 @@ def _without_duplicates(
 ) -> PutativeMatches:
     """Drop matches that have a better one within ``radius_px`` at both ends."""
     order = np.argsort(matches.ratios, kind="stable")
-    points1 = image1.keypoints[matches.indices[order, 0]]
-    points2 = image2.keypoints[matches.indices[order, 1]]
-    close = neighbors_within(points1, radius_px)
-    rows, others = close.of(np.arange(len(order)))
-    near = ((points2[rows] - points2[others]) ** 2).sum(axis=1) <= radius_px**2
-    keep = np.ones(len(order), dtype=bool)
-    for row, other in zip(
-        rows[near & (others < rows)], others[near & (others < rows)], strict=True
-    ):
-        if keep[other]:
-            keep[row] = False
+    rows, columns = matches.indices[order].T
+    keep = without_duplicates(image1.keypoints[rows], image2.keypoints[columns], radius_px)
     kept = np.sort(order[keep])
     return PutativeMatches(matches.indices[kept], matches.ratios[kept])

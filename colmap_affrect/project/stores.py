@@ -3,7 +3,8 @@
 ``features.h5``: a group per image name with ``keypoints`` (N, 2) float32, ``descriptors``
 (D, N) float16, ``scores`` (N,), ``image_size`` (width, height) and, of our own, ``lafs``
 (N, 2, 3) float32, ``rectification_ids`` (N,), and ``level_ends``: the features of level k of
-escalation follow those of level k - 1 and end at ``level_ends[k]``. ``matches.h5``: a group
+escalation follow those of level k - 1 and end at ``level_ends[k]``. Descriptors of several sizes
+are filled up with zeros, which change no distance. ``matches.h5``: a group
 per pair with ``matches0`` (N0,), -1 where unmatched, ``matching_scores0`` (N0,) and the
 attributes ``level``, whose features were matched together with those of level 0, and
 ``tried_level``, the highest that was tried. ``guided.h5``: a group per pair that was matched again
@@ -197,8 +198,9 @@ class FeatureStore(_Store):
             ends = group["level_ends"][()].tolist()
             there = self._features(group, ends[-1])
             first_id = int(there.rectification_ids.max(initial=0))
-            added = replace(features, rectification_ids=features.rectification_ids + first_id)
-            both = union([there, added])
+            ids = features.rectification_ids
+            added = replace(features, rectification_ids=np.where(ids, ids + first_id, 0))
+            both = union(_of_one_size([there, added]))
             self._write_features(file, name, both, size, [*ends, len(both)])
 
     def _write_features(
@@ -229,11 +231,10 @@ class FeatureStore(_Store):
             group = self._group(file, name)
             return self._features(group, group["level_ends"][()].tolist()[-1])
 
-    def level_indices(self, name: str, level: int) -> NDArray[np.int64]:
-        """Return the indices of the features of the image itself and of one level."""
-        ends = self.level_ends(name)
-        added = np.arange(ends[level - 1], ends[level]) if level else np.arange(0)
-        return np.concatenate([np.arange(ends[0]), added])
+    def level_indices(self, name: str, level: int, base: int = 0) -> NDArray[np.int64]:
+        """Return the indices of the features of two levels, each once, in their order."""
+        ends = [0, *self.level_ends(name)]
+        return np.concatenate([np.arange(*ends[k : k + 2]) for k in sorted({base, level})])
 
     def _group(self, file: h5py.File, name: str) -> h5py.Group:
         if name not in file or not file[name].attrs.get("complete", False):
@@ -286,6 +287,16 @@ class FeatureStore(_Store):
         """Read the (N,) warps that the features of one image come from."""
         with self._open("r") as file:
             return np.asarray(self._group(file, name)["rectification_ids"][()])
+
+
+def _of_one_size(parts: list[LocalFeatures]) -> list[LocalFeatures]:
+    """Fill up shorter descriptors with zeros."""
+    size = max(part.descriptors.shape[1] for part in parts)
+    return [
+        replace(part, descriptors=np.pad(part.descriptors, ((0, 0), (0, size - width))))
+        for part in parts
+        for width in (part.descriptors.shape[1],)
+    ]
 
 
 def pair_key(name1: str, name2: str) -> str:

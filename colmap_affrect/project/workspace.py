@@ -29,7 +29,7 @@ LOCAL = ("image_path", "image_list_path", "from_database", "cameras")
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
 COPY_STAGES = ("copy", "verify", "map")
 """Of a folder in which another program's database is mapped."""
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 """Of ``config.toml``: counts up when a stage records other options than before."""
 
 

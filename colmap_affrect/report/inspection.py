@@ -22,10 +22,12 @@ def inspect_image(
     the level has no warps and a ``warning``, as in extraction. ``mask`` is (H, W) bool of the
     stored image. Raises ImageError when the file cannot be read.
     """
-    photograph, stored_size = extractor.photograph(path, mask=mask)
+    numbers = range(len(extractor.rectifiers))
+    read = [extractor.photograph(path, mask=mask, level=number) for number in numbers]
+    stored_size = read[0][1]
     output_path.mkdir(parents=True, exist_ok=True)
     lines, paths, descriptions = [], [], []
-    for number in range(len(extractor.rectifiers)):
+    for number, (photograph, _) in enumerate(read):
         level = inspect_level(extractor, photograph, number)
         suffix = f"-level-{number}" if number else ""
         paths.append(output_path / f"{path.stem}-inspection{suffix}.png")
@@ -33,9 +35,8 @@ def inspect_image(
         lines.append(f"level {number}, {level.options.name}: {summary(level)}")
         descriptions.append(describe_level(level))
     description = {
-        "image": photograph.name,
+        "image": path.name,
         "stored_size": list(stored_size),
-        "size": list(photograph.size),
         "options": extractor.options.to_mapping(),
         "levels": descriptions,
     }

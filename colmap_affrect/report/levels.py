@@ -73,16 +73,16 @@ def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int
     watch = Stopwatch("plan", "warp and choose", "detect", "describe")
     with watch.step("plan"):
         plan, warning = extractor.plan_or_warn(photograph, number)
-    recorder = _Recorder(extractor.extractor, watch)
+    level = extractor.options.levels[number]
+    recorder = _Recorder(extractor.extractors[number], watch)
+    recorders = (*extractor.extractors[:number], recorder, *extractor.extractors[number + 1 :])
     with watch.step("warp and choose"):
-        features = replace(extractor, extractor=recorder).execute(
-            photograph, plan, with_original=number == 0
-        )
-    first_id = 0 if number == 0 else 1
+        features = replace(extractor, extractors=recorders).execute(photograph, plan, number)
+    first_id = 0 if level.base == number else 1
     return InspectedLevel(
         number,
-        extractor.options.rectifiers[number],
-        extractor.options.features.name,
+        level.rectifier,
+        level.features.name,
         photograph,
         plan,
         warning,
@@ -134,7 +134,7 @@ def _shapes(extractor: ImageExtractor, photograph: Photograph, number: int) -> S
     source: ShapeSource | None = _read_by(extractor, photograph, number, "shapes")
     if source is None:
         return None
-    if isinstance(extractor.options.rectifiers[number], DenseShapesOptions):
+    if isinstance(extractor.options.levels[number].rectifier, DenseShapesOptions):
         return source.grid(photograph.gray).samples()
     return source.samples(photograph.gray)
 
@@ -166,6 +166,7 @@ def describe_level(level: InspectedLevel) -> dict[str, Any]:
         "level": level.number,
         "rectifier": level.options.name,
         "features": level.extractor_name,
+        "size": list(level.photograph.size),
         "warning": level.warning,
         "original": {
             "features_found": len(level.found[0]) if 0 in level.found else 0,

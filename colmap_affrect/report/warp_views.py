@@ -74,13 +74,17 @@ def warped_photographs(
     found = []
     for task in image_tasks(workspace, inputs, extractor.options, [(name, 0) for name in names]):
         photographs = task.photographs
-        photograph, _ = extractor.photograph(
-            photographs.folder / task.name, task.name, task.intrinsics, photographs.mask(task.name)
-        )
-        for level, options in enumerate(extractor.options.rectifiers):
+        for level, chosen in enumerate(extractor.options.levels):
+            photograph, _ = extractor.photograph(
+                photographs.folder / task.name,
+                task.name,
+                task.intrinsics,
+                photographs.mask(task.name),
+                level,
+            )
             plan, _ = extractor.plan_or_warn(photograph, level)
             if plan.items:
-                found.append(_view(photograph, plan, level, options.name))
+                found.append(_view(photograph, plan, level, chosen.rectifier.name))
                 break
     return found
 
@@ -127,4 +131,5 @@ def rectifies(workspace: Workspace) -> bool:
     """Tell whether photographs are warped there; COLMAP's SIFT leaves no record and warps none."""
     if workspace.planned("extract") is None:
         return False
-    return any(item.name != "identity" for item in recorded_extraction(workspace).rectifiers)
+    levels = recorded_extraction(workspace).levels
+    return any(level.rectifier.name != "identity" for level in levels)

@@ -18,13 +18,13 @@ from colmap_affrect.colmap.camera_vote import (
     needs_vote,
     voting_pairs,
 )
-from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.colmap.verification import ExtractedPx, VerificationOptions, verify
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import is_copy
-from colmap_affrect.stages.extract import Inputs, recorded_extraction
-from colmap_affrect.stages.verify import recorded_verification
+from colmap_affrect.stages.extract import Inputs
+from colmap_affrect.stages.verify import extracted_px, recorded_verification
 
 logger = logging.getLogger(__name__)
 
@@ -41,13 +41,13 @@ def choose_cameras(context: Context, *, may_share: bool = True) -> StageReport:
     workspace = context.workspace
     workspace.require("verify")
     copied = is_copy(workspace)
-    extracted_px = None if copied else recorded_extraction(workspace).max_image_size_px
+    size_px = None if copied else extracted_px(context)
     may_share = may_share and not copied and Inputs.recorded(workspace).cameras.mode == "auto"
     hold_vote(
         workspace.database,
         workspace.cameras,
         recorded_verification(workspace),
-        extracted_px,
+        size_px,
         may_share=may_share,
         progress=context.progress,
     )
@@ -60,7 +60,7 @@ def hold_vote(
     database_path: Path,
     records_path: Path,
     verification: VerificationOptions,
-    extracted_px: int | None = None,
+    size_px: ExtractedPx = None,
     *,
     may_share: bool,
     progress: Progress = SILENT,
@@ -75,20 +75,20 @@ def hold_vote(
             know.
         records_path: what is known of the cameras; brought up to date.
         verification: options.
-        extracted_px: longest side that photographs were shrunk to before extraction, if any.
+        size_px: that photographs were shrunk to before extraction.
         may_share: whether cameras of images of one size may turn out to be the same.
         progress: counts the pairs that vote.
     """
     records = read_camera_records(records_path)
     if needs_vote(records):
         records = forget_votes(database_path, records)
-        verify(database_path, verification, extracted_px)
+        verify(database_path, verification, size_px)
         unknown = {key for key, record in records.items() if record.source == "guess"}
-        pairs = voting_pairs(database_path, unknown, extracted_px)
+        pairs = voting_pairs(database_path, unknown, size_px)
         records = CameraVote(records, pairs, may_share).decide(progress)
         write_camera_records(records_path, records)
         for line in notable_lines(r for r in records.values() if r.low_px is not None):
             logger.info("cameras: %s", line)
     if any(record.low_px is not None for record in records.values()):
         apply_records(database_path, records)
-        verify(database_path, verification, extracted_px)
+        verify(database_path, verification, size_px)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from colmap_affrect.errors import WeightsError
+from colmap_affrect.features.weights import file_sha256
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
@@ -34,6 +37,16 @@ class Resources:
             from colmap_affrect.features.networks import resolve_device
 
             resolve_device(self.device)
+
+
+def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) -> None:
+    """Refuse weights that are not those of the machine that leads the work."""
+    for key, path in weights.items():
+        if file_sha256(path) != digests[key]:
+            raise WeightsError(
+                f"{path}: is another file than {key} on the machine that leads the work; give "
+                "both the same"
+            )
 
 
 @dataclass(frozen=True)

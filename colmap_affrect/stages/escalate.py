@@ -59,7 +59,7 @@ from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, recorded_m
 from colmap_affrect.stages.one_image import ImageExtractor
 from colmap_affrect.stages.one_pair import iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
-from colmap_affrect.stages.verify import recorded_verification, verify_new
+from colmap_affrect.stages.verify import extracted_px, recorded_verification, verify_new
 
 
 def recorded_escalation(workspace: Workspace) -> EscalateOptions:
@@ -122,12 +122,12 @@ class _Forecast:
 def pair_levels(context: Context) -> dict[str, int]:
     """Return how many pairs each level of a recipe with escalation decided, and how many none.
 
-    Keys are the names of the rectifiers, in order, and ``none``; empty without escalation.
+    Keys are the names of the levels, in order, and ``none``; empty without escalation.
     """
     extraction = recorded_extraction(context.workspace)
     if not extraction.escalation:
         return {}
-    names = [rectifier.name for rectifier in extraction.rectifiers]
+    names = [level.name for level in extraction.levels]
     escalation = Escalation(context, EscalateOptions())
     num_inliers, levels = escalation.num_inliers(), context.matches.levels(escalation.pairs)
     counts = dict.fromkeys([*names, "none"], 0)
@@ -171,7 +171,7 @@ class Escalation:
         self.pairs = listed_pairs(context)
         self.features, self.matches = context.features, context.matches
         self.path = context.workspace.database
-        self.levels = range(1, len(self.extraction.rectifiers))
+        self.levels = range(1, len(self.extraction.levels))
         self._consistent: dict[Pair, tuple[bytes, int]] = {}
 
     @cached_property
@@ -280,7 +280,7 @@ class Escalation:
         """Bring the database up to what is stored."""
         write_images_and_keypoints(self.context)
         self._replace_matches()
-        verify_new(self.context.workspace)
+        verify_new(self.context)
         self._unwritten = set()
 
     def undo(self) -> None:
@@ -301,19 +301,21 @@ class Escalation:
             for found in found_matches:
                 first, second = (ids[name] for name in found.names)
                 colmap_database.replace_matches(database, first, second, found.indices)
-        verify(path, self.verification, self.extraction.max_image_size_px)
+        verify(path, self.verification, extracted_px(self.context))
 
     def _iterate_matches(
         self, pairs: Sequence[Pair], level: int
     ) -> Generator[PairMatches, None, None]:
+        chosen = self.extraction.levels[level]
         return iterate_matches(
             pairs,
             self.features,
-            self.matching,
+            chosen.matching or self.matching,
             level,
             self.context.resources,
             self.context.executor,
-            self.extraction.features.name,
+            chosen.features.name,
+            chosen.base,
         )
 
     def _images_to_extend(self, pairs: Sequence[Pair], level: int) -> list[str]:
@@ -342,7 +344,7 @@ class Escalation:
     def _match_again(
         self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]
     ) -> None:
-        size_px = self.extraction.max_image_size_px
+        size_px = self.extraction.levels[level].max_image_size_px
         verifier, graph = PairVerifier(self.path, self.verification, size_px), self.graph()
         tried: list[Pair] = []
         better: list[PairMatches] = []

@@ -35,7 +35,7 @@ from colmap_affrect.stages.one_guided_pair import (
     GuidedTask,
     PairView,
 )
-from colmap_affrect.stages.verify import recorded_verification, verify_new
+from colmap_affrect.stages.verify import extracted_px, recorded_verification, verify_new
 
 Matches = NDArray[np.int64]
 
@@ -104,7 +104,7 @@ def restore_exact(context: Context, pairs: Collection[Pair] | None = None) -> No
     with colmap_database.open_database(workspace.database) as database:
         for pair in guided:
             database.delete_two_view_geometry(*(ids[name] for name in pair.names))
-    verify_new(workspace)
+    verify_new(context)
     context.guided.write([replace(pair, num_inliers=0) for pair in guided])
 
 
@@ -188,7 +188,7 @@ class Guiding:
         sizes = context.features.image_sizes()
         self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()}
         self.verifier = PairVerifier(
-            self.path, recorded_verification(context.workspace), max_size_px
+            self.path, recorded_verification(context.workspace), extracted_px(context)
         )
 
     def todo(self, images: Collection[str] | None) -> tuple[list[Pair], int]:

@@ -19,6 +19,9 @@ from colmap_affrect.stages.pairs import listed_pairs
 
 PAIRS_PER_WRITE = 64
 
+SECONDS_PER_WRITE = 30.0
+"""Pairs of a network take seconds each: what is found is stored before there are so many."""
+
 
 def recorded_matching(workspace: Workspace) -> MatcherOptions:
     """Return the options on record of matching, done or still to be done."""
@@ -56,6 +59,7 @@ def match_pairs(
     """Match pairs by the features that every image has, and store them batch by batch."""
     matches = context.matches
     batch: list[PairMatches] = []
+    written = time.monotonic()
     try:
         with closing(
             iterate_matches(
@@ -71,9 +75,10 @@ def match_pairs(
             for found in found_pairs:
                 batch.append(found)
                 advance(1)
-                if len(batch) == PAIRS_PER_WRITE:
+                is_due = time.monotonic() - written > SECONDS_PER_WRITE
+                if len(batch) == PAIRS_PER_WRITE or is_due:
                     matches.write(batch)
-                    batch = []
+                    batch, written = [], time.monotonic()
     finally:
         if batch:
             matches.write(batch)

@@ -27,7 +27,7 @@ from colmap_affrect.data import (
     RectificationPlan,
     in_mask,
 )
-from colmap_affrect.errors import DepthError, ImageError, OptionError, WeightsError
+from colmap_affrect.errors import DepthError, ImageError, OptionError
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
 from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.geometry.affine import transform_frames
@@ -45,7 +45,7 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, Rectifier, RectifierInputs
 from colmap_affrect.rectifiers.execute import extract_rectified
-from colmap_affrect.stages.context import Resources
+from colmap_affrect.stages.context import Resources, require_same_files
 
 MIN_RECTIFIABLE_PX = 32
 """Images with a shorter side are not rectified: no block would see its surroundings."""
@@ -131,15 +131,15 @@ class ImageExtractor:
 
     Attributes:
         options: of the recipe.
-        extractor: detector and descriptor.
-        rectifiers: one per level, that of every image first, then those of escalation.
+        extractors: detector and descriptor of each level, that of every image first.
+        rectifiers: of each level.
         weights: files of the networks by key.
         resources: that it was prepared with.
         network_lock: held while networks run, which take one image at a time.
     """
 
     options: ExtractionOptions
-    extractor: FeatureExtractor
+    extractors: tuple[FeatureExtractor, ...]
     rectifiers: tuple[Rectifier, ...]
     weights: Mapping[str, Path] = field(default_factory=dict)
     resources: Resources = field(default_factory=Resources)
@@ -189,7 +189,7 @@ class ImageExtractor:
         features may be. Raises ImageError when the file cannot be read, or its mask has another
         size.
         """
-        photograph, original_size = self.photograph(path, name, intrinsics, mask)
+        photograph, original_size = self.photograph(path, name, intrinsics, mask, level)
         with self.network_lock, SHARED_OPENCV_THREADS:
             found = unless_gpu_is_full(
                 lambda: self.extract(photograph, level),
@@ -209,7 +209,7 @@ class ImageExtractor:
     def extract(self, photograph: Photograph, level: int = 0) -> ExtractedImage:
         """Plan and execute; frames are in px of the photograph at the size of processing."""
         plan, warning = self.plan_or_warn(photograph, level)
-        features = self.execute(photograph, plan, with_original=level == 0)
+        features = self.execute(photograph, plan, level)
         return ExtractedImage(features, photograph.size, warning)
 
     def _extract_on_cpu(self, photograph: Photograph, level: int) -> ExtractedImage:
@@ -226,6 +226,7 @@ class ImageExtractor:
         name: str = "",
         intrinsics: NDArray[np.float64] | None = None,
         mask: Mask | None = None,
+        level: int = 0,
     ) -> tuple[Photograph, tuple[int, int]]:
         """Read an image at the size of processing; also return its stored (width, height)."""
         image = read_gray(path)
@@ -235,9 +236,10 @@ class ImageExtractor:
                 f"{mask.shape[1]} x {mask.shape[0]} px; they must have one size"
             )
         original_size = (image.shape[1], image.shape[0])
-        limit = self.options.max_image_size_px
+        chosen = self.options.levels[level]
+        limit = chosen.max_image_size_px
         gray = shrink_to(image, limit)
-        color = read_color(path, limit) if self.options.features.in_color else None
+        color = read_color(path, limit) if chosen.features.in_color else None
         size = (gray.shape[1], gray.shape[0])
         original_camera = camera_matrix(original_size) if intrinsics is None else intrinsics
         camera = resized_from_original(original_size, size) @ original_camera
@@ -259,15 +261,19 @@ class ImageExtractor:
             return RectificationPlan(photograph.size), f"not rectified: {error}"
 
     def execute(
-        self, photograph: Photograph, plan: RectificationPlan, *, with_original: bool = True
+        self, photograph: Photograph, plan: RectificationPlan, level: int = 0
     ) -> LocalFeatures:
-        """Extract the features of a plan, frames in px of the photograph."""
+        """Extract the features of a level's plan, frames in px of the photograph.
+
+        Those of the image itself only where no lower level has them.
+        """
+        chosen = self.options.levels[level]
         return extract_rectified(
             photograph.gray if photograph.color is None else photograph.color,
             plan,
-            self.extractor,
-            self.options.features.max_num_rectified_features,
-            with_original=with_original,
+            self.extractors[level],
+            chosen.features.max_num_rectified_features,
+            with_original=chosen.base == level,
             mask=photograph.mask,
         )
 
@@ -290,7 +296,8 @@ def num_images_at_once(extractor: ImageExtractor) -> int:
     """
     if extractor.options.uses_networks:
         return 2
-    num_bytes = BYTES_PER_PIXEL * extractor.options.max_image_size_px**2
+    longest = max(level.max_image_size_px for level in extractor.options.levels)
+    num_bytes = BYTES_PER_PIXEL * longest**2
     return min(available_cores(), max(1, available_memory_bytes() // 2 // num_bytes))
 
 
@@ -321,11 +328,14 @@ def prepare(
     resources = resources or Resources()
     weights = resolve(options.weights, resources.weights_path, progress=progress)
     network = NetworkContext(weights, _device(options, resources))
-    extractor = EXTRACTORS.make(options.features, network)
+    levels = options.levels
+    extractors = {
+        features: EXTRACTORS.make(features, network) for features in {x.features for x in levels}
+    }
     depth = None
     if options.uses_depth:
         if not options.depth.is_given:
-            needing = next(item.name for item in options.rectifiers if item.uses_depth)
+            needing = next(x.rectifier.name for x in levels if x.rectifier.uses_depth)
             raise OptionError(
                 f"rectifier {needing} needs depth maps: give --depth-path FOLDER, or "
                 "--depth-model NAME for a monocular depth network"
@@ -334,20 +344,21 @@ def prepare(
         depth = DEPTH_SOURCES.make(options.depth, depth_context)
         if image_names is not None:
             depth.require_some(image_names)
-    covers = (item for item in options.rectifiers if isinstance(item, CoverOptions))
-    sources = {cover.shape_source for cover in covers}
-    shapes = {source: SHAPES.make(source, network, options.features) for source in sources}
-    rectifiers = tuple(
-        RECTIFIERS.make(
-            item,
-            RectifierInputs(
-                shapes[item.shape_source] if isinstance(item, CoverOptions) else None,
-                depth if item.uses_depth else None,
-            ),
+    shapes = {
+        (item.shape_source, level.features): SHAPES.make(item.shape_source, network, level.features)
+        for level in levels
+        if isinstance(item := level.rectifier, CoverOptions)
+    }
+    rectifiers = []
+    for level in levels:
+        item = level.rectifier
+        source = (
+            shapes[item.shape_source, level.features] if isinstance(item, CoverOptions) else None
         )
-        for item in options.rectifiers
-    )
-    return ImageExtractor(options, extractor, rectifiers, weights, resources)
+        inputs = RectifierInputs(source, depth if item.uses_depth else None)
+        rectifiers.append(RECTIFIERS.make(item, inputs))
+    of_levels = tuple(extractors[level.features] for level in levels)
+    return ImageExtractor(options, of_levels, tuple(rectifiers), weights, resources)
 
 
 def _prepared_elsewhere(
@@ -355,12 +366,7 @@ def _prepared_elsewhere(
 ) -> ImageExtractor:
     """Prepare a recipe in another process; depth maps of networks are not kept from there."""
     extractor = prepare(options, replace(resources, depth_cache_path=None))
-    for key, path in extractor.weights.items():
-        if file_sha256(path) != digests[key]:
-            raise WeightsError(
-                f"{path}: is another file than {key} on the machine that leads the work; give "
-                "both the same"
-            )
+    require_same_files(extractor.weights, digests)
     return extractor
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.features.weights import resolve
+from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.matchers.base import (
     MATCHERS,
     ImageFeatures,
@@ -28,7 +28,7 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import ordered_for_reuse
 from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.stores import FeatureStore, PairMatches
-from colmap_affrect.stages.context import Resources
+from colmap_affrect.stages.context import Resources, require_same_files
 
 CACHE_BYTES = 1 << 29
 """Memory that prepared images may take in a process."""
@@ -45,8 +45,9 @@ def iterate_matches(
     resources: Resources | None = None,
     executor: Executor | None = None,
     extractor: str = "",
+    base: int = 0,
 ) -> Generator[PairMatches, None, None]:
-    """Match pairs by the features of the images themselves and those of one level.
+    """Match pairs by the features of one level and those of the images themselves, in its base.
 
     Pairs come in an order in which an image, once read, stays in memory for most of its pairs.
     Workers that do not see the file of features get those of each pair; ``extractor`` is the name
@@ -66,6 +67,7 @@ def iterate_matches(
         num_similarities=num_similarities,
         resources=resources or Resources(),
         extractor=extractor,
+        base=base,
     )
     files = [store.path]
     is_shared = executor.sees(files)
@@ -196,19 +198,22 @@ class CachedMatcher:
         num_similarities: float = 0,
         resources: Resources | None = None,
         extractor: str = "",
+        base: int = 0,
     ) -> None:
         """Name the features and build the matcher.
 
-        The features of a level come together with those of level 0; ``max_num_features`` are those
+        The features of a level come together with those of its base; ``max_num_features`` are those
         of the largest responses, None takes all. ``num_similarities`` is about how many pairs of
         features there will be to compare.
         """
         resources = resources or Resources()
+        options.require_extractor(extractor)
         self._store, self._options, self._level = store, options, level
         self._max_num_features, self._num_similarities = max_num_features, num_similarities
-        self._resources, self._extractor = resources, extractor
+        self._resources, self._extractor, self._base = resources, extractor, base
         weights = resolve(options.weights, resources.weights_path)
         context = MatcherContext(weights, resources.device, num_similarities)
+        self._weights = weights
         self._matcher = MATCHERS.make(options, context)
         self._images = ImageCache(lambda name: self._prepare(self.read(name)))
 
@@ -219,8 +224,10 @@ class CachedMatcher:
             "num_similarities": self._num_similarities,
             "resources": self._resources,
             "extractor": self._extractor,
+            "base": self._base,
         }
-        return _rebuilt, (self._store, self._options, given)
+        digests = {key: file_sha256(path) for key, path in self._weights.items()}
+        return _rebuilt, (self._store, self._options, given, digests)
 
     def __call__(self, task: PairTask) -> PairMatches:
         """Match by the features that came with the task, or by those in the store."""
@@ -241,7 +248,7 @@ class CachedMatcher:
 
     def read(self, name: str) -> StoredFeatures:
         """Read the features of an image."""
-        indices = self._store.level_indices(name, self._level)
+        indices = self._store.level_indices(name, self._level, self._base)
         features = self._store.read(name).select(indices)
         if self._max_num_features is not None:
             order = np.argsort(-features.responses, kind="stable")
@@ -259,5 +266,9 @@ class CachedMatcher:
         return self._images.get(name)
 
 
-def _rebuilt(store: FeatureStore, options: MatcherOptions, given: dict[str, Any]) -> CachedMatcher:
-    return CachedMatcher(store, options, **given)
+def _rebuilt(
+    store: FeatureStore, options: MatcherOptions, given: dict[str, Any], digests: Mapping[str, str]
+) -> CachedMatcher:
+    matcher = CachedMatcher(store, options, **given)
+    require_same_files(matcher._weights, digests)
+    return matcher

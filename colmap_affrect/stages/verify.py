@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.verification import VerificationOptions, verify
+from colmap_affrect.colmap.verification import ExtractedPx, VerificationOptions, verify
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
@@ -41,11 +41,27 @@ def verify_matches(
     write_matches(context, pairs)
     todo = len(colmap_database.unverified_pairs(workspace.database))
     with context.progress.stage("verify", todo, "pairs") as advance:
-        verify_new(workspace, advance)
+        verify_new(context, advance)
     return StageReport("verify", time.perf_counter() - start, todo, len(pairs) - todo)
 
 
-def verify_new(workspace: Workspace, advance: Callable[[int], None] | None = None) -> None:
+def extracted_px(context: Context) -> ExtractedPx:
+    """Return the longest side that photographs were shrunk to, or pairs by what they climbed to."""
+    levels = recorded_extraction(context.workspace).levels
+    sizes = [level.max_image_size_px for level in levels]
+    if len(set(sizes)) == 1:
+        return sizes[0]
+    ids = colmap_database.image_ids(context.workspace.database)
+    pairs = [pair for pair in listed_pairs(context) if ids.keys() >= set(pair)]
+    found: dict[tuple[int, int], int] = {}
+    for (first, second), level in context.matches.levels(pairs).items():
+        low, high = sorted((ids[first], ids[second]))
+        found[low, high] = sizes[level]
+    return found
+
+
+def verify_new(context: Context, advance: Callable[[int], None] | None = None) -> None:
     """Verify the pairs of the database that have matches and no two-view geometry, good or bad."""
-    extracted_px = recorded_extraction(workspace).max_image_size_px
-    verify(workspace.database, recorded_verification(workspace), extracted_px, advance)
+    workspace = context.workspace
+    options = recorded_verification(workspace)
+    verify(workspace.database, options, extracted_px(context), advance)

@@ -91,10 +91,15 @@ def main() -> None:
     arguments = parser.parse_args()
     recipe = load_recipe("dense-affnet", [f"features.descriptor={arguments.descriptor}"])
     extractor = prepare(recipe.extraction, Resources(arguments.weights, "cpu"))
-    if not isinstance(extractor.extractor, AffNetHardNet):
+    if not isinstance(extractor.extractors[0], AffNetHardNet):
         raise SystemExit("dense-affnet has other features")
-    ways = [extractor, replace(extractor, extractor=KorniaChain(extractor.extractor, extractor))]
-    exact = replace(extractor, extractor=KorniaChain(extractor.extractor, extractor, torch.float64))
+    ways = [
+        extractor,
+        replace(extractor, extractors=(KorniaChain(extractor.extractors[0], extractor),)),
+    ]
+    exact = replace(
+        extractor, extractors=(KorniaChain(extractor.extractors[0], extractor, torch.float64),)
+    )
     names = list_images(arguments.image_path)[: arguments.max_num_images]
     print(describe_machine())
     for name in names:

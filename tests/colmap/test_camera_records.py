@@ -14,6 +14,7 @@ from colmap_affrect.colmap.camera_records import (
     write_camera_records,
 )
 from colmap_affrect.errors import WorkspaceError
+from colmap_affrect.project.report import ModelSummary
 
 FROM_EXIF = CameraRecord(("a č.jpg", "b.jpg"), "exif", 812.5, size=(640, 480))
 VOTED = CameraRecord(("c.jpg",), "pairs", 500.0, 480.0, 530.0, "40 pairs agree", (300, 400))
@@ -36,11 +37,15 @@ def test_damaged_records_are_one_clear_line(tmp_path: Path, text: str) -> None:
 
 
 def test_report_has_the_focal_length_in_longer_sides_and_the_spread() -> None:
-    entry = VOTED.to_report(12, 1450.0)
+    model = ModelSummary((), 0, 0.0, 0.0, focals_px={"c.jpg": 470.0, "z": 9.0},
+                         rival_focals_px={"c.jpg": (460.0, 560.0)})  # fmt: skip
+    entry = VOTED.to_report(12, model)
+    assert (entry["refined_px"], entry["rival_px"]) == (470.0, (460.0, 560.0))
     assert (entry["id"], entry["num_images"], entry["source"]) == (12, 1, "pairs")
     assert entry["focal_longer_sides"] == pytest.approx(1.25)
     assert entry["spread_px"] == [480.0, 530.0]
-    assert FROM_EXIF.to_report(3, None)["spread_px"] is None
+    known = FROM_EXIF.to_report(3, None)
+    assert known["spread_px"] is known["refined_px"] is known["rival_px"] is None
 
 
 def test_only_cameras_with_a_story_are_named_and_not_all() -> None:

@@ -163,6 +163,15 @@ def test_shapes_that_are_all_alike_tell_nothing() -> None:
     assert telling_shapes(rows(lafs)) is None
 
 
+def test_shapes_that_are_those_of_views_tell_nothing() -> None:
+    lafs, _ = frames_of([HOMOGRAPHY], 90, 4)
+    views = np.array([np.eye(2), [[1.5, 0.4], [0.0, 0.6]], [[0.5, 0.0], [-0.8, 2.0]]])
+    lafs[:, :, :2] = 12.0 * views[np.arange(90) % 3]
+    assert telling_shapes(rows(lafs)) is None
+    lafs[:, :, :2] = lafs[:, :, :2] @ rotation(np.linspace(0, 3, 90))
+    assert telling_shapes(rows(lafs)) is not None
+
+
 def test_frames_of_a_plane_turn_as_its_homography_does() -> None:
     first, second = frames_of([HOMOGRAPHY], 40, 5)
     np.testing.assert_allclose(second[:, :, 2], project(HOMOGRAPHY, first[:, :, 2]))

@@ -49,7 +49,7 @@ class RectifierContract:
 
     def extractor(self) -> ImageExtractor:
         options = ExtractionOptions()
-        return ImageExtractor(options, RootSift(SiftOptions()), (self.make(),))
+        return ImageExtractor(options, (RootSift(SiftOptions()),), (self.make(),))
 
     @pytest.mark.parametrize("kind", IMAGES)
     def test_plan_keeps_the_invariants(self, kind: str) -> None:
@@ -70,7 +70,10 @@ class RectifierContract:
         plan = extractor.plan(photograph)
         features = extractor.execute(photograph, plan)
         assert len(features) or kind != "textured"
-        assert features.descriptors.shape == (len(features), extractor.extractor.descriptor_size)
+        assert features.descriptors.shape == (
+            len(features),
+            extractor.extractors[0].descriptor_size,
+        )
         assert features.inside(plan.image_size).all()
         for number, item in enumerate(plan.items, 1):
             of_warp = features.select(features.rectification_ids == number)

@@ -19,7 +19,11 @@ NETWORKS = {
     }
     for detector in ("dog", "keynet", "hessian")
 }
-CASES = {name: {"name": name} for name in EXTRACTORS.names() if name != "affnet-hardnet"} | NETWORKS
+CASES = {
+    **{name: {"name": name} for name in EXTRACTORS.names() if name != "affnet-hardnet"},
+    **NETWORKS,
+    "xfeat": {"name": "xfeat", "score_threshold": 0.0},  # random scores are far below the default
+}
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +31,8 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return write_random_weights(tmp_path_factory.mktemp("weights"))
 
 
-LONG = [f"affnet-hardnet {detector}" for detector in ("keynet", "hessian")]
-"""Detectors of kornia, which take seconds."""
+LONG = ["affnet-hardnet keynet", "affnet-hardnet hessian", "aliked", "disk"]
+"""Detectors of kornia, which take seconds; the quickest of the learned features stays."""
 
 
 @pytest.mark.parametrize(

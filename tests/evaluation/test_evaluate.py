@@ -253,7 +253,9 @@ def test_unforeseen_error_of_a_score_fails_its_pair_only(
 @pytest.fixture
 def climbing(tmp_path: Path) -> str:
     path = tmp_path / "climbing.toml"
-    path.write_text('[rectifier]\nname = "identity"\n[[escalation]]\nname = "dense-shapes"\n')
+    path.write_text(
+        '[rectifier]\nname = "identity"\n[[escalation]]\nrectifier.name = "dense-shapes"\n'
+    )
     return f"{path}:escalate.strong_num_inliers="
 
 

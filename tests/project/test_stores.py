@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -40,6 +41,28 @@ def assert_same_features(read: LocalFeatures, written: LocalFeatures) -> None:
     assert_array_equal(read.rectification_ids, written.rectification_ids)
     assert read.descriptors.shape == written.descriptors.shape
     assert_allclose(read.descriptors, written.descriptors, atol=FLOAT16_ROUNDING)
+
+
+def test_levels_of_other_features_are_kept_side_by_side(tmp_path: Path) -> None:
+    """Shorter and longer descriptors; the photograph looked at again is no warp."""
+    store, first = FeatureStore(tmp_path / "features.h5"), some_features(4)
+    short, long = some_features(3, seed=1), some_features(2, seed=2)
+    short = replace(short, descriptors=short.descriptors[:, :64])
+    wide = np.pad(long.descriptors, ((0, 0), (100, 0)))
+    long = replace(long, descriptors=wide)
+    store.write("a.png", first, (300, 200))
+    store.extend("a.png", replace(short, rectification_ids=np.array([0, 1, 0], np.int32)))
+    store.extend("a.png", long)
+    read = store.read("a.png")
+    highest = first.rectification_ids.max()
+    assert_array_equal(read.rectification_ids[4:7], [0, highest + 1, 0])
+    assert_array_equal(store.level_indices("a.png", 2), [0, 1, 2, 3, 7, 8])
+    assert_array_equal(store.level_indices("a.png", 2, base=1), [4, 5, 6, 7, 8])
+    assert_array_equal(store.level_indices("a.png", 1, base=1), [4, 5, 6])
+    assert read.descriptors.shape == (9, 228)
+    assert_allclose(read.descriptors[4:7, :64], short.descriptors, atol=FLOAT16_ROUNDING)
+    assert not read.descriptors[4:7, 64:].any()
+    assert_allclose(read.descriptors[7:], wide, atol=FLOAT16_ROUNDING)
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMom
 from colmap_affrect.geometry.affine import lafs_from_keypoints, project
 from colmap_affrect.geometry.canvas import fit_canvas, image_corners, rectifying_affine
 from colmap_affrect.geometry.tilts import asift_covering, metrics_from_tilts
-from colmap_affrect.recipes import ExtractionOptions
+from colmap_affrect.recipes import ExtractionOptions, LevelOptions
 from colmap_affrect.rectifiers.base import (
     RECTIFIERS,
     CoverOptions,
@@ -148,14 +148,18 @@ def extractor_of(
     """Extractor whose levels have these plans."""
     levels = [AsiftOptions() if plan.items else IdentityOptions() for plan in plans]
     return ImageExtractor(
-        ExtractionOptions(rectifier=levels[0], escalation=tuple(levels[1:]), **options),
-        extractor or GridFeatures(),
+        ExtractionOptions(
+            rectifier=levels[0],
+            escalation=tuple(LevelOptions(rectifier=item) for item in levels[1:]),
+            **options,
+        ),
+        (extractor or GridFeatures(),) * len(plans),
         tuple(Planned(plan) for plan in plans),
     )
 
 
 def extractor_with(options: RectifierOptions, rectifier: Any) -> ImageExtractor:
-    return ImageExtractor(ExtractionOptions(rectifier=options), GridFeatures(), (rectifier,))
+    return ImageExtractor(ExtractionOptions(rectifier=options), (GridFeatures(),), (rectifier,))
 
 
 @pytest.fixture
@@ -195,7 +199,7 @@ def test_json_describes_a_known_plan(tmp_path: Path, photo: Path) -> None:
     shown = inspect_image(extractor, photo, tmp_path / "new" / "out")
     plan_path = tmp_path / "new" / "out" / "photo-plan.json"
     data = json.loads(plan_path.read_text(encoding="utf-8"))
-    assert data["size"] == data["stored_size"] == [300, 200]
+    assert data["levels"][0]["size"] == data["stored_size"] == [300, 200]
     assert data["options"]["rectifier"]["name"] == "asift"
     (level,) = data["levels"]
     warp1, warp2, warp3 = level["warps"]
@@ -230,7 +234,7 @@ def test_sizes_are_those_of_processing(tmp_path: Path, photo: Path) -> None:
     plan = RectificationPlan((150, 100), (affine_warp(2.0, 0.3, (10, 5, 60, 40)),))
     inspect_image(extractor_of(plan, max_image_size_px=150), photo, tmp_path)
     data = json.loads((tmp_path / "photo-plan.json").read_text(encoding="utf-8"))
-    assert (data["stored_size"], data["size"]) == ([300, 200], [150, 100])
+    assert (data["stored_size"], data["levels"][0]["size"]) == ([300, 200], [150, 100])
     assert data["levels"][0]["warps"][0]["region"]["share"] == pytest.approx(2400 / 15_000)
 
 

@@ -31,7 +31,7 @@ from colmap_affrect.stages.escalate import Escalation, recorded_escalation
 from colmap_affrect.stages.extract import Inputs, extract, recorded_extraction
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
-from colmap_affrect.stages.verify import verify_matches
+from colmap_affrect.stages.verify import extracted_px, verify_matches
 
 FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images"
 NAMES = ["view_1_tilt00.jpg", "view_2_tilt30.jpg", "view_6_tilt75.jpg"]
@@ -180,6 +180,54 @@ def test_trial_of_a_pair_is_what_the_database_then_holds(
         indices = matches(workspace, pair).astype(np.int64)
         count = verifier.num_inliers(pair, tuple(frames), indices)
         assert count == len(geometry(workspace, pair))
+
+
+OTHER_FEATURES = """
+[rectifier]
+name = "identity"
+[[escalation]]
+max_image_size_px = 360
+features = { name = "rootsift", contrast_threshold = 0.01 }
+matching = { name = "nearest", max_ratio = 0.9 }
+[[escalation]]
+rectifier.name = "dense-shapes"
+max_image_size_px = 360
+features = { name = "rootsift", contrast_threshold = 0.01 }
+[escalate]
+strong_num_inliers = 1000000
+min_num_consistent = 0
+"""
+
+
+def test_levels_with_features_and_matching_of_their_own(photos: Path, tmp_path: Path) -> None:
+    """The first of them looks at the photographs again; others add warps to what it found."""
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text(OTHER_FEATURES)
+    workspace = verified(photos, tmp_path / "out", str(recipe))
+    escalate(workspace)
+    features, store = FeatureStore(workspace.features), MatchStore(workspace.matches)
+    ids, tried = image_ids(workspace.database), store.tried_levels([EASY, HARD])
+    assert max(tried.values()) == 2
+    sizes = extracted_px(Context(workspace))
+    for name in HARD:
+        first, second, third = features.level_ends(name)
+        origin = features.read_rectification_ids(name)
+        assert not origin[:second].any()
+        assert (origin[second:] > 0).all()
+        scales = features.read(name).scales
+        assert scales[first:second].min() > 1.2 * scales[:first].min()  # it was shrunk more
+        assert_array_equal(features.level_indices(name, 2, base=1), np.arange(first, third))
+    for pair in (EASY, HARD):
+        level = store.levels([pair])[pair]
+        low, high = sorted(ids[name] for name in pair)
+        assert sizes[low, high] == (480, 360, 360)[level]
+        (found,) = store.read([pair])
+        for side, name in enumerate(pair):
+            ends = features.level_ends(name)
+            own = found.indices[:, side]
+            assert own.max() < ends[level]
+            assert own.min() >= (ends[0] if level else 0)
+    assert store.levels([EASY])[EASY] > 0
 
 
 def numbered(*rows: tuple[int, int]) -> np.ndarray:

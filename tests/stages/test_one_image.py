@@ -145,7 +145,7 @@ def test_features_of_a_gpu_without_memory_are_those_of_the_cpu():
     photo = COURTYARD / "images" / "court_4.jpg"
     extractor = prepare(load_recipe("default", ["max_image_size_px=200"]).extraction)
     full = FailingExtractor("CUDA out of memory. Tried to allocate 2.00 GiB.")
-    found = replace(extractor, extractor=full).extract_file(photo)
+    found = replace(extractor, extractors=(full,)).extract_file(photo)
     assert found.warning == "extracted on the CPU, the memory of the GPU is full"
     assert_array_equal(found.features.lafs, extractor.extract_file(photo).features.lafs)
 
@@ -153,7 +153,7 @@ def test_features_of_a_gpu_without_memory_are_those_of_the_cpu():
 def test_other_failures_of_a_gpu_are_not_passed_over():
     extractor = prepare(load_recipe("default", ["max_image_size_px=200"]).extraction)
     broken = replace(
-        extractor, extractor=FailingExtractor("CUDA error: device-side assert triggered")
+        extractor, extractors=(FailingExtractor("CUDA error: device-side assert triggered"),)
     )
     with pytest.raises(RuntimeError, match="device-side assert"):
         broken.extract_file(COURTYARD / "images" / "court_4.jpg")
@@ -236,7 +236,7 @@ def test_extractors_that_ask_for_colour_see_the_warps_in_colour(tmp_path):
     keeps = KeepsViews()
     gray = prepare(ExtractionOptions(max_image_size_px=360))
     options = gray.options.changed(features=ColorOptions())
-    color = replace(gray, options=options, extractor=keeps)
+    color = replace(gray, options=options, extractors=(keeps,))
     assert len(color.extract_file(path).features) == 0
     whole, *warps = keeps.views
     assert whole.shape == (270, 360, 3)

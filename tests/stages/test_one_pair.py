@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.affine import lafs_from_keypoints
-from colmap_affrect.matchers import nearest
+from colmap_affrect.matchers import base, nearest
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.matchers.nearest_8bit import MakeCoarse, ShortList
 from colmap_affrect.pairs.lists import exhaustive_pairs
@@ -89,7 +89,7 @@ def test_what_a_gpu_has_no_memory_for_is_matched_by_the_cpu(
     make_coarse: MakeCoarse,
 ) -> None:
     expected = matches(store)
-    nearest._warn_that_gpu_is_full.cache_clear()
+    base._warn_that_gpu_is_full.cache_clear()
     monkeypatch.setattr(nearest, "coarse_descriptors", lambda *_: make_coarse)
     with caplog.at_level(logging.WARNING):
         assert matches(store) == expected

@@ -1,0 +1,256 @@
+"""Features ``aliked``, ``disk`` and ``xfeat``: networks that detect and describe in one pass.
+
+They find a point and neither scale nor shape: all frames are upright circles of RADIUS_PX, which
+a warp makes ellipses in the image.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.conventions import HALF_PIXEL
+from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, Mask, View, in_mask
+from colmap_affrect.features.base import FeatureOptions, NetworkContext
+from colmap_affrect.features.sift import is_searchable
+from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.options import within
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+RADIUS_PX = 12.0
+"""Radius of all frames: a sigma of 2 px, within which all three networks find a point again, so
+that a point that warps show again is known as the same."""
+
+MIN_NETWORK_PX = 32
+"""Views are filled up to this side: DISK normalises over what is a sixteenth of it."""
+
+Found = tuple["Tensor", "Tensor", "Tensor"]
+"""(N, 2) points in pixel-centre px, (N,) responses, (N, D) descriptors of unit length."""
+
+
+class LearnedOptions(FeatureOptions):
+    """What the three networks have in common."""
+
+    in_color: ClassVar[bool] = True
+    max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
+    """Most features of one view, by response, as their authors match them."""
+    dtype: Literal["float32", "float16", "bfloat16"] = "float32"
+    """Arithmetic of the network on a GPU; on a CPU it is ``float32``."""
+
+
+class AlikedOptions(LearnedOptions):
+    """Features ``aliked`` (Zhao et al. 2023)."""
+
+    name: Literal["aliked"] = "aliked"
+    model: Literal["n16", "n16rot", "n32"] = "n16"
+    """``n16rot`` was trained with rotated images, ``n32`` looks at twice as many places."""
+    score_threshold: Annotated[float, within(0.001, 1.0)] = 0.2
+    """Least score; where nothing has it, all maxima above the mean score of the view stay."""
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Key of the file of weights."""
+        return (f"aliked-{self.model}",)
+
+
+class DiskOptions(LearnedOptions):
+    """Features ``disk`` (Tyszkiewicz et al. 2020), trained with depth maps."""
+
+    name: Literal["disk"] = "disk"
+    score_threshold: Annotated[float, within(0.0, 1e6)] = 0.0
+    """Scores are above it."""
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Key of the file of weights."""
+        return ("disk",)
+
+
+class XFeatOptions(LearnedOptions):
+    """Features ``xfeat`` (Potje et al. 2024)."""
+
+    name: Literal["xfeat"] = "xfeat"
+    score_threshold: Annotated[float, within(0.0, 1.0)] = 0.05
+    """Scores are above it, before they are weighted by reliability."""
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Key of the file of weights."""
+        return ("xfeat",)
+
+
+class LearnedFeatures(ABC):
+    """A network on one view after another; its class says how it is called."""
+
+    descriptor_size: int
+
+    def __init__(self, options: LearnedOptions, context: NetworkContext) -> None:
+        """Keep the options; classes load the network, as :mod:`.networks` says."""
+        from colmap_affrect.features.networks import resolve_device
+
+        self.limit, self.dtype = options.max_num_features, options.dtype
+        self.device = resolve_device(context.device)
+
+    def detect(self, view: View) -> LocalFeatures:
+        """Detect and describe, by falling response; none for views under 8 px.
+
+        A gray view is taken as one whose colours are equal. The mask chooses among what was
+        found, so that its edge is no feature.
+        """
+        image, mask = view
+        if not is_searchable(image, mask):
+            return LocalFeatures.empty(self.descriptor_size)
+        import torch
+
+        allowed = np.ones(image.shape[:2], dtype=bool) if mask is None else mask > 0
+        best = _Best(allowed, self.limit)
+        with torch.inference_mode(), self._arithmetic():
+            found = self._run(_pixels(image).to(self.device), best)
+        points, responses, descriptors = (_array(values) for values in found)
+        lafs = lafs_from_keypoints(points, np.full(len(points), RADIUS_PX), np.zeros(len(points)))
+        return LocalFeatures(lafs, responses, descriptors)
+
+    def describe(
+        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
+    ) -> list[LocalFeatures]:
+        """Return the features as they are: :meth:`detect` has described them."""
+        del images
+        return list(detected)
+
+    @abstractmethod
+    def _run(self, pixels: Tensor, best: _Best) -> Found:
+        """Return the best features of a (1, 3, H, W) view in [0, 1]."""
+
+    def _arithmetic(self) -> AbstractContextManager[object]:
+        if self.dtype == "float32" or self.device.type == "cpu":
+            return nullcontext()
+        import torch
+
+        return torch.autocast(self.device.type, getattr(torch, self.dtype))
+
+
+class Aliked(LearnedFeatures):
+    """ALIKED: maxima of a score map to parts of a pixel, descriptors from places round them.
+
+    ``n16`` and ``n32`` find points where they are; ``n16rot`` up to 1 px below, by what there is.
+    """
+
+    Options = AlikedOptions
+    descriptor_size = 128
+
+    def __init__(self, options: AlikedOptions, context: NetworkContext) -> None:
+        """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
+        from colmap_affrect.features.networks import load_aliked
+
+        super().__init__(options, context)
+        (key,) = options.weights
+        self.network: Any = load_aliked(
+            key, options.score_threshold, context.weights[key], context.device
+        )
+
+    def _run(self, pixels: Tensor, best: _Best) -> Found:
+        features, scores = self.network.extract_dense_map(pixels)
+        (places,), (responses,), _ = self.network.dkd(scores)
+        size = places.new_tensor([pixels.shape[3] - 1, pixels.shape[2] - 1])
+        points = (places + 1) / 2 * size
+        chosen = best(points, responses)
+        (descriptors,), _ = self.network.desc_head(features, [places[chosen]])
+        return points[chosen], responses[chosen], descriptors
+
+
+class Disk(LearnedFeatures):
+    """DISK: maxima of a heat map at whole pixels, with the descriptor of that pixel.
+
+    Pixel i stands for the corner coordinate i, as the cameras have it that it was trained with:
+    compared with shrunk photographs it finds points 0.4 px right of and below where they are.
+    """
+
+    Options = DiskOptions
+    descriptor_size = 128
+
+    def __init__(self, options: DiskOptions, context: NetworkContext) -> None:
+        """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
+        from colmap_affrect.features.networks import load_disk
+
+        super().__init__(options, context)
+        self.score_threshold = options.score_threshold
+        self.network: Any = load_disk(context.weights["disk"], context.device)
+
+    def _run(self, pixels: Tensor, best: _Best) -> Found:
+        from torch.nn.functional import pad
+
+        height, width = pixels.shape[2:]
+        missing = max(MIN_NETWORK_PX - width, 0), max(MIN_NETWORK_PX - height, 0)
+        filled = pad(pixels, (0, missing[0], 0, missing[1]))
+        (found,) = self.network(
+            filled, score_threshold=self.score_threshold, pad_if_not_divisible=True
+        )
+        points = found.keypoints - HALF_PIXEL
+        chosen = best(points, found.detection_scores)
+        return points[chosen], found.detection_scores[chosen], found.descriptors[chosen]
+
+
+class XFeat(LearnedFeatures):
+    """XFeat: maxima of a heat map, descriptors of cells of 8 px interpolated at them.
+
+    The network sees the view shrunk to whole multiples of 32 px. Pixel i there stands for the
+    middle between i and i + 1: compared with shrunk photographs it finds points 0.4 px left of and
+    above where they are.
+    """
+
+    Options = XFeatOptions
+    descriptor_size = 64
+
+    def __init__(self, options: XFeatOptions, context: NetworkContext) -> None:
+        """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
+        from colmap_affrect.features.networks import load_xfeat
+
+        super().__init__(options, context)
+        self.network: Any = load_xfeat(
+            options.score_threshold, context.weights["xfeat"], context.device
+        )
+
+    def _run(self, pixels: Tensor, best: _Best) -> Found:
+        height, width = pixels.shape[2:]
+        (found,) = self.network.detectAndCompute(pixels, top_k=height * width)
+        # kornia multiplies whole pixels of the shrunk view by these; of corner coordinates, which
+        # that is right for, those of the middle are i + 1.
+        factors = [side / max(side // 32 * 32, 32) for side in (width, height)]
+        points = found["keypoints"] + pixels.new_tensor(factors) - HALF_PIXEL
+        chosen = best(points, found["scores"])
+        return points[chosen], found["scores"][chosen], found["descriptors"][chosen]
+
+
+class _Best:
+    """Chooses the strongest features where they are allowed."""
+
+    def __init__(self, allowed: Mask, limit: int) -> None:
+        self.allowed, self.limit = allowed, limit
+
+    def __call__(self, points: Tensor, responses: Tensor) -> Tensor:
+        """Return the indices of those that stay, by falling response."""
+        import torch
+
+        kept = np.flatnonzero(in_mask(self.allowed, _array(points)))
+        order = np.argsort(-_array(responses)[kept], kind="stable")[: self.limit]
+        return torch.from_numpy(kept[order]).to(points.device)
+
+
+def _pixels(image: GrayImage | ColorImage) -> Tensor:
+    """Return an (H, W) or (H, W, 3) image as (1, 3, H, W) float32 in [0, 1]."""
+    import torch
+
+    color = np.broadcast_to(np.atleast_3d(image), (*image.shape[:2], 3))
+    channels = np.ascontiguousarray(color.transpose(2, 0, 1), dtype=np.float32)
+    return torch.from_numpy(channels)[None] / 255
+
+
+def _array(values: Tensor) -> NDArray[np.float32]:
+    return np.asarray(values.float().cpu().numpy())

@@ -1,0 +1,367 @@
+"""LightGlue (Lindenberger, Sarlin, Pollefeys, ICCV 2023), built by kornia.
+
+LightGlue reads where features are, so it takes the features of one view: the image, or one of its
+warps, in coordinates of their own. Of images with warps every view of the one is matched with every
+view of the other, which costs the product of their numbers; what the views agree on is united.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.errors import OptionError, WeightsError
+from colmap_affrect.features.weights import load_state_dict
+from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.matchers.base import (
+    ImageFeatures,
+    MatcherContext,
+    MatcherOptions,
+    Matches,
+    unless_gpu_is_full_or_say,
+)
+from colmap_affrect.matchers.duplicates import without_duplicates
+from colmap_affrect.options import within
+from colmap_affrect.parallel.executor import one_openmp_thread
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+MIN_VIEW_FEATURES = 8
+"""Views with fewer features are left out: no geometry could be verified by what they add."""
+
+TRAINING_SIZE_PX = 1024
+"""Longer side of the images of training, whose pixels scales of features are in."""
+
+KORNIA_SIGMAS = 12.0
+"""Radius of kornia's frames of DoG features, in units of sigma."""
+
+DUPLICATE_RADIUS_PX = 2.0
+"""Of matches of several views that are closer than this at both ends the best one stays."""
+
+TrainedFor = Literal[
+    "aliked", "disk", "xfeat", "sift", "dog-affnet-hardnet", "keynet-affnet-hardnet"
+]
+
+
+@dataclass(frozen=True)
+class Training:
+    """What weights were trained for.
+
+    Attributes:
+        weights: key of the file.
+        kornia: name of the configuration in kornia.
+        extractor: whose features they take.
+        has_circles: whether frames are circles of one radius in the view, upright.
+    """
+
+    weights: str
+    kornia: str
+    extractor: str
+    has_circles: bool = True
+
+
+TRAININGS: dict[str, Training] = {
+    "aliked": Training("lightglue-aliked", "aliked", "aliked"),
+    "disk": Training("lightglue-disk", "disk", "disk"),
+    "xfeat": Training("lighterglue-xfeat", "xfeat", "xfeat"),
+    "sift": Training("lightglue-sift", "sift", "rootsift", False),
+    "dog-affnet-hardnet": Training(
+        "lightglue-dog-affnet-hardnet", "dog_affnet_hardnet", "affnet-hardnet", False
+    ),
+    "keynet-affnet-hardnet": Training(
+        "lightglue-keynet-affnet-hardnet", "keynet_affnet_hardnet", "affnet-hardnet", False
+    ),
+}
+
+
+class LightGlueOptions(MatcherOptions):
+    """LightGlue, and LighterGlue for XFeat; defaults are those of LightGlue's authors."""
+
+    name: Literal["lightglue"] = "lightglue"
+    trained_for: TrainedFor = "aliked"
+    """Features that the weights were trained for."""
+    max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
+    """Most features of each view that are matched, those of the largest responses."""
+    depth_confidence: Annotated[float, within(0.0, 1.0)] = 0.95
+    """No more layers when this share of the features is decided; 0: always all layers."""
+    width_confidence: Annotated[float, within(0.0, 1.0)] = 0.99
+    """Features that are this sure to have no match are dropped between layers; 0: none."""
+    min_score: Annotated[float, within(0.0, 1.0)] = 0.1
+    """Smallest score of a match."""
+    half_precision: bool = False
+    """Mixed precision on a GPU; a CPU keeps to 32 bits."""
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Key of the file of weights."""
+        return (TRAININGS[self.trained_for].weights,)
+
+    def require_extractor(self, extractor: str) -> None:
+        """Refuse features that the weights were not trained for."""
+        wanted = TRAININGS[self.trained_for].extractor
+        if extractor not in ("", wanted):
+            raise OptionError(
+                f"matching: trained_for={self.trained_for!r} takes features of {wanted}, not of "
+                f"{extractor}"
+            )
+
+
+@dataclass(frozen=True)
+class PreparedView:
+    """One view of an image as the network takes it.
+
+    Attributes:
+        rows: (N,) of the image's features.
+        inputs: the network's, a batch of one, on its device.
+    """
+
+    rows: NDArray[np.int64]
+    inputs: dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class PreparedViews:
+    """All views of an image that have features enough, and (N, 2) centres of all features, px."""
+
+    views: tuple[PreparedView, ...]
+    keypoints: NDArray[np.float64]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all arrays, on whatever device."""
+        tensors = (tensor for view in self.views for tensor in view.inputs.values())
+        return self.keypoints.nbytes + sum(tensor.nbytes for tensor in tensors)
+
+
+class LightGlue:
+    """Matches with one network, a pair of views at a time.
+
+    On a CPU each calling thread uses one core, so that results do not depend on their number. A GPU
+    takes one pair at a time; where its memory is full the CPU matches.
+    """
+
+    Options = LightGlueOptions
+
+    def __init__(self, options: LightGlueOptions, context: MatcherContext) -> None:
+        """Load the network.
+
+        Raises WeightsError when the file is damaged or of another network, DeviceError when the
+        device is not there.
+        """
+        from colmap_affrect.features.networks import resolve_device
+
+        self.options, self.training = options, TRAININGS[options.trained_for]
+        self._path = context.weights[self.training.weights]
+        self._device = resolve_device(context.device)
+        on_gpu = self._device.type != "cpu"
+        network = load_network(self._path, options, mixed=options.half_precision and on_gpu)
+        self._network = network.to(self._device)
+        self._gpu_lock = threading.Lock()
+
+    def prepare(self, image: ImageFeatures) -> PreparedViews:
+        """Bring the features of each view into its own coordinates, and onto the device."""
+        self.options.require_extractor(image.extractor)
+        features = image.features
+        views = []
+        for number in np.unique(features.rectification_ids):
+            rows = np.flatnonzero(features.rectification_ids == number)
+            if len(rows) < MIN_VIEW_FEATURES and number:
+                continue
+            order = np.argsort(-features.responses[rows], kind="stable")
+            rows = np.sort(rows[order[: self.options.max_num_features]])
+            views.append(self._view(features.select(rows), rows, image.image_size))
+        return PreparedViews(tuple(views), features.keypoints)
+
+    def _view(
+        self, features: LocalFeatures, rows: NDArray[np.int64], image_size: tuple[int, int]
+    ) -> PreparedView:
+        import torch
+
+        lafs, size = features.lafs, np.asarray(image_size, np.float64)
+        if features.rectification_ids[0]:
+            lafs, size = frames_of_view(lafs, has_circles=self.training.has_circles)
+        values = network_inputs(lafs, size, max(image_size), self.training.kornia)
+        values["descriptors"] = features.descriptors
+        inputs = {
+            name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
+            for name, array in values.items()
+        }
+        moved = unless_gpu_is_full_or_say(
+            lambda: {name: tensor.to(self._device) for name, tensor in inputs.items()},
+            lambda: inputs,
+        )
+        return PreparedView(rows, moved)
+
+    def match(self, first: PreparedViews, second: PreparedViews) -> Matches:
+        """Match two images; scores are the network's."""
+        parts = [self._match_views(view1, view2) for view1 in first.views for view2 in second.views]
+        if len(parts) == 1:
+            return parts[0]
+        return united(parts, first.keypoints, second.keypoints)
+
+    def _match_views(self, first: PreparedView, second: PreparedView) -> Matches:
+        if not len(first.rows) or not len(second.rows):
+            return NO_MATCHES
+        pair = {"image0": first.inputs, "image1": second.inputs}
+        rows, columns, scores = unless_gpu_is_full_or_say(
+            lambda: self._run(self._network, pair, self._device),
+            lambda: self._run(self._network_on_cpu, pair, _cpu()),
+        )
+        return Matches(np.stack([first.rows[rows], second.rows[columns]], axis=1), scores)
+
+    def _run(
+        self, network: torch.nn.Module, pair: dict[str, dict[str, Tensor]], device: torch.device
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+        import torch
+
+        on_gpu = device.type != "cpu"
+        torch.get_num_threads()  # lets torch set up this thread, which would undo the next line
+        limit = nullcontext() if on_gpu else one_openmp_thread()
+        with torch.inference_mode(), limit, self._gpu_lock if on_gpu else nullcontext():
+            there = {
+                image: {name: tensor.to(device) for name, tensor in inputs.items()}
+                for image, inputs in pair.items()
+            }
+            found = network(there)
+            rows, columns = found["matches"][0].cpu().numpy().T
+            scores = found["scores"][0].float().cpu().numpy()
+        order = np.argsort(rows, kind="stable")
+        return rows[order], columns[order], scores[order]
+
+    @cached_property
+    def _network_on_cpu(self) -> torch.nn.Module:
+        return load_network(self._path, self.options)
+
+
+NO_MATCHES = Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
+
+
+def _cpu() -> torch.device:
+    import torch
+
+    return torch.device("cpu")
+
+
+def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) -> torch.nn.Module:
+    """Build kornia's LightGlue with the parameters in a file; nothing is downloaded.
+
+    With ``mixed`` precision kornia computes in 16 bits where that is safe. Raises WeightsError when
+    the file does not hold all parameters in their shapes.
+    """
+    from kornia.feature import LightGlue as Network
+
+    configuration = {
+        **Network.features[TRAININGS[options.trained_for].kornia],
+        "weights": None,
+        "depth_confidence": options.depth_confidence,
+        "width_confidence": options.width_confidence,
+        "filter_threshold": options.min_score,
+        "mp": mixed,
+    }
+    network = Network(features=None, **configuration)  # type: ignore[arg-type]
+    state = {renamed(name): value for name, value in load_state_dict(path).items()}
+    try:
+        found = network.load_state_dict(state, strict=False)
+    except RuntimeError as error:
+        raise WeightsError(
+            f"{path}: not the weights of LightGlue for {options.trained_for} (of another size)"
+        ) from error
+    parameters = dict(network.named_parameters())
+    missing = [name for name in found.missing_keys if name in parameters]
+    if missing:
+        raise WeightsError(
+            f"{path}: not the weights of LightGlue for {options.trained_for} (no {missing[0]})"
+        )
+    return network.eval().requires_grad_(False)
+
+
+def renamed(name: str) -> str:
+    """Return kornia's name of a parameter, of files older than LightGlue's layers and XFeat's.
+
+    >>> renamed("matcher.self_attn.3.out_proj.bias")
+    'transformers.3.self_attn.out_proj.bias'
+    """
+    name = name.removeprefix("matcher.")
+    return re.sub(r"^(self_attn|cross_attn)\.(\d+)\.", r"transformers.\2.\1.", name)
+
+
+def frames_of_view(
+    lafs: NDArray[np.float64], *, has_circles: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Undo the warp of a view, whose frames were carried back into the image.
+
+    Circles became the map of the warp. Other frames have a common shape, which tells the map up to
+    a rotation; the one without is taken. The view is as large as its features reach.
+
+    Returns:
+        (N, 2, 3) frames in px of the view, and its (width, height).
+    """
+    shapes = lafs[:, :, :2] / np.sqrt(determinants(lafs[:, :, :2]))[:, None, None]
+    if has_circles:
+        linear = shapes.mean(axis=0)
+    else:
+        values, vectors = np.linalg.eigh((shapes @ shapes.transpose(0, 2, 1)).mean(axis=0))
+        linear = vectors * np.sqrt(values) @ vectors.T
+    linear = linear / np.sqrt(determinants(linear))
+    frames = np.linalg.inv(linear) @ lafs
+    low, high = frames[:, :, 2].min(axis=0), frames[:, :, 2].max(axis=0)
+    frames[:, :, 2] -= low
+    return frames, high - low + 1.0
+
+
+def network_inputs(
+    lafs: NDArray[np.float64], size: NDArray[np.float64], longer_side_px: int, kornia: str
+) -> dict[str, NDArray[np.floating[Any]]]:
+    """Return what the network reads of (N, 2, 3) frames in a view of (width, height).
+
+    Positions have their origin at the centre of the first pixel, as in training, and stay inside.
+    Scales are those of images of ``TRAINING_SIZE_PX``, of which only larger ones were shrunk;
+    orientations have the range and the sense of training: COLMAP's of SIFT, else kornia's.
+    """
+    values: dict[str, NDArray[np.floating[Any]]] = {
+        "keypoints": np.clip(lafs[:, :, 2], 0.0, size),
+        "image_size": size,
+    }
+    if kornia == "keynet_affnet_hardnet":
+        values["lafs"] = lafs
+    if kornia not in ("sift", "dog_affnet_hardnet"):
+        return values
+    sigmas = np.sqrt(determinants(lafs[:, :, :2])) / MEASUREMENT_SIGMAS
+    sigmas = sigmas * min(1.0, TRAINING_SIZE_PX / longer_side_px)
+    if kornia == "sift":
+        return values | {"scales": sigmas, "oris": np.arctan2(lafs[:, 1, 0], lafs[:, 0, 0])}
+    oris = np.arctan2(lafs[:, 0, 1], lafs[:, 0, 0]) % (2.0 * np.pi)
+    return values | {"scales": KORNIA_SIGMAS * sigmas, "oris": oris}
+
+
+def united(
+    parts: list[Matches], keypoints1: NDArray[np.float64], keypoints2: NDArray[np.float64]
+) -> Matches:
+    """Unite matches of several pairs of views: one-to-one, and each place once, the best first."""
+    if not sum(len(part.scores) for part in parts):
+        return NO_MATCHES
+    indices = np.concatenate([part.indices for part in parts])
+    scores = np.concatenate([part.scores for part in parts])
+    order = np.argsort(-scores, kind="stable")
+    indices, scores = indices[order], scores[order]
+    for column in (0, 1):  # the best match of each feature, in both images
+        _, best = np.unique(indices[:, column], return_index=True)
+        best.sort()
+        indices, scores = indices[best], scores[best]
+    places = keypoints1[indices[:, 0]], keypoints2[indices[:, 1]]
+    kept = without_duplicates(*places, DUPLICATE_RADIUS_PX)
+    indices, scores = indices[kept], scores[kept]
+    rising = np.argsort(indices[:, 0])
+    return Matches(indices[rising], scores[rising])

