@@ -37,6 +37,7 @@ def run_script(*arguments: object) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
+@pytest.mark.long
 def test_script_with_the_features_replaced_registers_the_scene(tmp_path: Path) -> None:
     write_photographs(tmp_path / "photos")
     script = RECIPES / "replace-sift" / "reconstruct.py"

@@ -139,6 +139,7 @@ def test_wrong_usage_ends_with_2_and_does_nothing(
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_json_goes_to_stdout_alone_and_progress_to_stderr(photos: Path, tmp_path: Path) -> None:
     done = run_command("run", *run_arguments(photos, tmp_path / "out"), "--json")
     assert done.returncode == 0, done.stderr
@@ -325,6 +326,7 @@ def test_interrupted_mapping_ends_with_130_and_leaves_no_half_written_models(
     assert f"preset      {preset}, {mapper} mapper\n" in done.stdout
 
 
+@pytest.mark.long
 def test_terminal_gets_bars(photos: Path, tmp_path: Path) -> None:
     controller, terminal = pty.openpty()
     termios.tcsetwinsize(terminal, (24, 80))

@@ -182,6 +182,7 @@ def _few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera_vote, "MAX_PAIRS_OF_IMAGE", 1)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_few_pairs")
 def test_images_that_are_added_later_are_voted_on_with_the_others(
     voted: Path, tmp_path: Path

@@ -230,6 +230,7 @@ def test_pairs_before_an_interruption_are_judged_and_the_others_come_later(
     assert list(verified_pairs(path, 1)) == [(1, 2)]
 
 
+@pytest.mark.long
 def test_trial_is_what_verification_finds(tmp_path: Path) -> None:
     path, options = tmp_path / "database.db", VerificationOptions(min_significance=5.0)
     write_pairs(path)

@@ -262,6 +262,7 @@ def test_lost_models_and_databases_are_said_in_their_place(
     assert page.number("registered", "sift") == 4
 
 
+@pytest.mark.long
 def test_page_of_200_photographs_is_below_15_mb(large_page_path: Path) -> None:
     page = Page(large_page_path.read_text(encoding="utf-8"))
     assert 2_000_000 < large_page_path.stat().st_size < 15_000_000

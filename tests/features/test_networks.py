@@ -113,6 +113,7 @@ def test_resolve_device_of_an_unknown_name_lists_the_known_ones(name: str) -> No
 # Files.
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     sorted(

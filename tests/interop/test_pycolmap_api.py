@@ -149,6 +149,7 @@ def test_reader_options_and_camera_mode_are_those_of_pycolmap(photos: Path, tmp_
         assert camera.focal_length == 2.0 * 320
 
 
+@pytest.mark.long
 def test_features_are_replaced_in_a_new_database_and_the_old_one_stays(
     photos: Path, sift: Path, tmp_path: Path
 ) -> None:

@@ -129,6 +129,7 @@ def test_global_mapper_registers_all_images_in_place_and_repeatably(tmp_path: Pa
         assert angle < ROTATION_ERROR_DEG
 
 
+@pytest.mark.long
 def test_global_mapper_has_a_model_of_two_images_by_our_preset_only(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     synthesize(path, 2, 400)
@@ -237,6 +238,7 @@ def processes_that_name(text: str) -> list[str]:
     return commands
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_global_mapper_ends_with_the_process_that_started_it(

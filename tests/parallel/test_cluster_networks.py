@@ -64,6 +64,7 @@ def matched(
     return hdf5_content(Workspace(out).matches)
 
 
+@pytest.mark.long
 def test_threads_one_pair_alone_and_a_resumed_run_find_the_same(
     tmp_path: Path, extracted: Path, weights: Path
 ) -> None:

@@ -142,6 +142,7 @@ def test_extract_rectified_without_warps_returns_the_features_of_the_image() -> 
     assert (actual.rectification_ids == 0).all()
 
 
+@pytest.mark.long
 def test_extract_rectified_keeps_the_strongest_features_of_all_warps() -> None:
     image = texture(SIZE, seed=24)
     columns = np.indices(SIZE[::-1])[1]

@@ -303,6 +303,7 @@ def test_sheet_of_plan(kind: str, extractor: GridFeatures, tmp_path: Path, photo
     assert len(level["warps"]) == len(PLANS[kind].items)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", [DenseShapesOptions(), AffNetShapesOptions()])
 def test_sheet_of_a_rectifier_that_reads_shapes(
     options: RectifierOptions, tmp_path: Path, photo: Path

@@ -19,6 +19,7 @@ from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 
 
+@pytest.mark.long
 def test_unreadable_image_is_reported_and_the_run_goes_on(
     trio: Path, tmp_path: Path, call: Call
 ) -> None:
@@ -52,6 +53,7 @@ def test_folder_of_unreadable_images_only_is_one_clear_line(tmp_path: Path, call
     ]
 
 
+@pytest.mark.long
 def test_blank_image_has_no_features_and_the_run_goes_on(
     trio: Path, tmp_path: Path, call: Call
 ) -> None:

@@ -199,6 +199,7 @@ min_num_consistent = 0
 """
 
 
+@pytest.mark.long
 def test_levels_with_features_and_matching_of_their_own(photos: Path, tmp_path: Path) -> None:
     """The first of them looks at the photographs again; others add warps to what it found."""
     recipe = tmp_path / "recipe.toml"

@@ -75,6 +75,7 @@ def test_photographs_of_one_room_are_chosen_by_their_features(
     assert choose(call, rooms, *arguments) == ["1.png 3.png", "2.png 4.png"]
 
 
+@pytest.mark.long
 def test_pairs_stay_and_come_when_photographs_come(
     extracted: Path, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -301,6 +301,7 @@ def test_other_options_than_before_are_named(copy: Workspace, photos: Path, call
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.long
 def test_options_survive_stage_by_stage(
     photos: Path, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -328,6 +329,7 @@ def test_options_survive_stage_by_stage(
     assert workspace.options_digest("extract", "match") != digest
 
 
+@pytest.mark.long
 def test_mapper_options_are_added_to_what_is_on_record(copy: Workspace, call: Call) -> None:
     seeds = ["--preset", "colmap", "--random-seed", "4"]
     assert call("map", "--output-path", copy.path, "--overwrite", *seeds).code in (0, 3)
