@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.comparison import DEFAULT_METHODS
+from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS
 from colmap_affrect.options import PRESETS
 from colmap_affrect.pairs.base import PairOptions
 
@@ -211,9 +211,10 @@ def json(text: str = "print report.json, no summary") -> Option:
 
 COMPARISON = (
     _value("--methods", "A,B,...",
-        "sift, sift-affine-dsp, recipes by name or path; NAME=RECIPE:section.option=value "
-        f"changes options (default: {','.join(DEFAULT_METHODS)})",
-        nargs="+", default=DEFAULT_METHODS),
+        "sift-colmap (all as COLMAP does it by default), sift, sift-affine-dsp (with our preset), "
+        "recipes by name or path; NAME=RECIPE:section.option=value changes options (default: "
+        f"{','.join(DEFAULT_METHODS)}, and {', '.join(LEARNED_METHODS)} where their weights are)",
+        nargs="+"),
     _value("--seeds", "N,...",
         "seeds of verification and mapping, which run once for each (default: 0,1,2)",
         type=_whole_numbers, default=(0, 1, 2)),

@@ -179,11 +179,12 @@ def compare(options: argparse.Namespace) -> int:
 
     if options.viewer:
         require_viewer()
+    methods = options.methods and parse_methods(options.methods, given.depth_settings(options))
     comparison = compare(
         options.image_path,
         options.output_path,
         CompareOptions(
-            methods=parse_methods(options.methods, given.depth_settings(options)),
+            methods=methods,
             seeds=options.seeds,
             ground_truth_path=options.ground_truth_path,
             **given.inputs(options),

@@ -1,4 +1,9 @@
 """Comparison of methods on one set of photographs."""
 
-DEFAULT_METHODS = ("sift", "sift-affine-dsp", "unrectified-rootsift", "default", "on-demand")
+DEFAULT_METHODS = (
+    "sift-colmap", "sift", "sift-affine-dsp", "unrectified-rootsift", "default", "on-demand",
+)  # fmt: skip
 """What is compared where nothing else is asked for."""
+
+LEARNED_METHODS = ("aliked-lightglue", "on-demand-learned")
+"""What is compared then too, where the weights are."""

@@ -20,13 +20,20 @@ from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
 from colmap_affrect.colmap.poses import Poses, disagreeing_images, pose_scores, read_poses
-from colmap_affrect.comparison import DEFAULT_METHODS, worker
-from colmap_affrect.comparison.methods import Method, parse_methods
+from colmap_affrect.colmap.verification import VerificationOptions
+from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
+from colmap_affrect.comparison.methods import (
+    SIFT_COLMAP,
+    Method,
+    parse_methods,
+    without_weights,
+)
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.request import Layout, Request
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.tables import to_csv, to_json
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
+from colmap_affrect.features.weights import install_hint
 from colmap_affrect.images.reading import require_png
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import Options
@@ -37,6 +44,7 @@ from colmap_affrect.pipeline import InputOptions, installed_versions
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.workspace import Workspace, first_difference
+from colmap_affrect.recipes import DEFAULT_MAPPERS
 
 DEFAULT_SEEDS = (0, 1, 2)
 
@@ -46,12 +54,13 @@ class CompareOptions(InputOptions):
     """Everything a comparison depends on beside its images and its output folder.
 
     Attributes:
-        methods: names of methods as the command line takes them, or methods.
+        methods: names of methods as the command line takes them, or methods; None for those that
+            need no weights, and learned ones whose weights are there.
         seeds: of verification and mapping, which run once for each.
         ground_truth_path: folder of a COLMAP model with true poses, in any frame; None for none.
     """
 
-    methods: Sequence[str | Method] = DEFAULT_METHODS
+    methods: Sequence[str | Method] | None = None
     seeds: Sequence[int] = DEFAULT_SEEDS
     ground_truth_path: Path | None = None
 
@@ -107,6 +116,8 @@ class _Plan:
         options: with checked mapping options.
         names: all images given, sorted.
         truth: true poses; None without ground truth.
+        not_compared: learned methods that would have been compared with their weights, and how
+            these are had.
     """
 
     image_path: Path
@@ -116,11 +127,14 @@ class _Plan:
     names: list[str]
     pairs: list[Pair]
     truth: Poses | None
+    not_compared: str = ""
 
     @classmethod
     def checked(cls, image_path: Path, layout: Layout, options: CompareOptions) -> _Plan:
         """Refuse what cannot work before anything is written."""
-        methods = parse_methods(options.methods)
+        lacking = without_weights(options.resources.weights_path) if not options.methods else {}
+        learned = [name for name in LEARNED_METHODS if name not in lacking]
+        methods = parse_methods(options.methods or [*DEFAULT_METHODS, *learned])
         if not options.seeds or len(set(options.seeds)) < len(options.seeds):
             raise OptionError(f"--seeds {','.join(map(str, options.seeds))}: give different seeds")
         options.resources.require_device()
@@ -143,7 +157,10 @@ class _Plan:
             pairs = read_pairs(Path(options.pairs.match_list_path), names)
         truth = _ground_truth(options.ground_truth_path, names)
         options = replace(options, mapping=mapping)
-        return cls(image_path, layout, options, methods, names, pairs, truth)
+        files = {file.file_name: file for group in lacking.values() for file in group}
+        hint = install_hint(files.values()).removesuffix(", or ")
+        absent = f"{', '.join(lacking)}: {hint}" if lacking else ""
+        return cls(image_path, layout, options, methods, names, pairs, truth, absent)
 
     def inputs(self) -> dict[str, Any]:
         """Return what the results of every method depend on."""
@@ -168,6 +185,7 @@ class _Plan:
             "masks": inputs["masks"],
             **{key: _absolute(getattr(self.options, key)) for key in paths},
             "match_list_path": self.options.pairs.match_list_path,
+            "not_compared": self.not_compared,
             "preset": self.options.mapping.preset_name,
             "verification": inputs["verification"],
             "mapping": inputs["mapping"],
@@ -176,20 +194,26 @@ class _Plan:
     def requests(self) -> list[Request]:
         """Return what the process of each method is to do."""
         options = self.options
+        ours = options.verification, options.mapping, options.holds_vote
+        mapper = MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset("colmap")
+        colmaps = VerificationOptions.preset("colmap"), mapper, False
         return [
             Request(
                 method=method,
                 output_path=self.layout.path.resolve(),
                 image_path=self.image_path.resolve(),
                 masks=options.masks,
-                verification=options.verification,
-                mapping=options.mapping,
-                focal_vote=options.holds_vote,
+                verification=verification,
+                mapping=mapping,
+                focal_vote=focal_vote,
                 may_share=options.cameras.mode == "auto",
                 seeds=tuple(options.seeds),
                 resources=options.resources,
             )
             for method in self.methods
+            for verification, mapping, focal_vote in (
+                colmaps if method.label == SIFT_COLMAP else ours,
+            )
         ]
 
 

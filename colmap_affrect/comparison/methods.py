@@ -7,13 +7,16 @@ import re
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
+from colmap_affrect.comparison import LEARNED_METHODS
 from colmap_affrect.errors import OptionError
+from colmap_affrect.features.weights import WeightFile, missing
 from colmap_affrect.recipes import Recipe, load_recipe, recipe_names
 
-SIFT, SIFT_AFFINE_DSP = "sift", "sift-affine-dsp"
+SIFT_COLMAP, SIFT, SIFT_AFFINE_DSP = "sift-colmap", "sift", "sift-affine-dsp"
 SIFT_SUMMARIES = {
+    SIFT_COLMAP: "SIFT, verification and mapping as COLMAP does them by default",
     SIFT: "COLMAP's SIFT with its default options",
     SIFT_AFFINE_DSP: "COLMAP's SIFT with affine shapes and domain-size pooling",
 }
@@ -43,6 +46,13 @@ class Method:
         if plain == self.label:
             return plain
         return f"{plain}-{zlib.crc32(self.label.encode()):08x}"
+
+
+def without_weights(weights_path: Path | None = None) -> dict[str, list[WeightFile]]:
+    """Return the files that learned methods lack here, by method; none of those that lack none."""
+    recipes = {name: load_recipe(name) for name in LEARNED_METHODS}
+    lacking = {name: missing(recipe.weights, weights_path) for name, recipe in recipes.items()}
+    return {name: files for name, files in lacking.items() if files}
 
 
 def parse_methods(
@@ -76,7 +86,7 @@ def parse_methods(
 
 
 def parse_method(text: str, depth_settings: Sequence[str] = ()) -> Method:
-    """Read ``sift``, ``sift-affine-dsp`` or ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``.
+    """Read ``sift-colmap``, ``sift``, ``sift-affine-dsp`` or ``[LABEL=]RECIPE[:KEY=VALUE[,...]]``.
 
     Commas inside of brackets belong to a value. The recipe is a name or the path of a TOML file;
     one that uses depth gets the ``depth_settings`` too. Raises OptionError for an unknown method or

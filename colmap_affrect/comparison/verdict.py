@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from colmap_affrect.comparison.results import Comparison, MethodResult, Span, in_most
 
-REFERENCES = ("sift", "sift-affine-dsp")
+REFERENCES = ("sift", "sift-affine-dsp", "sift-colmap")
 """What gains are measured against: the first of these that was run."""
 
 MIN_MEAN_GAIN = 0.5
@@ -28,9 +28,15 @@ def verdict(comparison: Comparison) -> tuple[str, ...]:
     """Return the paragraphs, the most important one first."""
     rules = (
         headline, changes, seeds_disagree, wrong_poses, registered_by_none, failures,
-        doubts, unstable_poses, contradictions,
+        doubts, unstable_poses, contradictions, not_compared,
     )  # fmt: skip
     return tuple(text for rule in rules for text in rule(comparison))
+
+
+def not_compared(comparison: Comparison) -> list[str]:
+    """Say which learned methods could be compared too, and how their weights are had."""
+    absent = comparison.settings.get("not_compared")
+    return [f"Not compared for want of weights: {absent}"] if absent else []
 
 
 @dataclass(frozen=True)

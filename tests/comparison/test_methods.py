@@ -55,7 +55,7 @@ def test_folders_of_methods_differ_and_stay_inside():
         (["sfit"], "did you mean 'sift'"),
         (["sift,sift"], "two methods are called 'sift'"),
         (["sift=default"], "'sift' is COLMAP's"),
-        ([","], "no method given; known are sift, sift-affine-dsp"),
+        ([","], "no method given; known are sift-colmap, sift, sift-affine-dsp"),
         (["default:matching.max_ration=1"], "did you mean 'max_ratio'"),
     ],
 )
