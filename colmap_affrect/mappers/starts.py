@@ -20,7 +20,7 @@ MIN_STEP = 1.15
 """Starts that are nearer to one another end in the same model."""
 
 MIN_SHARE_OF_RIVAL = 0.97
-"""Of the best attempt's agreement with the pairs; that of two seeds differs by as much."""
+"""Of the best attempt's agreement with the pairs; attempts that come so near are as good as it."""
 
 MAX_EXCESS = 1.5
 """How far beyond its interval a focal length may be refined; a camera that few points see goes
