@@ -48,6 +48,8 @@ class FeatureOptions(NetworkOptions):
 
     in_color: ClassVar[bool] = False
     """Whether views are (H, W, 3) instead of (H, W)."""
+    has_shapes: ClassVar[bool] = True
+    """Whether frames were measured one by one, so that they can tell right matches from wrong."""
     max_num_features: Annotated[int, within(1, 1_000_000)] = 8192
     """Most features of the image itself, by response."""
     max_num_rectified_features: Annotated[int, within(1, 1_000_000)] = 6144

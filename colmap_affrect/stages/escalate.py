@@ -159,6 +159,33 @@ def first_level_database(context: Context) -> Iterator[Path | None]:
         yield path
 
 
+@contextmanager
+def measured_database(context: Context) -> Iterator[Path | None]:
+    """Give a copy of the database without the pairs that levels without measured frames verified.
+
+    None where there are no such pairs.
+    """
+    levels = recorded_extraction(context.workspace).levels
+    unmeasured = {k for k, level in enumerate(levels) if not level.features.has_shapes}
+    escalation = Escalation(context, EscalateOptions()) if unmeasured else None
+    verified = (
+        [pair for pair, count in escalation.num_inliers().items() if count] if escalation else []
+    )
+    reached = context.matches.levels(verified) if verified else {}
+    doubted = [pair for pair, level in reached.items() if level in unmeasured]
+    if not doubted or len(unmeasured) == len(levels):
+        yield None
+        return
+    with TemporaryDirectory(dir=context.workspace.path) as folder:
+        path = Path(folder) / "database.db"
+        copy_database(context.workspace.database, path)
+        ids = colmap_database.image_ids(path)
+        with colmap_database.open_database(path) as database:
+            for first, second in doubted:
+                database.delete_two_view_geometry(ids[first], ids[second])
+        yield path
+
+
 class Escalation:
     """Lets pairs of a workspace climb to a level, with the options on record."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
@@ -33,7 +33,7 @@ from colmap_affrect.stages.climbing import connected_parts
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copied_image_path, is_copy
 from colmap_affrect.stages.depth_lookup import depth_lookup
-from colmap_affrect.stages.escalate import first_level_database
+from colmap_affrect.stages.escalate import first_level_database, measured_database
 from colmap_affrect.stages.extract import Inputs
 from colmap_affrect.stages.guide import guided_matches
 from colmap_affrect.stages.verify import recorded_verification
@@ -48,6 +48,10 @@ NUM_BEST_PAIRS = 3
 
 STRONGER_RECIPES = ("on-demand", "affnet-shapes")
 """Advised where photographs are missing; the second needs weights."""
+
+MIN_MEASURED_AGREEMENT = 0.9
+"""Share of what pairs with measured frames could say for a model at most; below, they are mapped by
+themselves."""
 
 LEARNED_RECIPE = "on-demand-learned"
 """Advised where its weights are."""
@@ -105,6 +109,8 @@ def map_images(
         models = map_database(mapper, task, workspace.sparse, advance)
     if not is_copy(workspace) and _num_registered(models) < min(num_images, LARGE_MODEL):
         models = _or_first_level(context, mapper, task, models)
+    if not is_copy(workspace):
+        models = _or_measured(context, mapper, task, models)
     replace_text(path, inputs)
     warnings = {}
     if extend and existing and existing.num_other_keypoints:
@@ -159,6 +165,38 @@ def _or_first_level(
         rmtree(context.workspace.sparse)
         sparse.rename(context.workspace.sparse)
     return firsts
+
+
+def _or_measured(
+    context: Context, mapper: Mapper, task: MappingTask, models: list[ModelSummary]
+) -> list[ModelSummary]:
+    """Keep the models of pairs with measured frames, where those of all pairs contradict them.
+
+    Learned matching verifies sides of a building that look the same as one.
+    """
+    sparse = context.workspace.sparse
+    with measured_database(context) as path:
+        if path is None or not models:
+            return models
+        graph = PairGraph.read(path)
+        agreement = graph.best_score(_reconstructions(sparse))
+        if agreement >= MIN_MEASURED_AGREEMENT * sum(pair.weight for pair in graph.pairs):
+            return models
+        others = path.with_name("sparse")
+        measured = map_database(mapper, replace(task, database_path=path), others, _ignore)
+        if graph.best_score(_reconstructions(others)) <= agreement:
+            return models
+        logger.warning(
+            "pairs that learned matching verified contradict the others and were left out"
+        )
+        rmtree(sparse)
+        others.rename(sparse)
+    return measured
+
+
+def _reconstructions(sparse_path: Path) -> Iterator[pycolmap.Reconstruction]:
+    folders = (path for path in sparse_path.iterdir() if path.name.isdigit())
+    yield from (pycolmap.Reconstruction(folder) for folder in folders)
 
 
 def _num_registered(models: Sequence[ModelSummary]) -> int:
@@ -274,8 +312,7 @@ def advice(
 def agreement(context: Context, sparse_path: Path) -> float:
     """Return how well the best of some models agrees with the verified pairs."""
     graph = PairGraph.read(context.workspace.database)
-    folders = [path for path in sparse_path.iterdir() if path.name.isdigit()]
-    return graph.best_score(pycolmap.Reconstruction(folder) for folder in folders)
+    return graph.best_score(_reconstructions(sparse_path))
 
 
 def images_in_need(context: Context, sparse_path: Path, min_num_tracks: int) -> set[str]:
