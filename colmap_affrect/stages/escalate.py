@@ -20,7 +20,7 @@ lowest level that has something to do comes first, so that a killed run goes on 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -272,20 +272,35 @@ class Escalation:
         tried = self.matches.tried_levels(self.pairs)
         joining, hanging = graph.joining(self.options), graph.hanging(self.options)
         for level in self.levels:
+            settled = self._settled(level, graph, levels)
             unwritten = {pair for pair in self._unwritten if tried[pair] == level}
             for pairs in (joining, hanging, graph.links(levels, level)):
-                todo = [pair for pair in pairs if tried[pair] < level]
+                todo = [pair for pair in pairs if tried[pair] < level and pair not in settled]
                 if todo or unwritten.intersection(pairs):
                     return level, todo
         return None
 
+    def _settled(self, level: int, graph: ClimbingGraph, levels: Mapping[Pair, int]) -> set[Pair]:
+        """Return the pairs that a level leaves alone.
+
+        Frames that were measured one by one tell right matches from wrong: what they verified is
+        not replaced by matches without, of which there may be more where two sides look the same.
+        """
+        features = [item.features for item in self.extraction.levels]
+        if features[level].has_shapes:
+            return set()
+        verified = (pair for pair, count in graph.num_inliers.items() if count)
+        return {pair for pair in verified if features[levels[pair]].has_shapes}
+
     def num_steps_ahead(self) -> int:
         """Return how many steps are left if no pair succeeds."""
-        graph, tried = self.graph(), self.matches.tried_levels(self.pairs)
+        graph, levels = self.graph(), self.matches.levels(self.pairs)
+        tried = self.matches.tried_levels(self.pairs)
         pairs = {*graph.joining(self.options), *graph.hanging(self.options)}
         steps = 0
         for level in self.levels:
-            todo = [pair for pair in pairs if tried[pair] < level]
+            settled = self._settled(level, graph, levels)
+            todo = [pair for pair in pairs if tried[pair] < level and pair not in settled]
             steps += len(self._images_to_extend(todo, level)) + len(todo)
         return steps
 
