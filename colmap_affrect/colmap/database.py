@@ -7,7 +7,7 @@ index out of range would later end the Python process.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -234,6 +234,15 @@ def replace_matches(
         if database.exists_two_view_geometry(image_id1, image_id2):
             database.delete_two_view_geometry(image_id1, image_id2)
     write_matches(database, image_id1, image_id2, indices)
+
+
+def reject_pairs(path: Path, pairs: Iterable[tuple[str, str]]) -> None:
+    """Let pairs of image names count as verified in vain; their matches stay."""
+    ids = image_ids(path)
+    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
+        for first, second in pairs:
+            database.delete_two_view_geometry(ids[first], ids[second])
+            database.write_two_view_geometry(ids[first], ids[second], pycolmap.TwoViewGeometry())
 
 
 def camera_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:

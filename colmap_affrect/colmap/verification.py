@@ -303,20 +303,22 @@ class PairVerifier:
         with open_database(path) as database:
             self._cameras = read_image_cameras(database)
 
-    def num_inliers(
+    def inliers(
         self,
         names: tuple[str, str],
         frames: tuple[NDArray[np.floating], NDArray[np.floating]],
         indices: NDArray[np.integer],
-    ) -> int:
-        """Return the number of inliers of a two-view geometry, 0 if it is rejected.
+    ) -> NDArray[np.int64]:
+        """Return the (K, 2) matches that a two-view geometry explains; none if it is rejected.
 
         Args:
             names: of the two images.
             frames: (N1, 2, 3) and (N2, 2, 3) local affine frames in pixel-centre px.
             indices: (M, 2) matches.
         """
-        return len(self.geometry(names, frames, indices).inlier_matches)
+        geometry = self.geometry(names, frames, indices)
+        found = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+        return found if self._ids[names[0]] < self._ids[names[1]] else found[:, ::-1]
 
     def geometry(
         self,
@@ -326,7 +328,7 @@ class PairVerifier:
     ) -> pycolmap.TwoViewGeometry:
         """Return the two-view geometry, from the image with the lower id to the other one.
 
-        Arguments are those of :meth:`num_inliers`; without inliers where there is none.
+        Arguments are those of :meth:`inliers`; without inliers where there is none.
         """
         ids = self._ids[names[0]], self._ids[names[1]]
         first, second = (

@@ -19,9 +19,11 @@ lowest level that has something to do comes first, so that a killed run goes on 
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -39,6 +41,7 @@ from colmap_affrect.colmap.verification import (
 )
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.consistency import num_consistent_matches
+from colmap_affrect.mappers.pair_graph import MIN_SHARE
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.connectivity import weakly_connected_images
 from colmap_affrect.project.report import StageReport
@@ -160,30 +163,34 @@ def first_level_database(context: Context) -> Iterator[Path | None]:
 
 
 @contextmanager
-def measured_database(context: Context) -> Iterator[Path | None]:
-    """Give a copy of the database without the pairs that levels without measured frames verified.
+def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | None]:
+    """Give a copy of the database without the pairs that no match of measured frames supports.
 
-    None where there are no such pairs.
+    And these pairs; None where there are none, or no others.
     """
-    levels = recorded_extraction(context.workspace).levels
-    unmeasured = {k for k, level in enumerate(levels) if not level.features.has_shapes}
-    escalation = Escalation(context, EscalateOptions()) if unmeasured else None
-    verified = (
-        [pair for pair, count in escalation.num_inliers().items() if count] if escalation else []
-    )
-    reached = context.matches.levels(verified) if verified else {}
-    doubted = [pair for pair, level in reached.items() if level in unmeasured]
-    if not doubted or len(unmeasured) == len(levels):
+    if all(level.features.has_shapes for level in recorded_extraction(context.workspace).levels):
+        yield None
+        return
+    escalation = Escalation(context, EscalateOptions())
+    inliers = escalation.inlier_matches()
+    doubted = [
+        pair for pair, indices in inliers.items() if not escalation.measured(pair, indices).any()
+    ]
+    if len(doubted) in (0, len(inliers)):
         yield None
         return
     with TemporaryDirectory(dir=context.workspace.path) as folder:
         path = Path(folder) / "database.db"
         copy_database(context.workspace.database, path)
-        ids = colmap_database.image_ids(path)
-        with colmap_database.open_database(path) as database:
-            for first, second in doubted:
-                database.delete_two_view_geometry(ids[first], ids[second])
-        yield path
+        colmap_database.reject_pairs(path, doubted)
+        yield path, doubted
+
+
+def reject(context: Context, pairs: Sequence[Pair]) -> None:
+    """Let pairs count as not verified, and none climb again: further levels would be no better."""
+    escalation = Escalation(context, EscalateOptions())
+    context.matches.mark_tried(escalation.pairs, escalation.levels[-1])
+    colmap_database.reject_pairs(context.workspace.database, pairs)
 
 
 class Escalation:
@@ -272,35 +279,20 @@ class Escalation:
         tried = self.matches.tried_levels(self.pairs)
         joining, hanging = graph.joining(self.options), graph.hanging(self.options)
         for level in self.levels:
-            settled = self._settled(level, graph, levels)
             unwritten = {pair for pair in self._unwritten if tried[pair] == level}
             for pairs in (joining, hanging, graph.links(levels, level)):
-                todo = [pair for pair in pairs if tried[pair] < level and pair not in settled]
+                todo = [pair for pair in pairs if tried[pair] < level]
                 if todo or unwritten.intersection(pairs):
                     return level, todo
         return None
 
-    def _settled(self, level: int, graph: ClimbingGraph, levels: Mapping[Pair, int]) -> set[Pair]:
-        """Return the pairs that a level leaves alone.
-
-        Frames that were measured one by one tell right matches from wrong: what they verified is
-        not replaced by matches without, of which there may be more where two sides look the same.
-        """
-        features = [item.features for item in self.extraction.levels]
-        if features[level].has_shapes:
-            return set()
-        verified = (pair for pair, count in graph.num_inliers.items() if count)
-        return {pair for pair in verified if features[levels[pair]].has_shapes}
-
     def num_steps_ahead(self) -> int:
         """Return how many steps are left if no pair succeeds."""
-        graph, levels = self.graph(), self.matches.levels(self.pairs)
-        tried = self.matches.tried_levels(self.pairs)
+        graph, tried = self.graph(), self.matches.tried_levels(self.pairs)
         pairs = {*graph.joining(self.options), *graph.hanging(self.options)}
         steps = 0
         for level in self.levels:
-            settled = self._settled(level, graph, levels)
-            todo = [pair for pair in pairs if tried[pair] < level and pair not in settled]
+            todo = [pair for pair in pairs if tried[pair] < level]
             steps += len(self._images_to_extend(todo, level)) + len(todo)
         return steps
 
@@ -383,11 +375,21 @@ class Escalation:
                 if reached == level:
                     advance(1)
 
+    def measured(self, pair: Pair, indices: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Return which of the (M, 2) matches of a pair are of frames that were measured singly."""
+        kinds = np.array([level.features.has_shapes for level in self.extraction.levels])
+        sides = []
+        for side, name in enumerate(pair):
+            ends = self.features.level_ends(name)
+            sides.append(kinds[np.searchsorted(ends, indices[:, side], side="right")])
+        return np.asarray(sides[0] & sides[1])
+
     def _match_again(
         self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]
     ) -> None:
         size_px = self.extraction.levels[level].max_image_size_px
         verifier, graph = PairVerifier(self.path, self.verification, size_px), self.graph()
+        others = self._inliers_of_other_kind(pairs, level)
         tried: list[Pair] = []
         better: list[PairMatches] = []
 
@@ -401,8 +403,9 @@ class Escalation:
             with closing(self._iterate_matches(pairs, level)) as found_pairs:
                 for found in found_pairs:
                     tried.append(found.names)
-                    if self._worth(found, verifier) > graph.worth(found.names):
-                        better.append(found)
+                    chosen, worth = self._judged(found, others.get(found.names), verifier)
+                    if worth > graph.worth(found.names):
+                        better.append(chosen)
                     advance(1)
                     if len(tried) == PAIRS_PER_WRITE:
                         record()
@@ -410,14 +413,51 @@ class Escalation:
             if tried:
                 record()
 
-    def _worth(self, found: PairMatches, verifier: PairVerifier) -> tuple[int, int]:
-        """Return the inliers of matches; where there are none, how many confirm each other."""
+    def _judged(
+        self, found: PairMatches, others: NDArray[np.int64] | None, verifier: PairVerifier
+    ) -> tuple[PairMatches, tuple[float, int]]:
+        """Return what a pair may have at a level, and what that is worth beside what it has.
+
+        That is its inliers, or without any how many matches confirm each other. Inliers that the
+        pair has of the other kind of frames are added where both agree; else those decide that
+        were measured one by one: they tell right matches from wrong, while of others there may be
+        more where two sides look the same.
+        """
+        inliers = self._inliers(found, verifier)
+        if not len(inliers):
+            return found, (0, num_consistent_matches(*self._frames(found.names, found.indices)))
+        if others is None:
+            return found, (len(inliers), 0)
+        indices = np.concatenate([found.indices, others])
+        scores = np.concatenate([found.scores, np.ones(len(others), np.float32)])
+        order = np.argsort(indices[:, 0])
+        united = replace(found, indices=indices[order], scores=scores[order])
+        explained = self._inliers(united, verifier)
+        is_measured = bool(self.measured(found.names, inliers).all())
+        measured = inliers if is_measured else others
+        if self.measured(found.names, explained).sum() >= MIN_SHARE * len(measured):
+            return united, (len(explained), 0)
+        return found, (math.inf if is_measured else 0, 0)
+
+    def _inliers(self, found: PairMatches, verifier: PairVerifier) -> NDArray[np.int64]:
         first, second = (self.features.read_frames(name) for name in found.names)
-        count = verifier.num_inliers(found.names, (first, second), found.indices)
-        if count:
-            return count, 0
-        rows, columns = found.indices.T
-        return 0, num_consistent_matches(first[rows], second[columns])
+        return verifier.inliers(found.names, (first, second), found.indices)
+
+    def _inliers_of_other_kind(
+        self, pairs: Sequence[Pair], level: int
+    ) -> dict[Pair, NDArray[np.int64]]:
+        """Return the (M, 2) inliers, of frames measured or not, that a level does not look for."""
+        is_measured, todo = self.extraction.levels[level].features.has_shapes, set(pairs)
+        found = {}
+        for (one, two), inliers in self.inlier_matches().items():
+            pair, indices = (
+                ((one, two), inliers) if (one, two) in todo else ((two, one), inliers[:, ::-1])
+            )
+            if pair in todo:
+                others = indices[self.measured(pair, indices) != is_measured]
+                if len(others):
+                    found[pair] = others
+        return found
 
     def _replace_matches(self) -> None:
         """Put matches into the database where they differ from the ones there."""

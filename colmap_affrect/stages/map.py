@@ -24,7 +24,7 @@ from colmap_affrect.mappers.attempts import (
 )
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing, require_extends
-from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
@@ -33,7 +33,7 @@ from colmap_affrect.stages.climbing import connected_parts
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copied_image_path, is_copy
 from colmap_affrect.stages.depth_lookup import depth_lookup
-from colmap_affrect.stages.escalate import first_level_database, measured_database
+from colmap_affrect.stages.escalate import first_level_database, measured_database, reject
 from colmap_affrect.stages.extract import Inputs
 from colmap_affrect.stages.guide import guided_matches
 from colmap_affrect.stages.verify import recorded_verification
@@ -48,10 +48,6 @@ NUM_BEST_PAIRS = 3
 
 STRONGER_RECIPES = ("on-demand", "affnet-shapes")
 """Advised where photographs are missing; the second needs weights."""
-
-MIN_MEASURED_AGREEMENT = 0.9
-"""Share of what pairs with measured frames could say for a model at most; below, they are mapped by
-themselves."""
 
 LEARNED_RECIPE = "on-demand-learned"
 """Advised where its weights are."""
@@ -109,10 +105,16 @@ def map_images(
         models = map_database(mapper, task, workspace.sparse, advance)
     if not is_copy(workspace) and _num_registered(models) < min(num_images, LARGE_MODEL):
         models = _or_first_level(context, mapper, task, models)
-    if not is_copy(workspace):
-        models = _or_measured(context, mapper, task, models)
-    replace_text(path, inputs)
     warnings = {}
+    if not is_copy(workspace):
+        models, num_rejected = _or_measured(context, mapper, task, models)
+        if num_rejected:
+            inputs = _inputs(workspace, extend)
+            warnings[workspace.database.name] = (
+                f"{num_rejected} pairs that only learned matching verified contradict the others "
+                "and were rejected"
+            )
+    replace_text(path, inputs)
     if extend and existing and existing.num_other_keypoints:
         warnings[str(extend.model_path)] = (
             f"keypoints of {existing.num_other_keypoints} of its {len(existing.names)} images are "
@@ -169,29 +171,34 @@ def _or_first_level(
 
 def _or_measured(
     context: Context, mapper: Mapper, task: MappingTask, models: list[ModelSummary]
-) -> list[ModelSummary]:
+) -> tuple[list[ModelSummary], int]:
     """Keep the models of pairs with measured frames, where those of all pairs contradict them.
 
-    Learned matching verifies sides of a building that look the same as one.
+    Learned matching verifies sides of a building that look the same as one. The pairs that only it
+    has verified count as rejected then. A few pairs that make a small model decide nothing.
+
+    Returns:
+        The models, and how many pairs were rejected.
     """
     sparse = context.workspace.sparse
-    with measured_database(context) as path:
-        if path is None or not models:
-            return models
+    with measured_database(context) as found:
+        if not found or not models:
+            return models, 0
+        path, doubted = found
         graph = PairGraph.read(path)
         agreement = graph.best_score(_reconstructions(sparse))
-        if agreement >= MIN_MEASURED_AGREEMENT * sum(pair.weight for pair in graph.pairs):
-            return models
+        if agreement >= MIN_SHARE * sum(pair.weight for pair in graph.pairs):
+            return models, 0
         others = path.with_name("sparse")
         measured = map_database(mapper, replace(task, database_path=path), others, _ignore)
-        if graph.best_score(_reconstructions(others)) <= agreement:
-            return models
-        logger.warning(
-            "pairs that learned matching verified contradict the others and were left out"
-        )
+        best = graph.best_score(_reconstructions(others))
+        is_small = _num_registered(measured) < MIN_SHARE * _num_registered(models)
+        if is_small or agreement >= MIN_SHARE * best:
+            return models, 0
+        reject(context, doubted)
         rmtree(sparse)
         others.rename(sparse)
-    return measured
+    return measured, len(doubted)
 
 
 def _reconstructions(sparse_path: Path) -> Iterator[pycolmap.Reconstruction]:

@@ -178,7 +178,7 @@ def test_trial_of_a_pair_is_what_the_database_then_holds(
     for pair in (EASY, HARD, HARD[::-1]):
         frames = [store.read_frames(name) for name in pair]
         indices = matches(workspace, pair).astype(np.int64)
-        count = verifier.num_inliers(pair, tuple(frames), indices)
+        count = len(verifier.inliers(pair, tuple(frames), indices))
         assert count == len(geometry(workspace, pair))
 
 
