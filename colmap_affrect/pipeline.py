@@ -42,6 +42,7 @@ from colmap_affrect.stages.guide import (
 from colmap_affrect.stages.map import (
     advice,
     agreement,
+    contradicting_pairs,
     image_names,
     images_in_need,
     intrinsics_given,
@@ -273,6 +274,7 @@ def map_and_report(
             "mapping": mapper.differences(intrinsics_given=intrinsics_given(workspace)),
         },
         pair_levels={} if copied else pair_levels(context),
+        contradicting_pairs={} if copied else contradicting_pairs(context),
         guided=guided_counts(context),
         cameras=tuple(
             record.to_report(camera_id, models[0] if models else None)

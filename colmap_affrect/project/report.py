@@ -150,6 +150,7 @@ class ReconstructionReport:
             COLMAP's default, by pycolmap's dotted keys.
         pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
             and ``none``; empty for other recipes.
+        contradicting_pairs: of these the verified ones that do not fit the largest model.
         extended: names of the images of the model that was extended; empty where none was.
         advice: what to try for the images that are missing.
         guided: ``pairs`` that guided matching gave more inliers, and these inliers
@@ -170,6 +171,7 @@ class ReconstructionReport:
     mapping: dict[str, Any]
     differs_from_colmap: dict[str, dict[str, Any]]
     pair_levels: dict[str, int] = dataclasses.field(default_factory=dict)
+    contradicting_pairs: dict[str, int] = dataclasses.field(default_factory=dict)
     extended: tuple[str, ...] = ()
     advice: tuple[str, ...] = ()
     guided: dict[str, int] = dataclasses.field(default_factory=dict)
@@ -240,6 +242,7 @@ class ReconstructionReport:
             "num_pairs": self.num_pairs,
             "num_verified_pairs": self.num_verified_pairs,
             "pair_levels": self.pair_levels,
+            "contradicting_pairs": self.contradicting_pairs,
             "guided": self.guided,
             "cameras": list(self.cameras),
             "stages": [dataclasses.asdict(stage) for stage in self.stages],
@@ -271,6 +274,9 @@ class ReconstructionReport:
         if self.pair_levels:
             counts = ", ".join(f"{count} by {name}" for name, count in self.pair_levels.items())
             lines += [f"decided     {counts}"]
+        if self.contradicting_pairs:
+            counts = ", ".join(f"{n} by {name}" for name, n in self.contradicting_pairs.items())
+            lines += [f"            the model contradicts {counts}"]
         if self.guided:
             before, after = self.guided["matches_before"], self.guided["matches_after"]
             lines += [f"guided      {self.guided['pairs']} pairs, {before} to {after} inliers"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from colmap_affrect.mappers.attempts import (
 )
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing, require_extends
-from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph
+from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import Workspace
@@ -34,8 +34,9 @@ from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copied_image_path, is_copy
 from colmap_affrect.stages.depth_lookup import depth_lookup
 from colmap_affrect.stages.escalate import first_level_database, measured_database, reject
-from colmap_affrect.stages.extract import Inputs
+from colmap_affrect.stages.extract import Inputs, recorded_extraction
 from colmap_affrect.stages.guide import guided_matches
+from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import recorded_verification
 
 logger = logging.getLogger(__name__)
@@ -320,6 +321,24 @@ def agreement(context: Context, sparse_path: Path) -> float:
     """Return how well the best of some models agrees with the verified pairs."""
     graph = PairGraph.read(context.workspace.database)
     return graph.best_score(_reconstructions(sparse_path))
+
+
+def contradicting_pairs(context: Context) -> dict[str, int]:
+    """Return how many verified pairs of each level of a recipe the largest model contradicts."""
+    names = [level.name for level in recorded_extraction(context.workspace).levels]
+    path = context.workspace.sparse / "0"
+    if len(names) < 2 or not path.exists():
+        return {}
+    graph, model = PairGraph.read(context.workspace.database), pycolmap.Reconstruction(path)
+    poses, cameras = poses_of(model), cameras_of(model)
+    found = {
+        frozenset(graph.names[image_id] for image_id in pair.ids)
+        for pair in graph.pairs_inside(poses)
+        if graph.agreement(pair, poses, cameras) < MIN_SHARE
+    }
+    pairs = [pair for pair in listed_pairs(context) if frozenset(pair) in found]
+    levels = Counter(context.matches.levels(pairs).values())
+    return {names[level]: levels[level] for level in sorted(levels)}
 
 
 def images_in_need(context: Context, sparse_path: Path, min_num_tracks: int) -> set[str]:

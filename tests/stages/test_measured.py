@@ -1,27 +1,30 @@
-"""Pairs of levels without measured frames: they replace no others, and must not contradict them."""
+"""Levels without measured frames: their matches join those of others, or give way to them."""
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.verification import verified_pairs
+from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.mappers.attempts import read_models
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import map as stage
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation, escalate, measured_database
+from colmap_affrect.stages.escalate import Escalation, escalate, measured_database, reject
 from colmap_affrect.stages.extract import Inputs, extract
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
@@ -67,42 +70,100 @@ def context(verified: Workspace, tmp_path: Path) -> Context:
     return Context(Workspace(Path(shutil.copytree(verified.path, tmp_path / "out"))))
 
 
-def with_level_1(context: Context, *pairs: tuple[str, str]) -> None:
-    """Say that the matches of pairs are those of the level without measured frames."""
-    found = [replace(item, level=1) for item in context.matches.read(pairs)]
-    context.matches.write(found)
+PAIR = NAMES[0], NAMES[1]
 
 
-def test_what_measured_frames_verified_is_left_alone(context: Context) -> None:
-    pairs = Escalation(context, load_recipe("default").escalate).pairs
-    assert len(verified_pairs(context.workspace.database, 1)) == len(pairs) == 6
-    assert escalate(context).num_done == 0
-    assert set(context.matches.tried_levels(pairs).values()) == {0}
+def with_both_levels(context: Context) -> Escalation:
+    """Let all pairs climb to the level without measured frames."""
+    escalate(context)
+    return Escalation(context, load_recipe("default").escalate)
 
 
-def test_measured_database_has_the_pairs_of_levels_with_measured_frames(context: Context) -> None:
-    with measured_database(context) as path:
-        assert path is None
-    with_level_1(context, (NAMES[0], NAMES[1]), (NAMES[1], NAMES[3]))
+def shapeless_only(escalation: Escalation, *pairs: tuple[str, str]) -> None:
+    """Take the matches of measured frames from some pairs."""
+    for found in list(escalation.matches.read(pairs)):
+        rows = ~escalation.measured(found.names, found.indices)
+        kept = replace(found, indices=found.indices[rows], scores=found.scores[rows])
+        escalation.matches.write([kept])
+    escalation.write()
+
+
+def test_matches_of_both_kinds_of_frames_are_united(context: Context) -> None:
+    before = verified_pairs(context.workspace.database, 1)
+    escalation = with_both_levels(context)
+    assert set(escalation.matches.levels(escalation.pairs).values()) == {1}
+    after = verified_pairs(context.workspace.database, 1)
+    assert len(after) == len(before) == 6
+    for pair, inliers in escalation.inlier_matches().items():
+        num_measured = np.count_nonzero(escalation.measured(pair, inliers))
+        assert 0.5 * len(inliers) < 2 * num_measured < 1.5 * len(inliers)
+    assert all(after[ids] > 1.5 * before[ids] for ids in before)
+
+
+class OneKind:
+    """Says that a geometry explains measured matches, or the others, and never both."""
+
+    def __init__(self, escalation: Escalation, measured: bool) -> None:
+        self._escalation, self._measured = escalation, measured
+
+    def inliers(self, names: tuple[str, str], _: object, indices: NDArray[Any]) -> NDArray[Any]:
+        rows = self._escalation.measured(names, indices) == self._measured
+        return indices[rows] if rows.any() else indices
+
+
+@pytest.mark.parametrize(
+    ("is_measured", "worth"), [(False, 0), (True, math.inf)], ids=["they stay", "they win"]
+)
+def test_measured_frames_decide_where_both_kinds_differ(
+    context: Context, is_measured: bool, worth: float
+) -> None:
+    escalation = with_both_levels(context)
+    (found,) = escalation.matches.read([PAIR])
+    measured = escalation.measured(PAIR, found.indices)
+    new = measured == is_measured
+    level = replace(found, indices=found.indices[new], scores=found.scores[new])
+    others = found.indices[~new]
+    disagreeing = cast("PairVerifier", OneKind(escalation, measured=False))
+    chosen, worth_found = escalation._judged(level, others, disagreeing)
+    assert chosen is level
+    assert worth_found == (worth, 0)
+    agreeing = cast("PairVerifier", OneKind(escalation, measured=True))
+    united, (count, _) = escalation._judged(level, others, agreeing)
+    assert np.array_equal(united.indices, found.indices)
+    assert count == np.count_nonzero(measured)
+
+
+def test_measured_database_lacks_the_pairs_that_no_measured_frames_support(
+    context: Context,
+) -> None:
+    with measured_database(context) as found:
+        assert found is None
+    escalation = with_both_levels(context)
+    with measured_database(context) as found:
+        assert found is None
+    shapeless_only(escalation, PAIR, (NAMES[1], NAMES[3]))
     everything = verified_pairs(context.workspace.database, 1)
-    with measured_database(context) as path:
-        assert path is not None
+    with measured_database(context) as found:
+        assert found
+        path, doubted = found
+        assert set(doubted) == {PAIR, (NAMES[1], NAMES[3])}
         measured = verified_pairs(path, 1)
     assert len(measured) == len(everything) - 2
     assert measured.items() <= everything.items()
 
 
-@pytest.mark.parametrize("is_wrong", [False, True])
-def test_models_that_contradict_measured_pairs_give_way(
-    context: Context, monkeypatch: pytest.MonkeyPatch, is_wrong: bool
-) -> None:
-    @contextmanager
-    def all_pairs(_: Context) -> Iterator[Path]:
-        folder = context.workspace.path / "measured"
-        folder.mkdir()
-        copy_database(context.workspace.database, folder / "database.db")
-        yield folder / "database.db"
+def test_rejected_pairs_stay_so(context: Context) -> None:
+    escalation = with_both_levels(context)
+    reject(context, [PAIR])
+    assert escalation.num_inliers()[PAIR] == 0
+    assert escalate(context).num_done == 0
+    verify_matches(context)
+    assert escalation.num_inliers()[PAIR] == 0
 
+
+@pytest.mark.parametrize("is_wrong", [False, True])
+def test_models_that_contradict_measured_pairs_give_way(context: Context, is_wrong: bool) -> None:
+    shapeless_only(with_both_levels(context), PAIR)
     mapper = MAPPERS.make(MAPPERS.options("sparse"))
     stage.map_images(context, mapper)
     sparse = context.workspace.sparse
@@ -113,9 +174,10 @@ def test_models_that_contradict_measured_pairs_give_way(
         frames[0].rig_from_world, frames[1].rig_from_world = poses[1], poses[0]
         model.write(sparse / "0")
     task = MappingTask(context.workspace.database, None, True)
-    monkeypatch.setattr(stage, "measured_database", all_pairs)
-    models = stage.read_models(sparse, task)
-    kept = stage._or_measured(context, mapper, task, models)
+    models = read_models(sparse, task)
+    assert stage.contradicting_pairs(context) == ({"identity shapeless": 3} if is_wrong else {})
+    kept, num_rejected = stage._or_measured(context, mapper, task, models)
+    assert num_rejected == is_wrong
     assert (kept is models) == (not is_wrong)
     assert kept[0].registered_names == tuple(sorted(NAMES))
     again = pycolmap.Reconstruction(sparse / "0")
