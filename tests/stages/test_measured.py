@@ -30,6 +30,8 @@ from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verify_matches
 
+PAIR = NAMES[0], NAMES[1]
+Counts = dict[tuple[int, int], int]
 RECIPE = """
 [rectifier]
 name = "identity"
@@ -49,8 +51,9 @@ def _shapeless() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def verified(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    folder = tmp_path_factory.mktemp("verified")
+def climbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Workspace, Counts]:
+    """All pairs have climbed to the level without measured frames; what they had before."""
+    folder = tmp_path_factory.mktemp("climbed")
     write_photographs(folder / "photos")
     (folder / "recipe.toml").write_text(RECIPE)
     workspace = Workspace(folder / "out")
@@ -62,20 +65,17 @@ def verified(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
         choose_pairs(context)
         match(context)
         verify_matches(context)
-    return workspace
+        before = verified_pairs(workspace.database, 1)
+        escalate(context)
+    return workspace, before
 
 
 @pytest.fixture
-def context(verified: Workspace, tmp_path: Path) -> Context:
-    return Context(Workspace(Path(shutil.copytree(verified.path, tmp_path / "out"))))
+def context(climbed: tuple[Workspace, Counts], tmp_path: Path) -> Context:
+    return Context(Workspace(Path(shutil.copytree(climbed[0].path, tmp_path / "out"))))
 
 
-PAIR = NAMES[0], NAMES[1]
-
-
-def with_both_levels(context: Context) -> Escalation:
-    """Let all pairs climb to the level without measured frames."""
-    escalate(context)
+def escalation_of(context: Context) -> Escalation:
     return Escalation(context, load_recipe("default").escalate)
 
 
@@ -88,9 +88,10 @@ def shapeless_only(escalation: Escalation, *pairs: tuple[str, str]) -> None:
     escalation.write()
 
 
-def test_matches_of_both_kinds_of_frames_are_united(context: Context) -> None:
-    before = verified_pairs(context.workspace.database, 1)
-    escalation = with_both_levels(context)
+def test_matches_of_both_kinds_of_frames_are_united(
+    climbed: tuple[Workspace, Counts], context: Context
+) -> None:
+    before, escalation = climbed[1], escalation_of(context)
     assert set(escalation.matches.levels(escalation.pairs).values()) == {1}
     after = verified_pairs(context.workspace.database, 1)
     assert len(after) == len(before) == 6
@@ -117,7 +118,7 @@ class OneKind:
 def test_measured_frames_decide_where_both_kinds_differ(
     context: Context, is_measured: bool, worth: float
 ) -> None:
-    escalation = with_both_levels(context)
+    escalation = escalation_of(context)
     (found,) = escalation.matches.read([PAIR])
     measured = escalation.measured(PAIR, found.indices)
     new = measured == is_measured
@@ -136,9 +137,7 @@ def test_measured_frames_decide_where_both_kinds_differ(
 def test_measured_database_lacks_the_pairs_that_no_measured_frames_support(
     context: Context,
 ) -> None:
-    with measured_database(context) as found:
-        assert found is None
-    escalation = with_both_levels(context)
+    escalation = escalation_of(context)
     with measured_database(context) as found:
         assert found is None
     shapeless_only(escalation, PAIR, (NAMES[1], NAMES[3]))
@@ -153,7 +152,7 @@ def test_measured_database_lacks_the_pairs_that_no_measured_frames_support(
 
 
 def test_rejected_pairs_stay_so(context: Context) -> None:
-    escalation = with_both_levels(context)
+    escalation = escalation_of(context)
     reject(context, [PAIR])
     assert escalation.num_inliers()[PAIR] == 0
     assert escalate(context).num_done == 0
@@ -163,7 +162,7 @@ def test_rejected_pairs_stay_so(context: Context) -> None:
 
 @pytest.mark.parametrize("is_wrong", [False, True])
 def test_models_that_contradict_measured_pairs_give_way(context: Context, is_wrong: bool) -> None:
-    shapeless_only(with_both_levels(context), PAIR)
+    shapeless_only(escalation_of(context), PAIR)
     mapper = MAPPERS.make(MAPPERS.options("sparse"))
     stage.map_images(context, mapper)
     sparse = context.workspace.sparse
