@@ -1,17 +1,19 @@
 """LightGlue (Lindenberger, Sarlin, Pollefeys, ICCV 2023), built by kornia.
 
 LightGlue reads where features are, so it takes the features of one view: the image, or one of its
-warps, in coordinates of their own. Of images with warps every view of the one is matched with every
-view of the other, which costs the product of their numbers; what the views agree on is united.
+warps, in coordinates of their own. Of images with warps those pairs of views are matched whose
+descriptors have most nearest neighbours in common, which is cheap to see; what they find is united.
 """
 
 from __future__ import annotations
 
 import re
 import threading
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -46,6 +48,9 @@ TRAINING_SIZE_PX = 1024
 
 KORNIA_SIGMAS = 12.0
 """Radius of kornia's frames of DoG features, in units of sigma."""
+
+CHUNK_ROWS = 1 << 10
+"""Features of an image whose similarities are held at once, which bounds memory."""
 
 DUPLICATE_RADIUS_PX = 2.0
 """Of matches of several views that are closer than this at both ends the best one stays."""
@@ -100,6 +105,9 @@ class LightGlueOptions(MatcherOptions):
     """Features that are this sure to have no match are dropped between layers; 0: none."""
     min_score: Annotated[float, within(0.0, 1.0)] = 0.1
     """Smallest score of a match."""
+    max_num_view_pairs: Annotated[int, within(0, 1_000_000)] = 8
+    """Of images with warps: pairs of views that are matched, those with most mutual nearest
+    neighbours; 0: all."""
     half_precision: bool = False
     """Mixed precision on a GPU; a CPU keeps to 32 bits."""
 
@@ -206,7 +214,11 @@ class LightGlue:
 
     def match(self, first: PreparedViews, second: PreparedViews) -> Matches:
         """Match two images; scores are the network's."""
-        parts = [self._match_views(view1, view2) for view1 in first.views for view2 in second.views]
+        pairs = list(product(first.views, second.views))
+        limit = self.options.max_num_view_pairs
+        if limit and len(pairs) > limit:
+            pairs = promising(first.views, second.views, limit)
+        parts = [self._match_views(*pair) for pair in pairs]
         if len(parts) == 1:
             return parts[0]
         return united(parts, first.keypoints, second.keypoints)
@@ -344,6 +356,33 @@ def network_inputs(
         return values | {"scales": sigmas, "oris": np.arctan2(lafs[:, 1, 0], lafs[:, 0, 0])}
     oris = np.arctan2(lafs[:, 0, 1], lafs[:, 0, 0]) % (2.0 * np.pi)
     return values | {"scales": KORNIA_SIGMAS * sigmas, "oris": oris}
+
+
+def promising(
+    first: Sequence[PreparedView], second: Sequence[PreparedView], count: int
+) -> list[tuple[PreparedView, PreparedView]]:
+    """Return the pairs of views with most mutual nearest neighbours among all features."""
+    descriptors1, descriptors2 = (
+        np.concatenate([view.inputs["descriptors"][0].cpu().numpy() for view in views])
+        for views in (first, second)
+    )
+    views1, views2 = (
+        np.repeat(np.arange(len(views)), [len(view.rows) for view in views])
+        for views in (first, second)
+    )
+    nearest1 = np.empty(len(views1), np.int64)
+    nearest2, closest = np.zeros(len(views2), np.int64), np.full(len(views2), -np.inf)
+    for start in range(0, len(views1), CHUNK_ROWS):
+        similarities = descriptors1[start : start + CHUNK_ROWS] @ descriptors2.T
+        nearest1[start : start + CHUNK_ROWS] = similarities.argmax(axis=1)
+        best = similarities.max(axis=0)
+        nearest2 = np.where(best > closest, start + similarities.argmax(axis=0), nearest2)
+        closest = np.maximum(best, closest)
+    mutual = nearest2[nearest1] == np.arange(len(views1))
+    shared = np.zeros((len(first), len(second)), np.int64)
+    np.add.at(shared, (views1[mutual], views2[nearest1[mutual]]), 1)
+    chosen = np.argsort(-shared, axis=None, kind="stable")[:count]
+    return [(first[i], second[j]) for i, j in zip(*np.divmod(chosen, len(second)), strict=True)]
 
 
 def united(

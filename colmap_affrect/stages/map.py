@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
@@ -103,18 +103,16 @@ def map_images(
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
-        models = map_database(mapper, task, workspace.sparse, advance)
+        models, num_rejected = _map(context, mapper, task, advance)
     if not is_copy(workspace) and _num_registered(models) < min(num_images, LARGE_MODEL):
         models = _or_first_level(context, mapper, task, models)
     warnings = {}
-    if not is_copy(workspace):
-        models, num_rejected = _or_measured(context, mapper, task, models)
-        if num_rejected:
-            inputs = _inputs(workspace, extend)
-            warnings[workspace.database.name] = (
-                f"{num_rejected} pairs that only learned matching verified contradict the others "
-                "and were rejected"
-            )
+    if num_rejected:
+        inputs = _inputs(workspace, extend)
+        warnings[workspace.database.name] = (
+            f"{num_rejected} pairs that only learned matching verified contradict the others and "
+            "were rejected"
+        )
     replace_text(path, inputs)
     if extend and existing and existing.num_other_keypoints:
         warnings[str(extend.model_path)] = (
@@ -155,10 +153,8 @@ def _or_first_level(
     So escalation never loses an image; but a model that is doubtful as a whole does not take the
     place of one that is not.
     """
-    min_num_inliers = recorded_verification(context.workspace).min_num_inliers
     with first_level_database(context) as path:
-        parts = connected_parts(verified_pairs(path, min_num_inliers)) if path else []
-        if path is None or max(map(len, parts), default=0) <= _num_registered(models):
+        if path is None or _num_tied(context, path) <= _num_registered(models):
             return models
         sparse = path.with_name("sparse")
         firsts = map_database(mapper, replace(task, database_path=path), sparse, _ignore)
@@ -170,41 +166,61 @@ def _or_first_level(
     return firsts
 
 
-def _or_measured(
-    context: Context, mapper: Mapper, task: MappingTask, models: list[ModelSummary]
+def _map(
+    context: Context, mapper: Mapper, task: MappingTask, advance: Callable[[int], None]
 ) -> tuple[list[ModelSummary], int]:
-    """Keep the models of pairs with measured frames, where those of all pairs contradict them.
+    """Map, first the pairs that measured frames support where there are others, too.
 
-    Learned matching verifies sides of a building that look the same as one. The pairs that only it
-    has verified count as rejected then. A few pairs that make a small model decide nothing.
+    Learned matching verifies sides of a building that look the same as one. Its pairs bring in what
+    the others leave out, but have no say in how those stand to each other. Where measured frames
+    tie less than half of the images, all pairs are mapped together.
 
     Returns:
         The models, and how many pairs were rejected.
     """
     sparse = context.workspace.sparse
+    if task.extend or is_copy(context.workspace):
+        return map_database(mapper, task, sparse, advance), 0
     with measured_database(context) as found:
-        if not found or not models:
-            return models, 0
+        num_tied = _num_tied(context, context.workspace.database)
+        if not found or _num_tied(context, found[0]) < MIN_SHARE * num_tied:
+            return map_database(mapper, task, sparse, advance), 0
         path, doubted = found
-        graph = PairGraph.read(path)
-        agreement = graph.best_score(_reconstructions(sparse))
-        if agreement >= MIN_SHARE * sum(pair.weight for pair in graph.pairs):
-            return models, 0
-        others = path.with_name("sparse")
-        measured = map_database(mapper, replace(task, database_path=path), others, _ignore)
-        best = graph.best_score(_reconstructions(others))
-        is_small = _num_registered(measured) < MIN_SHARE * _num_registered(models)
-        if is_small or agreement >= MIN_SHARE * best:
-            return models, 0
-        reject(context, doubted)
-        rmtree(sparse)
-        others.rename(sparse)
-    return measured, len(doubted)
+        first = path.with_name("sparse")
+        models = map_database(mapper, replace(task, database_path=path), first, advance)
+        num = _num_registered(models)
+        if num < MIN_SHARE * num_tied or not models[0].is_trustworthy:
+            return map_database(mapper, task, sparse, _ignore), 0
+        contradicting = _contradicting(
+            PairGraph.read(context.workspace.database), pycolmap.Reconstruction(first / "0")
+        )
+        rejected = [pair for pair in doubted if frozenset(pair) in contradicting]
+        if rejected:
+            reject(context, rejected)
+        if num < num_tied and mapper.options.extends:
+            existing = read_existing(Extension(first / "0"), task.database_path)
+            more = map_database(mapper, replace(task, extend=existing), sparse, _ignore)
+            if _num_registered(more) > num:
+                return more, len(rejected)
+        rmtree(sparse, ignore_errors=True)
+        first.rename(sparse)
+    return models, len(rejected)
 
 
-def _reconstructions(sparse_path: Path) -> Iterator[pycolmap.Reconstruction]:
-    folders = (path for path in sparse_path.iterdir() if path.name.isdigit())
-    yield from (pycolmap.Reconstruction(folder) for folder in folders)
+def _num_tied(context: Context, path: Path) -> int:
+    """Return how many images the verified pairs of a database connect at most."""
+    parts = connected_parts(verified_pairs(path, _min_num_inliers(context.workspace)))
+    return max(map(len, parts), default=0)
+
+
+def _contradicting(graph: PairGraph, model: pycolmap.Reconstruction) -> set[frozenset[str]]:
+    """Return the names of the pairs that a model contradicts."""
+    poses, cameras = poses_of(model), cameras_of(model)
+    return {
+        frozenset(graph.names[image_id] for image_id in pair.ids)
+        for pair in graph.pairs_inside(poses)
+        if graph.agreement(pair, poses, cameras) < MIN_SHARE
+    }
 
 
 def _num_registered(models: Sequence[ModelSummary]) -> int:
@@ -320,7 +336,8 @@ def advice(
 def agreement(context: Context, sparse_path: Path) -> float:
     """Return how well the best of some models agrees with the verified pairs."""
     graph = PairGraph.read(context.workspace.database)
-    return graph.best_score(_reconstructions(sparse_path))
+    folders = [path for path in sparse_path.iterdir() if path.name.isdigit()]
+    return graph.best_score(pycolmap.Reconstruction(folder) for folder in folders)
 
 
 def contradicting_pairs(context: Context) -> dict[str, int]:
@@ -330,12 +347,7 @@ def contradicting_pairs(context: Context) -> dict[str, int]:
     if len(names) < 2 or not path.exists():
         return {}
     graph, model = PairGraph.read(context.workspace.database), pycolmap.Reconstruction(path)
-    poses, cameras = poses_of(model), cameras_of(model)
-    found = {
-        frozenset(graph.names[image_id] for image_id in pair.ids)
-        for pair in graph.pairs_inside(poses)
-        if graph.agreement(pair, poses, cameras) < MIN_SHARE
-    }
+    found = _contradicting(graph, model)
     pairs = [pair for pair in listed_pairs(context) if frozenset(pair) in found]
     levels = Counter(context.matches.levels(pairs).values())
     return {names[level]: levels[level] for level in sorted(levels)}

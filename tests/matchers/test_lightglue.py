@@ -27,12 +27,16 @@ from colmap_affrect.geometry.affine import (
 from colmap_affrect.matchers import lightglue
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext
 from colmap_affrect.matchers.lightglue import (
+    NO_MATCHES,
     TRAININGS,
     LightGlue,
     LightGlueOptions,
+    PreparedView,
+    PreparedViews,
     frames_of_view,
     load_network,
     network_inputs,
+    promising,
     renamed,
 )
 
@@ -153,6 +157,29 @@ def test_views_are_matched_one_by_one_and_united(matcher: LightGlue) -> None:
     assert_array_equal(shown[found.indices[:, 0]], found.indices[:, 1])
     assert_array_equal(np.unique(found.indices[:, 1]), np.arange(60))  # the ten in both views once
     assert (np.diff(found.indices[:, 0]) > 0).all()
+
+
+def test_views_with_most_neighbours_in_common_are_matched(
+    matcher: LightGlue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lightglue, "CHUNK_ROWS", 7)
+    things = np.random.default_rng(4).normal(size=(60, 128)).astype(np.float32)
+    things /= np.linalg.norm(things, axis=1, keepdims=True)
+
+    def views(*parts: list[int]) -> PreparedViews:
+        inputs = [{"descriptors": torch.from_numpy(things[part])[None]} for part in parts]
+        rows = [np.arange(len(part)) for part in parts]
+        return PreparedViews(tuple(map(PreparedView, rows, inputs)), np.zeros((60, 2)))
+
+    first = views([*range(10)], [*range(10, 25)], [*range(25, 45)])
+    second = views([*range(20, 24), *range(50, 60)], [*range(26, 45)])
+    found = promising(first.views, second.views, 2)
+    assert found == [(first.views[2], second.views[1]), (first.views[1], second.views[0])]
+    tried: list[object] = []
+    matcher.options = LightGlueOptions(max_num_view_pairs=1)
+    matcher._match_views = lambda *pair: tried.append(pair) or NO_MATCHES  # type: ignore[method-assign]
+    matcher.match(first, second)
+    assert tried == found[:1]
 
 
 def test_one_place_seen_in_two_views_is_one_match(matcher: LightGlue) -> None:
