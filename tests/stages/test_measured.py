@@ -14,11 +14,12 @@ import pytest
 from numpy.typing import NDArray
 from small_scene import INTRINSICS, NAMES, write_photographs
 
+from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers.attempts import read_models
+from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
@@ -160,29 +161,61 @@ def test_rejected_pairs_stay_so(context: Context) -> None:
     assert escalation.num_inliers()[PAIR] == 0
 
 
+def poses(workspace: Workspace, names: list[str]) -> list[NDArray[Any]]:
+    model = pycolmap.Reconstruction(workspace.sparse / "0")
+    images = [model.find_image_with_name(name) for name in names]
+    return [image.cam_from_world().matrix() for image in images if image]
+
+
 @pytest.mark.parametrize("is_wrong", [False, True])
-def test_models_that_contradict_measured_pairs_give_way(context: Context, is_wrong: bool) -> None:
-    shapeless_only(escalation_of(context), PAIR)
+def test_other_pairs_are_rejected_where_they_contradict(context: Context, is_wrong: bool) -> None:
+    workspace, escalation = context.workspace, escalation_of(context)
+    shapeless_only(escalation, PAIR)
+    if is_wrong:
+        ids = colmap_database.image_ids(workspace.database)
+        with colmap_database.open_database(workspace.database) as database:
+            geometry = database.read_two_view_geometry(*(ids[name] for name in PAIR))
+            inliers = np.asarray(geometry.inlier_matches)
+            geometry.inlier_matches = np.stack([inliers[:, 0], inliers[::-1, 1]], axis=1)
+            database.delete_two_view_geometry(*(ids[name] for name in PAIR))
+            database.write_two_view_geometry(*(ids[name] for name in PAIR), geometry)
     mapper = MAPPERS.make(MAPPERS.options("sparse"))
-    stage.map_images(context, mapper)
-    sparse = context.workspace.sparse
-    model = pycolmap.Reconstruction(sparse / "0")
-    if is_wrong:  # two photographs stand where the other one was
-        frames = [model.frames[image.frame_id] for image in model.images.values()][:2]
-        poses = [frame.rig_from_world for frame in frames]
-        frames[0].rig_from_world, frames[1].rig_from_world = poses[1], poses[0]
-        model.write(sparse / "0")
-    task = MappingTask(context.workspace.database, None, True)
-    models = read_models(sparse, task)
-    assert stage.contradicting_pairs(context) == ({"identity shapeless": 3} if is_wrong else {})
-    kept, num_rejected = stage._or_measured(context, mapper, task, models)
-    assert num_rejected == is_wrong
-    assert (kept is models) == (not is_wrong)
-    assert kept[0].registered_names == tuple(sorted(NAMES))
-    again = pycolmap.Reconstruction(sparse / "0")
-    same = all(
-        again.find_image_with_name(name).cam_from_world().matrix().tolist()
-        == model.find_image_with_name(name).cam_from_world().matrix().tolist()
-        for name in NAMES
-    )
-    assert same == (not is_wrong)
+    report, models = stage.map_images(context, mapper)
+    assert models[0].registered_names == tuple(sorted(NAMES))
+    assert ("rejected" in "".join(report.warnings.values())) == is_wrong
+    assert (escalation.num_inliers()[PAIR] == 0) == is_wrong
+    assert stage.contradicting_pairs(context) == {}
+    before = poses(workspace, NAMES)
+    assert stage.map_images(context, mapper)[0].num_done == 0
+    assert np.array_equal(before, poses(workspace, NAMES))
+
+
+def test_images_that_other_pairs_alone_tie_come_in_last(context: Context) -> None:
+    workspace, escalation = context.workspace, escalation_of(context)
+    last, tied = NAMES[3], NAMES[:3]
+    shapeless_only(escalation, *(pair for pair in escalation.pairs if last in pair))
+    mapper = MAPPERS.make(MAPPERS.options("sparse"))
+    with measured_database(context) as found:
+        assert found
+        first = Workspace(workspace.path / "first")
+        task = MappingTask(found[0], None, intrinsics_given=True)
+        map_database(mapper, task, first.sparse, lambda _: None)
+    _, models = stage.map_images(context, mapper)
+    assert models[0].registered_names == tuple(sorted(NAMES))
+    assert np.allclose(poses(first, tied), poses(workspace, tied), atol=1e-12)
+    model = pycolmap.Reconstruction(workspace.sparse / "0")
+    image = model.find_image_with_name(last)
+    assert image
+    assert image.num_points3D > 50
+    assert not models[0].doubtful
+
+
+def test_report_counts_pairs_that_the_model_contradicts(context: Context) -> None:
+    workspace = context.workspace
+    stage.map_images(context, MAPPERS.make(MAPPERS.options("sparse")))
+    model = pycolmap.Reconstruction(workspace.sparse / "0")
+    frames = [model.frames[image.frame_id] for image in model.images.values()][:2]
+    swapped = [frame.rig_from_world for frame in frames][::-1]
+    frames[0].rig_from_world, frames[1].rig_from_world = swapped
+    model.write(workspace.sparse / "0")
+    assert stage.contradicting_pairs(context) == {"identity shapeless": 3}
