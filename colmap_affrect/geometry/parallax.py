@@ -21,6 +21,12 @@ MAX_NUM_POINTS = 500
 MIN_DEPTH = 1e-3
 """Of a turned ray of length 1; what is behind the camera lands far outside of the image."""
 
+DISPLACEMENT_PX = np.array([13.0, 7.0])
+"""Keypoints that are moved by it meet others by chance only, and lie as dense as before."""
+
+MIN_FREE_SHARE = 0.1
+"""Where keypoints are so dense that chance leaves less, nothing can be told."""
+
 MAX_ITERATIONS = 3
 """Least squares are repeated without outliers; a verified pair has few of them."""
 
@@ -80,6 +86,8 @@ def mirrored_share(
 ) -> float:
     """Return the share of all keypoints of image 1 that a mirrored copy of it has too.
 
+    Beyond what chance brings, which of dense keypoints is most: as a share of what it leaves.
+
     Args:
         points1: all keypoints of image 1.
         points2: all keypoints of image 2, of the same size.
@@ -92,8 +100,11 @@ def mirrored_share(
     for axis in (0, 1) if len(points1) else ():
         mirrored = _some(points1.astype(np.float64))
         mirrored[:, axis] = size[axis] - mirrored[:, axis]
-        found = np.isin(_cells(mirrored, row)[:, None] + neighbors, taken).any(axis=1)
-        shares.append(float(found.mean()))
+        share, chance = (
+            np.isin(_cells(points, row)[:, None] + neighbors, taken).any(axis=1).mean()
+            for points in (mirrored, mirrored + DISPLACEMENT_PX)
+        )
+        shares.append(float((share - chance) / max(1.0 - chance, MIN_FREE_SHARE)))
     return max(shares)
 
 

@@ -130,6 +130,13 @@ class ExistingModel:
         )
         adjuster.solve()
 
+    def is_part_of(self, model: pycolmap.Reconstruction) -> bool:
+        """Tell whether a model that was made from this one has all its images, posed or not.
+
+        COLMAP drops those that no pair ties to others.
+        """
+        return all(image.frame_id in model.frames for image in self.images)
+
     def restore(self, model: pycolmap.Reconstruction) -> None:
         """Give an extended model the poses that it had before, to the bit, and images it lost.
 

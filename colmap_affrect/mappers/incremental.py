@@ -183,7 +183,7 @@ class _Call:
                     clear_points=False, options=self.options, cancellation_token=token,
                 )  # fmt: skip
             start.write(folder)
-            models = self._map(token, folder) or [start]
+            models = [m for m in self._map(token, folder) if existing.is_part_of(m)] or [start]
         for model in models:
             existing.restore(model)
         return models

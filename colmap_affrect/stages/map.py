@@ -169,13 +169,15 @@ def _map(
             others = map_database(mapper, task, sparse, _ignore)
             if _rank(others) >= _rank(models):
                 return others, 0
-            climbed = []
-        model = pycolmap.Reconstruction(first / "0")
-        contradicting = _contradicting(PairGraph.read(task.database_path), model)
+            rmtree(sparse, ignore_errors=True)
+            first.rename(sparse)
+            return models, 0
+        graph = PairGraph.read(task.database_path)
+        contradicting = _contradicting(graph, pycolmap.Reconstruction(first / "0"))
         rejected = [pair for pair in climbed if frozenset(pair) in contradicting]
         if rejected:
             reject(context, rejected)
-        if climbed and num < num_tied and mapper.options.extends:
+        if num < num_tied and mapper.options.extends:
             existing = read_existing(Extension(first / "0"), task.database_path)
             more = map_database(mapper, replace(task, extend=existing), sparse, _ignore)
             if _num_registered(more) > num:

@@ -12,6 +12,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.errors import StoreError
+from colmap_affrect.geometry.parallax import mirrored_share
 from colmap_affrect.mappers.arrivals import FILE_NAME, arrivals, read_arrivals, write_arrivals
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 from colmap_affrect.mappers.doubts import find_doubts, without_impossible
@@ -156,6 +157,19 @@ def test_mirrored_copies(tmp_path: Path) -> None:
         old = database.read_keypoints(other)
         database.update_keypoints(other, np.vstack([points, old])[: max(len(points), len(old))])
     assert any("mirrored copies" in text for text in find_doubts(model, task).model)
+
+
+def test_dense_keypoints_are_no_mirrored_copies() -> None:
+    rng, size = np.random.default_rng(2), (320, 240)
+    few, many, others = (rng.uniform(0, size, (number, 2)) for number in (900, 12000, 12000))
+    assert mirrored_share(many, others, size) < 0.3
+    assert mirrored_share(many, many, size) < 0.3
+    for axis in (0, 1):
+        copies = [points.copy() for points in (few, many)]
+        for points in copies:
+            points[:, axis] = size[axis] - points[:, axis]
+        assert mirrored_share(few, copies[0], size) > 0.9
+        assert mirrored_share(many, copies[1], size) > 0.9
 
 
 def test_views_from_nearly_one_place(tmp_path: Path) -> None:
