@@ -180,8 +180,7 @@ def _adjust_weak(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -
     verified = inlier_matches(task.database_path, 1) if weak else {}
     for model in weak:
         constant = task.constant_cameras(mapper.options) | runaways(model.reconstruction, task)
-        given = task.intrinsics_given and mapper.options.keep_given_intrinsics
-        if given or task.keeps_focal_lengths(mapper.options):
+        if task.keeps_focal_lengths(mapper.options):
             constant = set(model.reconstruction.cameras)
         adjust_last(model.reconstruction, verified, task.guided, constant_cameras=constant)
 

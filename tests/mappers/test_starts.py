@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from mapping_tasks import ALL_GIVEN, WHOLE
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
@@ -226,7 +227,6 @@ def test_large_models_are_mapped_once(
 
 
 GIVEN = CameraRecord(("a",), "given", 1300.0, size=(1024, 768), given=("focal",))
-WHOLE = replace(GIVEN, given=("focal", "distortion"))
 FREE = replace(GIVEN, source="exif", given=())
 
 
@@ -249,8 +249,6 @@ def test_given_parts_of_cameras_stay(
     distortion_kept: set[int],
 ) -> None:
     """One whose focal length is given has its distortion refined if all are of that kind."""
-    if mapper == "global" and distortion_kept:
-        pytest.skip("pycolmap's global mapper refines all cameras or none")
     path = tmp_path / "database.db"
     path.write_bytes(scene[0].read_bytes())
     with open_database(path) as database:
@@ -265,6 +263,19 @@ def test_given_parts_of_cameras_stay(
     params = {key: camera.params for key, camera in model.cameras.items()}
     assert {key for key, values in params.items() if values[0] == 1300.0} == kept
     assert {key for key, values in params.items() if values[3] == 0.0} == distortion_kept
+
+
+@pytest.mark.parametrize("name", MAPPERS.names())
+def test_report_says_what_of_cameras_is_not_refined(name: str) -> None:
+    def held(task: MappingTask, **options: object) -> set[str]:
+        differs = MAPPERS.make(MAPPERS.options({"name": name, **options})).differences(task)
+        return {key.split("refine_")[1] for key, value in differs.items() if "refine_" in key}
+
+    assert held(task_of({1: GIVEN, 2: WHOLE})) == {"focal_length"}
+    assert held(ALL_GIVEN) == {"focal_length", "extra_params"}
+    assert held(task_of({1: GIVEN, 2: FREE})) == held(task_of({})) == set()
+    assert held(ALL_GIVEN, keep_given_intrinsics=False) == set()
+    assert held(replace(task_of({1: FREE}), distortion_held=True)) == {"extra_params"}
 
 
 def test_given_focal_lengths_are_refined_where_that_is_asked_for() -> None:
