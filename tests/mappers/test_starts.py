@@ -16,7 +16,7 @@ from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers import starts as module
 from colmap_affrect.mappers.arrivals import read_arrivals
 from colmap_affrect.mappers.attempts import MAX_HOLDING_ATTEMPTS, map_database
-from colmap_affrect.mappers.base import MAPPERS, MappedModel, MapperOptions, MappingTask
+from colmap_affrect.mappers.base import MAPPERS, Bridge, MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.mappers.starts import (
     MAX_EXCESS,
@@ -215,6 +215,23 @@ def test_attempts_to_hold_cameras_end(
     mapped(scene, tmp_path, mapper, records(scene, KNOWN))
     assert len(mapper.held) == 1 + MAX_HOLDING_ATTEMPTS
     assert mapper.held[-1] == {1, 2}
+
+
+def test_images_that_the_last_adjustment_leaves_without_points_are_taken_out(
+    scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lose_points(model: pycolmap.Reconstruction, *_: object, **__: object) -> None:
+        image = model.images[max(model.reg_image_ids())]
+        for index in image.get_observation_point2D_idxs()[3:]:
+            model.delete_observation(image.image_id, index)
+
+    monkeypatch.setattr(attempts, "adjust_last", lose_points)
+    bridge = Bridge(("a", "b"), ("b",), 20, 20, 0.01)
+    mapper = Recorder(lambda _: [replace(m, bridges=(bridge,)) for m in without(scene, 0)])
+    mapped(scene, tmp_path, mapper, records(scene, KNOWN))
+    model = read_arrivals(pycolmap.Reconstruction(tmp_path / "sparse" / "0"), tmp_path / "sparse/0")
+    assert model.reconstruction.num_reg_images() == NUM_IMAGES - 1
+    assert list(model.taken_out.values()) == ["only 3 points hold it"]
 
 
 def test_large_models_are_mapped_once(
