@@ -17,7 +17,7 @@ from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
-from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions
+from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions, MappingTask
 from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.base import PairOptions
@@ -45,7 +45,6 @@ from colmap_affrect.stages.map import (
     contradicting_pairs,
     image_names,
     images_in_need,
-    intrinsics_given,
     map_images,
     num_verified_pairs,
     unregistered,
@@ -257,6 +256,7 @@ def map_and_report(
     names, copied = image_names(workspace), is_copy(workspace)
     verification = recorded_verification(workspace)
     missing = unregistered(context, names, models)
+    cameras = read_camera_records(workspace.cameras)
     result = ReconstructionReport(
         images_total=len(names),
         unregistered=missing,
@@ -271,14 +271,14 @@ def map_and_report(
         mapping=options.to_mapping(),
         differs_from_colmap={
             "verification": verification_differences(verification),
-            "mapping": mapper.differences(intrinsics_given=intrinsics_given(workspace)),
+            "mapping": mapper.differences(MappingTask(workspace.database, None, cameras=cameras)),
         },
         pair_levels={} if copied else pair_levels(context),
         contradicting_pairs={} if copied else contradicting_pairs(context),
         guided=guided_counts(context),
         cameras=tuple(
             record.to_report(camera_id, models[0] if models else None)
-            for camera_id, record in read_camera_records(workspace.cameras).items()
+            for camera_id, record in cameras.items()
         ),
         extended=tuple(before),
         advice=advice(context, missing, models),

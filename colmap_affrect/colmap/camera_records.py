@@ -83,11 +83,6 @@ class CameraRecord:
         return {"focal", "distortion"} <= set(self.given)
 
 
-def all_given(records: Mapping[int, CameraRecord]) -> bool:
-    """Tell whether nothing of any camera is to be refined."""
-    return bool(records) and all(record.is_fixed for record in records.values())
-
-
 def read_camera_records(path: Path) -> dict[int, CameraRecord]:
     """Return the records by camera id of the database; none where there is no file.
 

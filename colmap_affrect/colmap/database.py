@@ -98,10 +98,16 @@ def nearest_positions(
 
 
 def geometry_digest(path: Path) -> str:
-    """Return a sha256 of which pairs are verified with how many inliers."""
+    """Return a sha256 of which pairs are verified with how many inliers, and of the cameras."""
     with open_database(path) as database:
         pair_ids, counts = database.read_two_view_geometry_num_inliers()
+        cameras = database.read_all_cameras()
     lines = sorted(f"{pair} {count}" for pair, count in zip(pair_ids, counts, strict=True))
+    lines += sorted(
+        f"{camera.camera_id} {camera.model.name} {camera.params.tolist()}"
+        f" {camera.has_prior_focal_length}"
+        for camera in cameras
+    )
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import all_given, read_camera_records
+from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database, unverified_pairs
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import (
@@ -217,9 +217,7 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
             _vote(request, workspace, options)
         with watch.step("map"), told.stage("map", len(names), "images") as advance:
             records = read_camera_records(workspace.cameras)
-            task = MappingTask(
-                database_path, request.image_path, all_given(records), cameras=records
-            )
+            task = MappingTask(database_path, request.image_path, cameras=records)
             models = map_database(mapper, task, folder / "sparse", advance)
     largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
     model_path = folder / "sparse" / "0" if models else None

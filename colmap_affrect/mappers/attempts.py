@@ -89,14 +89,14 @@ def map_database(
                 found = attempts.next(partial / "started.db", raw, show)
                 shutil.rmtree(raw)
                 if not task.extend:  # whose images stay, whatever they are
-                    found = [m for m in (without_impossible(model, kept) for model in found) if m]
+                    found = _possible(found, kept)
                 found = sorted(found, key=_size, reverse=True)
                 attempts.judge(found)
                 best = better(kept, best, found)
             (partial / "started.db").unlink(missing_ok=True)
         best = attempts.with_rivals(best)
-        if not task.extend:
-            _adjust_weak(mapper, task, best)
+        if not task.extend and _adjust_weak(mapper, task, best):
+            best = sorted(_possible(best, task), key=_size, reverse=True)
         shutil.rmtree(sparse_path, ignore_errors=True)
         for index, model in enumerate(best):
             write_model(model.reconstruction, partial / str(index))
@@ -174,16 +174,25 @@ def _is_well_tied(model: pycolmap.Reconstruction) -> bool:
     return all(counts[image_id] >= MIN_NUM_TRACKS for image_id in model.reg_image_ids())
 
 
-def _adjust_weak(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -> None:
-    """Adjust models that guided matches or bridges hold; others stay as COLMAP made them."""
+def _possible(models: list[MappedModel], task: MappingTask) -> list[MappedModel]:
+    """Return models without the images that are certainly wrong."""
+    return [model for model in (without_impossible(each, task) for each in models) if model]
+
+
+def _adjust_weak(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -> bool:
+    """Adjust models that guided matches or bridges hold; others stay as COLMAP made them.
+
+    Returns:
+        Whether there were any.
+    """
     weak = [model for model in models if task.guided or model.bridges]
     verified = inlier_matches(task.database_path, 1) if weak else {}
     for model in weak:
         constant = task.constant_cameras(mapper.options) | runaways(model.reconstruction, task)
-        given = task.intrinsics_given and mapper.options.keep_given_intrinsics
-        if given or task.keeps_focal_lengths(mapper.options):
+        if task.keeps_focal_lengths(mapper.options):
             constant = set(model.reconstruction.cameras)
         adjust_last(model.reconstruction, verified, task.guided, constant_cameras=constant)
+    return bool(weak)
 
 
 def _size(model: MappedModel) -> tuple[int, int]:

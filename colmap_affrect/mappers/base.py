@@ -78,7 +78,6 @@ class MappingTask:
     Attributes:
         database_path: COLMAP database with two-view geometries.
         image_path: folder of the photographs, for the colours of the points; None for no colours.
-        intrinsics_given: the user gave the camera parameters.
         extend: register images into this model; only for mappers whose options say ``extends``.
         snapshot_path: folder of snapshots, to be gone on from; mappers may leave it unused.
         cancellation: a token by which mapping is stopped from outside.
@@ -91,7 +90,6 @@ class MappingTask:
 
     database_path: Path
     image_path: Path | None
-    intrinsics_given: bool = False
     extend: ExistingModel | None = None
     snapshot_path: Path | None = None
     cancellation: pycolmap.CancellationToken | None = None
@@ -105,6 +103,11 @@ class MappingTask:
     def colors_path(self) -> Path:
         """A folder that exists, as pycolmap needs one also where there are no photographs."""
         return self.image_path or self.database_path.parent
+
+    def keeps_intrinsics(self, options: MapperOptions) -> bool:
+        """Tell whether nothing of any camera is to be refined: the user gave all of it."""
+        fixed = (record.is_fixed for record in self.cameras.values())
+        return options.keep_given_intrinsics and bool(self.cameras) and all(fixed)
 
     def keeps_focal_lengths(self, options: MapperOptions) -> bool:
         """Tell whether no focal length is to be refined: the user gave all of them."""
@@ -187,7 +190,7 @@ class Mapper(Protocol):
             KeyboardInterrupt: after mapping has been stopped.
         """
 
-    def differences(self, *, intrinsics_given: bool) -> dict[str, Any]:
+    def differences(self, task: MappingTask) -> dict[str, Any]:
         """Return where mapping differs from COLMAP's defaults, by pycolmap's dotted keys."""
 
 

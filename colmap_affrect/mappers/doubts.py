@@ -131,6 +131,7 @@ def _image_doubts(model: MappedModel, graph: PairGraph, task: MappingTask) -> Do
     registered = set(reconstruction.reg_image_ids())
     bridges = {name: bridge for bridge in model.bridges for name in bridge.names}
     poses, cameras = poses_of(reconstruction), cameras_of(reconstruction)
+    given = {key for key, record in task.cameras.items() if record.is_fixed}
     totals = {image_id: np.zeros(2) for image_id in registered}
     for pair in graph.pairs_inside(registered):
         count = len(pair.matches)
@@ -144,7 +145,7 @@ def _image_doubts(model: MappedModel, graph: PairGraph, task: MappingTask) -> Do
         agreeing, total = totals[image_id].tolist()
         agreement = agreeing / total if total else 1.0
         found = [
-            *([] if task.intrinsics_given else _camera_doubts(_camera(image))),
+            *([] if image.camera_id in given else _camera_doubts(_camera(image))),
             *_observation_doubts(image.num_points3D),
             *_agreement_doubts(agreement),
             *_angle_doubts([near for near, _ in angles[image_id]]),

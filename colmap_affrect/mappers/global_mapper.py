@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import all_cameras
 from colmap_affrect.colmap.model_files import read_model
 from colmap_affrect.colmap.native_options import Plain, differences, resolve, set_values
 from colmap_affrect.errors import MappingError
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
+from colmap_affrect.mappers.last_adjustment import adjust
 from colmap_affrect.parallel.executor import return_freed_memory
 from colmap_affrect.parallel.subprocesses import child, end_with_parent
 
@@ -49,7 +51,8 @@ class GlobalMapper:
     """COLMAP's global mapper, in one thread.
 
     Tracks of two views count in all steps or in none: triangulated at the end only, they would
-    make points that bundle adjustment has not seen.
+    make points that bundle adjustment has not seen. It refines all cameras or none; those that are
+    to stay get their parameters back, and the model is adjusted to them.
     """
 
     Options = GlobalOptions
@@ -64,25 +67,40 @@ class GlobalMapper:
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`; all images register at once."""
-        native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
+        native = self.native(task, random_seed)
         values = differences(native, pycolmap.GlobalPipelineOptions())
-        if task.keeps_focal_lengths(self.options):
-            values.setdefault("mapper.bundle_adjustment.refine_focal_length", False)
         map_globally(task.database_path, task.colors_path, output_path, values)
-        models = [MappedModel(read_model(path)) for path in sorted(output_path.iterdir())]
-        show(max((model.reconstruction.num_reg_images() for model in models), default=0))
-        return models
+        models = [read_model(path) for path in sorted(output_path.iterdir())]
+        for model in models:
+            self._hold_cameras(model, task, native.mapper.bundle_adjustment)
+        show(max((model.num_reg_images() for model in models), default=0))
+        return [MappedModel(model) for model in models]
 
-    def native(self, random_seed: int, *, intrinsics_given: bool) -> pycolmap.GlobalPipelineOptions:
+    def _hold_cameras(
+        self,
+        model: pycolmap.Reconstruction,
+        task: MappingTask,
+        options: pycolmap.BundleAdjustmentOptions,
+    ) -> None:
+        """Give the cameras that are to stay their parameters back, and adjust all else."""
+        constant = task.constant_cameras(self.options) & set(model.cameras)
+        given = {c.camera_id: c.params.tolist() for c in all_cameras(task.database_path)}
+        before = {key: model.cameras[key].params.tolist() for key in constant}
+        for key in constant:
+            model.cameras[key].params = given[key]
+        if any(before[key] != given[key] for key in constant):
+            adjust(model, options, constant)
+
+    def native(self, task: MappingTask, random_seed: int) -> pycolmap.GlobalPipelineOptions:
         """Translate the options into pycolmap's."""
         options = self.options
-        refine = not (intrinsics_given and options.keep_given_intrinsics)
+        distortion = not (task.keeps_intrinsics(options) or task.distortion_held)
         native = pycolmap.GlobalPipelineOptions()
         values: dict[str, Plain] = {
             "min_model_size": options.min_model_size,
             "mapper.retriangulation.ignore_two_view_tracks": options.ignore_two_view_tracks,
-            "mapper.bundle_adjustment.refine_focal_length": refine,
-            "mapper.bundle_adjustment.refine_extra_params": refine,
+            "mapper.bundle_adjustment.refine_focal_length": not task.keeps_focal_lengths(options),
+            "mapper.bundle_adjustment.refine_extra_params": distortion,
         }
         if not options.ignore_two_view_tracks:
             values |= dict.fromkeys(TRACK_LENGTHS, 2)
@@ -93,9 +111,9 @@ class GlobalMapper:
         set_values(native, values | options.mapper_options)
         return native
 
-    def differences(self, *, intrinsics_given: bool) -> dict[str, Plain]:
+    def differences(self, task: MappingTask) -> dict[str, Plain]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
-        native = self.native(self.options.random_seed, intrinsics_given=intrinsics_given)
+        native = self.native(task, self.options.random_seed)
         return differences(native, pycolmap.GlobalPipelineOptions())
 
 

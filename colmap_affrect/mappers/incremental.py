@@ -60,7 +60,7 @@ class IncrementalMapper:
     spite of the seed.
     """
 
-    Options = IncrementalOptions
+    Options: ClassVar[type[PipelineOptions]] = IncrementalOptions
 
     def __init__(self, options: PipelineOptions) -> None:
         """Check the options for pycolmap."""
@@ -75,7 +75,7 @@ class IncrementalMapper:
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
-        native = self.native_of(task, random_seed)
+        native = self.native(task, random_seed)
         if task.image_path is None:
             native.extract_colors = False
         call = _Call(task, native, output_path, show)
@@ -88,36 +88,24 @@ class IncrementalMapper:
             raise MappingError(f"COLMAP's incremental mapper failed: {reason}") from error
         return [MappedModel(model) for model in models]
 
-    def native_of(self, task: MappingTask, random_seed: int) -> pycolmap.IncrementalPipelineOptions:
-        """Return pycolmap's options for a task, with what is not to be refined of its cameras."""
-        native = self.native(random_seed, intrinsics_given=task.intrinsics_given)
-        native.constant_cameras = task.constant_cameras(self.options)
-        kept = []
-        if task.keeps_focal_lengths(self.options):
-            kept += ["ba_refine_focal_length", "mapper.abs_pose_refine_focal_length"]
-        if task.distortion_held:
-            kept += ["ba_refine_extra_params", "mapper.abs_pose_refine_extra_params"]
-        set_values(native, dict.fromkeys(kept, False) | self.options.mapper_options)
-        return native
-
-    def native(
-        self, random_seed: int, *, intrinsics_given: bool
-    ) -> pycolmap.IncrementalPipelineOptions:
-        """Translate the options into pycolmap's."""
+    def native(self, task: MappingTask, random_seed: int) -> pycolmap.IncrementalPipelineOptions:
+        """Translate the options into pycolmap's, with what of a task's cameras is refined."""
         options = self.options
-        refine = not (intrinsics_given and options.keep_given_intrinsics)
+        focals = not task.keeps_focal_lengths(options)
+        distortion = not (task.keeps_intrinsics(options) or task.distortion_held)
         native = pycolmap.IncrementalPipelineOptions(
             min_model_size=options.min_model_size,
             random_seed=random_seed,
             num_threads=1,
-            ba_refine_focal_length=refine,
-            ba_refine_extra_params=refine,
+            ba_refine_focal_length=focals,
+            ba_refine_extra_params=distortion,
+            constant_cameras=task.constant_cameras(options),
             mapper=dict(
                 init_min_tri_angle=options.init_min_tri_angle_deg,
                 init_min_num_inliers=options.init_min_num_inliers,
                 abs_pose_min_num_inliers=options.abs_pose_min_num_inliers,
-                abs_pose_refine_focal_length=refine,
-                abs_pose_refine_extra_params=refine,
+                abs_pose_refine_focal_length=focals,
+                abs_pose_refine_extra_params=distortion,
                 random_seed=random_seed,
                 num_threads=1,
             ),
@@ -128,9 +116,9 @@ class IncrementalMapper:
         set_values(native, options.mapper_options)
         return native
 
-    def differences(self, *, intrinsics_given: bool) -> dict[str, Plain]:
+    def differences(self, task: MappingTask) -> dict[str, Plain]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
-        native = self.native(self.options.random_seed, intrinsics_given=intrinsics_given)
+        native = self.native(task, self.options.random_seed)
         return differences(native, pycolmap.IncrementalPipelineOptions())
 
 

@@ -68,10 +68,11 @@ def adjust_last(
     for image_id, index in zip(dropped >> 32, dropped & 0xFFFFFFFF, strict=True):
         if model.images[image_id].points2D[index].has_point3D():
             model.delete_observation(image_id, index)
-    for _ in range(NUM_ROUNDS):
-        _adjust(model, constant_cameras)
-        pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
-    model.update_point_3d_errors()
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = LOSS_SCALE_PX
+    options.ceres.solver_options.num_threads = 1
+    adjust(model, options, constant_cameras)
     return len(dropped)
 
 
@@ -125,15 +126,19 @@ def exactly_held(ties: Observations) -> set[int]:
     return set(max(nx.connected_components(parts), key=len, default=()))
 
 
-def _adjust(model: pycolmap.Reconstruction, constant_cameras: Collection[int]) -> None:
-    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = LOSS_SCALE_PX
-    options.ceres.solver_options.num_threads = 1
+def adjust(
+    model: pycolmap.Reconstruction,
+    options: pycolmap.BundleAdjustmentOptions,
+    constant_cameras: Collection[int],
+) -> None:
+    """Adjust a model, of which some cameras stay, and take out what does not fit."""
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
     for camera_id in constant_cameras:
         config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    for _ in range(NUM_ROUNDS):
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+        pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
+    model.update_point_3d_errors()

@@ -40,13 +40,14 @@ def with_snapshots(
 ) -> Iterator[MappingTask]:
     """Give a task a folder for snapshots; it is removed when mapping has ended.
 
-    Those that an interrupted mapping of the same pairs with the same options has left are kept
-    until then. Small sets and models that are extended have none.
+    Those that an interrupted mapping of the same pairs and cameras with the same options has left
+    are kept until then. Small sets and models that are extended have none.
     """
     if num_images < SNAPSHOT_FRAMES or task.extend:
         yield task
         return
-    made_from = [geometry_digest(task.database_path), options.to_mapping(), task.intrinsics_given]
+    given = {str(key): record.given for key, record in task.cameras.items()}
+    made_from = [geometry_digest(task.database_path), options.to_mapping(), given]
     digest = hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()
     record = folder / INPUTS
     if not (record.exists() and record.read_text() == digest):

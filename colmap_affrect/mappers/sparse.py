@@ -12,7 +12,6 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import copy_without_pairs
-from colmap_affrect.colmap.native_options import Plain
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 from colmap_affrect.mappers.bridging import Bridges, Hypothesis, Part
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
@@ -29,7 +28,7 @@ class SparseOptions(PipelineOptions):
     name: Literal["sparse"] = "sparse"
 
 
-class SparseMapper:
+class SparseMapper(IncrementalMapper):
     """Incremental mapping; what it leaves out, images and models, is joined by bridges.
 
     Pairs that contradict the loops they stand in are left out when that explains the others
@@ -38,17 +37,12 @@ class SparseMapper:
 
     Options = SparseOptions
 
-    def __init__(self, options: SparseOptions) -> None:
-        """Check the options for pycolmap."""
-        self._incremental = IncrementalMapper(options)
-        self.options = self._incremental.options
-
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
         models = self._mapped(task, output_path / "all", random_seed, show)
-        native = self._incremental.native_of(task, random_seed)
+        native = self.native(task, random_seed)
         graph = graph_of(task, native.min_num_matches)
         if models and graph.is_explained_by(models[0]):
             return [MappedModel(model) for model in models]
@@ -75,18 +69,8 @@ class SparseMapper:
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[pycolmap.Reconstruction]:
         output_path.mkdir()
-        found = self._incremental.map(task, output_path, random_seed, show)
+        found = super().map(task, output_path, random_seed, show)
         return [model.reconstruction for model in found]
-
-    def native(
-        self, random_seed: int, *, intrinsics_given: bool
-    ) -> pycolmap.IncrementalPipelineOptions:
-        """Translate the options into pycolmap's."""
-        return self._incremental.native(random_seed, intrinsics_given=intrinsics_given)
-
-    def differences(self, *, intrinsics_given: bool) -> dict[str, Plain]:
-        """See :class:`colmap_affrect.mappers.base.Mapper`."""
-        return self._incremental.differences(intrinsics_given=intrinsics_given)
 
 
 class Joiner:

@@ -12,7 +12,7 @@ from shutil import rmtree
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import all_given, read_camera_records
+from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.errors import StaleStoreError
@@ -92,7 +92,6 @@ def map_images(
     task = MappingTask(
         workspace.database,
         _image_path(workspace),
-        intrinsics_given(workspace),
         existing,
         guided={} if is_copy(workspace) else guided_matches(context),
         cameras=read_camera_records(workspace.cameras),
@@ -214,11 +213,6 @@ def _rank(models: Sequence[ModelSummary]) -> tuple[bool, int]:
 
 def _ignore(_: int) -> None:
     pass
-
-
-def intrinsics_given(workspace: Workspace) -> bool:
-    """Tell whether the user gave all cameras' parameters; of a copied database it is not known."""
-    return all_given(read_camera_records(workspace.cameras))
 
 
 def num_verified_pairs(workspace: Workspace) -> int:

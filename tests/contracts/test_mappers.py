@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from mapping_tasks import NOTHING_KNOWN, task_with_given_cameras
 from small_scene import INTRINSICS, NAMES, write_photographs
 
 import colmap_affrect
@@ -22,7 +24,7 @@ def task(tmp_path_factory: pytest.TempPathFactory) -> MappingTask:
     cameras = {"camera_model": "PINHOLE", "camera_params": INTRINSICS}
     colmap_affrect.extract_features(path, folder / "photos", (), "single", cameras)
     colmap_affrect.match_exhaustive(path)
-    return MappingTask(path, folder / "photos", intrinsics_given=True)
+    return replace(task_with_given_cameras(path), image_path=folder / "photos")
 
 
 @pytest.mark.parametrize("name", MAPPERS.names())
@@ -44,7 +46,7 @@ def test_mapper_registers_tells_of_it_and_keeps_given_cameras(
 @pytest.mark.parametrize("name", MAPPERS.names())
 def test_mapper_says_where_it_differs_and_takes_native_options(name: str) -> None:
     options = MAPPERS.options({"name": name, "random_seed": 5, "mapper_options": {}})
-    differences = MAPPERS.make(options).differences(intrinsics_given=False)
+    differences = MAPPERS.make(options).differences(NOTHING_KNOWN)
     assert differences["random_seed"] == 5
     colmap = type(options).preset("colmap")
     assert (colmap.preset_name, options.preset_name) == ("colmap", "sparse")

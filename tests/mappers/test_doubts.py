@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mapping_tasks import task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
@@ -72,7 +73,7 @@ def test_cameras_that_no_lens_has(
     doubts = find_doubts(model, task)
     assert text in doubts.images[image.name]
     assert (image.name in doubts.impossible) >= impossible
-    given = MappingTask(task.database_path, tmp_path, intrinsics_given=True)
+    given = task_with_given_cameras(task.database_path)
     assert text not in find_doubts(model, given).images.get(image.name, "")
 
 

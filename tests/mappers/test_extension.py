@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mapping_tasks import NOTHING_KNOWN, task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
@@ -45,7 +47,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def old(database: Path) -> pycolmap.Reconstruction:
     """A model of half of the images, moved, and of other ids than the database's."""
-    native = mapper_of().native(SEED, intrinsics_given=False)
+    native = mapper_of().native(NOTHING_KNOWN, SEED)
     with open_database(database) as opened:
         names = [image.name for image in opened.read_all_images()]
     native.image_names, native.extract_colors = names[1::2], False
@@ -137,7 +139,7 @@ def test_new_images_are_where_they_were_taken(
 ) -> None:
     path = written(old, tmp_path / "old")
     model, _ = extended(database, read_existing(Extension(path), database), tmp_path)
-    native = mapper_of().native(SEED, intrinsics_given=False)
+    native = mapper_of().native(NOTHING_KNOWN, SEED)
     native.extract_colors = False
     (tmp_path / "all").mkdir()
     whole = pycolmap.incremental_mapping(database, tmp_path, tmp_path / "all", options=native)[0]
@@ -307,3 +309,29 @@ def test_snapshots_of_other_options_are_dropped(
     with pytest.raises(OSError, match="full"):
         fail(10, min_model_size=3)
     assert not folder.exists()
+
+
+def test_snapshots_of_other_cameras_are_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are of the same pairs, with as many inliers."""
+    path, folder = tmp_path / "database.db", tmp_path / "sparse.snapshots"
+    synthesize(path)
+    task, options = MappingTask(path, None), mapper_of().options
+    monkeypatch.setattr(snapshots, "SNAPSHOT_FRAMES", 2)
+
+    def is_gone_on_with(task: MappingTask) -> bool:
+        found = []
+        with suppress(OSError), snapshots.with_snapshots(task, options, folder, 10):
+            found.append((folder / "1").exists())
+            (folder / "1").mkdir(exist_ok=True)
+            raise OSError("full")
+        return found[0]
+
+    assert [is_gone_on_with(task) for _ in range(2)] == [False, True]
+    with open_database(path) as database:
+        camera = database.read_all_cameras()[0]
+        camera.params = camera.params * 1.01
+        database.update_camera(camera)
+    assert [is_gone_on_with(task) for _ in range(2)] == [False, True]
+    assert not is_gone_on_with(task_with_given_cameras(path))

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mapping_tasks import ALL_GIVEN, NOTHING_KNOWN, task_with_given_cameras
 from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
@@ -23,7 +24,7 @@ from colmap_affrect.errors import MappingError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers.attempts import map_database
-from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper, MappingTask
+from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions, map_globally
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.matchers.guided import GuidedOptions
@@ -56,10 +57,10 @@ def options_of(mapper: str) -> object:
 def test_differences_say_all_that_another_process_must_know(mapper: str) -> None:
     values = {"min_num_matches": 16, "ignore_watermarks": True}
     made = mapper_of(mapper, mapper_options=values)
-    told = made.differences(intrinsics_given=True)
+    told = made.differences(ALL_GIVEN)
     native = options_of(mapper)
     set_values(native, json.loads(json.dumps(told)))
-    ours = made.native(SEED, intrinsics_given=True)
+    ours = made.native(ALL_GIVEN, SEED)
     assert differences(native, ours) == {}
     assert (told["min_num_matches"], told["ignore_watermarks"]) == (16, True)
 
@@ -68,14 +69,14 @@ def test_differences_say_all_that_another_process_must_know(mapper: str) -> None
 def test_mapper_options_win_over_the_preset(preset: str) -> None:
     given = {"min_model_size": "4", "init_min_num_inliers": "33", "ignore_two_view_tracks": "1"}
     mapper = IncrementalMapper(IncrementalOptions.preset(preset, mapper_options=given))
-    native = mapper.native(SEED, intrinsics_given=False)
+    native = mapper.native(NOTHING_KNOWN, SEED)
     assert (native.min_model_size, native.mapper.init_min_num_inliers) == (4, 33)
     assert native.triangulation.ignore_two_view_tracks is True
     assert native.random_seed == SEED
     assert mapper.options.preset_name == preset
     given = {"min_model_size": 5, "track_min_num_views_per_track": 4}
     global_mapper = GlobalMapper(GlobalOptions.preset(preset, mapper_options=given))
-    native = global_mapper.native(SEED, intrinsics_given=False)
+    native = global_mapper.native(NOTHING_KNOWN, SEED)
     assert (native.min_model_size, native.mapper.track_min_num_views_per_track) == (5, 4)
 
 
@@ -102,8 +103,9 @@ def mapper_of(name: str, **options: Any) -> Any:
 def reconstruct(path: Path, mapper: Mapper) -> tuple[list[ModelSummary], int]:
     """Map into path/../sparse; return the models and the number of images shown."""
     shown: list[int] = []
-    task = MappingTask(path, path.parent, intrinsics_given=True)
-    found = map_database(mapper, task, path.parent / "sparse", shown.append)
+    found = map_database(
+        mapper, task_with_given_cameras(path), path.parent / "sparse", shown.append
+    )
     assert not (path.parent / "sparse.partial").exists()
     return found, sum(shown)
 

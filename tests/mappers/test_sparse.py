@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mapping_tasks import task_with_given_cameras
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Poses, model_poses, pose_errors, relative_pose
 from colmap_affrect.colmap.verification import VerificationOptions, verify
-from colmap_affrect.mappers.base import DepthLookup, MappedModel, MappingTask
+from colmap_affrect.mappers.base import DepthLookup, MappedModel
 from colmap_affrect.mappers.loops import check_loops
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
@@ -100,7 +101,7 @@ def is_inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 def mapped(path: Path, output_path: Path, depth_at: DepthLookup | None = None) -> list[MappedModel]:
     output_path.mkdir()
-    task = MappingTask(path, path.parent, intrinsics_given=True, depth_at=depth_at)
+    task = task_with_given_cameras(path, depth_at=depth_at)
     return SparseMapper(SparseOptions()).map(task, output_path, 0, lambda _: None)
 
 

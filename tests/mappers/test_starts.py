@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from mapping_tasks import ALL_GIVEN, WHOLE
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
@@ -15,7 +16,7 @@ from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers import starts as module
 from colmap_affrect.mappers.arrivals import read_arrivals
 from colmap_affrect.mappers.attempts import MAX_HOLDING_ATTEMPTS, map_database
-from colmap_affrect.mappers.base import MAPPERS, MappedModel, MapperOptions, MappingTask
+from colmap_affrect.mappers.base import MAPPERS, Bridge, MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.mappers.starts import (
     MAX_EXCESS,
@@ -216,6 +217,23 @@ def test_attempts_to_hold_cameras_end(
     assert mapper.held[-1] == {1, 2}
 
 
+def test_images_that_the_last_adjustment_leaves_without_points_are_taken_out(
+    scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lose_points(model: pycolmap.Reconstruction, *_: object, **__: object) -> None:
+        image = model.images[max(model.reg_image_ids())]
+        for index in image.get_observation_point2D_idxs()[3:]:
+            model.delete_observation(image.image_id, index)
+
+    monkeypatch.setattr(attempts, "adjust_last", lose_points)
+    bridge = Bridge(("a", "b"), ("b",), 20, 20, 0.01)
+    mapper = Recorder(lambda _: [replace(m, bridges=(bridge,)) for m in without(scene, 0)])
+    mapped(scene, tmp_path, mapper, records(scene, KNOWN))
+    model = read_arrivals(pycolmap.Reconstruction(tmp_path / "sparse" / "0"), tmp_path / "sparse/0")
+    assert model.reconstruction.num_reg_images() == NUM_IMAGES - 1
+    assert list(model.taken_out.values()) == ["only 3 points hold it"]
+
+
 def test_large_models_are_mapped_once(
     scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -226,7 +244,6 @@ def test_large_models_are_mapped_once(
 
 
 GIVEN = CameraRecord(("a",), "given", 1300.0, size=(1024, 768), given=("focal",))
-WHOLE = replace(GIVEN, given=("focal", "distortion"))
 FREE = replace(GIVEN, source="exif", given=())
 
 
@@ -249,8 +266,6 @@ def test_given_parts_of_cameras_stay(
     distortion_kept: set[int],
 ) -> None:
     """One whose focal length is given has its distortion refined if all are of that kind."""
-    if mapper == "global" and distortion_kept:
-        pytest.skip("pycolmap's global mapper refines all cameras or none")
     path = tmp_path / "database.db"
     path.write_bytes(scene[0].read_bytes())
     with open_database(path) as database:
@@ -265,6 +280,19 @@ def test_given_parts_of_cameras_stay(
     params = {key: camera.params for key, camera in model.cameras.items()}
     assert {key for key, values in params.items() if values[0] == 1300.0} == kept
     assert {key for key, values in params.items() if values[3] == 0.0} == distortion_kept
+
+
+@pytest.mark.parametrize("name", MAPPERS.names())
+def test_report_says_what_of_cameras_is_not_refined(name: str) -> None:
+    def held(task: MappingTask, **options: object) -> set[str]:
+        differs = MAPPERS.make(MAPPERS.options({"name": name, **options})).differences(task)
+        return {key.split("refine_")[1] for key, value in differs.items() if "refine_" in key}
+
+    assert held(task_of({1: GIVEN, 2: WHOLE})) == {"focal_length"}
+    assert held(ALL_GIVEN) == {"focal_length", "extra_params"}
+    assert held(task_of({1: GIVEN, 2: FREE})) == held(task_of({})) == set()
+    assert held(ALL_GIVEN, keep_given_intrinsics=False) == set()
+    assert held(replace(task_of({1: FREE}), distortion_held=True)) == {"extra_params"}
 
 
 def test_given_focal_lengths_are_refined_where_that_is_asked_for() -> None:
