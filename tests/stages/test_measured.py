@@ -16,6 +16,7 @@ from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.images.photographs import CameraOptions
@@ -180,7 +181,7 @@ def test_images_that_climbing_ties_come_in_last(
     with first_level_database(context) as found:
         assert found
         first = Workspace(workspace.path / "first")
-        task = MappingTask(found[0], None, intrinsics_given=True)
+        task = MappingTask(found[0], None, cameras=read_camera_records(workspace.cameras))
         map_database(mapper, task, first.sparse, lambda _: None)
     _, models = stage.map_images(context, mapper)
     assert models[0].registered_names == tuple(sorted(NAMES))
