@@ -317,6 +317,11 @@ def inspect(options: argparse.Namespace) -> int:
     from colmap_affrect.stages.one_image import prepare
 
     recipe = given.recipe(options)
+    if options.output_path.resolve() == options.image.parent.resolve():
+        raise OptionError(
+            f"--output-path {options.output_path}: give another folder than that of the "
+            "photographs; the drawing would be taken for one"
+        )
     photographs = Photographs(options.image.parent, given.masks(options))
     photographs.check()
     mask = photographs.mask(options.image.name)

@@ -89,6 +89,10 @@ class DepthOptions(PartOptions):
         """Whether there is a source of depth at all."""
         return True
 
+    def file(self, name: str) -> Path | None:  # noqa: ARG002
+        """Return the file that the depth of an image is read from, if there is one."""
+        return None
+
 
 class DepthFilesOptions(DepthOptions):
     """Depth maps in a folder."""
@@ -109,6 +113,12 @@ class DepthFilesOptions(DepthOptions):
     def is_given(self) -> bool:
         """Whether a folder is named."""
         return bool(self.path)
+
+    def file(self, name: str) -> Path | None:
+        """Return the first that exists of the files that an image's map may be in."""
+        stems = (name, splitext(name)[0])
+        paths = (Path(self.path) / f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES)
+        return next((path for path in paths if path.is_file()), None)
 
 
 class MonocularOptions(DepthOptions):
@@ -152,7 +162,7 @@ class DepthFiles:
         """Check, before any image is processed, that at least one has a map; else DepthError."""
         if not self._path.is_dir():
             raise DepthError(f"{self._path}: no such folder; give the folder of the depth maps")
-        if not any(self._find(name) for name in names):
+        if not any(self._options.file(name) for name in names):
             raise DepthError(
                 f"{self._path}: holds no depth map of any of the {len(names)} images; "
                 f"{self._places(names[0])}"
@@ -163,7 +173,7 @@ class DepthFiles:
 
         Raises DepthError if there is none, or it is damaged or not of this photograph.
         """
-        path = self._find(photograph.name)
+        path = self._options.file(photograph.name)
         if path is None:
             raise DepthError(
                 f"{self._path}: no depth map of {photograph.name}; {self._places(photograph.name)}"
@@ -176,11 +186,6 @@ class DepthFiles:
             return _z_depth(values, self._options.kind, photograph)
         except UnusableMap as error:
             raise DepthError(f"{path}: depth map of {photograph.name}: {error}") from error
-
-    def _find(self, name: str) -> Path | None:
-        stems = (name, splitext(name)[0])
-        paths = (self._path / f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES)
-        return next((path for path in paths if path.is_file()), None)
 
     def _places(self, name: str) -> str:
         suffixes = ", ".join(SUFFIXES)

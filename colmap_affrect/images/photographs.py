@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import unicodedata
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, Self
@@ -16,6 +17,7 @@ from colmap_affrect.images.masks import read_mask
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.stores import pair_key
+from colmap_affrect.project.workspace import is_output_folder
 
 
 class CameraOptions(Options):
@@ -153,14 +155,29 @@ def left_out(image_path: Path) -> dict[str, str]:
     }
 
 
+def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:
+    """Tell which photographs in a folder a database does not name."""
+    suffixes = IMAGE_SUFFIXES
+    found = [n for n in _visible_files(image_path) if _suffix(n) in suffixes and n not in names]
+    if not found:
+        return {}
+    return {
+        str(image_path): f"{len(found)} photographs are left out, such as {found[0]}: the database "
+        "does not name them"
+    }
+
+
 def _visible_files(folder: Path) -> list[str]:
-    """Return the sorted names, relative to a folder, of all files that are not hidden."""
-    paths = (path.relative_to(folder) for path in folder.rglob("*"))
-    return sorted(
-        path.as_posix()
-        for path in paths
-        if not any(part.startswith(".") for part in path.parts) and not (folder / path).is_dir()
-    )
+    """Return the sorted names, relative to a folder, of all files that are not hidden.
+
+    Output folders of this program are passed over with all that is in them.
+    """
+    found: list[str] = []
+    for path, inner, files in os.walk(folder):
+        below = Path(path)
+        inner[:] = [n for n in inner if n[0] != "." and not is_output_folder(below / n)]
+        found += ((below / n).relative_to(folder).as_posix() for n in files if n[0] != ".")
+    return sorted(found)
 
 
 def _suffix(name: str) -> str:

@@ -23,13 +23,21 @@ from colmap_affrect.images.photographs import (
     checked_names,
     left_out,
     list_images,
+    not_named,
     refuse_colliding_keys,
 )
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
+from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe
+from colmap_affrect.stages.changes import (
+    forget_changed,
+    refuse_changed,
+    refuse_other_photographs,
+    source_files,
+)
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.one_image import (
     ExtractedImage,
@@ -106,6 +114,20 @@ class Inputs(Options):
             raise ImageError(f"{listed}: lists {unknown[0]}, which {self.from_database} has not")
         return names
 
+    def files(self, name: str, options: ExtractionOptions) -> list[Path]:
+        """Return the files that the features of an image depend on."""
+        files = self.photographs.files(name)
+        if options.uses_depth:
+            depth = options.depth.file(name)
+            files += [*([depth] if depth else []), *self.camera_files]
+        return files
+
+    @property
+    def camera_files(self) -> list[Path]:
+        """The files that cameras and images of the database are taken from."""
+        given = [Path(path) for path in (self.from_database, self.cameras.cameras_path) if path]
+        return [file for path in given for file in source_files(path)]
+
     def check(self) -> None:
         """Refuse cameras and masks that cannot be used.
 
@@ -176,16 +198,21 @@ def extract(
         names = checked_names(folder, image_names, "image_names")
     inputs.check_names(names)
     extractor = prepared_recipe(context, recipe.extraction, names)
+    contents = Contents(workspace.contents)
+    digests = {name: contents.digest(inputs.files(name, extractor.options)) for name in names}
+    if not overwrite:
+        refuse_other_photographs(workspace, inputs.image_path, digests)
     _record(workspace, inputs, recipe, extractor, later or {}, overwrite=overwrite)
+    warnings = forget_changed(context, inputs, digests, contents, are_all=not image_names)
     _start_database(workspace)
     done = context.features.complete(names)
     missing = [name for name in names if name not in done]
     _refuse_foreign_features(workspace, missing)
-    is_whole_folder = not (inputs.image_list_path or image_names or inputs.from_database)
-    warnings = left_out(folder) if is_whole_folder else {}
+    if not (inputs.image_list_path or image_names):
+        warnings |= not_named(folder, names) if inputs.from_database else left_out(folder)
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
-    failures = _extract_missing(context, inputs, extractor, missing, warnings)
+    failures = _extract_missing(context, inputs, extractor, missing, digests, warnings)
     if len(failures) == len(names):
         raise ImageError(
             f"{folder}: none of the {len(names)} images can be used; the first: "
@@ -233,6 +260,7 @@ def _extract_missing(
     inputs: Inputs,
     extractor: ImageExtractor,
     names: Sequence[str],
+    digests: Mapping[str, str],
     warnings: dict[str, str],
 ) -> dict[str, str]:
     """Extract images one by one; return why some cannot be used, and add to the warnings."""
@@ -250,7 +278,7 @@ def _extract_missing(
                         logger.warning("%s: no features (blank or too small?)", name)
                     if found.warning:
                         warnings[name] = found.warning
-                    store.write(name, found.features, found.image_size)
+                    store.write(name, found.features, found.image_size, digests[name])
                 advance(1)
     return failures
 
@@ -282,6 +310,11 @@ def extract_images(
     """
     if not images:
         return
+    if later := {name for name, level in images if level}:
+        contents = Contents(context.workspace.contents)
+        refuse_changed(
+            context, {n: contents.digest(inputs.files(n, extractor.options)) for n in later}
+        )
     executor = context.executor or Threads(num_images_at_once(extractor))
     depth_folder = extractor.options.depth.folder
     if depth_folder and not executor.sees([depth_folder]):
