@@ -51,7 +51,6 @@ def copy_verified(
     if not workspace.database.exists():
         copy_with_frames(source, workspace.database)
     record_cameras(workspace.database, workspace.cameras)
-    colmap_database.refuse_wrong_matches(workspace.database)
     workspace.record_options("verify", verification.to_mapping())
     num_pairs = colmap_database.num_matched_pairs(workspace.database)
     if not num_pairs:

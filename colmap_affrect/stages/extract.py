@@ -11,7 +11,7 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.camera_records import read_camera_records
-from colmap_affrect.colmap.database_copy import copy_without_features, open_copy
+from colmap_affrect.colmap.database_copy import copy_without_features, read_names
 from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
 from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
@@ -104,8 +104,7 @@ class Inputs(Options):
         folder, listed = Path(self.image_path), Path(self.image_list_path)
         if not self.from_database:
             return list_images(folder, listed if self.image_list_path else None)
-        with open_copy(Path(self.from_database)) as database:
-            known = [image.name for image in database.read_all_images()]
+        known = read_names(Path(self.from_database))
         if not self.image_list_path:
             return checked_names(folder, known, self.from_database)
         names = list_images(folder, listed)
