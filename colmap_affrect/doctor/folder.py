@@ -14,6 +14,7 @@ from colmap_affrect.doctor.database import examine_database, examined_copy
 from colmap_affrect.doctor.findings import OWN_ADVICE, SAME_RUN, Findings, without_path
 from colmap_affrect.errors import AffrectError, WorkspaceError
 from colmap_affrect.pairs.lists import read_pairs
+from colmap_affrect.project.atomic_files import NEW_SUFFIX
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.stores import pair_key
 from colmap_affrect.project.workspace import COPY_STAGES, INPUTS, STAGES, Workspace
@@ -28,7 +29,7 @@ DAMAGED_HDF5 = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 DAMAGED_RECORD = (KeyError, TypeError, ValueError, AttributeError)
 """What reading a record of options of another shape than ours raises."""
 
-LEFTOVERS = ("*.new", "*.partial")
+LEFTOVERS = ("*.new", "*.partial", f"*{NEW_SUFFIX}")
 
 
 def examine_folder(findings: Findings, path: Path, image_path: Path | None) -> None:

@@ -8,6 +8,7 @@ its pixels to those of the photograph. The unit is free: normals do not depend o
 from __future__ import annotations
 
 import hashlib
+import io
 import threading
 import zlib
 from collections.abc import Sequence
@@ -23,10 +24,11 @@ from numpy.typing import NDArray
 
 from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.data import Photograph
-from colmap_affrect.errors import DepthError
+from colmap_affrect.errors import DepthError, WorkspaceError
 from colmap_affrect.images.depth_files import SUFFIXES, UnusableMap, read_map
 from colmap_affrect.images.reading import read_color, shrink_to
 from colmap_affrect.options import PartOptions, Registry, within
+from colmap_affrect.project.atomic_files import replace_bytes
 
 MAX_ASPECT_RATIO = 1.05
 """Aspects of map and photograph may differ by this factor: networks round sizes to 32 px."""
@@ -387,11 +389,10 @@ def _read_prediction(file: Path, model: str, pixels: str) -> _Prediction | None:
 
 def _write_prediction(file: Path, prediction: _Prediction, model: str, pixels: str) -> None:
     """Keep a prediction; the file appears under its name only when it is complete."""
-    new = file.with_name(file.name + ".new")
+    content = io.BytesIO()
+    np.savez(content, **vars(prediction), model=model, pixels=pixels)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with new.open("wb") as stream:
-            np.savez(stream, **vars(prediction), model=model, pixels=pixels)
-        new.replace(file)
-    except OSError as error:
-        raise DepthError(f"{file}: depth cannot be kept there ({error.strerror})") from error
+        replace_bytes(file, content.getvalue())
+    except (OSError, WorkspaceError) as error:
+        raise DepthError(f"{file}: depth cannot be kept there ({error})") from error

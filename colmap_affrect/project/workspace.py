@@ -20,7 +20,7 @@ from filelock import FileLock, Timeout
 
 from colmap_affrect.errors import StaleStoreError, WorkspaceError
 from colmap_affrect.options import flat
-from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 
 logger = logging.getLogger(__name__)
 
@@ -179,6 +179,7 @@ class Workspace:
         """
         record = self.recorded()
         self._refuse_foreign_results(record, stage)
+        self._remove(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
         begun = record.get("begun", [])
         if overwrite:
             self._remove(self._results(stage))
