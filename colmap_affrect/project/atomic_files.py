@@ -33,7 +33,14 @@ SHA256_BYTES = 32
 
 def replace_text(path: Path, text: str) -> None:
     """Write a text file as :func:`replace_bytes`."""
-    replace_bytes(path, text.encode("utf-8"))
+    try:
+        content = text.encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise WorkspaceError(
+            f"{path}: cannot hold {text[error.start - 40 : error.end + 40]!r}, which is not UTF-8; "
+            "rename that file or folder"
+        ) from error
+    replace_bytes(path, content)
 
 
 def replace_bytes(path: Path, content: bytes) -> None:
