@@ -192,6 +192,7 @@ def extract(
     start = time.perf_counter()
     workspace, folder = context.workspace, Path(inputs.image_path)
     inputs.check()
+    _require_camera(workspace, inputs.cameras.existing_camera_id)
     names = inputs.names()
     if image_names:
         names = checked_names(folder, image_names, "image_names")
@@ -226,6 +227,14 @@ def extract(
         failures,
         warnings,
     )
+
+
+def _require_camera(workspace: Workspace, camera_id: int) -> None:
+    """Refuse a camera that the database does not have before that is on record."""
+    path = workspace.database
+    cameras = colmap_database.all_cameras(path) if camera_id >= 0 and path.exists() else []
+    if camera_id >= 0 and all(camera.camera_id != camera_id for camera in cameras):
+        raise OptionError(f"existing_camera_id={camera_id}: {path} has no such camera")
 
 
 def _record(
