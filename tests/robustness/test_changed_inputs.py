@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command import FAST, Call
-from results import results
+from results import hdf5_content, results
 from small_scene import IMAGE_SIZE, NAMES, photograph, write_photographs
 from synthetic import write_image
 
@@ -325,3 +325,30 @@ def test_climbing_refuses_photographs_that_have_changed(tmp_path: Path) -> None:
     extractor = prepared_recipe(context, recipe.extraction, [FIRST])
     with pytest.raises(StaleStoreError, match=r"1 changed \(a.png\) since their features"):
         list(extract_images(context, inputs, extractor, [(SECOND, 1), (FIRST, 1)]))
+
+
+@pytest.mark.parametrize("step", ["MatchStore.remove", "FeatureStore.remove"])
+def test_changes_are_found_again_by_a_run_that_was_killed_while_it_forgot(
+    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    scene = Scene(tmp_path)
+    write_photographs(scene.photos, 3)
+    extracted(call, scene)
+    for stage in ("pairs", "match"):
+        assert call(stage, "--output-path", scene.out).code == 0
+    content(scene)
+    (scene.photos / SECOND).unlink()
+
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(f"colmap_affrect.project.stores.{step}", killed)
+        assert extracted(call, scene)[-1].startswith("interrupted")
+    assert extracted(call, scene)[0] == "extract: 1 done, 1 already there, 1 with a warning"
+    for out in (scene.out, scene.file("fresh")):
+        extracted(call, scene, "--output-path", out)
+        for stage in ("pairs", "match"):
+            assert call(stage, "--output-path", out).code == 0
+    for name in ("features.h5", "matches.h5"):
+        assert hdf5_content(scene.out / name) == hdf5_content(scene.file("fresh") / name)
