@@ -15,6 +15,7 @@ from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
+from colmap_affrect.errors import ImageError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions, MappingTask
@@ -249,6 +250,7 @@ def map_and_report(
 ) -> ReconstructionReport:
     """Map a verified workspace and write ``report.json``."""
     workspace, options = context.workspace, mapper.options
+    _require_photographs(context)
     if extend and overwrite:
         extend.refuse_discarding(workspace.path)
     before = existing_names(extend.model_path, image_names(workspace)) if extend else []
@@ -285,6 +287,22 @@ def map_and_report(
     )
     replace_text(workspace.report, result.to_json())
     return result
+
+
+def _require_photographs(context: Context) -> None:
+    """Refuse to map photographs that are not where they were when they were extracted."""
+    if is_copy(context.workspace):
+        return
+    inputs = Inputs.recorded(context.workspace)
+    if not Path(inputs.image_path).is_dir():
+        raise ImageError(
+            f"{inputs.image_path}: no such folder; if the photographs have moved, run extract "
+            "again with --image-path"
+        )
+    if gone := sorted(set(context.features.names()) - set(inputs.names())):
+        raise ImageError(
+            f"{inputs.image_path}: {gone[0]} has features, and is gone; run extract again"
+        )
 
 
 def map_guided(

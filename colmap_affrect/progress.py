@@ -8,6 +8,8 @@ from typing import TextIO
 
 from tqdm import tqdm
 
+from colmap_affrect.shown import shown
+
 Advance = Callable[[int], None]
 """Report that so many more units are done."""
 
@@ -45,6 +47,11 @@ class Progress:
 SILENT = Progress()
 
 
+def show(text: object, *, file: TextIO | None = None, end: str = "\n") -> None:
+    """Print what people or programs read; see :mod:`colmap_affrect.shown`."""
+    print(shown(str(text)), file=file, end=end)
+
+
 def _update(bar: tqdm[None], count: int) -> None:
     bar.update(count)
 
@@ -74,4 +81,4 @@ class _PlainLines:
             self._print()
 
     def _print(self) -> None:
-        print(f"{self._name}: {self._done}/{self._total} {self._unit}", file=self._stream)
+        show(f"{self._name}: {self._done}/{self._total} {self._unit}", file=self._stream)

@@ -254,7 +254,7 @@ def load_recipe(name: str, settings: Sequence[str] = ()) -> Recipe:
 def _read(name: str) -> dict[str, Any]:
     path = Path(name) if name.endswith(".toml") else recipe_folder() / f"{name}.toml"
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         close = difflib.get_close_matches(name, recipe_names(), n=1)
         hint = f"did you mean '{close[0]}'? " if close else ""

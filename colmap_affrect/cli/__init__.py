@@ -17,6 +17,7 @@ from colmap_affrect.cli.parser import build_parser
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.project.report import EXIT_FAILED, EXIT_INTERRUPTED
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.shown import one_line
 
 logger = logging.getLogger("colmap_affrect")
 
@@ -53,8 +54,7 @@ def main_of_process() -> NoReturn:
 
 def _fail(message: str) -> int:
     """Print one line; odd characters, out of files perhaps, must not reach the terminal."""
-    shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
-    print(f"error: {''.join(shown)}", file=sys.stderr)
+    print(f"error: {one_line(message)}", file=sys.stderr)
     return EXIT_FAILED
 
 
@@ -71,12 +71,17 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
     log_path.parent.mkdir(parents=True, exist_ok=True)
     python_stderr, terminal_fd = sys.stderr, os.dup(2)
     terminal = os.fdopen(terminal_fd, "w", buffering=1, encoding="utf-8", errors="replace")
-    with terminal, _quietly_closed(log_path.open("a", encoding="utf-8", buffering=1)) as log:
+    with (
+        terminal,
+        _quietly_closed(
+            log_path.open("a", encoding="utf-8", errors="backslashreplace", buffering=1)
+        ) as log,
+    ):
         level = logging.DEBUG if options.verbose else logging.WARNING
         handlers: list[logging.Handler] = [logging.StreamHandler(terminal), _LogHandler(log)]
         handlers[0].setLevel(logging.ERROR if options.quiet else level)
-        handlers[0].setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
-        handlers[1].setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        handlers[0].setFormatter(_OneLine("%(levelname)s: %(message)s"))
+        handlers[1].setFormatter(_OneLine("%(asctime)s %(levelname)s %(message)s"))
         for handler in handlers:
             logger.addHandler(handler)
         logger.setLevel(logging.DEBUG)
@@ -93,6 +98,14 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
             os.dup2(terminal.fileno(), 2)
             for handler in handlers:
                 logger.removeHandler(handler)
+
+
+class _OneLine(logging.Formatter):
+    """Shows a message in one line, whatever names are in it; a traceback keeps its lines."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        return one_line(super().formatMessage(record))
 
 
 class _LogHandler(logging.StreamHandler[TextIO]):

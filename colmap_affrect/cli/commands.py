@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from colmap_affrect.cli import given
 from colmap_affrect.errors import ComparisonError, OptionError
-from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def extract(options: argparse.Namespace) -> int:
         report = stage.extract(context, inputs, given.recipe(options), overwrite=options.overwrite)
         if options.database_descriptors:
             stage.write_descriptors(context)
-    print(report.summary())
+    show(report.summary())
     return _exit_code(report.failures, options)
 
 
@@ -105,8 +105,8 @@ def escalate(options: argparse.Namespace) -> int:
         chosen = EscalateOptions.from_mapping(values, "escalate")
         report = escalate(context, chosen, overwrite=options.overwrite)
         levels = pair_levels(context)
-    print(report.summary())
-    print(", ".join(f"{count} pairs by {name}" for name, count in levels.items()))
+    show(report.summary())
+    show(", ".join(f"{count} pairs by {name}" for name, count in levels.items()))
     return EXIT_OK
 
 
@@ -126,9 +126,9 @@ def guide(options: argparse.Namespace) -> int:
         if options.model_path:
             report = guide_by_model(context, read_model(options.model_path))
         counts = guided_counts(context)
-    print(report.summary())
+    show(report.summary())
     if counts:
-        print("{pairs} pairs, {matches_before} to {matches_after} inliers".format(**counts))
+        show("{pairs} pairs, {matches_before} to {matches_after} inliers".format(**counts))
     return EXIT_OK
 
 
@@ -192,12 +192,12 @@ def compare(options: argparse.Namespace) -> int:
         overwrite=options.overwrite,
         progress=SILENT if options.quiet else Progress(sys.stderr, num_plain_lines=1),
     )
-    print(to_json(comparison) if options.json else summary(comparison))
+    show(to_json(comparison) if options.json else summary(comparison))
     if not options.json:
-        print(f"\npictures: {options.output_path / 'report.html'}")
+        show(f"\npictures: {options.output_path / 'report.html'}")
     if options.viewer:
         path = log_comparison(comparison, options.output_path)
-        print(f"for rerun: {path}", file=sys.stderr)
+        show(f"for rerun: {path}", file=sys.stderr)
     return _comparison_exit_code(comparison, options)
 
 
@@ -220,9 +220,9 @@ def evaluate(options: argparse.Namespace) -> int:
         overwrite=options.overwrite,
         progress=given.progress(options),
     )
-    print(evaluation.to_json() if options.json else evaluation.summary())
+    show(evaluation.to_json() if options.json else evaluation.summary())
     if not options.json:
-        print(f"\nplots, all pairs: {options.output_path}")
+        show(f"\nplots, all pairs: {options.output_path}")
     failures = {name: why for recipe in evaluation.recipes for name, why in recipe.failures.items()}
     return _exit_code(failures, options)
 
@@ -233,7 +233,7 @@ def _comparison_exit_code(comparison: Comparison, options: argparse.Namespace) -
         where = options.output_path / "comparison.json"
         raise ComparisonError(f"failed: {', '.join(failed)}; {where} says why")
     if not any(seed.model_names for method in comparison.methods for seed in method.seeds):
-        print("error: no method found a model", file=sys.stderr)
+        show("error: no method found a model", file=sys.stderr)
         return EXIT_NO_MODEL
     failures = {name: why for m in comparison.methods for name, why in m.failures.items()}
     return _exit_code(failures, options)
@@ -281,24 +281,24 @@ def doctor(options: argparse.Namespace) -> int:
         weights_path=options.weights,
         progress=given.progress(options),
     )
-    print(diagnosis.to_json() if options.json else diagnosis.summary())
+    show(diagnosis.to_json() if options.json else diagnosis.summary())
     return EXIT_FAILED if diagnosis.num_errors else EXIT_OK
 
 
 def _printed(report: StageReport | InterchangeReport) -> int:
-    print(report.summary())
+    show(report.summary())
     return EXIT_OK
 
 
 def _print_reconstruction(report: ReconstructionReport, options: argparse.Namespace) -> int:
-    print(report.to_json() if options.json else report.summary())
+    show(report.to_json() if options.json else report.summary())
     why = ""
     if not report.models:
         why = "one image cannot make a model" if report.images_total == 1 else "no model was found"
     elif not report.models[0].is_trustworthy:
         why = "nothing in the model can be trusted"
     if why:
-        print(f"error: {why}; see {options.output_path / 'report.json'}", file=sys.stderr)
+        show(f"error: {why}; see {options.output_path / 'report.json'}", file=sys.stderr)
         return EXIT_NO_MODEL
     return _exit_code(report.failures, options)
 
@@ -307,7 +307,7 @@ def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
     if len(failures) <= options.max_failures:
         return EXIT_OK
     names = ", ".join(failures)
-    print(f"error: could not read {len(failures)} of the images: {names}", file=sys.stderr)
+    show(f"error: could not read {len(failures)} of the images: {names}", file=sys.stderr)
     return EXIT_FAILED
 
 
@@ -317,11 +317,16 @@ def inspect(options: argparse.Namespace) -> int:
     from colmap_affrect.stages.one_image import prepare
 
     recipe = given.recipe(options)
+    if options.output_path.resolve() == options.image.parent.resolve():
+        raise OptionError(
+            f"--output-path {options.output_path}: give another folder than that of the "
+            "photographs; the drawing would be taken for one"
+        )
     photographs = Photographs(options.image.parent, given.masks(options))
     photographs.check()
     mask = photographs.mask(options.image.name)
     extractor = prepare(recipe.extraction, given.resources(options), [options.image.name])
-    print(inspect_image(extractor, options.image, options.output_path, mask))
+    show(inspect_image(extractor, options.image, options.output_path, mask))
     return EXIT_OK
 
 
@@ -332,14 +337,14 @@ def recipes(options: argparse.Namespace) -> int:
 
     if options.name:
         recipe = load_recipe(options.name)
-        print(tomli_w.dumps({"summary": recipe.summary, **recipe.to_mapping()}), end="")
+        show(tomli_w.dumps({"summary": recipe.summary, **recipe.to_mapping()}), end="")
         return EXIT_OK
     for name in recipe_names():
         recipe = load_recipe(name)
         needs = list(recipe.weights)
         needs += ["depth"] if recipe.extraction.uses_depth else []
-        print(f"{name:28s} {recipe.summary}")
-        print(f"{'':28s} needs {', '.join(needs) or 'nothing'}")
+        show(f"{name:28s} {recipe.summary}")
+        show(f"{'':28s} needs {', '.join(needs) or 'nothing'}")
     return EXIT_OK
 
 
@@ -349,7 +354,7 @@ def weights(options: argparse.Namespace) -> int:
     if options.action == "fetch":
         keys = options.keys or ["affnet", "orinet", "hardnet"]
         for path in fetch(keys, options.weights, progress=Progress(sys.stderr)).values():
-            print(path)
+            show(path)
         return EXIT_OK
     checks = {None: "", True: ", verified", False: ", NOT the published file"}
     for row in describe_weights(options.weights):
@@ -357,8 +362,8 @@ def weights(options: argparse.Namespace) -> int:
         where = f"{row.path}{checks[row.verified]}"
         if not row.path:
             where = f"not found: {install_hint([file])}colmap-affrect weights fetch {row.key}"
-        print(f"{row.key:32s} {file.used_for}, {file.file_name}")
-        print(f"{'':4s}{where}")
+        show(f"{row.key:32s} {file.used_for}, {file.file_name}")
+        show(f"{'':4s}{where}")
         sha256, licence = file.sha256 or "not known", file.licence or "not stated"
-        print(f"{'':4s}sha256 {sha256}; licence {licence}")
+        show(f"{'':4s}sha256 {sha256}; licence {licence}")
     return EXIT_OK

@@ -1,23 +1,24 @@
 """What can be wrong in a COLMAP database, found without COLMAP.
 
 Rows that COLMAP does not expect end the process inside COLMAP, so the tables are read by SQLite
-itself. The database must have the current schema: give a copy (see :mod:`.database_copy`).
+itself, of databases of all versions of COLMAP.
 """
 
 from __future__ import annotations
 
 import sqlite3
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.colmap.database_copy import DAMAGED
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import DatabaseError
 
 Severity = Literal["error", "warning", "note"]
@@ -31,12 +32,24 @@ CHECKS: dict[str, Check] = {
         "import some, e.g. by 'colmap feature_extractor --database_path {path} --image_path X'"),
     "no-camera": ("error", "images whose camera does not exist",
         "import these images again into a new database"),
+    "camera-model": ("error", "cameras of a model that COLMAP does not have",
+        "import their images again into a new database"),
+    "camera-size": ("error", "cameras of a size that no photograph has",
+        "import their images again into a new database"),
+    "camera-params": ("error",
+        "cameras whose parameters are more or fewer than their model has, or not finite numbers",
+        "import their images again into a new database"),
     "no-prior-focal": ("note", "cameras whose focal length is a guess",
         "if you know the intrinsics, give them: --cameras-path or --focal-length-px here, "
         "--ImageReader.camera_params in COLMAP"),
     "no-frame": ("error", "images without a frame while others have one, at which mapping aborts",
         "give each of them a frame (pycolmap.Database.write_frame), or begin anew with "
         "'colmap-affrect run --database-path {path}', which adds frames to its copy"),
+    "frame-links": ("error", "rows of rigs and frames that belong to nothing",
+        "import the images again into a new database"),
+    "matrix-data": ("error", "rows whose matrices have more or less data than they should, or no "
+        "finite numbers", "delete these rows; two-view geometries are made anew by 'colmap "
+        "geometric_verifier'"),
     "unsafe-name": ("warning", "image names that lead out of the image folder",
         "rename these images; programs that write a file per image would write elsewhere"),
     "no-keypoints": ("warning", "images without keypoints, which cannot be registered",
@@ -84,6 +97,33 @@ CHECKS: dict[str, Check] = {
 Problems = dict[str, list[str]]
 """What was found: by kind, the images, pairs or cameras concerned, none if it is the database."""
 
+FATAL_FOR_IMAGES = frozenset(
+    {"no-camera", "camera-model", "camera-size", "camera-params", "frame-links"}
+)
+"""Problems of cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
+
+FATAL = FATAL_FOR_IMAGES | {
+    "keypoint-columns", "keypoint-data", "keypoints-not-finite", "self-pair", "unknown-pair",
+    "match-data", "match-range", "matrix-data",
+}  # fmt: skip
+"""The same of keypoints and matches."""
+
+MAX_SHOWN = 3
+"""Images or pairs that the message of a refusal names."""
+
+MAX_SIDE_PX = 1 << 24
+"""Of a photograph; the largest panoramas have a tenth of it."""
+
+MATRICES = {
+    ("two_view_geometries", "pair_id"): {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
+    ("pose_priors", "pose_prior_id"): {"position": 3, "position_covariance": 9, "gravity": 3},
+    ("rig_sensors", "sensor_id"): {"sensor_from_rig": 7},
+}
+"""Columns that hold so many float64 or nothing, by table and its key."""
+
+DAMAGED = (sqlite3.Error, UnicodeDecodeError)
+"""What sqlite3 raises on damaged files; its messages may quote bytes that are not UTF-8."""
+
 MAX_NUM_IMAGES = 2**31 - 1
 """COLMAP's id of a pair is the smaller image id times this, plus the larger one."""
 
@@ -101,11 +141,13 @@ SENSOR_CAMERA = 0
 
 @dataclass(frozen=True)
 class Camera:
-    """A row of the table of cameras; the size is in px."""
+    """A row of the table of cameras; the size is in px, the model a number of COLMAP's."""
 
     width: int
     height: int
     has_prior_focal: bool
+    model: int
+    params: Any
 
 
 @dataclass(frozen=True)
@@ -170,8 +212,30 @@ def pair_images(pair_id: int) -> tuple[int, int]:
     return pair_id // MAX_NUM_IMAGES, pair_id % MAX_NUM_IMAGES
 
 
+def refuse_unusable(path: Path, called: Path, kinds: Collection[str] = FATAL) -> None:
+    """Refuse a database with problems that would end the process inside COLMAP.
+
+    Args:
+        path: of the database.
+        called: its name in messages, which it is a copy of.
+        kinds: of problems, keys of ``CHECKS``.
+
+    Raises:
+        DatabaseError: when it is damaged or has such a problem; one line.
+    """
+    try:
+        _, problems = check_database(path)
+    except DatabaseError as error:
+        raise DatabaseError(str(error).replace(str(path), str(called))) from error
+    for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
+        _, what, advice = CHECKS[kind]
+        more = ", ..." if len(problems[kind]) > MAX_SHOWN else ""
+        items = ", ".join(problems[kind][:MAX_SHOWN])
+        raise DatabaseError(f"{called}: {what} ({items}{more}); {advice.format(path=called)}")
+
+
 def check_database(path: Path) -> tuple[Tables, Problems]:
-    """Check a database of the current schema that nobody has open; DatabaseError if damaged."""
+    """Check a database that nobody is writing to; DatabaseError if damaged."""
     found: Problems = defaultdict(list)
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
@@ -180,6 +244,9 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
             if verdict != "ok":
                 raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
             tables = _read_tables(connection)
+            _check_cameras(tables, found)
+            _check_links(connection, found)
+            _check_matrices(connection, found)
             if tables.names:
                 _check_images(tables, found)
                 _check_keypoints(connection, tables, found)
@@ -190,7 +257,7 @@ def check_database(path: Path) -> tuple[Tables, Problems]:
                 _check_pairs(connection, tables, found)
             elif tables.names:
                 found["no-matches"] = []
-    except (*DAMAGED, TypeError, ValueError) as error:
+    except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
         raise DatabaseError(f"{path}: damaged ({error})") from error
     return tables, dict(found)
 
@@ -224,25 +291,94 @@ def is_unsafe(name: str) -> bool:
 
 
 def _read_tables(connection: sqlite3.Connection) -> Tables:
-    rows = connection.execute
-    images = list(rows("SELECT image_id, name, camera_id FROM images"))
-    cameras = rows("SELECT camera_id, width, height, prior_focal_length FROM cameras")
-    frame_data = rows("SELECT data_id FROM frame_data WHERE sensor_type = ?", [SENSOR_CAMERA])
+    def rows(columns: str, table: str) -> list[tuple[Any, ...]]:
+        """Read columns of a table; 0 for those that it lacks, in databases of old."""
+        known = _columns(connection, table)
+        present = [name if name in known else "0" for name in columns.split()]
+        query = f"SELECT {', '.join(present)} FROM {table}"  # noqa: S608
+        return list(connection.execute(query)) if known else []
+
+    images = rows("image_id name camera_id", "images")
+    cameras = rows("camera_id width height prior_focal_length model params", "cameras")
     return Tables(
-        cameras={int(key): Camera(int(w), int(h), bool(prior)) for key, w, h, prior in cameras},
+        cameras={
+            int(key): Camera(int(width), int(height), bool(prior), int(model), params)
+            for key, width, height, prior, model, params in cameras
+        },
         names={int(key): str(name) for key, name, _ in images},
         camera_ids={int(key): int(camera_id) for key, _, camera_id in images},
-        frame_images={int(key) for (key,) in frame_data},
-        num_frames=int(next(rows("SELECT COUNT(*) FROM frames"))[0]),
-        keypoints=_numbers(rows("SELECT image_id, rows, cols FROM keypoints")),
-        descriptors=_numbers(rows("SELECT image_id, type, rows FROM descriptors")),
-        matches={int(key): int(count) for key, count in rows("SELECT pair_id, rows FROM matches")},
-        geometries=_numbers(rows("SELECT pair_id, rows, config FROM two_view_geometries")),
+        frame_images={
+            int(key)
+            for key, kind in rows("data_id sensor_type", "frame_data")
+            if kind == SENSOR_CAMERA
+        },
+        num_frames=len(rows("frame_id", "frames")),
+        keypoints=_numbers(rows("image_id rows cols", "keypoints")),
+        descriptors=_numbers(rows("image_id type rows", "descriptors")),
+        matches={int(key): int(count) for key, count in rows("pair_id rows", "matches")},
+        geometries=_numbers(rows("pair_id rows config", "two_view_geometries")),
     )
+
+
+def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
+    """Return the columns of a table, none if there is no such table."""
+    return {str(row[1]) for row in connection.execute(f"PRAGMA table_info({table})")}
 
 
 def _numbers(rows: Iterable[Any]) -> dict[int, tuple[int, int]]:
     return {int(key): (int(first), int(second)) for key, first, second in rows}
+
+
+def _check_cameras(tables: Tables, found: Problems) -> None:
+    for camera_id, camera in tables.cameras.items():
+        label = f"camera {camera_id}"
+        count = _num_params(camera.model)
+        if not count:
+            found["camera-model"].append(f"{label}: model {camera.model}")
+            continue
+        params = _array(camera.params, 1, count, np.dtype("<f8"))
+        if params is None or not np.isfinite(params).all():
+            found["camera-params"].append(label)
+        if not all(0 < side <= MAX_SIDE_PX for side in (camera.width, camera.height)):
+            found["camera-size"].append(f"{label}: {camera.width} x {camera.height} px")
+
+
+@cache
+def _num_params(model: int) -> int:
+    """Return how many parameters cameras of a model of COLMAP have, 0 if there is no such model."""
+    try:
+        made = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
+    except (ValueError, RuntimeError, TypeError):
+        return 0
+    return len(made.params)
+
+
+def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
+    tables = [
+        name for name in ("rig_sensors", "frames", "frame_data") if _columns(connection, name)
+    ]
+    for table in tables:
+        for _, row, parent, _ in connection.execute(f"PRAGMA foreign_key_check({table})"):
+            found["frame-links"].append(f"row {row} of {table}, {parent}")
+    if _columns(connection, "rigs"):
+        query = (
+            "SELECT rig_id FROM rigs WHERE ref_sensor_type = ? AND ref_sensor_id NOT IN "
+            "(SELECT camera_id FROM cameras)"
+        )
+        for (rig_id,) in connection.execute(query, [SENSOR_CAMERA]):
+            found["frame-links"].append(f"rig {rig_id}, cameras")
+
+
+def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
+    for (table, key), columns in MATRICES.items():
+        for name in columns.keys() & _columns(connection, table):
+            query = f"SELECT {key}, {name} FROM {table}"  # noqa: S608
+            for row, blob in connection.execute(query):
+                values = _array(blob, 1, columns[name], np.dtype("<f8")) if blob else True
+                # Priors of position that are not known are not a number.
+                is_odd = values is None or (name in "FEH" and not np.isfinite(values).all())
+                if is_odd:
+                    found["matrix-data"].append(f"{name} of {key} {row}")
 
 
 def _check_images(tables: Tables, found: Problems) -> None:
@@ -261,17 +397,19 @@ def _check_images(tables: Tables, found: Problems) -> None:
 def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     query = "SELECT data FROM keypoints WHERE image_id = ?"
     for image_id, name in tables.names.items():
-        count, width = tables.keypoints.get(image_id, (0, 0))
-        if not count:
+        if image_id not in tables.keypoints:
             found["no-keypoints"].append(name)
             continue
-        if width not in KEYPOINT_COLUMNS:
+        count, width = tables.keypoints[image_id]
+        if count and width not in KEYPOINT_COLUMNS:
             found["keypoint-columns"].append(f"{name} has {width}")
             continue
         (blob,) = connection.execute(query, [image_id]).fetchone()
         keypoints = _array(blob, count, width, np.dtype("<f4"))
         if keypoints is None:
             found["keypoint-data"].append(name)
+        elif not count:
+            found["no-keypoints"].append(name)
         elif not np.isfinite(keypoints).all():
             found["keypoints-not-finite"].append(name)
         elif _are_outside(keypoints, tables.cameras.get(tables.camera_ids[image_id])):

@@ -281,22 +281,6 @@ def read_cameras(path: Path) -> dict[str, ImageCamera]:
         return {image.name: cameras[image.camera_id] for image in database.read_all_images()}
 
 
-def refuse_wrong_matches(path: Path) -> None:
-    """Refuse a database with matches that would end the process inside COLMAP.
-
-    Raises:
-        DatabaseError: naming a pair of an image with itself, or with indices out of range.
-    """
-    with open_database(path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-        counts = {image_id: database.num_keypoints_for_image(image_id) for image_id in names}
-        for pair_id in database.read_num_matches()[0]:
-            pair = pycolmap.pair_id_to_image_pair(pair_id)
-            if not set(pair) <= counts.keys():
-                raise DatabaseError(f"{path}: has matches of images {pair} that it does not have")
-            _check_indices(database.read_matches(*pair), pair, [counts[i] for i in pair])
-
-
 def write_matches(
     database: pycolmap.Database,
     image_id1: int,

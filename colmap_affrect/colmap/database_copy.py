@@ -8,20 +8,21 @@ from __future__ import annotations
 
 import sqlite3
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.checks import DAMAGED, FATAL, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import DatabaseError
 
 TABLES = {"cameras", "images", "keypoints", "matches"}
 """Tables that databases of all versions of COLMAP have."""
 
-DAMAGED = (sqlite3.Error, UnicodeDecodeError)
-"""What sqlite3 raises on damaged files; its messages may quote bytes that are not UTF-8."""
+HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")
+"""How a rollback journal begins while its changes are not complete."""
 
 
 def schema_version(path: Path) -> int:
@@ -44,38 +45,53 @@ def newest_schema_version() -> int:
         return schema_version(path)
 
 
-def copy_database(source: Path, target: Path) -> None:
-    """Copy a database as it is now, including its write-ahead log.
+def copy_as_it_is(source: Path, target: Path) -> None:
+    """Copy a database as it is now, including its write-ahead log, with the schema that it has.
 
-    The copy has the schema of the installed pycolmap. Raises DatabaseError when the source is
-    missing, not a COLMAP database, or one of a newer COLMAP; or when the target exists.
+    Raises DatabaseError when the source is missing, damaged, no COLMAP database, or one of a newer
+    COLMAP.
     """
-    if target.exists():
-        raise DatabaseError(f"{target}: exists already; it is not overwritten")
     version, newest = schema_version(source), newest_schema_version()
     if version > newest:
         raise DatabaseError(
             f"{source}: was made by a newer COLMAP (schema {version}, pycolmap "
             f"{pycolmap.__version__} knows {newest}); update pycolmap"
         )
+    try:
+        with _open_read_only(source) as original, closing(sqlite3.connect(target)) as copy:
+            original.backup(copy)
+    except DAMAGED as error:
+        raise DatabaseError(f"cannot copy {source} to {target}: {error}") from error
+
+
+def copy_database(source: Path, target: Path, refused: Collection[str] = ()) -> None:
+    """Copy a database as it is now, including its write-ahead log.
+
+    The copy has the schema of the installed pycolmap. Raises DatabaseError when the source is
+    missing, not a COLMAP database, or one of a newer COLMAP; when the target exists; and when the
+    database has problems of kinds that are ``refused``: those of anybody are checked before COLMAP
+    sees the copy.
+    """
+    if target.exists():
+        raise DatabaseError(f"{target}: exists already; it is not overwritten")
     new = target.with_name(target.name + ".new")
     new.unlink(missing_ok=True)
     try:
-        with _open_read_only(source) as original, closing(sqlite3.connect(new)) as copy:
-            original.backup(copy)
+        copy_as_it_is(source, new)
+        if refused:
+            refuse_unusable(new, source, refused)
         with open_database(new):
             pass  # COLMAP migrates it
-    except (*DAMAGED, DatabaseError) as error:
+        new.replace(target)
+    finally:
         new.unlink(missing_ok=True)
-        raise DatabaseError(f"cannot copy {source} to {target}: {error}") from error
-    new.replace(target)
 
 
 def copy_with_frames(source: Path, target: Path) -> None:
     """Copy a database with all its content, as :func:`copy_database`; every image gets a frame."""
     partial = target.with_name(target.name + ".partial")
     partial.unlink(missing_ok=True)
-    copy_database(source, partial)
+    copy_database(source, partial, FATAL)
     with open_database(partial) as database:
         _add_frames(database)
     partial.replace(target)
@@ -91,7 +107,7 @@ def copy_without_features(source: Path, target: Path) -> None:
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
     partial = target.with_name(target.name + ".partial")
     partial.unlink(missing_ok=True)
-    copy_database(source, partial)
+    copy_database(source, partial, FATAL_FOR_IMAGES)
     with open_database(partial) as database:
         database.clear_keypoints()
         database.clear_descriptors()
@@ -130,21 +146,28 @@ def open_copy(source: Path) -> Iterator[pycolmap.Database]:
     """Open a temporary :func:`copy_database`; the original stays as it is."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "database.db"
-        copy_database(source, copy)
+        copy_database(source, copy, FATAL)
         with open_database(copy) as database:
             yield database
+
+
+def read_names(source: Path) -> list[str]:
+    """Return the names of the images of a database, which is only read."""
+    with _open_read_only(source) as connection:
+        return sorted(str(name) for (name,) in connection.execute("SELECT name FROM images"))
 
 
 @contextmanager
 def _open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a COLMAP database so that nothing can change it.
 
-    Without a write-ahead log nobody is writing to it, and it is opened as immutable: SQLite then
-    makes no files beside it, so that its folder may be read-only.
+    Without a write-ahead log or a journal nobody is writing to it, and it is opened as immutable:
+    SQLite then makes no files beside it, so that its folder may be read-only.
     """
     if not path.is_file():
         raise DatabaseError(f"{path}: no such file; give a COLMAP database")
-    mode = "mode=ro" if path.with_name(path.name + "-wal").exists() else "immutable=1"
+    wal, journal = (path.with_name(path.name + suffix) for suffix in ("-wal", "-journal"))
+    mode = "mode=ro" if wal.exists() or journal.exists() else "immutable=1"
     address = f"{path.resolve().as_uri()}?{mode}"
     try:
         with closing(sqlite3.connect(address, uri=True)) as connection:
@@ -156,4 +179,10 @@ def _open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
                 )
             yield connection
     except DAMAGED as error:
+        if journal.exists() and journal.read_bytes()[:8] == HOT_JOURNAL:
+            raise DatabaseError(
+                f"{path}: a program that was writing to it was killed, or is still at work, and "
+                f"{journal.name} undoes the half of it; wait, or open it once with a program that "
+                f"may write, e.g. sqlite3 {path.name} .tables"
+            ) from error
         raise DatabaseError(f"{path}: not a usable COLMAP database ({error})") from error

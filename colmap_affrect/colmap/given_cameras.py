@@ -87,7 +87,12 @@ def _numbers(text: str, where: str) -> tuple[float, ...]:
 
 
 def _require_model(name: str, where: str) -> None:
-    models = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    models = [
+        model
+        for model in pycolmap.CameraModelId.__members__
+        if model != "INVALID"
+        and len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).focal_length_idxs())
+    ]
     if name not in models:
         raise OptionError(f"{where} {name}: not one of {', '.join(models)}")
 

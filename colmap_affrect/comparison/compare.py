@@ -13,6 +13,7 @@ import signal
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +44,13 @@ from colmap_affrect.parallel.subprocesses import child
 from colmap_affrect.pipeline import InputOptions, installed_versions
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.workspace import Workspace, first_difference
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 
 DEFAULT_SEEDS = (0, 1, 2)
+NUM_DIGITS = 16
+"""Of the digests of photographs on record: messages name them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,15 +170,26 @@ class _Plan:
         """Return what the results of every method depend on."""
         options = self.options
         return {
-            "image_path": str(self.image_path.resolve()),
-            "from_database": _absolute(options.from_database),
+            "photographs": self._contents(),
             "images": _fingerprint(self.names),
             "pairs": _fingerprint([f"{first}\n{second}" for first, second in self.pairs]),
             "camera": {**options.cameras.to_mapping(), "focal_vote": options.holds_vote},
-            "masks": options.masks.to_mapping(),
+            "masks": {key: bool(path) for key, path in options.masks.to_mapping().items()},
             "verification": _without_seed(options.verification),
             "mapping": _without_seed(options.mapping),
         }
+
+    def _contents(self) -> dict[str, str]:
+        """Return what the files of each image hold, and those that cameras are taken from."""
+        inputs = self.options.inputs(self.image_path)
+        files = {name: inputs.photographs.files(name) for name in self.names}
+        files[""] = inputs.camera_files
+        return {name: self.contents.digest(paths)[:NUM_DIGITS] for name, paths in files.items()}
+
+    @cached_property
+    def contents(self) -> Contents:
+        """The record of what files hold."""
+        return Contents(Workspace(self.layout.path).contents)
 
     def settings(self) -> dict[str, Any]:
         """Return what all methods had, for the report."""
@@ -182,7 +197,7 @@ class _Plan:
         paths = ("image_list_path", "from_database", "ground_truth_path")
         return {
             "camera": inputs["camera"],
-            "masks": inputs["masks"],
+            "masks": self.options.masks.to_mapping(),
             **{key: _absolute(getattr(self.options, key)) for key in paths},
             "match_list_path": self.options.pairs.match_list_path,
             "not_compared": self.not_compared,
@@ -269,6 +284,7 @@ def _share(plan: _Plan, *, overwrite: bool) -> dict[str, str]:
         )
     if not layout.shared.exists():
         _make_shared(plan, inputs)
+    plan.contents.save()
     reason = f"COLMAP cannot read it, or does not take it (camera mode {plan.options.cameras.mode})"
     return dict.fromkeys(sorted(set(plan.names) - set(layout.image_names())), reason)
 

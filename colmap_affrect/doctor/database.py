@@ -14,7 +14,7 @@ from colmap_affrect.colmap.checks import (
     check_image_files,
     is_unsafe,
 )
-from colmap_affrect.colmap.database_copy import copy_database, newest_schema_version, schema_version
+from colmap_affrect.colmap.database_copy import copy_as_it_is, newest_schema_version, schema_version
 from colmap_affrect.doctor.cameras import examine_cameras
 from colmap_affrect.doctor.findings import Findings, without_path
 from colmap_affrect.errors import DatabaseError, ImageError
@@ -42,7 +42,7 @@ def examined_copy(
         copy = Path(temporary) / "database.db"
         try:
             version, newest = schema_version(path), newest_schema_version()
-            copy_database(path, copy)
+            copy_as_it_is(path, copy)
         except DatabaseError as error:
             message = without_path(path, error).replace(str(copy), "a temporary file")
             findings.add("no-database", path, error=message)

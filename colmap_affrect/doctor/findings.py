@@ -87,7 +87,10 @@ TEXTS: dict[str, Check] = CHECKS | {
     "no-features": ("warning",
         "images without features: added later, half done, or not readable", SAME_RUN),
     "only-features": ("warning", "images with features that are gone or not listed any more",
-        "put them back, or use another --output-path for the smaller set"),
+        f"put them back; or {SAME_RUN}, which leaves them out"),
+    "photographs-changed": ("warning",
+        "images that have changed since their features were extracted, or their masks or depth "
+        "maps", SAME_RUN),
     "database-missing": ("error", "is missing", f"{SAME_RUN} to make it anew"),
     "features-not-in-database": ("warning", "images whose features are not in the database",
         SAME_RUN),

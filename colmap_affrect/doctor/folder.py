@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,12 @@ from colmap_affrect.doctor.database import examine_database, examined_copy
 from colmap_affrect.doctor.findings import OWN_ADVICE, SAME_RUN, Findings, without_path
 from colmap_affrect.errors import AffrectError, WorkspaceError
 from colmap_affrect.pairs.lists import read_pairs
+from colmap_affrect.project.atomic_files import NEW_SUFFIX
+from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.stores import pair_key
-from colmap_affrect.project.workspace import COPY_STAGES, STAGES, Workspace
+from colmap_affrect.project.workspace import COPY_STAGES, INPUTS, STAGES, Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
-from colmap_affrect.stages.map import INPUTS
 from colmap_affrect.stages.match import recorded_matching
 from colmap_affrect.stages.verify import recorded_verification
 
@@ -28,7 +29,7 @@ DAMAGED_HDF5 = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 DAMAGED_RECORD = (KeyError, TypeError, ValueError, AttributeError)
 """What reading a record of options of another shape than ours raises."""
 
-LEFTOVERS = ("*.new", "*.partial")
+LEFTOVERS = ("*.new", "*.partial", f"*{NEW_SUFFIX}")
 
 
 def examine_folder(findings: Findings, path: Path, image_path: Path | None) -> None:
@@ -146,15 +147,26 @@ class _FolderExamination:
     def _photographs(self, features: Mapping[str, int] | None) -> set[str]:
         """Return the names of the photographs that were recorded, if they can be found."""
         try:
-            names = set(Inputs.recorded(self.workspace).names())
+            inputs = Inputs.recorded(self.workspace)
+            names = set(inputs.names())
         except AffrectError as error:
             self._add("photographs-gone", self.workspace.path, error=error)
             return set()
         if features is not None:
-            where = str(self.workspace.recorded()["extract"]["image_path"])
+            where = inputs.image_path
+            self._add_items("photographs-changed", where, self._changed(inputs, names))
             self._add_items("no-features", where, sorted(names - features.keys()))
             self._add_items("only-features", where, sorted(features.keys() - names))
         return names
+
+    def _changed(self, inputs: Inputs, names: Collection[str]) -> list[str]:
+        """Return the photographs that are not any more what their features are from."""
+        options, contents = recorded_extraction(self.workspace), Contents(self.workspace.contents)
+        return [
+            name
+            for name, known in Context(self.workspace).features.contents().items()
+            if known and name in names and known != contents.digest(inputs.files(name, options))
+        ]
 
     def _compare_keypoints(self, features: Mapping[str, int], tables: Tables) -> None:
         """Compare the feature file with the database."""

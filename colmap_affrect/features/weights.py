@@ -12,7 +12,6 @@ and else downloaded into that cache. torch and kornia are loaded only when they 
 
 from __future__ import annotations
 
-import hashlib
 import os
 import pickle
 import tempfile
@@ -27,6 +26,7 @@ from urllib.request import Request, urlopen
 
 from colmap_affrect.errors import WeightsError
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.contents import sha256_of
 
 ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
 
@@ -245,8 +245,7 @@ def file_sha256(path: Path) -> str:
 
 @lru_cache(maxsize=64)
 def _sha256(path: Path, _modified_ns: int, _size: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return sha256_of(path)
 
 
 def load_state_dict(path: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ its pixels to those of the photograph. The unit is free: normals do not depend o
 from __future__ import annotations
 
 import hashlib
+import io
 import threading
 import zlib
 from collections.abc import Sequence
@@ -23,10 +24,11 @@ from numpy.typing import NDArray
 
 from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.data import Photograph
-from colmap_affrect.errors import DepthError
+from colmap_affrect.errors import DepthError, WorkspaceError
 from colmap_affrect.images.depth_files import SUFFIXES, UnusableMap, read_map
 from colmap_affrect.images.reading import read_color, shrink_to
 from colmap_affrect.options import PartOptions, Registry, within
+from colmap_affrect.project.atomic_files import replace_bytes
 
 MAX_ASPECT_RATIO = 1.05
 """Aspects of map and photograph may differ by this factor: networks round sizes to 32 px."""
@@ -89,6 +91,10 @@ class DepthOptions(PartOptions):
         """Whether there is a source of depth at all."""
         return True
 
+    def file(self, name: str) -> Path | None:  # noqa: ARG002
+        """Return the file that the depth of an image is read from, if there is one."""
+        return None
+
 
 class DepthFilesOptions(DepthOptions):
     """Depth maps in a folder."""
@@ -109,6 +115,12 @@ class DepthFilesOptions(DepthOptions):
     def is_given(self) -> bool:
         """Whether a folder is named."""
         return bool(self.path)
+
+    def file(self, name: str) -> Path | None:
+        """Return the first that exists of the files that an image's map may be in."""
+        stems = (name, splitext(name)[0])
+        paths = (Path(self.path) / f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES)
+        return next((path for path in paths if path.is_file()), None)
 
 
 class MonocularOptions(DepthOptions):
@@ -152,7 +164,7 @@ class DepthFiles:
         """Check, before any image is processed, that at least one has a map; else DepthError."""
         if not self._path.is_dir():
             raise DepthError(f"{self._path}: no such folder; give the folder of the depth maps")
-        if not any(self._find(name) for name in names):
+        if not any(self._options.file(name) for name in names):
             raise DepthError(
                 f"{self._path}: holds no depth map of any of the {len(names)} images; "
                 f"{self._places(names[0])}"
@@ -163,7 +175,7 @@ class DepthFiles:
 
         Raises DepthError if there is none, or it is damaged or not of this photograph.
         """
-        path = self._find(photograph.name)
+        path = self._options.file(photograph.name)
         if path is None:
             raise DepthError(
                 f"{self._path}: no depth map of {photograph.name}; {self._places(photograph.name)}"
@@ -176,11 +188,6 @@ class DepthFiles:
             return _z_depth(values, self._options.kind, photograph)
         except UnusableMap as error:
             raise DepthError(f"{path}: depth map of {photograph.name}: {error}") from error
-
-    def _find(self, name: str) -> Path | None:
-        stems = (name, splitext(name)[0])
-        paths = (self._path / f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES)
-        return next((path for path in paths if path.is_file()), None)
 
     def _places(self, name: str) -> str:
         suffixes = ", ".join(SUFFIXES)
@@ -382,11 +389,10 @@ def _read_prediction(file: Path, model: str, pixels: str) -> _Prediction | None:
 
 def _write_prediction(file: Path, prediction: _Prediction, model: str, pixels: str) -> None:
     """Keep a prediction; the file appears under its name only when it is complete."""
-    new = file.with_name(file.name + ".new")
+    content = io.BytesIO()
+    np.savez(content, **vars(prediction), model=model, pixels=pixels)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with new.open("wb") as stream:
-            np.savez(stream, **vars(prediction), model=model, pixels=pixels)
-        new.replace(file)
-    except OSError as error:
-        raise DepthError(f"{file}: depth cannot be kept there ({error.strerror})") from error
+        replace_bytes(file, content.getvalue())
+    except (OSError, WorkspaceError) as error:
+        raise DepthError(f"{file}: depth cannot be kept there ({error})") from error

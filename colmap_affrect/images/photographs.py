@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import unicodedata
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, Self
@@ -16,6 +17,8 @@ from colmap_affrect.images.masks import read_mask
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.stores import pair_key
+from colmap_affrect.project.workspace import is_output_folder
+from colmap_affrect.shown import one_line
 
 
 class CameraOptions(Options):
@@ -131,51 +134,70 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
         raise ImageError(f"{image_path}: no such folder; give the folder of the photographs")
     if image_list_path is not None:
         return _listed_images(image_path, image_list_path)
-    names = [name for name in _visible_files(image_path) if _suffix(name) in IMAGE_SUFFIXES]
+    files = _visible_files(image_path)
+    names = [name for name in files if _suffix(name) in IMAGE_SUFFIXES and not _odd(name)]
     if not names:
         others = "".join(f"; {kind}: {what}" for kind, what in left_out(image_path).items())
         raise ImageError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}")
-    for name in names:
-        _check_name(name, image_path)
     return names
 
 
 def left_out(image_path: Path) -> dict[str, str]:
-    """Tell by ``*.suffix`` which photographs in a folder are passed over for their format."""
+    """Tell which photographs in a folder are passed over: for their format, or their names."""
     found: dict[str, list[str]] = {}
     for name in _visible_files(image_path):
         if _suffix(name) in OTHER_IMAGE_SUFFIXES:
             found.setdefault(f"*{_suffix(name)}", []).append(name)
+        elif _suffix(name) in IMAGE_SUFFIXES and _odd(name):
+            found.setdefault("names", []).append(name)
     return {
-        kind: f"{len(names)} left out, such as {names[0]}: COLMAP or OpenCV cannot read this "
-        "format; convert to PNG or JPEG"
+        kind: f"{len(names)} left out, such as {one_line(names[0])}: "
+        + (
+            f"{_odd(names[0])}; rename it"
+            if kind == "names"
+            else "COLMAP or OpenCV cannot read this format; convert to PNG or JPEG"
+        )
         for kind, names in found.items()
     }
 
 
+def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:
+    """Tell which photographs in a folder a database does not name."""
+    suffixes = IMAGE_SUFFIXES
+    found = [n for n in _visible_files(image_path) if _suffix(n) in suffixes and n not in names]
+    if not found:
+        return {}
+    why = f"{len(found)} photographs are left out, such as {one_line(found[0])}"
+    return {str(image_path): f"{why}: the database does not name them"}
+
+
 def _visible_files(folder: Path) -> list[str]:
-    """Return the sorted names, relative to a folder, of all files that are not hidden."""
-    paths = (path.relative_to(folder) for path in folder.rglob("*"))
-    return sorted(
-        path.as_posix()
-        for path in paths
-        if not any(part.startswith(".") for part in path.parts) and not (folder / path).is_dir()
-    )
+    """Return the sorted names, relative to a folder, of all files that are not hidden.
+
+    Output folders of this program are passed over with all that is in them.
+    """
+    found: list[str] = []
+    for path, inner, files in os.walk(folder):
+        below = Path(path)
+        inner[:] = [n for n in inner if n[0] != "." and not is_output_folder(below / n)]
+        found += ((below / n).relative_to(folder).as_posix() for n in files if n[0] != ".")
+    return sorted(found)
 
 
 def _suffix(name: str) -> str:
     return PurePosixPath(name).suffix.lower()
 
 
-def _check_name(name: str, where: Path) -> None:
-    """Refuse a name that a list of images, one a line, cannot hold."""
+def _odd(name: str) -> str:
+    """Say why lists of images, one a line, cannot hold a name; empty if they can."""
     if name != name.encode("utf-8", "replace").decode("utf-8"):
-        raise ImageError(f"{where}: the name {name!r} is not UTF-8; rename it")
+        return "the name is not UTF-8"
     if any(unicodedata.category(character) in ("Cc", "Zl", "Zp") for character in name):
-        raise ImageError(
-            f"{where}: the name {name!r} has a line break, tab or other control character, which "
-            "lists of images cannot hold; rename it"
+        return (
+            "the name has a line break, tab or other control character, which lists of images "
+            "cannot hold"
         )
+    return ""
 
 
 def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
@@ -202,7 +224,8 @@ def checked_names(image_path: Path, names: Sequence[str], where: str) -> list[st
     found = sorted({PurePosixPath(name).as_posix() for name in names})
     missing = [name for name in found if not _is_below(image_path, name)]
     for name in found:
-        _check_name(name, image_path)
+        if why := _odd(name):
+            raise ImageError(f"{image_path}: {name!r}: {why}; rename it")
     if missing:
         more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
         raise ImageError(f"{where}: lists {missing[0]}{more}, which is not in {image_path}")

@@ -338,8 +338,6 @@ class _DatabaseContent:
             data |= _frame_datasets(np.concatenate([shapes, points[:, :, None]], axis=2))
         elif columns == 4:
             data |= {"scales": keypoints[:, 2], "oris": np.rad2deg(keypoints[:, 3])}
-        elif len(keypoints) and columns != 2:
-            raise DatabaseError(f"{self.where}: {name} has keypoints of {columns} columns")
         if self._database.exists_descriptors(image.image_id):
             data["descriptors"] = self._descriptors(name, len(points)).T
         return (camera.width, camera.height), data

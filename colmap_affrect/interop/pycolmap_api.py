@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import image_ids, open_database, refuse_wrong_matches
+from colmap_affrect.colmap.checks import refuse_unusable
+from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.native_options import differences, flat_values
@@ -165,7 +166,7 @@ def verify(
     """
     path = Path(database_path)
     verification = _verification_options(options, random_seed)
-    refuse_wrong_matches(path)
+    refuse_unusable(path, path)
     if pairs_path is None:
         verify_database(path, verification)
     else:
@@ -227,7 +228,7 @@ def incremental_mapping(
     native = _pipeline_options(options)
     mapper = MAPPERS.make(_mapper_options(native))
     database, output = Path(database_path), Path(output_path)
-    refuse_wrong_matches(database)
+    refuse_unusable(database, database)
     existing = None
     if _given_path(input_path):
         extension = Extension(Path(input_path), refine_existing=not native.fix_existing_frames)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import io
+import logging
 import os
+import secrets
 import shutil
 import signal
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from math import ceil
 from pathlib import Path
@@ -17,24 +20,74 @@ from typing import BinaryIO
 
 from colmap_affrect.errors import WorkspaceError
 
+logger = logging.getLogger(__name__)
+
 PAGE_BYTES = 4096
+NEW_SUFFIX = ".affrect-new"
+"""Of files that are being written; a killed program leaves them."""
+JOURNAL_MARK = b"AFFRECT1"
+JOURNAL_HEADER = struct.Struct("<8sQ")
+"""Mark and size of the file; then pages after their numbers, then SHA-256 of all."""
+SHA256_BYTES = 32
 
 
 def replace_text(path: Path, text: str) -> None:
     """Write a text file as :func:`replace_bytes`."""
-    replace_bytes(path, text.encode("utf-8"))
+    try:
+        content = text.encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise WorkspaceError(
+            f"{path}: cannot hold {text[error.start - 40 : error.end + 40]!r}, which is not UTF-8; "
+            "rename that file or folder"
+        ) from error
+    replace_bytes(path, content)
 
 
 def replace_bytes(path: Path, content: bytes) -> None:
     """Write or replace a file; WorkspaceError when that fails, and an old one stays as it is."""
-    new = path.with_name(path.name + ".new")
     try:
-        new.write_bytes(content)
-        new.replace(path)
+        _replace(path, [content])
     except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def _replace(path: Path, chunks: Iterable[bytes | bytearray]) -> None:
+    """Write a file under another name and give it its own; on the disk in this order."""
+    with _new_beside(path) as (file, new):
+        for chunk in chunks:
+            file.write(chunk)
+        _sync(file)
+        file.close()
+        new.replace(path)
+    _sync_folder(path.parent)
+
+
+@contextmanager
+def _new_beside(path: Path) -> Iterator[tuple[BinaryIO, Path]]:
+    """Make a file that is there for nobody else, and follows no link; removed in the end."""
+    new = path.with_name(f"{path.name}.{secrets.token_hex(4)}{NEW_SUFFIX}")
+    try:
+        with new.open("xb") as file:
+            yield file, new
+    finally:
         with suppress(OSError):
             new.unlink(missing_ok=True)
-        raise cannot_write(path, error) from error
+
+
+def _sync(file: BinaryIO) -> None:
+    """Wait until what was written is on the disk."""
+    file.flush()
+    os.fsync(file.fileno())
+
+
+def _sync_folder(path: Path) -> None:
+    """Wait until new names in a folder are on the disk, where the system can do that."""
+    with suppress(OSError):
+        number = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
 
 
 def require_space(path: Path, num_bytes: int) -> None:
@@ -42,14 +95,11 @@ def require_space(path: Path, num_bytes: int) -> None:
 
     For files that are written by libraries which do not survive a full disk: else WorkspaceError.
     """
-    scratch = path.with_name(path.name + ".new")
     try:
-        with scratch.open("wb") as file:
+        with _new_beside(path) as (file, _):
             _allocate(file, num_bytes)
     except OSError as error:
         raise cannot_write(path, error) from error
-    finally:
-        scratch.unlink(missing_ok=True)
 
 
 def _allocate(file: BinaryIO, num_bytes: int) -> None:
@@ -156,8 +206,6 @@ class FileTransaction(io.RawIOBase):
 
     def commit(self) -> None:
         """Make all changes; OSError when they cannot be written; the file stays as it was."""
-        journal = journal_of(self._path)
-        new = journal.with_name(journal.name + ".new")
         for number in range(
             self._readable_size // PAGE_BYTES, ceil(min(self._stored_size, self._size) / PAGE_BYTES)
         ):
@@ -174,13 +222,11 @@ class FileTransaction(io.RawIOBase):
                         file.seek(number * PAGE_BYTES)
                     file.write(page)
                     following = number + 1
-            with new.open("wb") as file:
-                file.write(struct.pack("<Q", self._size))
-                for number, page in inside:
-                    file.write(struct.pack("<Q", number) + page)
-            new.replace(journal)
+                _sync(file)
+            header = JOURNAL_HEADER.pack(JOURNAL_MARK, self._size)
+            content = header + b"".join(struct.pack("<Q", k) + page for k, page in inside)
+            _replace(journal_of(self._path), [content, hashlib.sha256(content).digest()])
         except OSError:
-            new.unlink(missing_ok=True)
             os.truncate(self._path, self._stored_size)
             raise
         apply_journal(self._path)
@@ -221,14 +267,23 @@ def journal_of(path: Path) -> Path:
 
 
 def apply_journal(path: Path) -> None:
-    """Put the changes of an interrupted :meth:`FileTransaction.commit` in place, if any."""
+    """Put the changes of an interrupted :meth:`FileTransaction.commit` in place, if any.
+
+    A journal that is not complete never counted: it is removed, and the file is as it was before.
+    """
     journal = journal_of(path)
     if not journal.exists():
         return
-    with journal.open("rb") as changes, path.open("r+b") as file:
-        (size,) = struct.unpack("<Q", changes.read(8))
-        while header := changes.read(8):
-            file.seek(struct.unpack("<Q", header)[0] * PAGE_BYTES)
-            file.write(changes.read(PAGE_BYTES))
-        file.truncate(size)
+    content, digest = (whole := journal.read_bytes())[:-SHA256_BYTES], whole[-SHA256_BYTES:]
+    if hashlib.sha256(content).digest() == digest and content.startswith(JOURNAL_MARK):
+        _, size = JOURNAL_HEADER.unpack_from(content)
+        with path.open("r+b") as file:
+            for start in range(JOURNAL_HEADER.size, len(content), 8 + PAGE_BYTES):
+                (number,) = struct.unpack_from("<Q", content, start)
+                file.seek(number * PAGE_BYTES)
+                file.write(content[start + 8 : start + 8 + PAGE_BYTES])
+            file.truncate(size)
+            _sync(file)
+    else:
+        logger.warning("%s: is not complete; the changes in it are left out", journal)
     journal.unlink()

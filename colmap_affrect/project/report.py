@@ -14,6 +14,9 @@ from typing import Any
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
 
+FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
+"""How cells begin that spreadsheets compute."""
+
 MAX_LINES, MAX_ADVICE = 12, 4
 """Of each list in a summary; report.json has all."""
 
@@ -30,6 +33,8 @@ def _some(lines: Iterable[str]) -> list[str]:
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return a table with a header; a column for every key, in the order of first use.
 
+    Text that a spreadsheet would take for a formula gets an apostrophe in front of it.
+
     >>> print(csv_text([{"a": 1}, {"a": 2, "b": "x"}]), end="")
     a,b
     1,
@@ -39,8 +44,17 @@ def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({key: _no_formula(value) for key, value in row.items()} for row in rows)
     return text.getvalue()
+
+
+def _no_formula(value: Any) -> Any:
+    """Return a cell that no spreadsheet computes.
+
+    >>> _no_formula("=1+1"), _no_formula(-1.5), _no_formula("-1.5"), _no_formula("a-b")
+    ("'=1+1", -1.5, "'-1.5", 'a-b')
+    """
+    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA_STARTS) else value
 
 
 @dataclass(frozen=True)

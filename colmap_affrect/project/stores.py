@@ -17,7 +17,7 @@ the attribute ``complete``, of another program, does not count.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -185,10 +185,32 @@ class FeatureStore(_Store):
 
     kind = "features"
 
-    def write(self, name: str, features: LocalFeatures, image_size: tuple[int, int]) -> None:
-        """Write the features of one image, in the place of incomplete ones."""
+    def write(
+        self, name: str, features: LocalFeatures, image_size: tuple[int, int], content: str = ""
+    ) -> None:
+        """Write the features of one image, and the digest of the files that they are from."""
         with self._open("a") as file:
-            self._write_features(file, name, features, image_size, [len(features)])
+            self._write_features(file, name, features, image_size, [len(features)], content)
+
+    def contents(self) -> dict[str, str]:
+        """Return for each image the digest of the files that it was extracted from, if known."""
+        names = self.names()
+        if not names:
+            return {}
+        with self._open("r") as file:
+            return {name: str(file[name].attrs.get("content", "")) for name in names}
+
+    def record_contents(self, contents: Mapping[str, str]) -> None:
+        """Put on record what images were extracted from."""
+        with self._open("a") as file:
+            for name, content in contents.items():
+                file[name].attrs["content"] = content
+
+    def remove(self, names: Iterable[str]) -> None:
+        """Remove the features of images."""
+        with self._open("a") as file:
+            for name in names:
+                del file[name]
 
     def extend(self, name: str, features: LocalFeatures) -> None:
         """Add the features of the next level; what is there keeps its indices."""
@@ -201,7 +223,8 @@ class FeatureStore(_Store):
             ids = features.rectification_ids
             added = replace(features, rectification_ids=np.where(ids, ids + first_id, 0))
             both = union(_of_one_size([there, added]))
-            self._write_features(file, name, both, size, [*ends, len(both)])
+            content = str(group.attrs.get("content", ""))
+            self._write_features(file, name, both, size, [*ends, len(both)], content)
 
     def _write_features(
         self,
@@ -210,6 +233,7 @@ class FeatureStore(_Store):
         features: LocalFeatures,
         image_size: tuple[int, int],
         level_ends: list[int],
+        content: str,
     ) -> None:
         self._write(
             file,
@@ -223,6 +247,7 @@ class FeatureStore(_Store):
                 "rectification_ids": features.rectification_ids,
                 "level_ends": np.asarray(level_ends),
             },
+            content=content,
         )
 
     def read(self, name: str) -> LocalFeatures:
@@ -333,6 +358,24 @@ class MatchStore(_Store):
                     level=pair.level,
                     tried_level=pair.level,
                 )
+
+    def remove(self, images: Iterable[str] = (), pairs: Iterable[tuple[str, str]] = ()) -> None:
+        """Remove the matches of pairs, of all pairs of some images, and of those that climbed.
+
+        Which pairs climb depends on all others.
+        """
+        if not self.path.exists():
+            return
+        names = {pair_key(name, "")[:-1] for name in images}
+        keys = {pair_key(*pair) for pair in pairs}
+        with self._open("a") as file:
+            for key in list(_complete_groups(file)):
+                if (
+                    key in keys
+                    or not names.isdisjoint(key.split("/"))
+                    or file[key].attrs.get("tried_level")
+                ):
+                    del file[key]
 
     def mark_tried(self, pairs: Iterable[tuple[str, str]], level: int) -> None:
         """Record that a level was tried for pairs, which keep the matches they have."""

@@ -8,8 +8,8 @@ import logging
 import os
 import shutil
 import tomllib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from functools import lru_cache
 from pathlib import Path
@@ -20,15 +20,25 @@ from filelock import FileLock, Timeout
 
 from colmap_affrect.errors import StaleStoreError, WorkspaceError
 from colmap_affrect.options import flat
-from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 
 logger = logging.getLogger(__name__)
 
 LOCAL = ("image_path", "image_list_path", "from_database", "cameras")
 """Options that :meth:`Workspace.options_digest` leaves out: where files are, and cameras."""
+PLACES = {
+    "image_path", "image_list_path", "from_database", "cameras.cameras_path", "masks.path",
+    "masks.camera_path", "depth.path", "match_list_path", "database",
+}  # fmt: skip
+"""Options that say where files are: other places are no other options, what the files hold counts
+(:mod:`colmap_affrect.project.contents`). But none at all is another option."""
+INPUTS = "inputs.sha256"
+"""File in sparse/ that names the verified pairs, and the extended model, they were made from."""
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
 COPY_STAGES = ("copy", "verify", "map")
 """Of a folder in which another program's database is mapped."""
+BYTES_OF_MARK = 200
+"""At the beginning of our files, in which they tell what they are."""
 FORMAT_VERSION = 6
 """Of ``config.toml``: counts up when a stage records other options than before."""
 
@@ -62,6 +72,7 @@ class Workspace:
         snapshots: folder of what a mapping that was interrupted goes on from.
         report: of the last run (JSON).
         cameras: what is known of the cameras of the database, and from where (JSON).
+        contents: digests of the files that were read (JSON).
         depth: folder of the depth maps that a network made.
         config: record of the options (TOML).
         log: of all runs.
@@ -76,6 +87,7 @@ class Workspace:
         self.snapshots, self.depth = path / "sparse.snapshots", path / "depth"
         self.config, self.log = path / "config.toml", path / "run.log"
         self.report, self.cameras = path / "report.json", path / "cameras.json"
+        self.contents = path / "contents.json"
 
     @classmethod
     def beside(cls, database_path: Path) -> Self:
@@ -167,13 +179,14 @@ class Workspace:
         """
         record = self.recorded()
         self._refuse_foreign_results(record, stage)
+        self._remove(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
         begun = record.get("begun", [])
         if overwrite:
-            self._discard(stage)
+            self._remove(self._results(stage))
             begun = [name for name in begun if STAGES.index(name) < STAGES.index(stage)]
             record = record if begun else {}
         if stage in begun:
-            difference = first_difference(record[stage], options)
+            difference = first_difference(_placeless(record[stage]), _placeless(options))
             if difference:
                 raise StaleStoreError(
                     f"{self.path}: the {stage} stage was run there with {difference}; "
@@ -184,9 +197,28 @@ class Workspace:
         record = {**record, **later, stage: dict(options), "begun": begun}
         if recipe:
             record["recipe"] = recipe
+        self._write_record(record)
+
+    def _write_record(self, record: Mapping[str, Any]) -> None:
         ordered = {key: record[key] for key in ("recipe", "begun", *STAGES) if key in record}
         text = tomli_w.dumps({"format_version": FORMAT_VERSION, **ordered})
         replace_text(self.config, text)
+
+    def rewind(self) -> None:
+        """Remove the database and what was made from it, for inputs that have changed.
+
+        The options of these stages stay on record, and models until others take their place.
+        Raises StaleStoreError for a database of the user.
+        """
+        if self.users_database:
+            raise StaleStoreError(
+                f"{self.users_database}: what it was made from has changed; {self._remedy}"
+            )
+        (self.sparse / INPUTS).unlink(missing_ok=True)
+        self._remove(path for path in self._results("verify") if path != self.sparse)
+        record, first = self.recorded(), STAGES.index("verify")
+        record["begun"] = [name for name in record["begun"] if STAGES.index(name) < first]
+        self._write_record(record)
 
     @property
     def _remedy(self) -> str:
@@ -197,12 +229,13 @@ class Workspace:
     def options_digest(self, *stages: str) -> str:
         """Return a sha256 of the recorded options of stages, without those in ``LOCAL``.
 
-        The digest stays the same when photographs are moved or get other cameras.
+        The digest stays the same when files are moved or photographs get other cameras.
         """
         record = self.recorded()
         options = {
-            stage: {key: value for key, value in record.get(stage, {}).items() if key not in LOCAL}
+            stage: {key: value for key, value in values.items() if key not in LOCAL}
             for stage in stages
+            for values in (_placeless(record.get(stage, {})),)
         }
         return hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()
 
@@ -235,26 +268,56 @@ class Workspace:
                     "another --output-path"
                 )
 
-    def _discard(self, stage: str) -> None:
-        """Remove what a stage and those after it made."""
+    def _results(self, stage: str) -> list[Path]:
+        """Return what a stage and those after it make."""
         first = STAGES.index(stage)
         outdated = [self.sparse, self.aside, self.snapshots, self.report]
         if first <= STAGES.index("guide"):
             outdated.append(self.guided)
         if first <= STAGES.index("verify"):
-            outdated += [self.database, self.cameras]
+            outdated += [self.cameras, *database_files(self.database)]
         if first <= STAGES.index("match"):
             outdated.append(self.matches)
         if first <= STAGES.index("pairs"):
             outdated.append(self.pairs)
         if first <= STAGES.index("extract"):
-            outdated.append(self.features)
-        for path in outdated:
-            logger.info("overwrite: removing %s", path)
+            outdated += [self.features, self.contents]
+        return outdated
+
+    @staticmethod
+    def _remove(paths: Iterable[Path]) -> None:
+        for path in paths:
+            if path.exists():
+                logger.info("removing %s", path)
             if path.is_dir():
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
+
+
+def is_output_folder(path: Path) -> bool:
+    """Tell whether this program has written its record or its log into a folder."""
+    for name, mark in (("config.toml", b"format_version"), ("run.log", b"colmap-affrect")):
+        with suppress(OSError), (path / name).open("rb") as file:
+            if mark in file.read(BYTES_OF_MARK):
+                return True
+    return False
+
+
+def database_files(path: Path) -> list[Path]:
+    """Return a database of SQLite and the files that it may have beside it."""
+    return [path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", "-journal"))]
+
+
+def _placeless(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return options that only tell of places whether there are any."""
+    found = dict(options)
+    for key, value in options.items():
+        if isinstance(value, Mapping):
+            found[key] = _placeless(value, f"{prefix}{key}.")
+        elif value and prefix + key in PLACES:
+            found[key] = "given"
+    return found
 
 
 def _is_name(key: str) -> bool:

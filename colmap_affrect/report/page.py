@@ -12,6 +12,7 @@ import jinja2
 
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.report import match_plots, scene, view_graph
+from colmap_affrect.shown import shown
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -29,6 +30,7 @@ def write_page(path: Path, template: Path, content: Mapping[str, Any]) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
+        finalize=lambda value: shown(value) if type(value) is str else value,
     )
     environment.tests["contains"] = lambda values, value: value in values
     script = (TEMPLATES / "page.js").read_text(encoding="utf-8")

@@ -11,8 +11,10 @@ from colmap_affrect.colmap.database_copy import copy_with_frames
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.changes import source_files
 from colmap_affrect.stages.context import Context
 
 logger = logging.getLogger(__name__)
@@ -37,12 +39,18 @@ def copy_verified(
         raise DatabaseError(f"--image-path {image_path}: no such folder")
     given = {"database": str(source.resolve()), "image_path": _absolute(image_path)}
     workspace.record_options("copy", given, overwrite=overwrite)
-    if _is_older(workspace.database, source):
-        workspace.database.unlink(missing_ok=True)
-        workspace.cameras.unlink(missing_ok=True)
+    contents = Contents(workspace.contents)
+    digest, before = contents.digest(source_files(source)), contents.recorded("copy")
+    warnings = {}
+    if digest != before:
+        if before:
+            warnings[str(source)] = "has changed; its copy and the models are made anew"
+            logger.warning("%s: %s", source, warnings[str(source)])
+        workspace.rewind()
+        contents.record("copy", digest)
+    if not workspace.database.exists():
         copy_with_frames(source, workspace.database)
     record_cameras(workspace.database, workspace.cameras)
-    colmap_database.refuse_wrong_matches(workspace.database)
     workspace.record_options("verify", verification.to_mapping())
     num_pairs = colmap_database.num_matched_pairs(workspace.database)
     if not num_pairs:
@@ -52,7 +60,8 @@ def copy_verified(
         logger.warning("%s: %d pairs have matches only; they are verified now", source, todo)
     with context.progress.stage("verify", todo, "pairs") as advance:
         verify(workspace.database, verification, advance=advance)
-    return StageReport("verify", time.perf_counter() - start, todo, num_pairs - todo)
+    wall_s = time.perf_counter() - start
+    return StageReport("verify", wall_s, todo, num_pairs - todo, warnings=warnings)
 
 
 def is_copy(workspace: Workspace) -> bool:
@@ -68,9 +77,3 @@ def copied_image_path(workspace: Workspace) -> Path | None:
 
 def _absolute(path: Path | None) -> str:
     return str(path.resolve()) if path else ""
-
-
-def _is_older(copy: Path, source: Path) -> bool:
-    files = (source, source.with_name(source.name + "-wal"))
-    newest = max((file.stat().st_mtime for file in files if file.exists()), default=0.0)
-    return not copy.exists() or copy.stat().st_mtime < newest

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.camera_records import read_camera_records
-from colmap_affrect.colmap.database_copy import copy_without_features, open_copy
+from colmap_affrect.colmap.database_copy import copy_without_features, read_names
 from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
 from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
@@ -23,13 +23,21 @@ from colmap_affrect.images.photographs import (
     checked_names,
     left_out,
     list_images,
+    not_named,
     refuse_colliding_keys,
 )
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
+from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe
+from colmap_affrect.stages.changes import (
+    forget_changed,
+    refuse_changed,
+    refuse_other_photographs,
+    source_files,
+)
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.one_image import (
     ExtractedImage,
@@ -96,8 +104,7 @@ class Inputs(Options):
         folder, listed = Path(self.image_path), Path(self.image_list_path)
         if not self.from_database:
             return list_images(folder, listed if self.image_list_path else None)
-        with open_copy(Path(self.from_database)) as database:
-            known = [image.name for image in database.read_all_images()]
+        known = read_names(Path(self.from_database))
         if not self.image_list_path:
             return checked_names(folder, known, self.from_database)
         names = list_images(folder, listed)
@@ -105,6 +112,20 @@ class Inputs(Options):
         if unknown:
             raise ImageError(f"{listed}: lists {unknown[0]}, which {self.from_database} has not")
         return names
+
+    def files(self, name: str, options: ExtractionOptions) -> list[Path]:
+        """Return the files that the features of an image depend on."""
+        files = self.photographs.files(name)
+        if options.uses_depth:
+            depth = options.depth.file(name)
+            files += [*([depth] if depth else []), *self.camera_files]
+        return files
+
+    @property
+    def camera_files(self) -> list[Path]:
+        """The files that cameras and images of the database are taken from."""
+        given = [Path(path) for path in (self.from_database, self.cameras.cameras_path) if path]
+        return [file for path in given for file in source_files(path)]
 
     def check(self) -> None:
         """Refuse cameras and masks that cannot be used.
@@ -171,21 +192,27 @@ def extract(
     start = time.perf_counter()
     workspace, folder = context.workspace, Path(inputs.image_path)
     inputs.check()
+    _require_camera(workspace, inputs.cameras.existing_camera_id)
     names = inputs.names()
     if image_names:
         names = checked_names(folder, image_names, "image_names")
     inputs.check_names(names)
     extractor = prepared_recipe(context, recipe.extraction, names)
+    contents = Contents(workspace.contents)
+    digests = {name: contents.digest(inputs.files(name, extractor.options)) for name in names}
+    if not overwrite:
+        refuse_other_photographs(workspace, inputs.image_path, digests)
     _record(workspace, inputs, recipe, extractor, later or {}, overwrite=overwrite)
+    warnings = forget_changed(context, inputs, digests, contents, are_all=not image_names)
     _start_database(workspace)
     done = context.features.complete(names)
     missing = [name for name in names if name not in done]
     _refuse_foreign_features(workspace, missing)
-    is_whole_folder = not (inputs.image_list_path or image_names or inputs.from_database)
-    warnings = left_out(folder) if is_whole_folder else {}
+    if not (inputs.image_list_path or image_names):
+        warnings |= not_named(folder, names) if inputs.from_database else left_out(folder)
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
-    failures = _extract_missing(context, inputs, extractor, missing, warnings)
+    failures = _extract_missing(context, inputs, extractor, missing, digests, warnings)
     if len(failures) == len(names):
         raise ImageError(
             f"{folder}: none of the {len(names)} images can be used; the first: "
@@ -200,6 +227,14 @@ def extract(
         failures,
         warnings,
     )
+
+
+def _require_camera(workspace: Workspace, camera_id: int) -> None:
+    """Refuse a camera that the database does not have before that is on record."""
+    path = workspace.database
+    cameras = colmap_database.all_cameras(path) if camera_id >= 0 and path.exists() else []
+    if camera_id >= 0 and all(camera.camera_id != camera_id for camera in cameras):
+        raise OptionError(f"existing_camera_id={camera_id}: {path} has no such camera")
 
 
 def _record(
@@ -233,6 +268,7 @@ def _extract_missing(
     inputs: Inputs,
     extractor: ImageExtractor,
     names: Sequence[str],
+    digests: Mapping[str, str],
     warnings: dict[str, str],
 ) -> dict[str, str]:
     """Extract images one by one; return why some cannot be used, and add to the warnings."""
@@ -250,7 +286,7 @@ def _extract_missing(
                         logger.warning("%s: no features (blank or too small?)", name)
                     if found.warning:
                         warnings[name] = found.warning
-                    store.write(name, found.features, found.image_size)
+                    store.write(name, found.features, found.image_size, digests[name])
                 advance(1)
     return failures
 
@@ -282,6 +318,11 @@ def extract_images(
     """
     if not images:
         return
+    if later := {name for name, level in images if level}:
+        contents = Contents(context.workspace.contents)
+        refuse_changed(
+            context, {n: contents.digest(inputs.files(n, extractor.options)) for n in later}
+        )
     executor = context.executor or Threads(num_images_at_once(extractor))
     depth_folder = extractor.options.depth.folder
     if depth_folder and not executor.sees([depth_folder]):

@@ -27,7 +27,7 @@ from colmap_affrect.mappers.existing import Extension, read_existing, require_ex
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
-from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.project.workspace import INPUTS, Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.climbing import connected_parts
 from colmap_affrect.stages.context import Context
@@ -40,9 +40,6 @@ from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import recorded_verification
 
 logger = logging.getLogger(__name__)
-
-INPUTS = "inputs.sha256"
-"""File in sparse/ that names the verified pairs, and the extended model, they were made from."""
 
 NUM_BEST_PAIRS = 3
 """Pairs that are named for each image that was not registered."""

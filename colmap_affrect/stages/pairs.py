@@ -7,7 +7,7 @@ import time
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from colmap_affrect.errors import StaleStoreError
+from colmap_affrect.errors import PairListError
 from colmap_affrect.matchers.base import Matches
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair, PairOptions
@@ -15,6 +15,7 @@ from colmap_affrect.pairs.by_place import pairs_by_place
 from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.pairs.low_resolution import NUM_STRONGEST, low_resolution_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
+from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, write_images_and_keypoints
@@ -46,13 +47,16 @@ def choose_pairs(
     )
     pairs = _given_pairs(context, options)
     workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
-    there = _pairs_there(context)
-    if set(options.methods) == {"exhaustive"}:
-        _refuse_lost_pairs(workspace.pairs, there - pairs)
-    else:
-        pairs |= there | _similar_pairs(context, options, there)
+    there = kept = _pairs_there(context)
+    contents, listed = Contents(workspace.contents), options.match_list_path
+    digest = contents.digest([Path(listed)]) if listed else ""
+    if set(options.methods) == {"exhaustive"} or contents.recorded("pairs") not in ("", digest):
+        kept = set()
+    pairs |= kept | _similar_pairs(context, options, kept)
+    warnings = _forget_lost(context, there - pairs)
     write_pairs(workspace.pairs, sorted(pairs))
-    return StageReport("pairs", time.perf_counter() - start, len(pairs))
+    contents.record("pairs", digest)
+    return StageReport("pairs", time.perf_counter() - start, len(pairs), warnings=warnings)
 
 
 def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
@@ -106,17 +110,24 @@ def _pairs_there(context: Context) -> set[Pair]:
     return set(listed_pairs(context)) if path.exists() and path.stat().st_size else set()
 
 
-def _refuse_lost_pairs(path: Path, lost: Collection[Pair]) -> None:
-    """Refuse to drop pairs that are matched already: they would stay in the database."""
-    if lost:
-        raise StaleStoreError(
-            f"{path}: has pairs that are not to be matched any more, such as "
-            f"{' and '.join(min(lost))}; use --overwrite to redo the pairs stage and those after it"
-        )
+def _forget_lost(context: Context, lost: Collection[Pair]) -> dict[str, str]:
+    """Have a database made without the pairs that are not to be matched any more."""
+    if not lost:
+        return {}
+    context.workspace.rewind()
+    context.matches.remove(pairs=lost)
+    why = f"{len(lost)} pairs are not listed any more, such as {' and '.join(min(lost))}"
+    logger.warning("%s: %s", context.workspace.pairs, why)
+    return {str(context.workspace.pairs): why}
 
 
 def listed_pairs(context: Context) -> list[Pair]:
     """Return the pairs of the list whose images have features."""
     context.workspace.require("pairs")
+    if not context.workspace.pairs.exists():
+        raise PairListError(
+            f"{context.workspace.pairs}: no such file, the photographs have changed; run "
+            "'colmap-affrect pairs' and then match again"
+        )
     names = context.features.names()
     return read_pairs(context.workspace.pairs, names) if len(names) > 1 else []

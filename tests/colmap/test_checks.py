@@ -109,6 +109,11 @@ def test_healthy_database_has_no_problem(database_path: Path) -> None:
     }  # fmt: skip
 
 
+WITHOUT_PAIRS = [
+    ("UPDATE two_view_geometries SET rows = 0, data = NULL", []),
+    ("UPDATE matches SET rows = 0, data = NULL", []),
+]
+
 BROKEN: list[tuple[str, list[Statement], list[str]]] = [
     ("no-camera", ["UPDATE images SET camera_id = 9 WHERE image_id = 2"], ["b c.png"]),
     ("no-prior-focal", ["UPDATE cameras SET prior_focal_length = 0"], ["camera 1 (90 x 60)"]),
@@ -134,6 +139,43 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
         "keypoint-data",
         ["UPDATE keypoints SET data = substr(data, 1, 167) WHERE image_id = 2"],
         ["b c.png"],
+    ),
+    (
+        "keypoint-data",
+        ["UPDATE keypoints SET rows = -1 WHERE image_id = 2", *WITHOUT_PAIRS],
+        ["b c.png"],
+    ),
+    (
+        "keypoint-data",
+        ["UPDATE keypoints SET rows = 0 WHERE image_id = 2", *WITHOUT_PAIRS],
+        ["b c.png"],
+    ),
+    ("camera-model", ["UPDATE cameras SET model = 12345"], ["camera 1: model 12345"]),
+    (
+        "camera-size",
+        ["UPDATE cameras SET width = 9223372036854775807"],
+        ["camera 1: 9223372036854775807 x 60 px"],
+    ),
+    ("camera-params", ["UPDATE cameras SET params = substr(params, 1, 24)"], ["camera 1"]),
+    (
+        "camera-params",
+        [("UPDATE cameras SET params = ?", [np.full(4, np.nan).tobytes()])],
+        ["camera 1"],
+    ),
+    ("frame-links", ["UPDATE frames SET rig_id = 7 WHERE frame_id = 2"], ["row 2 of frames, rigs"]),
+    ("frame-links", ["UPDATE rigs SET ref_sensor_id = 5"], ["rig 1, cameras"]),
+    (
+        "matrix-data",
+        [
+            "UPDATE two_view_geometries SET F = substr(zeroblob(72), 1, 71) WHERE "
+            f"pair_id = {pair_id(1, 2)}"
+        ],
+        [f"F of pair_id {pair_id(1, 2)}"],
+    ),
+    (
+        "matrix-data",
+        ["INSERT INTO pose_priors VALUES (1, 1, 1, 0, x'00', NULL, NULL, 0)"],
+        ["position of pose_prior_id 1"],
     ),
     ("keypoint-data", ["UPDATE keypoints SET data = NULL WHERE image_id = 2"], ["b c.png"]),
     ("keypoint-data", ["UPDATE keypoints SET data = 'text' WHERE image_id = 2"], ["b c.png"]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import signal
 import time
 from collections.abc import Iterator
@@ -230,6 +231,19 @@ def test_finished_methods_are_not_run_again(scene, options, compared) -> None:
     comparison, out = compared
     again = compare(scene / "images", out, replace(options, methods=METHODS[:2]))
     assert again.methods == tuple(replace(m) for m in comparison.methods[:2])
+
+
+@pytest.mark.usefixtures("no_processes", "no_page")
+def test_photographs_that_moved_are_the_same_and_others_are_refused(
+    scene, options, compared, tmp_path
+) -> None:
+    images = Path(shutil.copytree(scene / "images", tmp_path / "moved"))
+    chosen = replace(options, methods=METHODS[:2])
+    assert compare(images, compared[1], chosen).methods == compared[0].methods[:2]
+    name = min(path.name for path in images.iterdir())
+    (images / name).write_bytes((images / name).read_bytes() + b" ")
+    with pytest.raises(StaleStoreError, match=rf"compared there with photographs\.{name}='.*, and"):
+        compare(images, compared[1], chosen)
 
 
 @pytest.mark.usefixtures("no_processes")

@@ -120,6 +120,12 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
         Finding("warning", "{photos}", "added later, half done, or not readable (1): z.png",
                 "run the same 'extract' or 'run' again"),
     ),
+    "photograph changed": (
+        lambda f: shutil.copy(f.photos / "b c.png", f.photos / "a.png"),
+        Finding("warning", "{photos}", "images that have changed since their features were "
+                "extracted, or their masks or depth maps (1): a.png",
+                "run the same 'extract' or 'run' again"),
+    ),
     "group incomplete": (
         lambda f: break_h5(f.out / "features.h5", unmark),
         Finding("warning", "{photos}", "images without features: added later, half done",
@@ -244,7 +250,7 @@ def test_photograph_that_was_deleted_is_found(folders: Folders) -> None:
 def test_features_that_the_database_lacks_are_found(folders: Folders) -> None:
     store = FeatureStore(folders.out / "features.h5")
     store.extend("a.png", store.read("b c.png"))
-    shutil.copy(folders.photos / "a.png", folders.photos / "z.png")
+    shutil.copy(folders.photos / "b c.png", folders.photos / "z.png")
     break_h5(folders.out / "features.h5", lambda file: file.copy("b c.png", "z.png"))
     missing, behind = findings(folders.out)
     assert missing.what == "images whose features are not in the database (1): z.png"

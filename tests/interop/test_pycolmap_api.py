@@ -336,7 +336,7 @@ def test_verify_refuses_matches_that_would_end_the_process(photos: Path, tmp_pat
     with open_database(path) as database:
         count = database.num_keypoints_for_image(2)
         database.write_matches(1, 2, np.array([[0, 0], [1, count]], np.uint32))
-    with pytest.raises(DatabaseError, match="point at keypoints that do not exist"):
+    with pytest.raises(DatabaseError, match="matches of keypoints that do not exist"):
         colmap_affrect.verify(path)
 
 

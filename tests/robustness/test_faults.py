@@ -156,9 +156,9 @@ def test_record_of_options_that_does_not_fit_on_the_disk(disturbed: Disturbed) -
 
 def test_report_that_cannot_be_written(disturbed: Disturbed) -> None:
     disturbed.begin_without()
-    (disturbed.out / "report.json.new").mkdir()
+    (disturbed.out / "report.json").mkdir()
     assert_says_what_to_do(disturbed.run(), disturbed.workspace.report)
-    (disturbed.out / "report.json.new").rmdir()
+    (disturbed.out / "report.json").rmdir()
     disturbed.assert_finishes()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from pathlib import Path
@@ -12,6 +13,7 @@ from command import FAST, Call
 from small_scene import write_photographs
 
 import colmap_affrect
+from colmap_affrect.project.stores import FeatureStore
 
 PACKAGE = Path(colmap_affrect.__file__).parent
 
@@ -95,4 +97,39 @@ def test_features_of_somebody_else_lead_nowhere(tmp_path: Path, call: Call) -> N
 def test_message_cannot_steer_the_terminal(tmp_path: Path, call: Call) -> None:
     ended = call("run", "--image-path", tmp_path / "\x1b[31m\nred", "--output-path", tmp_path / "o")
     assert (ended.code, len(ended.stderr)) == (1, 1)
-    assert "\\x1b[31m\\nred: no such folder" in ended.stderr[0]
+    assert "\\u001b[31m\\u000ared: no such folder" in ended.stderr[0]
+
+
+def test_any_name_of_a_file_comes_through_or_is_left_out_with_a_line(
+    tmp_path: Path, call: Call
+) -> None:
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    write_photographs(photos, 2)
+    image = (photos / "a.png").read_bytes()
+    taken = ["\u202etxt.png", "=1+1.png", "\U0001f600 \u200d.png", "-rf.png"]
+    odd = [b"\xff.png", b"new\nline.png", b"\x1b[31mred.png", b"\xfe.heic"]
+    for name in [*map(os.fsencode, taken), *odd]:
+        Path(os.fsdecode(os.fsencode(photos) + b"/" + name)).write_bytes(image)
+    ended = call("run", "--image-path", photos, "--output-path", out, *FAST)
+    assert ended.code in (0, 3)
+    assert (
+        "names: 3 left out, such as \\u001b[31mred.png: the name has a line break" in ended.stdout
+    )
+    assert "*.heic: 1 left out, such as \\udcfe.heic" in ended.stdout
+    log = (out / "run.log").read_text(encoding="utf-8")
+    shown = [ended.stdout, "\n".join(ended.stderr), log]
+    assert not any(c in text for c in "\x1b\u202e\u200d" for text in shown)
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert report["images_total"] == 2 + len(taken)
+    assert FeatureStore(out / "features.h5").names() == sorted(["a.png", "b c.png", *taken])
+    ended = call("run", "--image-path", photos, "--output-path", out, "--json", *FAST)
+    assert set(taken) <= {*ended.report["registered_names"], *ended.report["unregistered"]}
+    assert "\u202e" not in ended.stdout
+
+
+def test_folder_whose_name_is_not_utf8_is_one_line(tmp_path: Path, call: Call) -> None:
+    photos = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
+    write_photographs(photos, 2)
+    ended = call("run", "--image-path", photos, "--output-path", tmp_path / "out", *FAST)
+    assert (ended.code, len(ended.errors)) == (1, 1)
+    assert "which is not UTF-8; rename that file or folder" in ended.errors[0]

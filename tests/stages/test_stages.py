@@ -386,22 +386,21 @@ def test_stage_before_its_turn_says_what_to_run(tmp_path: Path, call: Call, stag
     assert "stage has not been run there; run 'colmap-affrect " in stderr[0]
 
 
-def test_pair_list_that_lost_pairs_is_refused(copy: Workspace, call: Call) -> None:
+def test_pairs_that_are_not_listed_any_more_leave_the_database(copy: Workspace, call: Call) -> None:
     names = FeatureStore(copy.features).names()
     path = copy.path.parent / "list.txt"
-    for lines, overwrite, expected in [
-        ([names[:2], names[1:3]], ["--overwrite"], 0),
-        ([names[:2], names[1:3], names[2:4]], [], 0),
-        ([names[:2]], [], 1),
-        ([names[:2]], ["--overwrite"], 0),
+    for lines, overwrite, has_lost in [
+        ([names[:2], names[1:3]], ["--overwrite"], False),
+        ([names[:2], names[1:3], names[2:4]], [], False),
+        ([names[:2]], [], True),
     ]:
         path.write_text("".join("\t".join(line) + "\n" for line in lines), encoding="utf-8")
         arguments = ["--output-path", copy.path, "--match-list-path", path, *overwrite]
         code, _, stderr = call("pairs", *arguments)
-        assert code == expected, stderr
-        if expected:
-            assert names[1] in stderr[-1]
-            assert "--overwrite" in stderr[-1]
+        assert code == 0, stderr
+        assert any("2 pairs are not listed any more" in line for line in stderr) == has_lost
+    assert call("match", "--output-path", copy.path).code == 0
+    assert set(database_content(copy.database)["raw matches"]) == {tuple(names[:2])}
 
 
 def test_match_index_out_of_range_is_refused_before_it_is_written(copy: Workspace) -> None:

@@ -1,0 +1,30 @@
+"""One filter for everything that is shown: names come out of files, and may be made to mislead."""
+
+from __future__ import annotations
+
+
+def shown(text: str) -> str:
+    r"""Write characters that do not print, or turn text round, as JSON does; lines stay lines.
+
+    Control and format characters of a terminal are among them, and what is no Unicode.
+
+    >>> shown("a\x1b[31m\u202eb\nc")
+    'a\\u001b[31m\\u202eb\nc'
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else _escaped(c) for c in text)
+
+
+def _escaped(character: str) -> str:
+    units = character.encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{units[k : k + 2].hex()}" for k in range(0, len(units), 2))
+
+
+def one_line(text: str) -> str:
+    r"""Return the same in one line.
+
+    >>> one_line("a\nb")
+    'a\\u000ab'
+    """
+    return shown(text).replace("\n", _escaped("\n"))

@@ -1,0 +1,140 @@
+"""Databases that are damaged or were made to do harm: one clear line, and nothing ends."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import Call
+from small_scene import write_photographs
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database_copy import read_names
+from colmap_affrect.doctor.database import examine_database
+from colmap_affrect.doctor.findings import Findings
+from colmap_affrect.errors import DatabaseError
+from colmap_affrect.progress import SILENT
+
+ROWS = [
+    (
+        "UPDATE images SET camera_id = 999 WHERE image_id = 1",
+        "images whose camera does not exist (",
+    ),
+    ("UPDATE keypoints SET rows = 100000 WHERE image_id = 1", "less data than rows and columns ("),
+    ("UPDATE keypoints SET rows = -1 WHERE image_id = 1", "less data than rows and columns ("),
+    ("UPDATE keypoints SET data = substr(data, 1, 100)", "less data than rows and columns ("),
+    ("UPDATE matches SET rows = 100000", "less data than rows and 2 columns ("),
+    ("UPDATE matches SET rows = -1", "less data than rows and 2 columns ("),
+    ("UPDATE matches SET data = substr(data, 1, 9)", "less data than rows and 2 columns ("),
+    ("UPDATE matches SET data = x'ffffffffffffffff', rows = 1", "at which COLMAP crashes"),
+    ("UPDATE cameras SET model = 12345 WHERE camera_id = 1", "(camera 1: model 12345)"),
+    ("UPDATE cameras SET width = 9223372036854775807", "of a size that no photograph has"),
+    ("UPDATE cameras SET width = 9223372036854775808.0", "of a size that no photograph has"),
+    ("UPDATE cameras SET params = x'00'", "are more or fewer than their model has"),
+    ("UPDATE cameras SET params = ?", "or not finite numbers (camera 1, camera 2)"),
+    ("UPDATE frames SET rig_id = 99", "rows of rigs and frames that belong to nothing"),
+    ("UPDATE two_view_geometries SET F = x'00'", "matrices have more or less data"),
+    ("UPDATE cameras SET width = 'wide'", "damaged"),
+]
+"""What is done to a database, and what is said of it."""
+
+
+@pytest.fixture(scope="module")
+def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database of two matched photographs."""
+    folder = tmp_path_factory.mktemp("healthy")
+    write_photographs(folder / "photos", 2)
+    path = folder / "any.db"
+    pycolmap.extract_features(path, folder / "photos")
+    pycolmap.match_exhaustive(path)
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA journal_mode = DELETE")
+    return path
+
+
+def num_errors(path: Path) -> int:
+    """What the doctor finds in a database; the installation is left out, which takes long."""
+    findings = Findings(SILENT)
+    examine_database(findings, path, None)
+    return findings.diagnosis().num_errors
+
+
+def changed(healthy: Path, path: Path, statement: str) -> Path:
+    """Make a copy on which a statement was executed."""
+    shutil.copy(healthy, path)
+    values = [np.full(4, np.nan).tobytes()] if "?" in statement else []
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA foreign_keys = OFF")
+        connection.execute(statement, values)
+        connection.commit()
+    return path
+
+
+@pytest.mark.parametrize(("statement", "said"), ROWS)
+def test_hostile_rows_are_one_line(
+    healthy: Path, tmp_path: Path, call: Call, statement: str, said: str
+) -> None:
+    path = changed(healthy, tmp_path / "any.db", statement)
+    before = path.read_bytes()
+    out = ["--output-path", tmp_path / "out"]
+    ended = call("map", "-q", "--from-database", path, *out)
+    assert (ended.code, len(ended.stderr)) == (1, 1)
+    assert ended.stderr[0].startswith(f"error: {path}: ")
+    assert said in ended.stderr[0]
+    if any(word in statement for word in ("cameras", "images", "frames")):
+        given = ["--image-path", healthy.parent / "photos", "--from-database", path]
+        ended = call("extract", "-q", "--output-path", tmp_path / "x", *given)
+        assert (ended.code, len(ended.stderr)) == (1, 1)
+        assert said in ended.stderr[0]
+    assert num_errors(path) > 0
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_damaged_pages_are_one_line(healthy: Path, tmp_path: Path, call: Call, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    data = bytearray(healthy.read_bytes())
+    page = int(rng.integers(1, len(data) // 4096)) * 4096
+    data[page : page + 4096] = rng.bytes(4096)
+    path = tmp_path / "any.db"
+    path.write_bytes(data)
+    ended = call("map", "-q", "--from-database", path, "--output-path", tmp_path / "out")
+    assert (ended.code, len(ended.stderr)) == (1, 1)
+    assert ended.stderr[0].startswith(f"error: {path}: damaged (")
+    assert num_errors(path) > 0
+
+
+def test_hot_journal_is_refused_with_advice(healthy: Path, tmp_path: Path, call: Call) -> None:
+    """What a killed program had not completed is not read as if it counted."""
+    killed = tmp_path / "killed.db"
+    work = Path(shutil.copy(healthy, tmp_path / "any.db"))
+    with closing(sqlite3.connect(work, isolation_level=None)) as connection:
+        connection.execute("PRAGMA cache_size = 1")  # pages reach the file before the end
+        connection.execute("BEGIN")
+        connection.execute("UPDATE keypoints SET data = zeroblob(length(data))")
+        connection.execute("UPDATE images SET name = 'half ' || name")
+        shutil.copy(work, killed)
+        shutil.copy(f"{work}-journal", f"{killed}-journal")
+        connection.execute("ROLLBACK")
+    before = killed.read_bytes()
+    ended = call("map", "--from-database", killed, "--output-path", tmp_path / "out")
+    assert ended.code == 1
+    assert "sqlite3 killed.db .tables" in ended.errors[0]
+    assert num_errors(killed) == 1
+    assert killed.read_bytes() == before
+    with closing(sqlite3.connect(killed)) as connection:
+        connection.execute("SELECT count(*) FROM images").fetchone()  # undoes the half
+    assert read_names(killed) == ["a.png", "b c.png"]
+
+
+def test_journal_that_is_over_does_not_matter(healthy: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(healthy, tmp_path / "any.db"))
+    path.with_name("any.db-journal").write_bytes(bytes(512))
+    assert read_names(path) == ["a.png", "b c.png"]
+    path.write_bytes(b"no database")
+    with pytest.raises(DatabaseError, match="not a usable COLMAP database"):
+        read_names(path)
