@@ -140,11 +140,11 @@ def pair_levels(context: Context) -> dict[str, int]:
 
 
 @contextmanager
-def first_level_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | None]:
+def first_level_database(context: Context) -> Iterator[Path | None]:
     """Give a copy of the database in which the pairs that climbed are as they were before.
 
-    It is what a recipe without escalation would have made; and these pairs. None when no pair of
-    the database has climbed with success.
+    It is what a recipe without escalation would have made. None when no pair of the database has
+    climbed with success.
     """
     if not recorded_extraction(context.workspace).escalation:
         yield None
@@ -159,7 +159,31 @@ def first_level_database(context: Context) -> Iterator[tuple[Path, list[Pair]] |
         path = Path(folder) / "database.db"
         copy_database(context.workspace.database, path)
         escalation.match_first_level(climbed, path)
-        yield path, climbed
+        yield path
+
+
+@contextmanager
+def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | None]:
+    """Give a copy of the database without the pairs that no match of measured frames supports.
+
+    And these pairs; None where there are none, or no others.
+    """
+    if all(level.features.has_shapes for level in recorded_extraction(context.workspace).levels):
+        yield None
+        return
+    escalation = Escalation(context, EscalateOptions())
+    inliers = escalation.inlier_matches()
+    doubted = [
+        pair for pair, indices in inliers.items() if not escalation.measured(pair, indices).any()
+    ]
+    if len(doubted) in (0, len(inliers)):
+        yield None
+        return
+    with TemporaryDirectory(dir=context.workspace.path) as folder:
+        path = Path(folder) / "database.db"
+        copy_database(context.workspace.database, path)
+        colmap_database.reject_pairs(path, doubted)
+        yield path, doubted
 
 
 def reject(context: Context, pairs: Sequence[Pair]) -> None:

@@ -33,7 +33,7 @@ from colmap_affrect.stages.climbing import connected_parts
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copied_image_path, is_copy
 from colmap_affrect.stages.depth_lookup import depth_lookup
-from colmap_affrect.stages.escalate import first_level_database, reject
+from colmap_affrect.stages.escalate import first_level_database, measured_database, reject
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
 from colmap_affrect.stages.guide import guided_matches
 from colmap_affrect.stages.pairs import listed_pairs
@@ -100,11 +100,14 @@ def map_images(
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models, num_rejected = _map(context, mapper, task, advance)
+    if not is_copy(workspace) and _num_registered(models) < min(num_images, LARGE_MODEL):
+        models = _or_first_level(context, mapper, task, models)
     warnings = {}
     if num_rejected:
         inputs = _inputs(workspace, extend)
         warnings[workspace.database.name] = (
-            f"{num_rejected} pairs that climbed contradict the others and were rejected"
+            f"{num_rejected} pairs that only learned matching verified contradict the others and "
+            "were rejected"
         )
     replace_text(path, inputs)
     if extend and existing and existing.num_other_keypoints:
@@ -138,39 +141,56 @@ def image_names(workspace: Workspace) -> list[str]:
     return Inputs.recorded(workspace).names()
 
 
+def _or_first_level(
+    context: Context, mapper: Mapper, task: MappingTask, models: list[ModelSummary]
+) -> list[ModelSummary]:
+    """Keep the models of the pairs as they were before they climbed, where those have more images.
+
+    So escalation never loses an image; but a model that is doubtful as a whole does not take the
+    place of one that is not.
+    """
+    with first_level_database(context) as path:
+        if path is None or _num_tied(context, path) <= _num_registered(models):
+            return models
+        sparse = path.with_name("sparse")
+        firsts = map_database(mapper, replace(task, database_path=path), sparse, _ignore)
+        if _rank(firsts) <= _rank(models):
+            return models
+        logger.info("the model of the pairs before they climbed has more images and is kept")
+        rmtree(context.workspace.sparse)
+        sparse.rename(context.workspace.sparse)
+    return firsts
+
+
 def _map(
     context: Context, mapper: Mapper, task: MappingTask, advance: Callable[[int], None]
 ) -> tuple[list[ModelSummary], int]:
-    """Map; where pairs have climbed, first what the pairs are without that.
+    """Map, first the pairs that measured frames support where there are others, too.
 
-    Further levels, learned ones above all, also verify sides of a building that look the same. They
-    bring in what the first one leaves out, but have no say in how its images stand to each other;
-    unless it ties less than half of the images. So escalation never loses an image, either.
+    Learned matching verifies sides of a building that look the same as one. Its pairs bring in what
+    the others leave out, but have no say in how those stand to each other. Where measured frames
+    tie less than half of the images, all pairs are mapped together.
 
     Returns:
-        The models, and how many pairs that climbed were rejected.
+        The models, and how many pairs were rejected.
     """
     sparse = context.workspace.sparse
-    num_images = len(colmap_database.image_ids(task.database_path))
-    if task.extend or is_copy(context.workspace) or num_images >= LARGE_MODEL:
+    if task.extend or is_copy(context.workspace):
         return map_database(mapper, task, sparse, advance), 0
-    with first_level_database(context) as found:
-        if not found:
+    with measured_database(context) as found:
+        num_tied = _num_tied(context, context.workspace.database)
+        if not found or _num_tied(context, found[0]) < MIN_SHARE * num_tied:
             return map_database(mapper, task, sparse, advance), 0
-        path, climbed = found
+        path, doubted = found
         first = path.with_name("sparse")
         models = map_database(mapper, replace(task, database_path=path), first, advance)
-        num, num_tied = _num_registered(models), _num_tied(context)
+        num = _num_registered(models)
         if num < MIN_SHARE * num_tied or not models[0].is_trustworthy:
-            others = map_database(mapper, task, sparse, _ignore)
-            if _rank(others) >= _rank(models):
-                return others, 0
-            rmtree(sparse, ignore_errors=True)
-            first.rename(sparse)
-            return models, 0
-        graph = PairGraph.read(task.database_path)
-        contradicting = _contradicting(graph, pycolmap.Reconstruction(first / "0"))
-        rejected = [pair for pair in climbed if frozenset(pair) in contradicting]
+            return map_database(mapper, task, sparse, _ignore), 0
+        contradicting = _contradicting(
+            PairGraph.read(context.workspace.database), pycolmap.Reconstruction(first / "0")
+        )
+        rejected = [pair for pair in doubted if frozenset(pair) in contradicting]
         if rejected:
             reject(context, rejected)
         if num < num_tied and mapper.options.extends:
@@ -183,10 +203,9 @@ def _map(
     return models, len(rejected)
 
 
-def _num_tied(context: Context) -> int:
-    """Return how many images the verified pairs connect at most."""
-    workspace = context.workspace
-    parts = connected_parts(verified_pairs(workspace.database, _min_num_inliers(workspace)))
+def _num_tied(context: Context, path: Path) -> int:
+    """Return how many images the verified pairs of a database connect at most."""
+    parts = connected_parts(verified_pairs(path, _min_num_inliers(context.workspace)))
     return max(map(len, parts), default=0)
 
 

@@ -87,6 +87,7 @@ def test_report_has_the_promised_keys_and_reads_back() -> None:
         "num_pairs": 10,
         "num_verified_pairs": 3,
         "pair_levels": {"identity": 2, "asift": 1, "none": 7},
+        "contradicting_pairs": {},
         "recipe": "default",
         "preset": "sparse",
         "mapper": "incremental",

@@ -13,7 +13,6 @@ from command import Call
 from numpy.testing import assert_array_equal
 from results import database_content
 
-from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
 from colmap_affrect.images.photographs import CameraOptions
@@ -296,36 +295,33 @@ def test_pairs_that_climbed_can_be_had_as_they_were(
     workspace = copy(climbed[0], tmp_path)
     assert len(geometry(workspace, HARD)) > len(geometry(before, HARD))
     content = database_content(workspace.database)
-    with escalation.first_level_database(Context(workspace)) as found:
-        assert found is not None
-        path, pairs = found
-        assert HARD in pairs
+    with escalation.first_level_database(Context(workspace)) as path:
+        assert path is not None
         first = SimpleNamespace(database=path)
         for pair in (EASY, HARD):
             assert_array_equal(geometry(first, pair), geometry(before, pair))
     assert not path.parent.exists()
     assert database_content(workspace.database) == content
-    with escalation.first_level_database(Context(before)) as found:
-        assert found is None
+    with escalation.first_level_database(Context(before)) as path:
+        assert path is None
 
 
 @pytest.mark.parametrize(
-    ("num_first", "doubts", "num_escalated", "kept"),
+    ("num_escalated", "doubts", "mapped_before", "kept"),
     [
-        (3, (), None, "first"),
-        (3, ("pure rotation",), 2, "escalated"),
-        (1, (), 3, "escalated"),
-        (1, (), 0, "first"),
+        (0, (), True, "first"),
+        (2, (), True, "first"),
+        (2, ("pure rotation",), True, "escalated"),
+        (3, (), False, "escalated"),
     ],
-    ids=["all are tied", "but cannot be trusted", "too few", "climbing brought nothing"],
 )
-def test_pairs_are_mapped_first_as_they_were_before_the_climb(
+def test_the_model_before_the_climb_is_kept_where_it_has_more_images(
     climbed: tuple[Workspace, StageReport],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    num_first: int,
+    num_escalated: int,
     doubts: tuple[str, ...],
-    num_escalated: int | None,
+    mapped_before: bool,
     kept: str,
 ) -> None:
     workspace, mapped = copy(climbed[0], tmp_path), []
@@ -334,9 +330,8 @@ def test_pairs_are_mapped_first_as_they_were_before_the_climb(
         is_first_level = task.database_path != workspace.database
         mapped.append(is_first_level)
         (sparse / "0").mkdir(parents=True)
-        pycolmap.Reconstruction().write(sparse / "0")
         (sparse / "0" / "which").write_text("first" if is_first_level else "escalated")
-        names = tuple(NAMES[: num_first if is_first_level else num_escalated])
+        names = tuple(NAMES[: 3 if is_first_level else num_escalated])
         return [ModelSummary(names, 10, 2.0, 0.5, doubts=doubts if is_first_level else ())]
 
     monkeypatch.setattr(map_stage, "connected_parts", lambda _: [{1, 2, 3}])
@@ -344,8 +339,8 @@ def test_pairs_are_mapped_first_as_they_were_before_the_climb(
     with workspace.locked():
         mapper = MAPPERS.make(IncrementalOptions())
         _, models = map_stage.map_images(Context(workspace), mapper)
-    assert mapped == ([True] if num_escalated is None else [True, False])
-    assert len(models[0].registered_names) == (num_first if kept == "first" else num_escalated)
+    assert mapped == ([False, True] if mapped_before else [False])
+    assert len(models[0].registered_names) == (3 if kept == "first" else num_escalated)
     assert (workspace.sparse / "0" / "which").read_text() == kept
     assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == ["sparse"]
 

@@ -26,7 +26,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import map as stage
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation, escalate, first_level_database, reject
+from colmap_affrect.stages.escalate import Escalation, escalate, measured_database, reject
 from colmap_affrect.stages.extract import Inputs, extract
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
@@ -81,6 +81,15 @@ def escalation_of(context: Context) -> Escalation:
     return Escalation(context, load_recipe("default").escalate)
 
 
+def shapeless_only(escalation: Escalation, *pairs: tuple[str, str]) -> None:
+    """Take the matches of measured frames from some pairs."""
+    for found in list(escalation.matches.read(pairs)):
+        rows = ~escalation.measured(found.names, found.indices)
+        kept = replace(found, indices=found.indices[rows], scores=found.scores[rows])
+        escalation.matches.write([kept])
+    escalation.write()
+
+
 def test_matches_of_both_kinds_of_frames_are_united(
     climbed: tuple[Workspace, Counts], context: Context
 ) -> None:
@@ -127,6 +136,23 @@ def test_measured_frames_decide_where_both_kinds_differ(
     assert count == np.count_nonzero(measured)
 
 
+def test_measured_database_lacks_the_pairs_that_no_measured_frames_support(
+    context: Context,
+) -> None:
+    escalation = escalation_of(context)
+    with measured_database(context) as found:
+        assert found is None
+    shapeless_only(escalation, PAIR, (NAMES[1], NAMES[3]))
+    everything = verified_pairs(context.workspace.database, 1)
+    with measured_database(context) as found:
+        assert found
+        path, doubted = found
+        assert set(doubted) == {PAIR, (NAMES[1], NAMES[3])}
+        measured = verified_pairs(path, 1)
+    assert len(measured) == len(everything) - 2
+    assert measured.items() <= everything.items()
+
+
 def test_rejected_pairs_stay_so(context: Context) -> None:
     escalation = escalation_of(context)
     reject(context, [PAIR])
@@ -143,10 +169,9 @@ def poses(workspace: Workspace, names: list[str]) -> list[NDArray[Any]]:
 
 
 @pytest.mark.parametrize("is_wrong", [False, True])
-def test_pairs_that_climbed_are_rejected_where_they_contradict(
-    context: Context, is_wrong: bool
-) -> None:
+def test_other_pairs_are_rejected_where_they_contradict(context: Context, is_wrong: bool) -> None:
     workspace, escalation = context.workspace, escalation_of(context)
+    shapeless_only(escalation, PAIR)
     if is_wrong:
         ids = colmap_database.image_ids(workspace.database)
         with colmap_database.open_database(workspace.database) as database:
@@ -166,19 +191,12 @@ def test_pairs_that_climbed_are_rejected_where_they_contradict(
     assert np.array_equal(before, poses(workspace, NAMES))
 
 
-def test_images_that_climbing_ties_come_in_last(
-    context: Context, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    workspace, last, tied = context.workspace, NAMES[3], NAMES[:3]
-    match = Escalation.match_first_level
-
-    def without_last(escalation: Escalation, pairs: Any, path: Path) -> None:
-        match(escalation, pairs, path)
-        colmap_database.reject_pairs(path, [pair for pair in pairs if last in pair])
-
-    monkeypatch.setattr(Escalation, "match_first_level", without_last)
+def test_images_that_other_pairs_alone_tie_come_in_last(context: Context) -> None:
+    workspace, escalation = context.workspace, escalation_of(context)
+    last, tied = NAMES[3], NAMES[:3]
+    shapeless_only(escalation, *(pair for pair in escalation.pairs if last in pair))
     mapper = MAPPERS.make(MAPPERS.options("sparse"))
-    with first_level_database(context) as found:
+    with measured_database(context) as found:
         assert found
         first = Workspace(workspace.path / "first")
         task = MappingTask(found[0], None, cameras=read_camera_records(workspace.cameras))
