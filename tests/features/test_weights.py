@@ -166,6 +166,13 @@ def test_installed_file_that_is_not_the_published_one_is_refused(installed: Path
     assert (row.path, row.verified) == (installed, False)
 
 
+def test_fetch_takes_what_is_installed(installed: Path, tmp_path: Path) -> None:
+    assert fetch(["xfeat"]) == {"xfeat": installed}
+    folder = tmp_path / "for another machine"
+    assert fetch(["xfeat"], folder) == {"xfeat": folder / "xfeat.pt"}
+    assert (folder / "xfeat.pt").read_bytes() == b"published"
+
+
 @pytest.mark.parametrize("name", ["disk-depth-save.pth", "depth-save.pth"])
 def test_resolve_knows_the_names_that_others_give_a_file(
     name: str, folders: dict[str, Path]
