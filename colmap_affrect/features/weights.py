@@ -13,8 +13,8 @@ and else downloaded into that cache. torch and kornia are loaded only when they 
 from __future__ import annotations
 
 import os
-import shutil
 import pickle
+import shutil
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
