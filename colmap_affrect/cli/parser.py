@@ -14,38 +14,48 @@ if TYPE_CHECKING:
     # The type of what takes arguments has no public name.
     Container = argparse._ActionsContainer
 
-EPILOG = """\
-examples:
-  colmap-affrect run --image-path photos --output-path out
-  colmap-affrect run --image-path photos --output-path out --camera-mode single
-  colmap-affrect run --image-path photos --output-path out --recipe unrectified-rootsift
-  colmap-affrect extract --image-path photos --output-path out
-  colmap-affrect pairs   --output-path out --pairs retrieval,sequence --num-neighbors 30
-  colmap-affrect match   --output-path out
-  colmap-affrect verify  --output-path out
-  colmap-affrect map     --output-path out
-  colmap-affrect map     --output-path out --from-database any.db --image-path photos
-  colmap-affrect run --image-path all-photos --output-path out --extend finished/sparse/0
-  colmap-affrect run --image-path photos --output-path out --recipe on-demand
-  colmap-affrect run --image-path photos --output-path out --recipe depth-planes-recommended \\
-      --depth-path depth
-  colmap-affrect compare --image-path photos --output-path out
-  colmap-affrect compare --image-path photos --output-path out --methods sift,default --seeds 0
-  colmap-affrect evaluate evd --dataset-path EVD --output-path out \\
-      --recipes unrectified-rootsift,default,on-demand
-  colmap-affrect inspect photos/a.jpg --output-path out
-  colmap-affrect weights fetch
-  colmap-affrect doctor out
-  colmap-affrect doctor database.db --image-path photos
-  colmap-affrect import-h5 --image-path photos --features-path features.h5 \\
-      --matches-path matches.h5 --database-path new.db
-  colmap-affrect export-h5 --database-path any.db --features-path features.h5 \\
-      --matches-path matches.h5
+EXAMPLES = (
+    "run --image-path photos --output-path out",
+    "run --image-path photos --output-path out --camera-mode single",
+    "run --image-path photos --output-path out --recipe on-demand",
+    "run --image-path photos --output-path out --recipe depth-planes-recommended \\\n"
+    "      --depth-path depth",
+    "run --image-path all-photos --output-path out --extend finished/sparse/0",
+    "extract --image-path photos --output-path out",
+    "pairs --output-path out --pairs retrieval,sequence --num-neighbors 30",
+    "match --output-path out",
+    "verify --output-path out",
+    "escalate --output-path out --overwrite --set escalate.min_num_tracks=10",
+    "guide --output-path out",
+    "map --output-path out",
+    "map --output-path out --from-database any.db --image-path photos",
+    "compare --image-path photos --output-path out",
+    "compare --image-path photos --output-path out --methods sift,default --seeds 0",
+    "evaluate evd --dataset-path EVD --output-path out \\\n"
+    "      --recipes unrectified-rootsift,default,on-demand",
+    "inspect photos/a.jpg --output-path out",
+    "recipes",
+    "recipes on-demand",
+    "weights fetch",
+    "doctor out",
+    "doctor database.db --image-path photos",
+    "import-h5 --image-path photos --features-path features.h5 \\\n"
+    "      --matches-path matches.h5 --database-path new.db",
+    "export-h5 --database-path any.db --features-path features.h5 \\\n"
+    "      --matches-path matches.h5",
+)
 
+ENDING = """
 Run a command again and it goes on where it stopped. Exit codes: 0 done, 1 failed (one line
 says why; also when images could not be read, see --max-failures), 2 wrong usage, 3 finished
-without a model, 130 interrupted.
+without a model that can be trusted, 130 interrupted.
 """
+
+
+def epilog(command: str = "") -> str:
+    """Return the examples of a command, or all, and what all commands have in common."""
+    examples = [text for text in EXAMPLES if command in ("", text.split()[0])]
+    return "\n  colmap-affrect ".join(["examples:", *examples]) + "\n" + ENDING
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -53,7 +63,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="colmap-affrect",
         description="Rectified wide-baseline features for COLMAP: photographs in, model out.",
-        epilog=EPILOG,
+        epilog=epilog(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"colmap-affrect {__version__}")
@@ -63,7 +73,7 @@ def build_parser() -> argparse.ArgumentParser:
             name,
             help=summary,
             description=summary,
-            epilog=EPILOG,
+            epilog=epilog(name),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         command.set_defaults(function=function, **ABSENT)

@@ -48,6 +48,8 @@ class FeatureOptions(NetworkOptions):
 
     in_color: ClassVar[bool] = False
     """Whether views are (H, W, 3) instead of (H, W)."""
+    bytes_per_px: ClassVar[int] = 256
+    """Memory of the extraction of one image, roughly."""
     has_shapes: ClassVar[bool] = True
     """Whether frames were measured one by one, so that they can tell right matches from wrong."""
     max_num_features: Annotated[int, within(1, 1_000_000)] = 8192

@@ -39,6 +39,7 @@ class LearnedOptions(FeatureOptions):
     """What the three networks have in common."""
 
     in_color: ClassVar[bool] = True
+    bytes_per_px: ClassVar[int] = 1600
     has_shapes: ClassVar[bool] = False
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
     """Most features of one view, by response, as their authors match them."""

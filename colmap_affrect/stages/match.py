@@ -5,8 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from typing import Any
 
 from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
@@ -23,10 +25,22 @@ SECONDS_PER_WRITE = 30.0
 """Pairs of a network take seconds each: what is found is stored before there are so many."""
 
 
+WEIGHTS = "weights"
+"""Of the record, beside the options: file name to sha256."""
+
+
 def recorded_matching(workspace: Workspace) -> MatcherOptions:
     """Return the options on record of matching, done or still to be done."""
-    options: MatcherOptions = MATCHERS.options(workspace.planned("match") or {})
+    record = {k: value for k, value in (workspace.planned("match") or {}).items() if k != WEIGHTS}
+    options: MatcherOptions = MATCHERS.options(record)
     return options
+
+
+def _with_weights(context: Context, options: MatcherOptions) -> dict[str, Any]:
+    """Return options for the record, with the digests of the files of weights, if any."""
+    paths = resolve(options.weights, context.resources.weights_path).values()
+    digests = {path.name: file_sha256(path) for path in paths}
+    return options.to_mapping() | ({WEIGHTS: digests} if digests else {})
 
 
 def match(
@@ -41,7 +55,7 @@ def match(
     context.resources.require_device()
     pairs = listed_pairs(context)
     options = options or recorded_matching(context.workspace)
-    context.workspace.record_options("match", options.to_mapping(), overwrite=overwrite)
+    context.workspace.record_options("match", _with_weights(context, options), overwrite=overwrite)
     done = context.matches.complete(pair_key(*pair) for pair in pairs)
     missing = [pair for pair in pairs if pair_key(*pair) not in done]
     with context.progress.stage("match", len(missing), "pairs") as advance:

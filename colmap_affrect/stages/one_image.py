@@ -52,9 +52,6 @@ MIN_RECTIFIABLE_PX = 32
 
 MEMORY_IS_FULL = "extracted on the CPU, the memory of the GPU is full"
 
-BYTES_PER_PIXEL = 256
-"""Memory of the extraction of one image, roughly."""
-
 
 @dataclass(frozen=True)
 class ExtractedImage:
@@ -291,14 +288,15 @@ def moved(path: Path, root: Path) -> Path:
 def num_images_at_once(extractor: ImageExtractor) -> int:
     """Return how many images are worked on at once in this process.
 
-    They take at most half of the memory there is. With networks two: one is read while the
-    networks run on the other.
+    They take at most half of the memory there is. With networks at most two: one is read while
+    the networks run on the other.
     """
-    if extractor.options.uses_networks:
-        return 2
-    longest = max(level.max_image_size_px for level in extractor.options.levels)
-    num_bytes = BYTES_PER_PIXEL * longest**2
-    return min(available_cores(), max(1, available_memory_bytes() // 2 // num_bytes))
+    num_bytes = max(
+        level.features.bytes_per_px * level.max_image_size_px**2
+        for level in extractor.options.levels
+    )
+    most = 2 if extractor.options.uses_networks else available_cores()
+    return min(most, max(1, available_memory_bytes() // 2 // num_bytes))
 
 
 def extract_image(image: GrayImage, options: ExtractionOptions | None = None) -> LocalFeatures:

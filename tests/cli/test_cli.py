@@ -19,6 +19,7 @@ from small_scene import INTRINSICS, write_photographs
 
 from colmap_affrect import __version__
 from colmap_affrect.cli import main
+from colmap_affrect.cli.parser import EXAMPLES, build_parser, epilog
 from colmap_affrect.features import weights
 from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers.doubts import Doubts
@@ -55,13 +56,22 @@ def run_arguments(photos: Path, out: Path) -> list[str]:
 def test_help_has_options_and_examples(command: list[str], call: Call) -> None:
     done = call(*command, "--help")
     assert (done.code, done.stderr) == (0, [])
-    assert "colmap-affrect run --image-path photos --output-path out" in done.stdout
+    assert f"colmap-affrect {(command or ['run'])[0]}" in done.stdout.partition("examples:")[2]
     assert "Exit codes: 0 done" in done.stdout
     if not command:
         assert all(f"    {name} " in done.stdout for name in COMMANDS)
     elif command[0] not in ("recipes", "weights", "doctor"):
         assert all(flag in done.stdout for flag in ("--output-path", "--quiet"))
         assert ("--overwrite" in done.stdout) == (command != ["inspect"])
+
+
+def test_each_command_has_examples_of_its_own_that_it_understands() -> None:
+    parser = build_parser()
+    assert {example.split()[0] for example in EXAMPLES} == set(COMMANDS)
+    for example in EXAMPLES:
+        parser.parse_args(example.replace("\\\n", " ").split())
+    shown = epilog("map")
+    assert shown.count("colmap-affrect ") == shown.count("colmap-affrect map ") == 2
 
 
 def test_help_loads_no_heavy_package() -> None:

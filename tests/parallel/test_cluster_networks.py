@@ -15,14 +15,14 @@ from random_weights import write_comparing_lightglue
 from results import hdf5_content
 from small_scene import write_photographs
 
-from colmap_affrect.errors import OptionError, WeightsError
+from colmap_affrect.errors import OptionError, StaleStoreError, WeightsError
 from colmap_affrect.parallel.cluster import connected
 from colmap_affrect.parallel.executor import Executor, Threads
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.extract import Inputs, extract
-from colmap_affrect.stages.match import match
+from colmap_affrect.stages.match import match, recorded_matching
 from colmap_affrect.stages.one_pair import CachedMatcher, iterate_matches
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
 
@@ -62,6 +62,19 @@ def matched(
     with Workspace(out).locked() as workspace:
         match(Context(workspace, Resources(weights, "cpu"), executor))
     return hdf5_content(Workspace(out).matches)
+
+
+@pytest.mark.long
+def test_matches_of_other_weights_are_not_mixed(
+    tmp_path: Path, extracted: Path, weights: Path
+) -> None:
+    matched(tmp_path / "out", extracted, weights, Threads(1))
+    workspace = Workspace(tmp_path / "out")
+    assert list(workspace.recorded()["match"]["weights"]) == ["sift_lightglue.pth"]
+    assert recorded_matching(workspace) == RECIPE.matching
+    write_comparing_lightglue(tmp_path / "sift_lightglue.pth", sharpness=30.0)
+    with pytest.raises(StaleStoreError, match="match stage was run there with weights"):
+        matched(tmp_path / "out", extracted, tmp_path, Threads(1))
 
 
 @pytest.mark.long
