@@ -420,6 +420,7 @@ def test_missing_weights_are_one_error_with_the_way_out(
         assert said in line
 
 
+@pytest.mark.long
 def test_finished_model_is_extended_and_another_database_mapped(
     photos: Path, tmp_path: Path, call: Call
 ) -> None:

@@ -431,6 +431,7 @@ def test_killed_comparison_goes_on_and_ends_as_an_undisturbed_one(
     assert method.seeds[0].num_points3D == expected.seeds[0].num_points3D
 
 
+@pytest.mark.long
 def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) -> None:
     """The methods are finished there: it only prints."""
     ended = run_in_process_of_its_own(

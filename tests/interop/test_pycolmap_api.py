@@ -67,6 +67,7 @@ def keypoints(path: Path) -> dict[str, Any]:
         return {image.name: database.read_keypoints(image.image_id) for image in images}
 
 
+@pytest.mark.long
 def test_the_documented_example_of_pycolmap_registers_the_scene(
     photos: Path, tmp_path: Path
 ) -> None:

@@ -159,6 +159,7 @@ def depth_in_image_1(places: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(7.0 + 2.0 * waves + 1.5 * (places[:, 1] > 300))
 
 
+@pytest.mark.long
 def test_depth_map_gives_the_scale_where_no_neighbours_and_no_plane_do(tmp_path: Path) -> None:
     truth = views(3)
     path = tmp_path / "database.db"

@@ -100,6 +100,7 @@ def test_message_cannot_steer_the_terminal(tmp_path: Path, call: Call) -> None:
     assert "\\u001b[31m\\u000ared: no such folder" in ended.stderr[0]
 
 
+@pytest.mark.long
 def test_any_name_of_a_file_comes_through_or_is_left_out_with_a_line(
     tmp_path: Path, call: Call
 ) -> None:

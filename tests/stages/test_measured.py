@@ -191,6 +191,7 @@ def test_other_pairs_are_rejected_where_they_contradict(context: Context, is_wro
     assert np.array_equal(before, poses(workspace, NAMES))
 
 
+@pytest.mark.long
 def test_images_that_other_pairs_alone_tie_come_in_last(context: Context) -> None:
     workspace, escalation = context.workspace, escalation_of(context)
     last, tied = NAMES[3], NAMES[:3]
