@@ -167,9 +167,8 @@ def _map(
 ) -> tuple[list[ModelSummary], int]:
     """Map, first the pairs that measured frames support where there are others, too.
 
-    Learned matching verifies sides of a building that look the same as one. Its pairs bring in what
-    the others leave out, but have no say in how those stand to each other. Where measured frames
-    tie less than half of the images, all pairs are mapped together.
+    Learned matching verifies sides of a building that look the same as one. Its pairs have no say
+    where the others register as many images without them; those that contradict are rejected.
 
     Returns:
         The models, and how many pairs were rejected.
@@ -187,17 +186,15 @@ def _map(
         num = _num_registered(models)
         if num < MIN_SHARE * num_tied or not models[0].is_trustworthy:
             return map_database(mapper, task, sparse, _ignore), 0
-        contradicting = _contradicting(
-            PairGraph.read(context.workspace.database), pycolmap.Reconstruction(first / "0")
-        )
+        if num < num_tied:
+            others = map_database(mapper, task, sparse, _ignore)
+            if _rank(others) > _rank(models):
+                return others, 0
+        graph = PairGraph.read(context.workspace.database)
+        contradicting = _contradicting(graph, pycolmap.Reconstruction(first / "0"))
         rejected = [pair for pair in doubted if frozenset(pair) in contradicting]
         if rejected:
             reject(context, rejected)
-        if num < num_tied and mapper.options.extends:
-            existing = read_existing(Extension(first / "0"), task.database_path)
-            more = map_database(mapper, replace(task, extend=existing), sparse, _ignore)
-            if _num_registered(more) > num:
-                return more, len(rejected)
         rmtree(sparse, ignore_errors=True)
         first.rename(sparse)
     return models, len(rejected)
