@@ -13,7 +13,7 @@ from colmap_affrect.errors import AffrectError
 from colmap_affrect.evaluation.costs import ImageCost, extract_measured
 from colmap_affrect.evaluation.protocol import EvaluationImage
 from colmap_affrect.evaluation.records import RecordFile
-from colmap_affrect.features.weights import file_sha256
+from colmap_affrect.features.weights import digests_by_name
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.recipes import ExtractionOptions
@@ -53,7 +53,7 @@ class RecipeFeatures:
         """
         self._images, self.resources = images, resources
         self._extractor = prepare(options, resources, list(images))
-        weights = {path.name: file_sha256(path) for path in self._extractor.weights.values()}
+        weights = digests_by_name(self._extractor.weights)
         self.settings = {**inputs, **options.to_mapping(), "weights": weights}
         digest = hashlib.sha256(json.dumps(self.settings, sort_keys=True).encode()).hexdigest()
         features_path, costs_path = (

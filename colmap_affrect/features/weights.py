@@ -245,6 +245,11 @@ def describe_weights(weights_path: Path | None = None) -> list[WeightStatus]:
     return rows
 
 
+def digests_by_name(files: Mapping[str, Path]) -> dict[str, str]:
+    """Return the sha256 of files of weights by their names, for records."""
+    return {path.name: file_sha256(path) for path in files.values()}
+
+
 def file_sha256(path: Path) -> str:
     """Return the SHA-256 of a file in hexadecimal digits."""
     there = path.stat()

@@ -140,6 +140,15 @@ def pair_levels(context: Context) -> dict[str, int]:
 
 
 @contextmanager
+def _copied_database(context: Context) -> Iterator[Path]:
+    """Give a copy of the database, in a folder of its own beside it."""
+    with TemporaryDirectory(dir=context.workspace.path) as folder:
+        path = Path(folder) / "database.db"
+        copy_database(context.workspace.database, path)
+        yield path
+
+
+@contextmanager
 def first_level_database(context: Context) -> Iterator[Path | None]:
     """Give a copy of the database in which the pairs that climbed are as they were before.
 
@@ -155,9 +164,7 @@ def first_level_database(context: Context) -> Iterator[Path | None]:
     if not climbed:
         yield None
         return
-    with TemporaryDirectory(dir=context.workspace.path) as folder:
-        path = Path(folder) / "database.db"
-        copy_database(context.workspace.database, path)
+    with _copied_database(context) as path:
         escalation.match_first_level(climbed, path)
         yield path
 
@@ -179,9 +186,7 @@ def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | No
     if len(doubted) in (0, len(inliers)):
         yield None
         return
-    with TemporaryDirectory(dir=context.workspace.path) as folder:
-        path = Path(folder) / "database.db"
-        copy_database(context.workspace.database, path)
+    with _copied_database(context) as path:
         colmap_database.reject_pairs(path, doubted)
         yield path, doubted
 

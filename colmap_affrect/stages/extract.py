@@ -15,7 +15,7 @@ from colmap_affrect.colmap.database_copy import copy_without_features, read_name
 from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
 from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
-from colmap_affrect.features.weights import file_sha256
+from colmap_affrect.features.weights import digests_by_name
 from colmap_affrect.images.photographs import (
     CameraOptions,
     MaskOptions,
@@ -247,7 +247,7 @@ def _record(
     overwrite: bool,
 ) -> None:
     """Put the options of this stage and those known of later ones on record."""
-    weights = {path.name: file_sha256(path) for path in extractor.weights.values()}
+    weights = digests_by_name(extractor.weights)
     planned: dict[str, Options] = {"match": recipe.matching, "guide": recipe.guided}
     if recipe.extraction.escalation:
         planned["escalate"] = recipe.escalate

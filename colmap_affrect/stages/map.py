@@ -177,10 +177,12 @@ def _map(
     if task.extend or is_copy(context.workspace):
         return map_database(mapper, task, sparse, advance), 0
     with measured_database(context) as found:
-        num_tied = _num_tied(context, context.workspace.database)
-        if not found or _num_tied(context, found[0]) < MIN_SHARE * num_tied:
+        if not found:
             return map_database(mapper, task, sparse, advance), 0
         path, doubted = found
+        num_tied = _num_tied(context, context.workspace.database)
+        if _num_tied(context, path) < MIN_SHARE * num_tied:
+            return map_database(mapper, task, sparse, advance), 0
         first = path.with_name("sparse")
         models = map_database(mapper, replace(task, database_path=path), first, advance)
         num = _num_registered(models)

@@ -8,7 +8,7 @@ from contextlib import closing
 from typing import Any
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.features.weights import file_sha256, resolve
+from colmap_affrect.features.weights import digests_by_name, resolve
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
@@ -38,8 +38,7 @@ def recorded_matching(workspace: Workspace) -> MatcherOptions:
 
 def _with_weights(context: Context, options: MatcherOptions) -> dict[str, Any]:
     """Return options for the record, with the digests of the files of weights, if any."""
-    paths = resolve(options.weights, context.resources.weights_path).values()
-    digests = {path.name: file_sha256(path) for path in paths}
+    digests = digests_by_name(resolve(options.weights, context.resources.weights_path))
     return options.to_mapping() | ({WEIGHTS: digests} if digests else {})
 
 

@@ -203,15 +203,21 @@ def test_full_disk_at_any_write_before_the_changes_count_leaves_none(
     assert passing > 5
 
 
-def test_journal_of_a_file_is_applied_before_it_is_changed_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "file"
+def file_beside_its_journal(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Write a file whose changes are in its journal only."""
+    path = folder / "file"
     path.write_bytes(b"old" * 3000)
     with FileTransaction(path) as changes, monkeypatch.context() as patch:
         changes.write(b"NEW")
         patch.setattr(files, "apply_journal", lambda _: None)
         changes.commit()
+    return path
+
+
+def test_journal_of_a_file_is_applied_before_it_is_changed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = file_beside_its_journal(tmp_path, monkeypatch)
     assert path.read_bytes()[:6] == b"oldold"
     with FileTransaction(path) as changes:
         assert changes.read(6) == b"NEWold"
@@ -221,12 +227,7 @@ def test_journal_that_is_torn_or_damaged_is_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """As after a power loss, where names may reach the disk before what is in the files."""
-    path = tmp_path / "file"
-    path.write_bytes(b"old" * 3000)
-    with FileTransaction(path) as changes, monkeypatch.context() as patch:
-        changes.write(b"NEW")
-        patch.setattr(files, "apply_journal", lambda _: None)
-        changes.commit()
+    path = file_beside_its_journal(tmp_path, monkeypatch)
     whole, before = journal_of(path).read_bytes(), path.read_bytes()
     flipped = bytearray(whole)
     flipped[100] ^= 1
