@@ -38,6 +38,7 @@ class Photograph:
         camera_matrix: (3, 3) pinhole intrinsics in pixel-centre px of ``gray``.
         mask: (H, W) bool, where features may be; None means everywhere.
         color: (H, W, 3), for feature extractors that ask for it.
+        stretched: whether its contrast was low, and its tones have been stretched.
     """
 
     gray: GrayImage
@@ -46,6 +47,7 @@ class Photograph:
     camera_matrix: NDArray[np.float64]
     mask: Mask | None = None
     color: ColorImage | None = None
+    stretched: bool = False
 
     @property
     def size(self) -> tuple[int, int]:

@@ -82,6 +82,9 @@ class ExtractionOptions(Options):
     max_image_size_px: ImageSize = 2400
     """Larger images are shrunk to this longer side before extraction, which bounds memory. COLMAP's
     limit for SIFT is 3200."""
+    stretch_contrast: bool = True
+    """Whether tones that fill less than half of a file's range are stretched to all of it before
+    extraction, as in faded prints and 12-bit scans."""
 
     @property
     def levels(self) -> tuple[Level, ...]:

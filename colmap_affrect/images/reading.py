@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -36,26 +37,70 @@ FOREIGN_FORMATS = {
 wheel does not."""
 
 
-def read_gray(path: Path) -> GrayImage:
+TONE_PERCENTILES = (0.5, 99.5)
+"""What is black and white of a stretched photograph: dust and glints are a few pixels."""
+MIN_TONE_RANGE = 0.5
+"""A photograph whose tones fill less of the range of its file is stretched."""
+MAX_TONE_STEP = 16
+"""Neighbouring tones get no further apart, in steps of 8 bits: beyond is noise."""
+NUM_TONES = 250_000
+"""About so many pixels are looked at."""
+FRAME_FRAC = 0.1
+"""So much along each border says nothing about tones: scans have frames and captions there."""
+
+
+def read_gray(path: Path, *, stretch: bool = False) -> GrayImage:
     """Read an image as gray, as stored: EXIF orientation is not applied, 16 bit becomes 8.
 
+    With ``stretch`` the tones of a photograph of low contrast fill the range (:func:`tones`).
     Raises ImageError when the file is missing, empty, or not an image.
     """
     image = decode(path)
-    if image.dtype == np.uint16:
-        image = image // 257
-    elif image.dtype != np.uint8:
-        image = np.nan_to_num(np.clip(image, 0.0, 1.0)) * 255.0
-    return np.ascontiguousarray(image, dtype=np.uint8)
+    return in_eight_bits(image, tones(image) if stretch else None)
 
 
-def read_color(path: Path, max_size_px: int) -> ColorImage:
+def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorImage:
     """Read an image in colour, as stored, its longer side shrunk to at most ``max_size_px``.
 
-    EXIF orientation is not applied. Raises ImageError as :func:`read_gray`.
+    EXIF orientation is not applied; for ``stretch`` and errors see :func:`read_gray`.
     """
-    image = decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return shrink_to(np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8), max_size_px)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = decode(path, flags)[:, :, ::-1]
+    return shrink_to(in_eight_bits(image, tones(image) if stretch else None), max_size_px)
+
+
+def tones(image: NDArray[np.generic]) -> tuple[float, float] | None:
+    """Return what is to be black and white of an (H, W[, 3]) image, None to leave it as it is.
+
+    Scans of faded prints and 12 bits in a file of 16 fill a small part of the range, and detectors
+    with a fixed threshold see next to nothing in them.
+    """
+    height, width = image.shape[:2]
+    y, x = int(FRAME_FRAC * height), int(FRAME_FRAC * width)
+    inner = image[y : height - y, x : width - x]
+    step = max(1, round(math.sqrt(inner.size / NUM_TONES)))
+    low, high = np.nanpercentile(inner[::step, ::step], TONE_PERCENTILES)
+    whole_numbers = np.issubdtype(image.dtype, np.integer)
+    white = np.iinfo(image.dtype).max if whole_numbers else 1.0
+    finest = 255 / MAX_TONE_STEP if whole_numbers else 0.0
+    if not finest < high - low < MIN_TONE_RANGE * white:
+        return None
+    return float(low), float(high)
+
+
+def in_eight_bits(
+    image: NDArray[np.generic], black_and_white: tuple[float, float] | None = None
+) -> NDArray[np.uint8]:
+    """Return an image of 8 or 16 bits or of floats from 0 to 1 in 8 bits."""
+    if black_and_white:
+        low, high = black_and_white
+        values = np.clip((image.astype(np.float32) - low) * (255.0 / (high - low)), 0.0, 255.0)
+        image = np.nan_to_num(values).round()
+    elif image.dtype == np.uint16:
+        image = image // np.uint16(257)
+    elif image.dtype != np.uint8:
+        image = np.nan_to_num(np.clip(image.astype(np.float32), 0.0, 1.0)) * 255.0
+    return np.ascontiguousarray(image, dtype=np.uint8)
 
 
 def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:

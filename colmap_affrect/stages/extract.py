@@ -32,6 +32,7 @@ from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe
+from colmap_affrect.shown import one_line
 from colmap_affrect.stages.changes import (
     forget_changed,
     refuse_changed,
@@ -274,6 +275,7 @@ def _extract_missing(
     """Extract images one by one; return why some cannot be used, and add to the warnings."""
     store = context.features
     failures: dict[str, str] = {}
+    faded: list[str] = []
     with context.progress.stage("extract", len(names), "images") as advance:
         images = [(name, 0) for name in names]
         with closing(extract_images(context, inputs, extractor, images)) as found_images:
@@ -286,8 +288,16 @@ def _extract_missing(
                         logger.warning("%s: no features (blank or too small?)", name)
                     if found.warning:
                         warnings[name] = found.warning
+                    if found.stretched:
+                        faded.append(name)
                     store.write(name, found.features, found.image_size, digests[name])
                 advance(1)
+    if faded:
+        warnings["contrast"] = (
+            f"is low in {len(faded)} of {len(names)} photographs, such as {one_line(faded[0])}; it "
+            "was stretched (--set stretch_contrast=false leaves it as it is)"
+        )
+        logger.warning("contrast: %s", warnings["contrast"])
     return failures
 
 

@@ -34,7 +34,7 @@ from colmap_affrect.geometry.affine import transform_frames
 from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
 from colmap_affrect.images.masks import shrink_mask
 from colmap_affrect.images.photographs import Photographs
-from colmap_affrect.images.reading import read_color, read_gray, shrink_to
+from colmap_affrect.images.reading import decode, in_eight_bits, read_color, shrink_to, tones
 from colmap_affrect.parallel.executor import (
     available_cores,
     available_memory_bytes,
@@ -62,11 +62,13 @@ class ExtractedImage:
         image_size: (width, height) of the stored image in px.
         warning: why it was not rectified though it was to be, or not on the GPU; empty if all
             went well.
+        stretched: whether its contrast was low and was stretched.
     """
 
     features: LocalFeatures
     image_size: tuple[int, int]
     warning: str = ""
+    stretched: bool = False
 
 
 @dataclass(frozen=True)
@@ -201,7 +203,9 @@ class ImageExtractor:
         keep = features.inside(original_size)
         if mask is not None:
             keep &= in_mask(mask, features.keypoints)
-        return ExtractedImage(features.select(keep), original_size, found.warning)
+        return ExtractedImage(
+            features.select(keep), original_size, found.warning, photograph.stretched
+        )
 
     def extract(self, photograph: Photograph, level: int = 0) -> ExtractedImage:
         """Plan and execute; frames are in px of the photograph at the size of processing."""
@@ -226,7 +230,9 @@ class ImageExtractor:
         level: int = 0,
     ) -> tuple[Photograph, tuple[int, int]]:
         """Read an image at the size of processing; also return its stored (width, height)."""
-        image = read_gray(path)
+        stored = decode(path)
+        black_and_white = tones(stored) if self.options.stretch_contrast else None
+        image = in_eight_bits(stored, black_and_white)
         if mask is not None and mask.shape != image.shape:
             raise ImageError(
                 f"{path}: is {image.shape[1]} x {image.shape[0]} px and its mask "
@@ -236,13 +242,17 @@ class ImageExtractor:
         chosen = self.options.levels[level]
         limit = chosen.max_image_size_px
         gray = shrink_to(image, limit)
-        color = read_color(path, limit) if chosen.features.in_color else None
+        color = None
+        if chosen.features.in_color:
+            color = read_color(path, limit, stretch=self.options.stretch_contrast)
         size = (gray.shape[1], gray.shape[0])
         original_camera = camera_matrix(original_size) if intrinsics is None else intrinsics
         camera = resized_from_original(original_size, size) @ original_camera
         if mask is not None:
             mask = shrink_mask(mask, size)
-        return Photograph(gray, name or path.name, path, camera, mask, color), original_size
+        stretched = black_and_white is not None
+        found = Photograph(gray, name or path.name, path, camera, mask, color, stretched)
+        return found, original_size
 
     def plan(self, photograph: Photograph, level: int = 0) -> RectificationPlan:
         """Decide which warps to look at; DepthError when a depth map is needed and unusable."""

@@ -16,7 +16,7 @@ from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.images.masks import connected_regions
-from colmap_affrect.images.reading import read_gray, shrink_to
+from colmap_affrect.images.reading import in_eight_bits, read_color, read_gray, shrink_to, tones
 from colmap_affrect.parallel.opencv_threads import SHARED_OPENCV_THREADS
 
 
@@ -176,3 +176,30 @@ def test_shrink_to_moves_points_as_the_conventions_say(limit: int) -> None:
     small = shrink_to(image, limit)
     matrix = resized_from_original((300, 170), small.shape[::-1])
     assert_allclose(centroid(small), project(matrix, center)[0], atol=0.03)
+
+
+def test_low_contrast_is_stretched_alike_in_gray_and_colour(tmp_path: Path) -> None:
+    ramp = np.tile(np.linspace(90, 150, 200), (120, 1)).astype(np.uint8)
+    ramp[:, :15], ramp[:, -15:] = 255, 0  # the frame of a scan
+    path = write_image(tmp_path / "faded.png", cv2.cvtColor(ramp, cv2.COLOR_GRAY2BGR))
+    np.testing.assert_array_equal(read_gray(path), ramp)
+    gray, color = read_gray(path, stretch=True), read_color(path, 200)
+    assert_allclose(gray[5, [22, 100, 177]], [0, 128, 255], atol=4)
+    assert (gray[:, :15] == 255).all()
+    assert not gray[:, -15:].any()
+    np.testing.assert_array_equal(color, np.dstack([gray] * 3))
+    np.testing.assert_array_equal(read_color(path, 200, stretch=False)[..., 0], ramp)
+
+
+@pytest.mark.parametrize("value_range", [(0, 255), (40, 220), (100, 108), (77, 77)])
+def test_tones_stay_where_contrast_is_good_or_nothing_is_seen(value_range: tuple[int, int]) -> None:
+    image = np.tile(np.linspace(*value_range, 100), (50, 1)).astype(np.uint8)
+    assert tones(image) is None
+
+
+def test_twelve_bits_in_sixteen_look_like_eight() -> None:
+    image = cv2.normalize(texture((160, 120), seed=3), None, 0, 255, cv2.NORM_MINMAX)
+    twelve = image.astype(np.uint16) * 16
+    deep = in_eight_bits(twelve, tones(twelve))
+    assert np.corrcoef(deep.ravel(), image.ravel())[0, 1] > 0.99
+    assert np.ptp(deep) == 255

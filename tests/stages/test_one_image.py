@@ -68,6 +68,23 @@ def test_blob_is_half_a_pixel_further_in_the_database_at_every_size(tmp_path, ma
     assert np.abs(offsets[found].mean(axis=0)).max() < MAX_BIAS_PX
 
 
+@pytest.mark.parametrize("stretch", [True, False])
+def test_faded_photograph_is_stretched_and_said_to_be(tmp_path, stretch):
+    photos = tmp_path / "photos"
+    write_blobs(photos / "good.png")
+    good = cv2.imread(str(photos / "good.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(photos / "good.png"), cv2.normalize(good, None, 0, 255, cv2.NORM_MINMAX))
+    cv2.imwrite(str(photos / "faded.png"), 90 + good // 5)
+    workspace = Workspace(tmp_path / "out")
+    recipe = load_recipe("default", [f"stretch_contrast={str(stretch).lower()}"])
+    with workspace.locked():
+        report = extract(Context(workspace), Inputs.of(photos), recipe)
+    counts = FeatureStore(workspace.features).num_keypoints()
+    assert (counts["faded.png"] > 0.9 * counts["good.png"]) == stretch
+    said = "is low in 1 of 2 photographs, such as faded.png; it was stretched"
+    assert [w.startswith(said) for w in report.warnings.values()] == [True] * stretch
+
+
 def test_features_of_a_shrunk_image_lie_within_the_stored_one(tmp_path):
     path = tmp_path / "noise.png"
     noise = np.random.default_rng(3).integers(0, 255, (301, 457), dtype=np.uint8)
