@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -69,7 +70,7 @@ def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorIm
     return shrink_to(in_eight_bits(image, tones(image) if stretch else None), max_size_px)
 
 
-def tones(image: NDArray[np.generic]) -> tuple[float, float] | None:
+def tones(image: NDArray[Any]) -> tuple[float, float] | None:
     """Return what is to be black and white of an (H, W[, 3]) image, None to leave it as it is.
 
     Scans of faded prints and 12 bits in a file of 16 fill a small part of the range, and detectors
@@ -89,7 +90,7 @@ def tones(image: NDArray[np.generic]) -> tuple[float, float] | None:
 
 
 def in_eight_bits(
-    image: NDArray[np.generic], black_and_white: tuple[float, float] | None = None
+    image: NDArray[Any], black_and_white: tuple[float, float] | None = None
 ) -> NDArray[np.uint8]:
     """Return an image of 8 or 16 bits or of floats from 0 to 1 in 8 bits."""
     if black_and_white:
@@ -135,7 +136,7 @@ def _encode(suffix: str, image: NDArray[np.uint8], settings: list[int]) -> bytes
 GRAY_AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 
-def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[np.generic]:
+def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
     """Read an image, by default as gray in the type it is stored in; ImageError if it is none."""
     if path.exists() and not path.is_file():
         raise ImageError(f"{path}: is not a file")

@@ -32,6 +32,10 @@ Found = TypeVar("Found")
 class MatcherOptions(NetworkOptions):
     """Base of the options of all matchers."""
 
+    filter_stationary_matches: bool = True
+    """Leave out matches that do not move where those of other pairs do not either: captions,
+    frames of scans, watermarks."""
+
     def require_extractor(self, extractor: str) -> None:
         """Raise OptionError for a feature extractor whose features cannot be matched.
 

@@ -17,6 +17,7 @@ the attribute ``complete``, of another program, does not count.
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -40,6 +41,7 @@ from colmap_affrect.project.atomic_files import (
 
 FORMAT_VERSION = 2
 MAX_INT16 = 32767
+STATIONARY = "stationary_cells"
 
 
 @dataclass(frozen=True)
@@ -376,6 +378,19 @@ class MatchStore(_Store):
                     or file[key].attrs.get("tried_level")
                 ):
                     del file[key]
+
+    def stationary_cells(self) -> dict[tuple[int, int], NDArray[np.int64]]:
+        """Return the (N, 2) cells that never move by size of photographs (stages/stationary)."""
+        if not self.path.exists():
+            return {}
+        with self._open("r") as file:
+            known = json.loads(file.attrs.get(STATIONARY, "[]"))
+        return {tuple(size): np.array(cells, np.int64).reshape(-1, 2) for size, cells in known}
+
+    def record_stationary_cells(self, cells: Mapping[tuple[int, int], NDArray[np.int64]]) -> None:
+        """Keep the cells that never move."""
+        with self._open("a") as file:
+            file.attrs[STATIONARY] = json.dumps([(s, found.tolist()) for s, found in cells.items()])
 
     def mark_tried(self, pairs: Iterable[tuple[str, str]], level: int) -> None:
         """Record that a level was tried for pairs, which keep the matches they have."""

@@ -62,6 +62,7 @@ from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, recorded_m
 from colmap_affrect.stages.one_image import ImageExtractor
 from colmap_affrect.stages.one_pair import iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
+from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import extracted_px, recorded_verification, verify_new
 
 
@@ -346,7 +347,7 @@ class Escalation:
         self, pairs: Sequence[Pair], level: int
     ) -> Generator[PairMatches, None, None]:
         chosen = self.extraction.levels[level]
-        return iterate_matches(
+        found_pairs = iterate_matches(
             pairs,
             self.features,
             chosen.matching or self.matching,
@@ -356,6 +357,10 @@ class Escalation:
             chosen.features.name,
             chosen.base,
         )
+        stationary = StationaryFilter(self.features, self.matches)
+        with closing(found_pairs):
+            for found in found_pairs:
+                yield stationary.filtered(found)
 
     def _images_to_extend(self, pairs: Sequence[Pair], level: int) -> list[str]:
         names = sorted({name for pair in pairs for name in pair})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -18,6 +19,9 @@ from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import recorded_extraction, write_images_and_keypoints
 from colmap_affrect.stages.one_pair import iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
+from colmap_affrect.stages.stationary import StationaryFilter
+
+logger = logging.getLogger(__name__)
 
 PAIRS_PER_WRITE = 64
 
@@ -59,8 +63,14 @@ def match(
     missing = [pair for pair in pairs if pair_key(*pair) not in done]
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance)
+    warnings = {}
+    stationary = StationaryFilter(context.features, context.matches)
+    if options.filter_stationary_matches and missing and (line := stationary.learn(pairs)):
+        warnings["matches"] = line
+        logger.warning("matches: %s", line)
     write_matches(context, pairs)
-    return StageReport("match", time.perf_counter() - start, len(missing), len(done))
+    wall_s = time.perf_counter() - start
+    return StageReport("match", wall_s, len(missing), len(done), warnings=warnings)
 
 
 def match_pairs(
@@ -71,6 +81,7 @@ def match_pairs(
 ) -> None:
     """Match pairs by the features that every image has, and store them batch by batch."""
     matches = context.matches
+    stationary = StationaryFilter(context.features, matches)
     batch: list[PairMatches] = []
     written = time.monotonic()
     try:
@@ -86,7 +97,7 @@ def match_pairs(
             )
         ) as found_pairs:
             for found in found_pairs:
-                batch.append(found)
+                batch.append(stationary.filtered(found))
                 advance(1)
                 is_due = time.monotonic() - written > SECONDS_PER_WRITE
                 if len(batch) == PAIRS_PER_WRITE or is_due:

@@ -1,0 +1,152 @@
+"""Matches that never move: captions, frames of scans, watermarks, dust on the sensor.
+
+Such a thing is at the same place of many photographs, whatever they show. Its matches tell a
+camera that does not move, and can outvote those of the scene.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.data import Mask
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
+
+logger = logging.getLogger(__name__)
+
+MAX_MOTION_FRAC = 0.0025
+"""Of the longer side: what moves less has not moved. COLMAP has 4 px, as this of 1600 px."""
+NUM_CELLS = 48
+"""Cells along the longer side."""
+MIN_NUM_PAIRS = 3
+MIN_NUM_IMAGES = 4
+"""Two views of a camera that did not turn have places that stay where they are; four have none."""
+MIN_SHARE = 0.5
+"""Of the pairs that have a match in a cell."""
+MAX_SHARE_OF_PHOTOGRAPH = 0.5
+"""Where more of what is matched never moves it is the camera that stands still."""
+
+Size = tuple[int, int]
+
+
+@dataclass
+class _Evidence:
+    """What the pairs of photographs of one size say, by cell: numbers of pairs, and images."""
+
+    matched: NDArray[np.int64]
+    still: NDArray[np.int64]
+    images: defaultdict[tuple[int, int], set[str]] = field(default_factory=lambda: defaultdict(set))
+
+    @classmethod
+    def empty(cls, size: Size) -> _Evidence:
+        width, height = _cells(np.array([size], np.float64) - 1.0, size)[0] + 1
+        return cls(np.zeros((height, width), np.int64), np.zeros((height, width), np.int64))
+
+    def places(self) -> Mask:
+        """Return the cells that nothing moves in."""
+        found = (self.still >= MIN_NUM_PAIRS) & (self.still >= MIN_SHARE * self.matched)
+        for row, column in np.argwhere(found):
+            found[row, column] = len(self.images[column, row]) >= MIN_NUM_IMAGES
+        num_matched = np.count_nonzero(self.matched >= MIN_NUM_PAIRS)
+        if np.count_nonzero(found) > MAX_SHARE_OF_PHOTOGRAPH * num_matched:
+            return np.zeros_like(found)
+        return found
+
+
+class StationaryFilter:
+    """Drops the matches of pairs that lie where nothing moves.
+
+    Where that is the file of matches knows, as long as it exists.
+    """
+
+    def __init__(self, features: FeatureStore, matches: MatchStore) -> None:
+        """Name the files; what is known of places is read now."""
+        self._features, self._matches = features, matches
+        self._points = lru_cache(256)(lambda name: features.read_frames(name)[:, :, 2])
+        self._places = {
+            size: _enlarged(cells) for size, cells in matches.stationary_cells().items()
+        }
+
+    @cached_property
+    def _sizes(self) -> dict[str, Size]:
+        return self._features.image_sizes()
+
+    def filtered(self, found: PairMatches) -> PairMatches:
+        """Return the matches of a pair without those that never move."""
+        size = self._common_size(found.names) if self._places else None
+        if size is None or size not in self._places:
+            return found
+        still, cells = self._still(found, size)
+        left = ~(still & self._places[size][cells[:, 1], cells[:, 0]])
+        return replace(found, indices=found.indices[left], scores=found.scores[left])
+
+    def learn(self, pairs: Sequence[Pair]) -> str:
+        """Look for places in all matches, and drop those there; return a line, empty if none."""
+        known = self._matches.stationary_cells()
+        found = {size: cells for size, cells in self._find(pairs).items() if len(cells)}
+        if not found:
+            return ""
+        for size, cells in found.items():
+            known[size] = np.unique(np.concatenate([known.get(size, cells), cells]), axis=0)
+            self._places[size] = _enlarged(known[size])
+        self._matches.record_stationary_cells(known)
+        num_pairs = num_matches = 0
+        for pair in pairs:
+            (before,) = self._matches.read([pair])
+            after = self.filtered(before)
+            if len(after.indices) < len(before.indices):
+                self._matches.write([after])
+                num_pairs += 1
+                num_matches += len(before.indices) - len(after.indices)
+        return (
+            f"{num_matches} matches of {num_pairs} pairs never move (a caption, a frame or a "
+            "watermark?) and were left out (--set matching.filter_stationary_matches=false keeps "
+            "them)"
+        )
+
+    def _find(self, pairs: Sequence[Pair]) -> dict[Size, NDArray[np.int64]]:
+        """Return the (N, 2) cells, column and row, of each size of photographs."""
+        evidence: dict[Size, _Evidence] = {}
+        alike = [pair for pair in pairs if self._common_size(pair)]
+        for found in self._matches.read(alike):
+            size = self._sizes[found.names[0]]
+            of_size = evidence.setdefault(size, _Evidence.empty(size))
+            still, cells = self._still(found, size)
+            of_size.matched[tuple(np.unique(cells, axis=0).T[::-1])] += 1
+            for column, row in np.unique(cells[still], axis=0).tolist():
+                of_size.still[row, column] += 1
+                of_size.images[column, row].update(found.names)
+        return {size: np.argwhere(e.places())[:, ::-1] for size, e in evidence.items()}
+
+    def _still(self, found: PairMatches, size: Size) -> tuple[Mask, NDArray[np.int64]]:
+        """Tell which matches do not move; also the (M, 2) cells, column and row, they begin in."""
+        first, second = (
+            self._points(name)[found.indices[:, side]] for side, name in enumerate(found.names)
+        )
+        motion = np.linalg.norm(second - first, axis=1)
+        return motion <= MAX_MOTION_FRAC * max(size), _cells(first, size)
+
+    def _common_size(self, pair: Pair) -> Size | None:
+        size = self._sizes[pair[0]]
+        return size if size == self._sizes[pair[1]] else None
+
+
+def _cells(points: NDArray[np.floating], size: Size) -> NDArray[np.int64]:
+    """Return the (N, 2) cells, column and row, of (N, 2) points in pixel-centre px."""
+    inside = np.clip(points + 0.5, 0.0, np.array(size) - 1e-6)
+    return np.asarray(inside * (NUM_CELLS / max(size)), np.int64)
+
+
+def _enlarged(cells: NDArray[np.int64]) -> Mask:
+    """Return a mask of cells and those beside them: what is faint there matches less often."""
+    mask = np.zeros((NUM_CELLS, NUM_CELLS), np.uint8)
+    mask[cells[:, 1], cells[:, 0]] = 1
+    return np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0)
