@@ -330,6 +330,14 @@ def inspect(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
+def convert(options: argparse.Namespace) -> int:
+    from colmap_affrect.images.conversion import convert_images
+
+    report = convert_images(options.image_path, options.converted_path, given.progress(options))
+    show(report.summary())
+    return EXIT_FAILED if report.failures else EXIT_OK
+
+
 def recipes(options: argparse.Namespace) -> int:
     import tomli_w
 

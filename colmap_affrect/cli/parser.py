@@ -33,6 +33,7 @@ EXAMPLES = (
     "compare --image-path photos --output-path out --methods sift,default --seeds 0",
     "evaluate evd --dataset-path EVD --output-path out \\\n"
     "      --recipes unrectified-rootsift,default,on-demand",
+    "convert --image-path scans --output-path photos",
     "inspect photos/a.jpg --output-path out",
     "recipes",
     "recipes on-demand",
@@ -140,6 +141,9 @@ COMMANDS: dict[str, Command] = {
         (*args.RESULTS, *args.EVALUATION, *args.RESOURCES, *args.DEPTH,
         args.seed("of the estimators and the statistics", default=0),
         args.json("print evaluation.json, no tables"))),
+    "convert": (commands.convert,
+        "a folder of photographs in formats that COLMAP reads: JPEG 2000, WebP, HEIC, pages",
+        (args.IMAGE_PATH, args.CONVERTED_PATH, args.VOLUME)),
     "inspect": (commands.inspect,
         "draw what a recipe does to one image: regions, warps, features; the plan as JSON",
         (args.OUTPUT_PATH, args.VOLUME, args.IMAGE, *args.MASKS, *args.recipe(), *args.RESOURCES,

@@ -155,10 +155,16 @@ def left_out(image_path: Path) -> dict[str, str]:
         + (
             f"{_odd(names[0])}; rename it"
             if kind == "names"
-            else "COLMAP or OpenCV cannot read this format; convert to PNG or JPEG"
+            else "COLMAP or OpenCV cannot read this format; colmap-affrect convert makes PNG"
         )
         for kind, names in found.items()
     }
+
+
+def photograph_files(folder: Path) -> list[str]:
+    """Return the sorted names of all photographs below a folder, in whatever format."""
+    suffixes = (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES)
+    return [name for name in _visible_files(folder) if _suffix(name) in suffixes]
 
 
 def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:

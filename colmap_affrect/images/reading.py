@@ -144,12 +144,11 @@ def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
         raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
-    for name, pattern in FOREIGN_FORMATS.items():
-        if re.match(pattern, data[:16].tobytes(), re.DOTALL):
-            raise ImageError(
-                f"{path}: is a {name} file, a format that COLMAP cannot read; convert it to PNG or "
-                "JPEG"
-            )
+    if name := _foreign(data[:16].tobytes()):
+        raise ImageError(
+            f"{path}: is a {name} file, a format that COLMAP cannot read; convert it to PNG or "
+            "JPEG (colmap-affrect convert)"
+        )
     try:
         image = cv2.imdecode(data, flags) if data.size else None
     except cv2.error:  # for one, of more pixels than OpenCV takes
@@ -157,6 +156,17 @@ def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
     if image is None:
         raise ImageError(f"{path}: not a readable image (damaged, empty, or of an unknown format)")
     return np.asarray(image)
+
+
+def foreign_format(path: Path) -> str:
+    """Return the format of a file that COLMAP cannot read, whatever its suffix, else nothing."""
+    with path.open("rb") as file:
+        return _foreign(file.read(16))
+
+
+def _foreign(beginning: bytes) -> str:
+    found = (n for n, p in FOREIGN_FORMATS.items() if re.match(p, beginning, re.DOTALL))
+    return next(found, "")
 
 
 def shrink_to(image: NDArray[np.uint8], max_size_px: int) -> NDArray[np.uint8]:

@@ -22,8 +22,8 @@ from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
 
-MAX_MOTION_FRAC = 0.0025
-"""Of the longer side: what moves less has not moved. COLMAP has 4 px, as this of 1600 px."""
+MAX_MOTION_FRAC = 0.005
+"""Of the longer side: what moves less has not moved; scans are not cut to the pixel."""
 NUM_CELLS = 48
 """Cells along the longer side."""
 MIN_NUM_PAIRS = 3

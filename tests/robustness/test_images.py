@@ -129,7 +129,7 @@ def test_formats_that_colmap_cannot_read_are_reported(mixed: Mixed) -> None:
     warnings = mixed.ended.report["stages"][0]["warnings"]
     assert set(warnings) == {"*.webp", "*.gif", "contrast"}
     assert warnings["*.webp"].startswith("2 left out, such as side/y.WebP: ")
-    assert "convert to PNG or JPEG" in warnings["*.gif"]
+    assert "colmap-affrect convert makes PNG" in warnings["*.gif"]
     assert any("*.gif: 1 left out, such as z.gif" in line for line in mixed.ended.stderr)
 
 

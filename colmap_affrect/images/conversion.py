@@ -1,0 +1,145 @@
+"""Photographs in formats that COLMAP cannot read, as PNG: JPEG 2000, WebP, AVIF, HEIC, pages."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+from PIL import Image, TiffImagePlugin, UnidentifiedImageError
+
+from colmap_affrect.errors import ImageError
+from colmap_affrect.images.photographs import photograph_files
+from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format
+from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.atomic_files import replace_bytes
+
+AS_STORED = ("1", "L", "I;16", "RGB")
+"""Pillow's modes that PNG holds and COLMAP reads; others become RGB."""
+
+
+NEW_SUBFILE_TYPE, REDUCED = 254, 1
+"""TIFF's tag, and its bit of a smaller copy of another page."""
+
+
+@dataclass
+class ConversionReport:
+    """What became of the files of a folder.
+
+    Attributes:
+        written: names of the files that were converted, with those that were made of them.
+        copied: names of the files that COLMAP can read as they are.
+        kept: names of the files that had been there before.
+        failures: names of the files that cannot be read, with the reason.
+    """
+
+    written: dict[str, list[str]] = field(default_factory=dict)
+    copied: list[str] = field(default_factory=list)
+    kept: list[str] = field(default_factory=list)
+    failures: dict[str, str] = field(default_factory=dict)
+
+    def summary(self) -> str:
+        """Return one line, and one for each file that failed."""
+        made = sum(len(names) for names in self.written.values())
+        line = f"{len(self.written)} files converted into {made} PNG, {len(self.copied)} copied"
+        kept = f", {len(self.kept)} already there" if self.kept else ""
+        return "\n".join([line + kept, *(f"not {n}: {why}" for n, why in self.failures.items())])
+
+
+def convert_images(
+    image_path: Path, output_path: Path, progress: Progress = SILENT
+) -> ConversionReport:
+    """Fill a folder with the photographs of another one, all in formats that COLMAP reads.
+
+    Pages of a file become a file each, ``scan-page2.png``. EXIF, its orientation too, stays. What
+    is there already is not made again.
+
+    Raises:
+        ImageError: when there are no photographs, or the new folder is inside the old one.
+    """
+    if output_path.resolve().is_relative_to(image_path.resolve()):
+        raise ImageError(f"{output_path}: is inside {image_path}; give a folder beside it")
+    with suppress(ImportError):  # of the extra "heic"
+        from pillow_heif import register_heif_opener
+
+        register_heif_opener()
+    names, report = photograph_files(image_path), ConversionReport()
+    if not names:
+        raise ImageError(f"{image_path}: holds no photographs")
+    with progress.stage("convert", len(names), "images") as advance:
+        for name in names:
+            try:
+                _convert(image_path / name, output_path, name, report)
+            except ImageError as error:
+                report.failures[name] = str(error)
+            advance(1)
+    return report
+
+
+def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> None:
+    """Convert or copy one file."""
+    suffix = PurePosixPath(name).suffix.lower()
+    is_read = suffix in IMAGE_SUFFIXES and not foreign_format(path)
+    pages = _pages(path) if suffix in (".tif", ".tiff") or not is_read else [0]
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    if is_read and pages == [0]:
+        if (folder / name).exists():
+            report.kept.append(name)
+            return
+        shutil.copy2(path, folder / name)
+        report.copied.append(name)
+        return
+    made = [_page_name(name, number) for number in range(1, len(pages) + 1)]
+    if all((folder / target).exists() for target in made):
+        report.kept.append(name)
+        return
+    with _opened(path) as image:
+        for target, page in zip(made, pages, strict=True):
+            image.seek(page)
+            replace_bytes(folder / target, _png(image, path))
+    report.written[name] = made
+
+
+def _page_name(name: str, page: int) -> str:
+    """Return what a page is called; the suffix stays, since a.jp2 may lie beside a.png.
+
+    >>> _page_name("box/a.jp2", 1), _page_name("b.tif", 2)
+    ('box/a.jp2.png', 'b.tif-page2.png')
+    """
+    return f"{name}-page{page}.png" if page > 1 else f"{name}.png"
+
+
+def _pages(path: Path) -> list[int]:
+    """Return the numbers of the pages of a TIFF without its previews; else of the first image."""
+    with _opened(path) as image:
+        if not isinstance(image, TiffImagePlugin.TiffImageFile):
+            return [0]
+        found = []
+        for page in range(image.n_frames):
+            image.seek(page)
+            if not image.tag_v2.get(NEW_SUBFILE_TYPE, 0) & REDUCED:
+                found.append(page)
+        return found or [0]
+
+
+def _opened(path: Path) -> Image.Image:
+    try:
+        return Image.open(path)
+    except UnidentifiedImageError as error:
+        heic = path.suffix.lower() in (".heic", ".heif")
+        hint = "; HEIC needs: pip install pillow-heif" if heic else ""
+        raise ImageError(f"{path}: is of a format that cannot be converted{hint}") from error
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise ImageError(f"{path}: cannot be read ({error})") from error
+
+
+def _png(page: Image.Image, path: Path) -> bytes:
+    try:
+        image = page if page.mode in AS_STORED else page.convert("RGB")
+        file = io.BytesIO()
+        image.save(file, "PNG", exif=page.getexif())
+    except (OSError, ValueError, SyntaxError) as error:
+        raise ImageError(f"{path}: cannot be read ({error})") from error
+    return file.getvalue()

@@ -1,0 +1,79 @@
+"""Folders of any formats become folders that COLMAP reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.errors import ImageError
+from colmap_affrect.images.conversion import convert_images
+from colmap_affrect.images.reading import decode
+
+FOCAL_LENGTH, EQUIVALENT, EXIF_IFD = 0x920A, 0xA405, 0x8769
+
+
+def picture(seed: int) -> Image.Image:
+    values = np.random.default_rng(seed).integers(0, 256, (30, 45, 3), np.uint8)
+    return Image.fromarray(values)
+
+
+def exif() -> Image.Exif:
+    tags = Image.Exif()
+    tags.get_ifd(EXIF_IFD)[FOCAL_LENGTH] = 50.0
+    tags.get_ifd(EXIF_IFD)[EQUIVALENT] = 80
+    return tags
+
+
+@pytest.fixture
+def scans(tmp_path: Path) -> Path:
+    folder = tmp_path / "scans"
+    (folder / "box").mkdir(parents=True)
+    picture(1).save(folder / "box" / "a.jp2", quality_layers=[0])  # lossless
+    picture(2).save(folder / "b.webp", lossless=True, exif=exif())
+    picture(3).save(folder / "c.jpg")
+    deep = Image.fromarray(np.arange(1350, dtype=np.uint16).reshape(30, 45) * 40)
+    preview = Image.fromarray(np.zeros((3, 4), np.uint8))
+    preview.encoderinfo = {"tiffinfo": {254: 1}}
+    deep.save(folder / "d.tif", save_all=True, append_images=[preview, picture(5).convert("L")])
+    picture(6).save(folder / "truly-webp.png", format="webp")
+    (folder / "broken.jp2").write_bytes(b"\x00\x00\x00\x0cjP  \r\n\x87\n")
+    return folder
+
+
+def test_every_photograph_arrives_as_colmap_reads_it(scans: Path, tmp_path: Path) -> None:
+    out = tmp_path / "photos"
+    report = convert_images(scans, out)
+    assert list(report.failures) == ["broken.jp2"]
+    assert report.written == {
+        "b.webp": ["b.webp.png"],
+        "box/a.jp2": ["box/a.jp2.png"],
+        "d.tif": ["d.tif.png", "d.tif-page2.png"],
+        "truly-webp.png": ["truly-webp.png.png"],
+    }
+    assert report.copied == ["c.jpg"]
+    assert (out / "c.jpg").read_bytes() == (scans / "c.jpg").read_bytes()
+    np.testing.assert_array_equal(Image.open(out / "box" / "a.jp2.png"), picture(1))
+    deep = decode(out / "d.tif.png")
+    assert (deep.dtype, int(deep[29, 44])) == (np.uint16, 1349 * 40)
+    np.testing.assert_array_equal(decode(out / "d.tif-page2.png"), picture(5).convert("L"))
+    for path in sorted(out.rglob("*.png")):
+        assert pycolmap.Bitmap.read(path, as_rgb=False) is not None
+    bitmap = pycolmap.Bitmap.read(out / "b.webp.png", as_rgb=True)
+    assert bitmap.exif_focal_length() == pytest.approx(80 / 43.27 * np.hypot(45, 30), rel=0.01)
+
+
+def test_what_is_there_is_not_made_again(scans: Path, tmp_path: Path) -> None:
+    convert_images(scans, tmp_path / "photos")
+    (tmp_path / "photos" / "d.tif-page2.png").unlink()
+    report = convert_images(scans, tmp_path / "photos")
+    assert list(report.written) == ["d.tif"]
+    assert report.kept == ["b.webp", "box/a.jp2", "c.jpg", "truly-webp.png"]
+
+
+def test_new_folder_inside_the_old_one_is_refused(scans: Path) -> None:
+    with pytest.raises(ImageError, match="give a folder beside it"):
+        convert_images(scans, scans / "png")
