@@ -166,7 +166,7 @@ def verify(
     """
     path = Path(database_path)
     verification = _verification_options(options, random_seed)
-    refuse_unusable(path, path)
+    refuse_unusable(path)
     if pairs_path is None:
         verify_database(path, verification)
     else:
@@ -228,7 +228,7 @@ def incremental_mapping(
     native = _pipeline_options(options)
     mapper = MAPPERS.make(_mapper_options(native))
     database, output = Path(database_path), Path(output_path)
-    refuse_unusable(database, database)
+    refuse_unusable(database)
     existing = None
     if _given_path(input_path):
         extension = Extension(Path(input_path), refine_existing=not native.fix_existing_frames)
