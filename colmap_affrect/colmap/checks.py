@@ -63,7 +63,8 @@ CHECKS: dict[str, Check] = {
     "keypoint-data": ("error",
         "images whose keypoints have more or less data than rows and columns",
         "extract these images again into a new database"),
-    "keypoints-not-finite": ("error", "images with keypoints that are not finite numbers",
+    "keypoints-not-finite": ("error",
+        "images with keypoints that are not finite numbers, or are where no image reaches",
         "extract these images again into a new database"),
     "keypoints-outside": ("warning", "images with keypoints outside of them",
         "see that they were found in the images as stored: not rotated, not resized"),
@@ -416,7 +417,7 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
             found["keypoint-data"].append(name)
         elif not count:
             found["no-keypoints"].append(name)
-        elif not np.isfinite(keypoints).all():
+        elif not (np.abs(keypoints) <= MAX_SIDE_PX).all():
             found["keypoints-not-finite"].append(name)
         elif _are_outside(keypoints, tables.cameras.get(tables.camera_ids[image_id])):
             found["keypoints-outside"].append(name)
