@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.reading import DAMAGED, open_read_only
 from colmap_affrect.errors import DatabaseError
 
 Severity = Literal["error", "warning", "note"]
@@ -34,6 +35,9 @@ CHECKS: dict[str, Check] = {
         "import these images again into a new database"),
     "camera-model": ("error", "cameras of a model that COLMAP does not have",
         "import their images again into a new database"),
+    "camera-panorama": ("warning", "cameras that look all around, which have no focal length",
+        "cut perspective views out of the panoramas, as COLMAP's example panorama.py does, and "
+        "give these"),
     "camera-size": ("error", "cameras of a size that no photograph has",
         "import their images again into a new database"),
     "camera-params": ("error",
@@ -59,7 +63,8 @@ CHECKS: dict[str, Check] = {
     "keypoint-data": ("error",
         "images whose keypoints have more or less data than rows and columns",
         "extract these images again into a new database"),
-    "keypoints-not-finite": ("error", "images with keypoints that are not finite numbers",
+    "keypoints-not-finite": ("error",
+        "images with keypoints that are not finite numbers, or are where no image reaches",
         "extract these images again into a new database"),
     "keypoints-outside": ("warning", "images with keypoints outside of them",
         "see that they were found in the images as stored: not rotated, not resized"),
@@ -98,7 +103,7 @@ Problems = dict[str, list[str]]
 """What was found: by kind, the images, pairs or cameras concerned, none if it is the database."""
 
 FATAL_FOR_IMAGES = frozenset(
-    {"no-camera", "camera-model", "camera-size", "camera-params", "frame-links"}
+    {"no-camera", "camera-model", "camera-panorama", "camera-size", "camera-params", "frame-links"}
 )
 """Problems of cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
 
@@ -120,9 +125,6 @@ MATRICES = {
     ("rig_sensors", "sensor_id"): {"sensor_from_rig": 7},
 }
 """Columns that hold so many float64 or nothing, by table and its key."""
-
-DAMAGED = (sqlite3.Error, UnicodeDecodeError)
-"""What sqlite3 raises on damaged files; its messages may quote bytes that are not UTF-8."""
 
 MAX_NUM_IMAGES = 2**31 - 1
 """COLMAP's id of a pair is the smaller image id times this, plus the larger one."""
@@ -212,51 +214,55 @@ def pair_images(pair_id: int) -> tuple[int, int]:
     return pair_id // MAX_NUM_IMAGES, pair_id % MAX_NUM_IMAGES
 
 
-def refuse_unusable(path: Path, called: Path, kinds: Collection[str] = FATAL) -> None:
+def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
     """Refuse a database with problems that would end the process inside COLMAP.
 
     Args:
-        path: of the database.
-        called: its name in messages, which it is a copy of.
+        path: of the database, which is only read.
         kinds: of problems, keys of ``CHECKS``.
 
     Raises:
         DatabaseError: when it is damaged or has such a problem; one line.
     """
-    try:
-        _, problems = check_database(path)
-    except DatabaseError as error:
-        raise DatabaseError(str(error).replace(str(path), str(called))) from error
+    with open_read_only(path) as connection:
+        _, problems = _check(connection, path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         _, what, advice = CHECKS[kind]
         more = ", ..." if len(problems[kind]) > MAX_SHOWN else ""
         items = ", ".join(problems[kind][:MAX_SHOWN])
-        raise DatabaseError(f"{called}: {what} ({items}{more}); {advice.format(path=called)}")
+        raise DatabaseError(f"{path}: {what} ({items}{more}); {advice.format(path=path)}")
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:
     """Check a database that nobody is writing to; DatabaseError if damaged."""
-    found: Problems = defaultdict(list)
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
-            connection.text_factory = lambda data: data.decode("utf-8", "replace")
-            (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-            if verdict != "ok":
-                raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
-            tables = _read_tables(connection)
-            _check_cameras(tables, found)
-            _check_links(connection, found)
-            _check_matrices(connection, found)
-            if tables.names:
-                _check_images(tables, found)
-                _check_keypoints(connection, tables, found)
-            else:
-                found["no-images"] = []
-            _check_descriptors(tables, found)
-            if tables.matches or tables.geometries:
-                _check_pairs(connection, tables, found)
-            elif tables.names:
-                found["no-matches"] = []
+            return _check(connection, path)
+    except DAMAGED as error:
+        raise DatabaseError(f"{path}: damaged ({error})") from error
+
+
+def _check(connection: sqlite3.Connection, path: Path) -> tuple[Tables, Problems]:
+    found: Problems = defaultdict(list)
+    try:
+        connection.text_factory = lambda data: data.decode("utf-8", "replace")
+        (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+        if verdict != "ok":
+            raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
+        tables = _read_tables(connection)
+        _check_cameras(tables, found)
+        _check_links(connection, found)
+        _check_matrices(connection, found)
+        if tables.names:
+            _check_images(tables, found)
+            _check_keypoints(connection, tables, found)
+        else:
+            found["no-images"] = []
+        _check_descriptors(tables, found)
+        if tables.matches or tables.geometries:
+            _check_pairs(connection, tables, found)
+        elif tables.names:
+            found["no-matches"] = []
     except (*DAMAGED, TypeError, ValueError, OverflowError) as error:
         raise DatabaseError(f"{path}: damaged ({error})") from error
     return tables, dict(found)
@@ -332,11 +338,13 @@ def _numbers(rows: Iterable[Any]) -> dict[int, tuple[int, int]]:
 def _check_cameras(tables: Tables, found: Problems) -> None:
     for camera_id, camera in tables.cameras.items():
         label = f"camera {camera_id}"
-        count = _num_params(camera.model)
-        if not count:
+        like = _camera_like(camera.model)
+        if not like:
             found["camera-model"].append(f"{label}: model {camera.model}")
             continue
-        params = _array(camera.params, 1, count, np.dtype("<f8"))
+        if not len(like.focal_length_idxs()):
+            found["camera-panorama"].append(f"{label}: {like.model.name}")
+        params = _array(camera.params, 1, len(like.params), np.dtype("<f8"))
         if params is None or not np.isfinite(params).all():
             found["camera-params"].append(label)
         if not all(0 < side <= MAX_SIDE_PX for side in (camera.width, camera.height)):
@@ -344,13 +352,12 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
 
 
 @cache
-def _num_params(model: int) -> int:
-    """Return how many parameters cameras of a model of COLMAP have, 0 if there is no such model."""
+def _camera_like(model: int) -> pycolmap.Camera | None:
+    """Return a camera of a model of COLMAP by its number, None if there is no such model."""
     try:
-        made = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
+        return pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
     except (ValueError, RuntimeError, TypeError):
-        return 0
-    return len(made.params)
+        return None
 
 
 def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
@@ -410,7 +417,7 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
             found["keypoint-data"].append(name)
         elif not count:
             found["no-keypoints"].append(name)
-        elif not np.isfinite(keypoints).all():
+        elif not (np.abs(keypoints) <= MAX_SIDE_PX).all():
             found["keypoints-not-finite"].append(name)
         elif _are_outside(keypoints, tables.cameras.get(tables.camera_ids[image_id])):
             found["keypoints-outside"].append(name)

@@ -14,15 +14,10 @@ from functools import cache
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import DAMAGED, FATAL, FATAL_FOR_IMAGES, refuse_unusable
+from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.reading import DAMAGED, open_read_only
 from colmap_affrect.errors import DatabaseError
-
-TABLES = {"cameras", "images", "keypoints", "matches"}
-"""Tables that databases of all versions of COLMAP have."""
-
-HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")
-"""How a rollback journal begins while its changes are not complete."""
 
 
 def schema_version(path: Path) -> int:
@@ -30,7 +25,7 @@ def schema_version(path: Path) -> int:
 
     Raises DatabaseError when the file is missing or no COLMAP database.
     """
-    with _open_read_only(path) as connection:
+    with open_read_only(path) as connection:
         version = connection.execute("PRAGMA user_version").fetchone()[0]
     return int(version)
 
@@ -58,7 +53,7 @@ def copy_as_it_is(source: Path, target: Path) -> None:
             f"{pycolmap.__version__} knows {newest}); update pycolmap"
         )
     try:
-        with _open_read_only(source) as original, closing(sqlite3.connect(target)) as copy:
+        with open_read_only(source) as original, closing(sqlite3.connect(target)) as copy:
             original.backup(copy)
     except DAMAGED as error:
         raise DatabaseError(f"cannot copy {source} to {target}: {error}") from error
@@ -74,12 +69,12 @@ def copy_database(source: Path, target: Path, refused: Collection[str] = ()) -> 
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
+    if refused:
+        refuse_unusable(source, refused)
     new = target.with_name(target.name + ".new")
     new.unlink(missing_ok=True)
     try:
         copy_as_it_is(source, new)
-        if refused:
-            refuse_unusable(new, source, refused)
         with open_database(new):
             pass  # COLMAP migrates it
         new.replace(target)
@@ -146,43 +141,12 @@ def open_copy(source: Path) -> Iterator[pycolmap.Database]:
     """Open a temporary :func:`copy_database`; the original stays as it is."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "database.db"
-        copy_database(source, copy, FATAL)
+        copy_database(source, copy, FATAL - {"camera-panorama"})
         with open_database(copy) as database:
             yield database
 
 
 def read_names(source: Path) -> list[str]:
     """Return the names of the images of a database, which is only read."""
-    with _open_read_only(source) as connection:
+    with open_read_only(source) as connection:
         return sorted(str(name) for (name,) in connection.execute("SELECT name FROM images"))
-
-
-@contextmanager
-def _open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a COLMAP database so that nothing can change it.
-
-    Without a write-ahead log or a journal nobody is writing to it, and it is opened as immutable:
-    SQLite then makes no files beside it, so that its folder may be read-only.
-    """
-    if not path.is_file():
-        raise DatabaseError(f"{path}: no such file; give a COLMAP database")
-    wal, journal = (path.with_name(path.name + suffix) for suffix in ("-wal", "-journal"))
-    mode = "mode=ro" if wal.exists() or journal.exists() else "immutable=1"
-    address = f"{path.resolve().as_uri()}?{mode}"
-    try:
-        with closing(sqlite3.connect(address, uri=True)) as connection:
-            rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-            missing = TABLES - {name for (name,) in rows}
-            if missing:
-                raise DatabaseError(
-                    f"{path}: not a COLMAP database (it has no table {min(missing)})"
-                )
-            yield connection
-    except DAMAGED as error:
-        if journal.exists() and journal.read_bytes()[:8] == HOT_JOURNAL:
-            raise DatabaseError(
-                f"{path}: a program that was writing to it was killed, or is still at work, and "
-                f"{journal.name} undoes the half of it; wait, or open it once with a program that "
-                f"may write, e.g. sqlite3 {path.name} .tables"
-            ) from error
-        raise DatabaseError(f"{path}: not a usable COLMAP database ({error})") from error

@@ -44,6 +44,7 @@ from colmap_affrect.images.exif import (
     exif_focal,
     read_camera_tags,
 )
+from colmap_affrect.images.headers import is_too_large
 from colmap_affrect.images.photographs import CameraOptions
 
 logger = logging.getLogger(__name__)
@@ -272,6 +273,7 @@ def import_images(
     for file in {path, new, read} if new != path else {read}:
         _remove_database(file)
     missing = sorted(set(names) - set(image_ids(new)))
+    missing = [name for name in missing if not is_too_large(initial.size(name))]
     if missing:
         require_database_space(new, 2 * len(missing))
         image_ids(read)  # makes it

@@ -13,7 +13,7 @@ import threading
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import log
+from math import log, prod
 from pathlib import Path
 from posixpath import splitext
 from typing import Annotated, Any, ClassVar, Literal, Protocol
@@ -26,6 +26,7 @@ from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError, WorkspaceError
 from colmap_affrect.images.depth_files import SUFFIXES, UnusableMap, read_map
+from colmap_affrect.images.headers import header_size
 from colmap_affrect.images.reading import read_color, shrink_to
 from colmap_affrect.options import PartOptions, Registry, within
 from colmap_affrect.project.atomic_files import replace_bytes
@@ -181,7 +182,8 @@ class DepthFiles:
                 f"{self._path}: no depth map of {photograph.name}; {self._places(photograph.name)}"
             )
         try:
-            values = read_map(path)
+            stored = photograph.path and header_size(photograph.path)
+            values = read_map(path, prod(stored or photograph.size))
             if path.suffix == ".png":
                 values = values * self._options.png_scale
             _require_same_aspect(values, photograph)

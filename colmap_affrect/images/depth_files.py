@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from math import prod
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 from zipfile import ZipFile, is_zipfile
 
 import cv2
@@ -22,34 +22,61 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_NUM_VALUES = 1 << 28
-"""Of a map; more is taken for damage."""
+MAX_NUM_VALUES_PER_PX = 4
+"""Of a map, for each pixel of its photograph; more is taken for damage."""
+
+MIN_LARGEST_MAP = 1 << 22
+"""A map of so many values is read whatever the size of the photograph."""
+
+
+EXR_WINDOW = b"dataWindow\0box2i\0\x10\0\0\0"
+"""What stands before the first and last column and row in a header of OpenEXR."""
+
+Require = Callable[..., None]
+"""Takes the shape of a map, and its type if it may be one that holds no numbers."""
 
 
 class UnusableMap(Exception):
     """Reason why a map cannot be used; the caller adds the file and the photograph."""
 
 
-def read_map(path: Path) -> NDArray[np.float64]:
-    """Read the (h, w) values of a file with one of ``SUFFIXES``; UnusableMap if it holds no map."""
+def read_map(path: Path, num_px: int) -> NDArray[np.float64]:
+    """Read the (h, w) values of a file with one of ``SUFFIXES``.
+
+    Raises:
+        UnusableMap: when it holds no map, or one that is too large for a photograph of so many
+            pixels.
+    """
+    max_num = max(MIN_LARGEST_MAP, MAX_NUM_VALUES_PER_PX * num_px)
+
+    def require(shape: Sequence[int], dtype: np.dtype[Any] | None = None) -> None:
+        """Refuse what a damaged or malicious header says before memory is taken for it."""
+        if prod(shape) > max_num:
+            raise UnusableMap(f"is of shape {tuple(shape)}, too large for a depth map of it")
+        if dtype is not None and dtype.kind not in "fiu":
+            raise _unexpected(shape, dtype)
+
     try:
-        values = _READERS[path.suffix](path)
+        values = _READERS[path.suffix](path, require)
     except UnusableMap:
         raise
     except Exception as error:  # damaged files make readers fail in any way
         raise UnusableMap("cannot be read; damaged, or not what its suffix says") from error
     if values.ndim != 2 or values.size == 0 or values.dtype.kind not in "fiu":
-        raise UnusableMap(
-            f"expected numbers of shape (height, width), found {values.dtype} of shape "
-            f"{values.shape}"
-        )
+        raise _unexpected(values.shape, values.dtype)
     return values.astype(np.float64)
 
 
-def _read_numpy(path: Path) -> NDArray[np.generic]:
+def _unexpected(shape: Sequence[int], dtype: np.dtype[Any]) -> UnusableMap:
+    return UnusableMap(
+        f"expected numbers of shape (height, width), found {dtype} of shape {tuple(shape)}"
+    )
+
+
+def _read_numpy(path: Path, require: Require) -> NDArray[np.generic]:
     with path.open("rb") as stream:
         if not is_zipfile(stream):
-            return _read_array(stream)
+            return _read_array(stream, require)
         with ZipFile(stream) as archive:
             names = sorted(name.removesuffix(".npy") for name in archive.namelist())
             if "depth" not in names and len(names) != 1:
@@ -57,10 +84,10 @@ def _read_numpy(path: Path) -> NDArray[np.generic]:
                     f"expected one array, or one named 'depth', found {_listed(names)}"
                 )
             with archive.open(f"{'depth' if 'depth' in names else names[0]}.npy") as member:
-                return _read_array(member)
+                return _read_array(member, require)
 
 
-def _read_array(stream: IO[bytes]) -> NDArray[np.generic]:
+def _read_array(stream: IO[bytes], require: Require) -> NDArray[np.generic]:
     """Read an array in the format of ``.npy``, never a pickle, when its header is sensible."""
     stream.seek(0)
     version = np.lib.format.read_magic(stream)
@@ -68,18 +95,13 @@ def _read_array(stream: IO[bytes]) -> NDArray[np.generic]:
         (1, 0): np.lib.format.read_array_header_1_0,
         (2, 0): np.lib.format.read_array_header_2_0,
     }[version]
-    _require_readable_size(read_header(stream)[0])
+    shape, _, dtype = read_header(stream)
+    require(shape, dtype)
     stream.seek(0)
     return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
 
 
-def _require_readable_size(shape: Sequence[int]) -> None:
-    """Refuse what a damaged or malicious header says before memory is taken for it."""
-    if prod(shape) > MAX_NUM_VALUES:
-        raise UnusableMap(f"claims to be of shape {tuple(shape)}, too large for a depth map")
-
-
-def _read_hdf5(path: Path) -> NDArray[np.generic]:
+def _read_hdf5(path: Path, require: Require) -> NDArray[np.generic]:
     maps: dict[str, h5py.Dataset] = {}
 
     def collect(name: str, item: h5py.Dataset | h5py.Group) -> None:
@@ -94,14 +116,17 @@ def _read_hdf5(path: Path) -> NDArray[np.generic]:
                 f"{_listed(maps)}"
             )
         chosen = maps["depth"] if "depth" in maps else next(iter(maps.values()))
-        _require_readable_size(chosen.shape)
+        require(chosen.shape, chosen.dtype)
+        if chosen.external or chosen.is_virtual:
+            raise UnusableMap("its values are in other files; save it as one file")
         return np.asarray(chosen[()])
 
 
-def _read_png(path: Path) -> NDArray[np.generic]:
+def _read_png(path: Path, require: Require) -> NDArray[np.generic]:
     data = np.fromfile(path, np.uint8)
-    if data[:8].tobytes() == b"\x89PNG\r\n\x1a\n":
-        _require_readable_size(data[16:24].view(">u4").tolist())  # width and height
+    if data[:8].tobytes() != b"\x89PNG\r\n\x1a\n":
+        raise ValueError
+    require(data[16:24].view(">u4").tolist())  # width and height
     values = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if values is None:
         raise ValueError
@@ -110,9 +135,13 @@ def _read_png(path: Path) -> NDArray[np.generic]:
     return np.asarray(values)
 
 
-def _read_exr(path: Path) -> NDArray[np.generic]:
+def _read_exr(path: Path, require: Require) -> NDArray[np.generic]:
+    data = np.fromfile(path, np.uint8)
+    window = data.tobytes().partition(EXR_WINDOW)[2][:16]
+    left, top, right, bottom = np.frombuffer(window, "<i4").tolist() or (0, 0, 0, 0)
+    require((bottom - top + 1, right - left + 1))
     try:
-        values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+        values = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:
         values = None
     if values is None:
@@ -127,7 +156,7 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(names) or "none"
 
 
-_READERS: dict[str, Callable[[Path], NDArray[np.generic]]] = {
+_READERS: dict[str, Callable[[Path, Require], NDArray[np.generic]]] = {
     ".npy": _read_numpy,
     ".npz": _read_numpy,
     ".png": _read_png,

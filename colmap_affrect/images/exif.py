@@ -7,7 +7,6 @@ keeps it as it was, so that every statement is held against the others and again
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,8 @@ from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image
+
+from colmap_affrect.images.headers import opened, stored_size
 
 FILM_DIAGONAL_MM = 43.27
 """Of 35 mm film, to which equivalent focal lengths refer (by COLMAP's rounding)."""
@@ -101,19 +102,14 @@ def read_camera_tags(path: Path) -> CameraTags | None:
     if not path.is_file():  # opening a pipe would wait for ever
         return None
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow warns of large photographs and broken EXIF
-            with Image.open(path) as image:
-                return _with_exif(image)
+        with opened(path) as image:
+            return _with_exif(image)
     except Exception:  # noqa: BLE001 - damaged files raise nearly anything in Pillow
         return None
 
 
 def _with_exif(image: Image.Image) -> CameraTags:
-    size = image.size
-    tiff: Any = getattr(image, "tag_v2", None)
-    if image.format == "TIFF" and tiff:  # Pillow turns what has an orientation
-        size = int(tiff[ExifTags.Base.ImageWidth]), int(tiff[ExifTags.Base.ImageLength])
+    size = stored_size(image)
     if image.format == "PNG" and "exif" not in image.info:  # else Pillow reads the pixels
         return CameraTags(size)
     try:

@@ -13,6 +13,7 @@ import numpy as np
 
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import ImageError, OptionError, StoreError
+from colmap_affrect.images.headers import header_size
 from colmap_affrect.images.masks import read_mask
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
@@ -77,15 +78,22 @@ class Photographs:
         """Return the (H, W) mask of an image, None where there are no masks.
 
         Raises:
-            ImageError: when a mask is missing or cannot be read.
+            ImageError: when a mask is missing, cannot be read or has another size.
         """
-        masks = []
-        if self.masks.path:
-            masks.append(read_mask(self._mask_path(name)))
-        if self.masks.camera_path:
-            masks.append(read_mask(Path(self.masks.camera_path)))
-        if len({mask.shape for mask in masks}) > 1:
-            raise ImageError(f"{self.folder / name}: its mask and the camera mask differ in size")
+        paths = [self._mask_path(name)] if self.masks.path else []
+        paths += [Path(self.masks.camera_path)] if self.masks.camera_path else []
+        size, masks = header_size(self.folder / name), list[Mask]()
+        for path in paths:
+            found = header_size(path)
+            if not size or found in (None, size):
+                masks.append(read_mask(path))
+                found = masks[-1].shape[1], masks[-1].shape[0]
+            size = size or found
+            if found != size:
+                raise ImageError(
+                    f"{self.folder / name}: is {size[0]} x {size[1]} px and its mask {found[0]} x "
+                    f"{found[1]} px ({path}); they must have one size"
+                )
         return np.logical_and.reduce(masks) if masks else None
 
     def _mask_path(self, name: str) -> Path:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 import re
+import struct
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import ExifTags
 
 from colmap_affrect import PYCOLMAP_CAME_FIRST
 from colmap_affrect.data import ColorImage, GrayImage
 from colmap_affrect.errors import ImageError
+from colmap_affrect.images.headers import require_possible
 
 IMAGE_SUFFIXES = (
     ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".pbm", ".pgm", ".pnm",
@@ -48,6 +52,10 @@ NUM_TONES = 250_000
 """About so many pixels are looked at."""
 FRAME_FRAC = 0.1
 """So much along each border says nothing about tones: scans have frames and captions there."""
+
+
+BIG_TIFF = 43
+"""What files of more than 4 GiB have in the place of 42, with offsets of 64 bits."""
 
 
 def read_gray(path: Path, *, stretch: bool = False) -> GrayImage:
@@ -140,6 +148,7 @@ def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
     """Read an image, by default as gray in the type it is stored in; ImageError if it is none."""
     if path.exists() and not path.is_file():
         raise ImageError(f"{path}: is not a file")
+    require_possible(path)
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
@@ -149,6 +158,7 @@ def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
             f"{path}: is a {name} file, a format that COLMAP cannot read; convert it to PNG or "
             "JPEG (colmap-affrect convert)"
         )
+    _forget_orientation_of_tiff(data)
     try:
         image = cv2.imdecode(data, flags) if data.size else None
     except cv2.error:  # for one, of more pixels than OpenCV takes
@@ -167,6 +177,25 @@ def foreign_format(path: Path) -> str:
 def _foreign(beginning: bytes) -> str:
     found = (n for n, p in FOREIGN_FORMATS.items() if re.match(p, beginning, re.DOTALL))
     return next(found, "")
+
+
+def _forget_orientation_of_tiff(data: NDArray[np.uint8]) -> None:
+    """Have the first picture of a TIFF stand upright: OpenCV turns it whatever the flags say."""
+    order = {b"II": "<", b"MM": ">"}.get(data[:2].tobytes())
+    if not order:
+        return
+    content = data.data
+    with suppress(struct.error):  # damaged
+        (version,) = struct.unpack_from(f"{order}H", content, 2)
+        where, offset, number, size = (
+            (8, "Q", "Q", 20) if version == BIG_TIFF else (4, "I", "H", 12)
+        )
+        (start,) = struct.unpack_from(order + offset, content, where)
+        (count,) = struct.unpack_from(order + number, content, start)
+        first = start + struct.calcsize(number)
+        for entry in range(first, min(first + count * size, data.size), size):
+            if struct.unpack_from(f"{order}H", content, entry) == (ExifTags.Base.Orientation,):
+                struct.pack_into(f"{order}H", content, entry + size - struct.calcsize(offset), 1)
 
 
 def shrink_to(image: NDArray[np.uint8], max_size_px: int) -> NDArray[np.uint8]:

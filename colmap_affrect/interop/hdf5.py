@@ -6,7 +6,6 @@ in the folder, and every value is checked before it reaches COLMAP.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.checks import MAX_SIDE_PX
 from colmap_affrect.colmap.database import (
     DESCRIPTOR_NORM,
     colmap_keypoints,
@@ -47,7 +47,7 @@ from colmap_affrect.interop.hdf5_layouts import (
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.stores import PairMatches
-from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.project.workspace import Workspace, temporary_folder
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.pairs import listed_pairs
 
@@ -121,9 +121,9 @@ def import_h5(
     with (
         open_files(features_path, matches_path, layout, names, image_path) as files,
         # Verification may take hours, and half a database must not be left behind.
-        tempfile.TemporaryDirectory(prefix=".import-h5-", dir=database_path.parent) as folder,
+        temporary_folder(database_path.parent) as folder,
     ):
-        new = Path(folder) / "new.db"
+        new = folder / "new.db"
         rejected = import_images(new, image_path, names, cameras)
         lost = sorted(files.keys.keys() & set(rejected))
         if lost:
@@ -276,7 +276,7 @@ def _read_keypoints(source: Source, key: str, pixel_origin: str) -> NDArray[np.f
                 raise StoreError(f"{source.path}: {scales} holds negative values")
             angles = np.deg2rad(source.read(oris, (count,)).astype(np.float32))
             keypoints = np.column_stack([centers, sigmas, angles])
-    if not np.isfinite(keypoints).all():
+    if not (np.abs(keypoints) <= MAX_SIDE_PX).all():
         raise StoreError(f"{source.path}: {path} or its shapes hold values that are too large")
     return keypoints
 

@@ -11,7 +11,6 @@ functions go on where an earlier call stopped.
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -37,7 +36,7 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.project.workspace import Workspace, temporary_folder
 from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe
 from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context, Resources
@@ -166,14 +165,14 @@ def verify(
     """
     path = Path(database_path)
     verification = _verification_options(options, random_seed)
-    refuse_unusable(path, path)
+    refuse_unusable(path)
     if pairs_path is None:
         verify_database(path, verification)
     else:
         _verify_pairs(path, read_pairs(Path(pairs_path), list(image_ids(path))), verification)
     if check_cameras:
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            records = Path(folder) / "cameras.json"
+        with temporary_folder(path.parent) as folder:
+            records = folder / "cameras.json"
             record_cameras(path, records)
             hold_vote(path, records, verification, may_share=False)
 
@@ -182,8 +181,8 @@ def _verify_pairs(path: Path, pairs: Sequence[Pair], verification: VerificationO
     """Verify in a copy that has the matches of these pairs only, and take over what is found."""
     ids = image_ids(path)
     wanted = {(min(pair), max(pair)) for pair in ((ids[one], ids[two]) for one, two in pairs)}
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        copy = Path(folder) / "database.db"
+    with temporary_folder(path.parent) as folder:
+        copy = folder / "database.db"
         copy_database(path, copy)
         with open_database(copy) as database:
             for pair_id in database.read_num_matches()[0]:
@@ -228,7 +227,7 @@ def incremental_mapping(
     native = _pipeline_options(options)
     mapper = MAPPERS.make(_mapper_options(native))
     database, output = Path(database_path), Path(output_path)
-    refuse_unusable(database, database)
+    refuse_unusable(database)
     existing = None
     if _given_path(input_path):
         extension = Extension(Path(input_path), refine_existing=not native.fix_existing_frames)
@@ -241,8 +240,8 @@ def incremental_mapping(
     )
     callbacks = _Callbacks(initial_image_pair_callback, next_image_callback, existing is not None)
     output.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=output) as folder:
-        found = Path(folder) / "sparse"
+    with temporary_folder(output) as folder:
+        found = folder / "sparse"
         try:
             map_database(mapper, task, found, callbacks.show)
         except KeyboardInterrupt as error:

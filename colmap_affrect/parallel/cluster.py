@@ -7,6 +7,7 @@ results are the same as here, because it must have the same versions of the pack
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import logging
 import pickle
@@ -17,7 +18,7 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,7 +31,7 @@ from colmap_affrect.parallel.executor import Result, Task, use_one_blas_thread
 from colmap_affrect.parallel.opencv_threads import use_one_opencv_thread
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client, Future, Security
 
 logger = logging.getLogger(__name__)
 
@@ -165,16 +166,10 @@ def connected(address: str) -> Iterator[Cluster]:
     # Tasks may contain large images: dask need not warn of that.
     images_are_large = {"distributed.admin.large-graph-warning-threshold": "1 TB"}
     with _silent("distributed"), config.set(images_are_large):
-        try:
-            client = Client(
-                address, timeout=CONNECT_TIMEOUT_S, security=security, set_as_default=False
-            )
-        except OSError as error:
-            raise ClusterError(
-                f"--scheduler {address}: no scheduler answers ({error}); give the address that "
-                "'dask scheduler' prints"
-            ) from error
-        with client:
+        _require_scheduler(address, security)
+        with Client(
+            address, timeout=CONNECT_TIMEOUT_S, security=security, set_as_default=False
+        ) as client:
             cluster = Cluster(client, address)
             cluster.require_workers()
             try:
@@ -182,6 +177,33 @@ def connected(address: str) -> Iterator[Cluster]:
             finally:
                 with suppress(OSError, RuntimeError, CancelledError):
                     client.run(_forget, on_error="ignore")
+
+
+def _require_scheduler(address: str, security: Security) -> None:
+    """Ask what listens at an address: a client waits for ever for what is not a scheduler."""
+    from distributed.comm import CommClosedError
+    from distributed.core import rpc
+
+    async def kind() -> str:
+        arguments = security.get_connection_args("client")
+        async with (
+            asyncio.timeout(CONNECT_TIMEOUT_S + 1.0),  # after that of connecting
+            rpc(address, timeout=CONNECT_TIMEOUT_S, connection_args=arguments) as there,
+        ):
+            return str((await there.identity())["type"])
+
+    try:
+        with ThreadPoolExecutor(1) as own_thread:  # the caller's may have an event loop
+            found = own_thread.submit(asyncio.run, kind()).result()
+        if found != "Scheduler":
+            raise ConnectionError(f"it is a {found.lower()}")
+    except Exception as error:  # what listens there may say anything
+        is_told = isinstance(error, OSError) and type(error) is not CommClosedError and str(error)
+        raise ClusterError(
+            f"--scheduler {address}: no scheduler answers "
+            f"({error if is_told else 'what listens there does not speak as dask does'}); give the "
+            "address that 'dask scheduler' prints"
+        ) from error
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from copy import deepcopy
 from functools import lru_cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Self
 
 import tomli_w
@@ -39,6 +40,8 @@ COPY_STAGES = ("copy", "verify", "map")
 """Of a folder in which another program's database is mapped."""
 BYTES_OF_MARK = 200
 """At the beginning of our files, in which they tell what they are."""
+TEMPORARY_PREFIX = ".affrect-"
+"""Of folders for what is not complete yet."""
 FORMAT_VERSION = 6
 """Of ``config.toml``: counts up when a stage records other options than before."""
 
@@ -293,6 +296,21 @@ class Workspace:
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_folder(parent: Path) -> Iterator[Path]:
+    """Yield a new folder in a folder, in which those that killed processes left are removed."""
+    for left in parent.glob(f"{TEMPORARY_PREFIX}*"):
+        with suppress(WorkspaceError, OSError):
+            if not left.is_symlink():
+                with Workspace(left).locked():  # its process has ended
+                    shutil.rmtree(left)
+    with (
+        TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=parent) as folder,
+        Workspace(Path(folder)).locked() as workspace,
+    ):
+        yield workspace.path
 
 
 def is_output_folder(path: Path) -> bool:

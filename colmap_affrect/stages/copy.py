@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_with_frames
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
@@ -37,6 +38,8 @@ def copy_verified(
     workspace = context.workspace
     if image_path and not image_path.is_dir():
         raise DatabaseError(f"--image-path {image_path}: no such folder")
+    if not workspace.database.exists():
+        refuse_unusable(source)
     given = {"database": str(source.resolve()), "image_path": _absolute(image_path)}
     workspace.record_options("copy", given, overwrite=overwrite)
     contents = Contents(workspace.contents)

@@ -26,7 +26,6 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +45,7 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.connectivity import weakly_connected_images
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
-from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.project.workspace import Workspace, temporary_folder
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images
 from colmap_affrect.stages.context import Context
@@ -143,8 +142,8 @@ def pair_levels(context: Context) -> dict[str, int]:
 @contextmanager
 def _copied_database(context: Context) -> Iterator[Path]:
     """Give a copy of the database, in a folder of its own beside it."""
-    with TemporaryDirectory(dir=context.workspace.path) as folder:
-        path = Path(folder) / "database.db"
+    with temporary_folder(context.workspace.path) as folder:
+        path = folder / "database.db"
         copy_database(context.workspace.database, path)
         yield path
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.camera_records import read_camera_records
+from colmap_affrect.colmap.checks import CHECKS, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_without_features, read_names
 from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
@@ -193,7 +194,7 @@ def extract(
     start = time.perf_counter()
     workspace, folder = context.workspace, Path(inputs.image_path)
     inputs.check()
-    _require_camera(workspace, inputs.cameras.existing_camera_id)
+    _require_usable_cameras(workspace, inputs)
     names = inputs.names()
     if image_names:
         names = checked_names(folder, image_names, "image_names")
@@ -230,10 +231,17 @@ def extract(
     )
 
 
-def _require_camera(workspace: Workspace, camera_id: int) -> None:
-    """Refuse a camera that the database does not have before that is on record."""
-    path = workspace.database
-    cameras = colmap_database.all_cameras(path) if camera_id >= 0 and path.exists() else []
+def _require_usable_cameras(workspace: Workspace, inputs: Inputs) -> None:
+    """Refuse cameras of a database that cannot be used before it is on record."""
+    path, camera_id = workspace.database, inputs.cameras.existing_camera_id
+    if inputs.from_database and not path.exists():
+        refuse_unusable(Path(inputs.from_database), FATAL_FOR_IMAGES)
+    is_asked = workspace.users_database or camera_id >= 0
+    cameras = colmap_database.all_cameras(path) if is_asked and path.exists() else []
+    for camera in cameras:
+        if not len(camera.focal_length_idxs()):
+            _, what, advice = CHECKS["camera-panorama"]
+            raise DatabaseError(f"{path}: {what} (camera {camera.camera_id}); {advice}")
     if camera_id >= 0 and all(camera.camera_id != camera_id for camera in cameras):
         raise OptionError(f"existing_camera_id={camera_id}: {path} has no such camera")
 

@@ -180,6 +180,8 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
     ("keypoint-data", ["UPDATE keypoints SET data = NULL WHERE image_id = 2"], ["b c.png"]),
     ("keypoint-data", ["UPDATE keypoints SET data = 'text' WHERE image_id = 2"], ["b c.png"]),
     ("keypoints-not-finite", [changed_keypoint(6, 1, np.nan)], ["b c.png"]),
+    ("keypoints-not-finite", [changed_keypoint(6, 0, np.inf)], ["b c.png"]),
+    ("keypoints-not-finite", [changed_keypoint(6, 0, -1e30)], ["b c.png"]),
     ("keypoints-outside", [changed_keypoint(3, 0, 91.5)], ["b c.png"]),
     ("keypoints-outside", [changed_keypoint(3, 1, 61.5)], ["b c.png"]),
     ("keypoints-outside", [changed_keypoint(3, 1, -1.5)], ["b c.png"]),

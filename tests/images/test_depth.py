@@ -253,7 +253,7 @@ def test_file_of_another_format_or_with_pickled_objects_is_unreadable(tmp_path, 
     np.save(pickled, np.array([[{}, {}]]), allow_pickle=True)
     for content in (b"not what the name says" * 20, pickled.read_bytes()):
         (tmp_path / f"a{suffix}").write_bytes(content)
-        with pytest.raises(DepthError, match="cannot be read; damaged, or not what its suffix"):
+        with pytest.raises(DepthError, match=r"not what its suffix says|found object"):
             source(tmp_path).depth(photograph())
 
 
@@ -270,6 +270,37 @@ def test_file_of_another_format_or_with_pickled_objects_is_unreadable(tmp_path, 
 def test_array_that_is_no_map_of_numbers_is_refused(tmp_path, values):
     write_map(tmp_path / "a.npy", values)
     with pytest.raises(DepthError, match=r"expected numbers of shape \(height, width\), found"):
+        source(tmp_path).depth(photograph())
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".png", ".h5"])
+def test_map_far_larger_than_the_photograph_is_refused_by_its_header(tmp_path, suffix):
+    large = np.ones((1800, 2700), np.uint16)
+    write_map(tmp_path / f"a{suffix}", large)
+    with pytest.raises(DepthError, match=r"is of shape .*1800.*, too large for a depth map"):
+        source(tmp_path).depth(photograph())
+    stored = write_image(tmp_path / "photo.png", np.zeros((1200, 1800), np.uint8))
+    assert source(tmp_path).depth(photograph(path=stored)).shape == (1800, 2700)
+
+
+def test_values_in_other_files_are_not_read(tmp_path):
+    np.ones((4, 6), "f4").tofile(tmp_path / "elsewhere.raw")
+    path = write_map(tmp_path / "inner.h5", asymmetric_map())
+    layout = h5py.VirtualLayout((4, 6), "f8")
+    layout[:] = h5py.VirtualSource(path, "depth", (4, 6))
+    for make in (
+        lambda file: file.create_dataset(
+            "depth", (4, 6), "f4", external=[(str(tmp_path / "elsewhere.raw"), 0, 96)]
+        ),
+        lambda file: file.create_virtual_dataset("depth", layout),
+    ):
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            make(file)
+        with pytest.raises(DepthError, match="its values are in other files"):
+            source(tmp_path).depth(photograph())
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["depth"] = h5py.ExternalLink(str(path), "depth")
+    with pytest.raises(DepthError, match="expected one dataset of two dimensions"):
         source(tmp_path).depth(photograph())
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -147,8 +148,14 @@ def test_mask_and_camera_mask_both_count(tmp_path: Path) -> None:
     both = Photographs(tmp_path, masks).mask("x.jpg")
     np.testing.assert_array_equal(both, one & other)
     write_mask(tmp_path / "camera.png", other[:40])
-    with pytest.raises(ImageError, match="differ in size"):
+    with pytest.raises(ImageError, match=r"60 x 50 px and its mask 60 x 40 px .*camera\.png"):
         Photographs(tmp_path, masks).mask("x.jpg")
+
+
+HUGE_PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(
+    ">IIBBBBBI", 32_000, 31_000, 8, 0, 0, 0, 0, 0
+)
+"""Only a header: whoever reads on finds it damaged."""
 
 
 @pytest.mark.parametrize(
@@ -157,6 +164,7 @@ def test_mask_and_camera_mask_both_count(tmp_path: Path) -> None:
         (Path.exists, "has no mask .*a b.png.png; make one"),
         (lambda path: path.write_bytes(b""), "not a readable image"),
         (lambda path: write_mask(path, diagonal_mask((300, 240))), "320 x 240 px and its mask 300"),
+        (lambda path: path.write_bytes(HUGE_PNG), "320 x 240 px and its mask 32000 x 31000 px"),
     ],
 )
 def test_image_with_a_wrong_mask_is_reported_and_the_others_go_on(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
+import struct
 from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.ExifTags
+import PIL.Image
 import pytest
 from numpy.testing import assert_allclose
 from synthetic import blobs, centroid, jpeg_with_orientation, texture, write_image
@@ -15,8 +18,16 @@ from synthetic import blobs, centroid, jpeg_with_orientation, texture, write_ima
 from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.affine import project
+from colmap_affrect.images.headers import header_size
 from colmap_affrect.images.masks import connected_regions
-from colmap_affrect.images.reading import in_eight_bits, read_color, read_gray, shrink_to, tones
+from colmap_affrect.images.reading import (
+    IMAGE_SUFFIXES,
+    in_eight_bits,
+    read_color,
+    read_gray,
+    shrink_to,
+    tones,
+)
 from colmap_affrect.parallel.opencv_threads import SHARED_OPENCV_THREADS
 
 
@@ -203,3 +214,48 @@ def test_twelve_bits_in_sixteen_look_like_eight() -> None:
     deep = in_eight_bits(twelve, tones(twelve))
     assert np.corrcoef(deep.ravel(), image.ravel())[0, 1] > 0.99
     assert np.ptp(deep) == 255
+
+
+def png_of_size(width: int, height: int) -> bytes:
+    """A PNG that claims to have a size; what follows the header is missing."""
+    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", 0)
+
+
+def test_photograph_of_absurd_size_is_refused_by_its_header(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(png_of_size(32_000, 32_000))
+    for read in (read_gray, lambda path: read_color(path, 100)):
+        with pytest.raises(ImageError, match=r"a\.png: claims to be 32000 x 32000 px, and 512 meg"):
+            read(path)
+
+
+@pytest.mark.parametrize("suffix", [*IMAGE_SUFFIXES, ".big.tif", ".motorola.tif"])
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_header_and_pixels_are_those_that_are_stored(
+    tmp_path: Path, suffix: str, orientation: int
+) -> None:
+    path, exif = tmp_path / f"a{suffix}", PIL.Image.Exif()
+    exif[PIL.ExifTags.Base.Orientation] = orientation
+    values = np.zeros((30, 50), np.uint8)
+    values[:8, :24] = 255
+    photo = PIL.Image.fromarray(values).convert("1" if suffix == ".pbm" else "L")
+    if suffix == ".motorola.tif":
+        photo = PIL.Image.frombytes("I;16B", (50, 30), values.repeat(2).tobytes())
+    if suffix in (".bmp", ".pbm", ".pgm", ".pnm", ".ppm"):
+        photo.save(path)
+    else:
+        photo.save(path, exif=exif, **({"big_tiff": True} if suffix == ".big.tif" else {}))
+    assert (path.read_bytes()[:2] == b"MM") == (suffix == ".motorola.tif")
+    assert header_size(path) == (50, 30)
+    assert_allclose(read_gray(path), values, atol=40)
+    assert_allclose(read_color(path, 50)[:, :, 1], values, atol=40)
+
+
+def test_size_of_a_photograph_of_four_hundred_megapixels_is_known(tmp_path: Path) -> None:
+    """Pillow opens no more than 179 megapixels; cameras that shift their sensor have more."""
+    path = tmp_path / "a.png"
+    path.write_bytes(png_of_size(23_200, 17_400))
+    assert header_size(path) == (23_200, 17_400)
+    path.write_bytes(b"P5 no number")
+    assert header_size(path) is None

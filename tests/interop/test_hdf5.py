@@ -407,6 +407,9 @@ ERRORS: dict[str, tuple[Callable[[Files], object], str]] = {
         change_features(keypoints=[[1.0, 2.0], [np.nan, 3.0]]),
         r"a\.png/keypoints holds values that are not finite",
     ),
+    "beyond all images": (
+        change_features(keypoints=[[1.0, -1e30]]), r"a\.png/keypoints or its shapes hold values"
+    ),
     "beyond float32": (
         change_features(keypoints=[[1e300, 2.0]]), r"a\.png/keypoints or its shapes hold values"
     ),

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -154,6 +156,27 @@ def test_cluster_that_is_no_use_is_refused_in_one_line(monkeypatch: pytest.Monke
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ClusterError, match=r"distributed is not installed; .*\[cluster\]"):
         connected("tcp://10.0.0.1:8786").__enter__()
+
+
+@pytest.mark.parametrize("said", [b"", b"SSH-2.0-OpenSSH_9.2\r\n"], ids=["silent", "ssh"])
+def test_port_of_another_program_is_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, said: bytes
+) -> None:
+    monkeypatch.setattr(cluster_module, "CONNECT_TIMEOUT_S", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        accepted = threading.Thread(target=greet, args=(server, said), daemon=True)
+        accepted.start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(ClusterError, match=rf"{address}: no scheduler answers \(.+\); give"):
+            connected(address).__enter__()
+
+
+def greet(server: socket.socket, said: bytes) -> None:
+    """Say something to the first that connects, and wait for it to go."""
+    with server.accept()[0] as connection:
+        connection.sendall(said)
+        while connection.recv(4096):
+            pass
 
 
 def test_worker_that_would_give_other_results_is_refused(tmp_path: Path) -> None:

@@ -185,6 +185,11 @@ def huge_png() -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk
 
 
+def huge_exr() -> bytes:
+    window = struct.pack("<4i", 0, 0, 29_999, 29_999)
+    return b"\x76\x2f\x31\x01\x02\0\0\0dataWindow\0box2i\0\x10\0\0\0" + window
+
+
 def huge_hdf5() -> bytes:
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
@@ -202,6 +207,7 @@ def huge_hdf5() -> bytes:
         (".npz", zipped(npy_header("(40000, 60000)") + bytes(60_000_000))),
         (".png", huge_png()),
         (".h5", huge_hdf5()),
+        (".exr", huge_exr()),
     ],
 )
 def test_header_of_a_huge_map_takes_no_memory(tmp_path: Path, suffix: str, data: bytes) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import Call
+from command import FAST, Call
 from small_scene import write_photographs
 
 from colmap_affrect.colmap import pycolmap
@@ -17,6 +17,7 @@ from colmap_affrect.colmap.database_copy import read_names
 from colmap_affrect.doctor.database import examine_database
 from colmap_affrect.doctor.findings import Findings
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.interop.pycolmap_api import extract_features
 from colmap_affrect.progress import SILENT
 
 ROWS = [
@@ -27,6 +28,10 @@ ROWS = [
     ("UPDATE keypoints SET rows = 100000 WHERE image_id = 1", "less data than rows and columns ("),
     ("UPDATE keypoints SET rows = -1 WHERE image_id = 1", "less data than rows and columns ("),
     ("UPDATE keypoints SET data = substr(data, 1, 100)", "less data than rows and columns ("),
+    (
+        "UPDATE keypoints SET rows = 1, cols = 2, data = x'CAF249F1CAF249F1'",  # -1e30
+        "or are where no image reaches (a.png, b c.png)",
+    ),
     ("UPDATE matches SET rows = 100000", "less data than rows and 2 columns ("),
     ("UPDATE matches SET rows = -1", "less data than rows and 2 columns ("),
     ("UPDATE matches SET data = substr(data, 1, 9)", "less data than rows and 2 columns ("),
@@ -41,6 +46,8 @@ ROWS = [
     ("UPDATE cameras SET width = 'wide'", "damaged"),
 ]
 """What is done to a database, and what is said of it."""
+
+NOT_NUMBERS = np.full(4, np.nan).tobytes()
 
 
 @pytest.fixture(scope="module")
@@ -63,10 +70,10 @@ def num_errors(path: Path) -> int:
     return findings.diagnosis().num_errors
 
 
-def changed(healthy: Path, path: Path, statement: str) -> Path:
+def changed(healthy: Path, path: Path, statement: str, value: bytes = NOT_NUMBERS) -> Path:
     """Make a copy on which a statement was executed."""
     shutil.copy(healthy, path)
-    values = [np.full(4, np.nan).tobytes()] if "?" in statement else []
+    values = [value] if "?" in statement else []
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("PRAGMA foreign_keys = OFF")
         connection.execute(statement, values)
@@ -92,6 +99,28 @@ def test_hostile_rows_are_one_line(
         assert said in ended.stderr[0]
     assert num_errors(path) > 0
     assert path.read_bytes() == before
+
+
+PANORAMA = pycolmap.CameraModelId.EQUIRECTANGULAR.value
+
+
+def test_panoramas_are_refused_before_anything_is_recorded(
+    healthy: Path, tmp_path: Path, call: Call
+) -> None:
+    statement = f"UPDATE cameras SET model = {PANORAMA}, params = ? WHERE camera_id = 2"
+    params = np.array([320.0, 240.0]).tobytes()
+    path = changed(healthy, tmp_path / "any.db", statement, params)
+    given = ["--output-path", tmp_path / "out", "--image-path", healthy.parent / "photos"]
+    for command in (["extract", *given], ["run", *given], ["map", *given[:2]]):
+        ended = call(*command, "-q", "--from-database", path)
+        assert (ended.code, len(ended.stderr)) == (1, 1)
+        assert "look all around, which have no focal length (camera 2: EQUIREC" in ended.stderr[0]
+        assert not (tmp_path / "out" / "config.toml").exists()
+    assert num_errors(path) == 0  # COLMAP has a use for it
+    with pytest.raises(DatabaseError, match=r"no focal length \(camera 2\); cut perspective views"):
+        extract_features(path, healthy.parent / "photos")
+    assert not (tmp_path / "any.affrect" / "config.toml").exists()
+    assert call("extract", "-q", *given, "--from-database", healthy, *FAST[:2]).code == 0
 
 
 @pytest.mark.parametrize("seed", range(6))

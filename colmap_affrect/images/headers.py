@@ -1,0 +1,83 @@
+"""Headers of image files: what they are of, before memory is taken for pixels."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from PIL import ExifTags, Image
+from PIL.BmpImagePlugin import BmpImageFile
+from PIL.JpegImagePlugin import jpeg_factory
+from PIL.PngImagePlugin import PngImageFile
+from PIL.PpmImagePlugin import PpmImageFile
+from PIL.TiffImagePlugin import TiffImageFile
+
+from colmap_affrect.errors import ImageError
+
+MAX_NUM_PX = 1 << 29
+"""Of a photograph; those of the largest cameras have 400 megapixels."""
+
+PNG = b"\x89PNG\r\n\x1a\n"
+READERS = {
+    b"\xff\xd8": jpeg_factory,
+    PNG: PngImageFile,
+    b"II": TiffImageFile,
+    b"MM": TiffImageFile,
+    b"BM": BmpImageFile,
+    b"P": PpmImageFile,
+}
+"""Pillow's by the first bytes: ``Image.open`` has a limit of pixels that photographs exceed."""
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Image.Image]:
+    """Open an image file by its header; what is damaged raises nearly anything."""
+    with warnings.catch_warnings(), path.open("rb") as file:
+        warnings.simplefilter("ignore")  # Pillow warns of broken EXIF
+        start = file.read(len(PNG))
+        file.seek(0)
+        yield next(read for magic, read in READERS.items() if start.startswith(magic))(file, "")
+
+
+def stored_size(image: Image.Image) -> tuple[int, int]:
+    """Return the (width, height) of the stored pixels; of TIFF Pillow turns what says so."""
+    if isinstance(image, TiffImageFile):
+        tags = image.tag_v2
+        return int(tags[ExifTags.Base.ImageWidth]), int(tags[ExifTags.Base.ImageLength])
+    return image.size
+
+
+def header_size(path: Path) -> tuple[int, int] | None:
+    """Return the (width, height) that a file claims to have; None if there is no readable header.
+
+    Nothing is opened that is not a file: a pipe would wait for ever.
+    """
+    if not path.is_file():
+        return None
+    try:
+        with path.open("rb") as file:
+            start = file.read(24)
+        if start.startswith(PNG):
+            return struct.unpack(">II", start[16:])
+        with opened(path) as image:
+            return stored_size(image)
+    except Exception:  # noqa: BLE001 - as Pillow does
+        return None
+
+
+def is_too_large(size: tuple[int, int] | None) -> bool:
+    """Tell whether a header claims more pixels than photographs have."""
+    return size is not None and size[0] * size[1] > MAX_NUM_PX
+
+
+def require_possible(path: Path) -> None:
+    """Refuse an image of more pixels than photographs have; ImageError."""
+    size = header_size(path)
+    if size and is_too_large(size):
+        raise ImageError(
+            f"{path}: claims to be {size[0]} x {size[1]} px, and {MAX_NUM_PX >> 20} megapixels are "
+            "the most that are read; shrink it"
+        )
