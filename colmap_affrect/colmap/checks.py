@@ -116,10 +116,11 @@ MAX_SIDE_PX = 1 << 24
 
 MATRICES = {
     ("two_view_geometries", "pair_id"): {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
-    ("pose_priors", "pose_prior_id"): {"position": 3, "position_covariance": 9, "gravity": 3},
+    ("pose_priors", "rowid"): {"position": 3, "position_covariance": 9, "gravity": 3},
     ("rig_sensors", "sensor_id"): {"sensor_from_rig": 7},
 }
-"""Columns that hold so many float64 or nothing, by table and its key."""
+"""Columns that hold so many float64 or nothing, by table and its key; that of priors is another
+before COLMAP 4."""
 
 DAMAGED = (sqlite3.Error, UnicodeDecodeError)
 """What sqlite3 raises on damaged files; its messages may quote bytes that are not UTF-8."""
