@@ -272,6 +272,13 @@ EXPORT_FORMAT = (
     _flag("--half", "float16, which rounds coordinates to 1 px and more"),
 )  # fmt: skip
 
+OLD_DATABASE = (
+    _path("path", "PATH", "output folder, or any COLMAP database; a copy of it is read"),
+    _path("database_path", "OUT.db", "the database to make; must not exist"),
+    _choice("--colmap", ["3.8"], "whose tables to write; COLMAP 3.8 to 3.13 read these",
+        default="3.8"),
+)  # fmt: skip
+
 IMAGE = Option("image", type=Path, metavar="IMAGE", help="the photograph")
 DOCTOR = (
     _path("path", "PATH", "output folder, or any COLMAP database", nargs="?"),

@@ -272,6 +272,16 @@ def export_h5(options: argparse.Namespace) -> int:
     return _printed(report)
 
 
+def export_database(options: argparse.Namespace) -> int:
+    from colmap_affrect.colmap.old_databases import export_database
+    from colmap_affrect.project.workspace import Workspace
+
+    path = Workspace(options.path).database if options.path.is_dir() else options.path
+    notes = export_database(path, options.database_path)
+    show("\n".join([f"{options.database_path}: for COLMAP {options.colmap} to 3.13", *notes]))
+    return EXIT_OK
+
+
 def doctor(options: argparse.Namespace) -> int:
     from colmap_affrect.doctor import diagnose
 

@@ -44,6 +44,7 @@ EXAMPLES = (
     "      --matches-path matches.h5 --database-path new.db",
     "export-h5 --database-path any.db --features-path features.h5 \\\n"
     "      --matches-path matches.h5",
+    "export-database out old.db --colmap 3.8",
 )
 
 ENDING = """
@@ -155,6 +156,9 @@ COMMANDS: dict[str, Command] = {
     "export-h5": (commands.export_h5,
         "features and matches of an output folder or a database for hloc or deep-image-matching",
         (args.EXPORT_SOURCE, *args.H5_FILES, *args.EXPORT_FORMAT, args.VOLUME)),
+    "export-database": (commands.export_database,
+        "any database for COLMAP 3.8 to 3.13, as Linux distributions have them",
+        (*args.OLD_DATABASE, args.VOLUME)),
     "doctor": (commands.doctor,
         "look for what is wrong with results or the installation, and say what to do about it",
         (*args.DOCTOR, args.json("print JSON"), args.VOLUME)),

@@ -121,10 +121,11 @@ MAX_SIDE_PX = 1 << 24
 
 MATRICES = {
     ("two_view_geometries", "pair_id"): {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
-    ("pose_priors", "pose_prior_id"): {"position": 3, "position_covariance": 9, "gravity": 3},
+    ("pose_priors", "rowid"): {"position": 3, "position_covariance": 9, "gravity": 3},
     ("rig_sensors", "sensor_id"): {"sensor_from_rig": 7},
 }
-"""Columns that hold so many float64 or nothing, by table and its key."""
+"""Columns that hold so many float64 or nothing, by table and its key; that of priors is another
+before COLMAP 4."""
 
 MAX_NUM_IMAGES = 2**31 - 1
 """COLMAP's id of a pair is the smaller image id times this, plus the larger one."""

@@ -8,16 +8,21 @@ from __future__ import annotations
 
 import sqlite3
 import tempfile
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
+
+import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.reading import DAMAGED, open_read_only
 from colmap_affrect.errors import DatabaseError
+
+FIRST_TYPED_SCHEMA = 4_000_000
+"""Descriptors have a type since COLMAP 4.0."""
 
 
 def schema_version(path: Path) -> int:
@@ -28,6 +33,17 @@ def schema_version(path: Path) -> int:
     with open_read_only(path) as connection:
         version = connection.execute("PRAGMA user_version").fetchone()[0]
     return int(version)
+
+
+def is_stamped(path: Path) -> bool:
+    """Tell whether an older COLMAP has put its own version on a database of COLMAP 4.
+
+    It does so when it opens one, before it fails at the tables, and changes nothing else.
+    """
+    with open_read_only(path) as connection:
+        (version,) = connection.execute("PRAGMA user_version").fetchone()
+        columns = {row[1] for row in connection.execute("PRAGMA table_info(descriptors)")}
+    return version < FIRST_TYPED_SCHEMA and "type" in columns
 
 
 @cache
@@ -62,7 +78,8 @@ def copy_as_it_is(source: Path, target: Path) -> None:
 def copy_database(source: Path, target: Path, refused: Collection[str] = ()) -> None:
     """Copy a database as it is now, including its write-ahead log.
 
-    The copy has the schema of the installed pycolmap. Raises DatabaseError when the source is
+    The copy has the schema of the installed pycolmap, which leaves positions (GPS) of COLMAP before
+    3.10 behind: they become pose priors. Raises DatabaseError when the source is
     missing, not a COLMAP database, or one of a newer COLMAP; when the target exists; and when the
     database has problems of kinds that are ``refused``: those of anybody are checked before COLMAP
     sees the copy.
@@ -75,11 +92,48 @@ def copy_database(source: Path, target: Path, refused: Collection[str] = ()) -> 
     new.unlink(missing_ok=True)
     try:
         copy_as_it_is(source, new)
-        with open_database(new):
-            pass  # COLMAP migrates it
+        positions = _old_positions(new)
+        with open_database(new) as database:  # COLMAP migrates it
+            _add_positions(database, positions)
         new.replace(target)
     finally:
         new.unlink(missing_ok=True)
+
+
+def _old_positions(path: Path) -> dict[int, tuple[float, float, float]]:
+    """Return the positions that COLMAP before 3.10 kept with images, by image id.
+
+    Beside a rotation there is the translation of a pose instead; scripts wrote zeros for none.
+    """
+    with open_read_only(path) as connection:
+        columns = {row[1] for row in connection.execute("PRAGMA table_info(images)")}
+        if "prior_tx" not in columns:
+            return {}
+        rows = connection.execute(
+            "SELECT image_id, prior_tx, prior_ty, prior_tz FROM images "
+            "WHERE abs(prior_tx) + abs(prior_ty) + abs(prior_tz) > 0 AND coalesce("
+            "abs(prior_qw) + abs(prior_qx) + abs(prior_qy) + abs(prior_qz), 0) = 0"
+        )
+        return {image_id: (x, y, z) for image_id, x, y, z in rows}
+
+
+def _add_positions(
+    database: pycolmap.Database, positions: Mapping[int, tuple[float, float, float]]
+) -> None:
+    """Make positions pose priors: of GPS if they can be latitudes and longitudes, else metric."""
+    if not positions:
+        return
+    is_gps = all(abs(x) <= 90 and abs(y) <= 180 for x, y, _ in positions.values())
+    systems = pycolmap.PosePriorCoordinateSystem
+    there = {prior.corr_data_id.id for prior in database.read_all_pose_priors()}
+    for image in database.read_all_images():
+        if image.image_id in positions.keys() - there:
+            prior = pycolmap.PosePrior(
+                position=np.array(positions[image.image_id]),
+                coordinate_system=systems.WGS84 if is_gps else systems.CARTESIAN,
+            )
+            prior.corr_data_id = image.data_id
+            database.write_pose_prior(prior)
 
 
 def copy_with_frames(source: Path, target: Path) -> None:

@@ -14,7 +14,12 @@ from colmap_affrect.colmap.checks import (
     check_image_files,
     is_unsafe,
 )
-from colmap_affrect.colmap.database_copy import copy_as_it_is, newest_schema_version, schema_version
+from colmap_affrect.colmap.database_copy import (
+    copy_as_it_is,
+    is_stamped,
+    newest_schema_version,
+    schema_version,
+)
 from colmap_affrect.doctor.cameras import examine_cameras
 from colmap_affrect.doctor.findings import Findings, without_path
 from colmap_affrect.errors import DatabaseError, ImageError
@@ -49,8 +54,9 @@ def examined_copy(
             yield None
             return
         if version < newest:
+            kind = "stamped" if is_stamped(path) else "old-schema"
             kept = path.with_suffix(".old.db")
-            findings.add("old-schema", path, version=version, newest=newest, path=path, copy=kept)
+            findings.add(kind, path, version=version, newest=newest, path=path, copy=kept)
         try:
             tables, problems = check_database(copy)
         except DatabaseError as error:

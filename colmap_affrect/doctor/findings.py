@@ -46,9 +46,13 @@ TEXTS: dict[str, Check] = CHECKS | {
         "give a COLMAP database or an output folder of colmap-affrect; of a damaged database, "
         f"{RECOVER}"),
     "old-schema": ("note",
-        "was made by an older COLMAP (schema {version}, now {newest}), and is changed to the new "
-        "schema as soon as COLMAP or pycolmap opens it",
+        "has the tables of an older COLMAP (schema {version}, now {newest}); COLMAP 4 and pycolmap "
+        "change them as soon as they open it, and an older COLMAP cannot read it any more",
         "keep a copy: cp {path} {copy}"),
+    "stamped": ("note",
+        "is of COLMAP 4, and an older COLMAP that failed to open it has put its own version on it "
+        "(schema {version}); nothing is lost, and COLMAP 4 or pycolmap puts it right",
+        "for an older COLMAP: colmap-affrect export-database {path} {copy}"),
     "database-damaged": ("error", "{error}", f"{RECOVER} of it; else make it anew"),
     "implausible-focal": ("warning",
         "cameras with focal lengths that hardly any photograph has, in px of the image and longer "

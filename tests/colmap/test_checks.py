@@ -175,7 +175,7 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
     (
         "matrix-data",
         ["INSERT INTO pose_priors VALUES (1, 1, 1, 0, x'00', NULL, NULL, 0)"],
-        ["position of pose_prior_id 1"],
+        ["position of rowid 1"],
     ),
     ("keypoint-data", ["UPDATE keypoints SET data = NULL WHERE image_id = 2"], ["b c.png"]),
     ("keypoint-data", ["UPDATE keypoints SET data = 'text' WHERE image_id = 2"], ["b c.png"]),

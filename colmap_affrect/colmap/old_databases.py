@@ -1,0 +1,142 @@
+"""Databases of COLMAP 3.8, which COLMAP up to 3.13 reads; those of COLMAP 4 make it stop.
+
+Their tables hold no rigs, frames or types of descriptors, and positions are columns of the images.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import tempfile
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.checks import FATAL
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.errors import DatabaseError
+from colmap_affrect.project.atomic_files import cannot_write, require_space
+
+VERSION = 3800
+"""What COLMAP 3.8 writes into ``user_version``; newer ones take the tables over by it."""
+
+LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
+"""Camera models of COLMAP 3.8 have numbers up to this one."""
+
+METRIC = pycolmap.PosePriorCoordinateSystem.CARTESIAN
+
+TABLES = f"""
+PRAGMA user_version = {VERSION};
+CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
+    model INTEGER NOT NULL, width INTEGER NOT NULL, height INTEGER NOT NULL, params BLOB,
+    prior_focal_length INTEGER NOT NULL);
+CREATE TABLE images (image_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
+    name TEXT NOT NULL UNIQUE, camera_id INTEGER NOT NULL,
+    prior_qw REAL, prior_qx REAL, prior_qy REAL, prior_qz REAL,
+    prior_tx REAL, prior_ty REAL, prior_tz REAL,
+    CONSTRAINT image_id_check CHECK (image_id >= 0 and image_id < 2147483647),
+    FOREIGN KEY (camera_id) REFERENCES cameras (camera_id));
+CREATE UNIQUE INDEX index_name ON images (name);
+CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY NOT NULL,
+    rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB,
+    FOREIGN KEY (image_id) REFERENCES images (image_id) ON DELETE CASCADE);
+CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY NOT NULL,
+    rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB,
+    FOREIGN KEY (image_id) REFERENCES images (image_id) ON DELETE CASCADE);
+CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL,
+    rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB);
+CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL,
+    rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL,
+    F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB);
+CREATE TABLE pose_priors (image_id INTEGER PRIMARY KEY NOT NULL,
+    position BLOB, coordinate_system INTEGER NOT NULL, position_covariance BLOB,
+    FOREIGN KEY (image_id) REFERENCES images (image_id) ON DELETE CASCADE);
+"""
+"""The last one is of COLMAP 3.10 to 3.13, which do not read positions of images any more."""
+
+CONTENT = """
+INSERT INTO cameras SELECT camera_id, model, width, height, params, prior_focal_length
+    FROM new.cameras;
+INSERT INTO images (image_id, name, camera_id) SELECT image_id, name, camera_id FROM new.images;
+INSERT INTO keypoints SELECT image_id, rows, cols, data FROM new.keypoints;
+INSERT INTO descriptors SELECT image_id, rows, cols, data FROM new.descriptors
+    WHERE type = 0 AND cols = 128;
+INSERT INTO matches SELECT pair_id, rows, cols, data FROM new.matches;
+INSERT INTO two_view_geometries
+    SELECT pair_id, rows, cols, data, CASE config WHEN 9 THEN 2 ELSE config END,
+    F, E, H, qvec, tvec FROM new.two_view_geometries;
+"""
+"""What fills the tables, from a database of the installed pycolmap: descriptors of type 0, SIFT;
+geometries of configuration 9, calibrated with rigs, as 2, calibrated."""
+
+
+def export_database(source: Path, target: Path) -> list[str]:
+    """Write a database as COLMAP 3.8 makes them; ids stay, and the source is only read.
+
+    Returns what COLMAP 3.8 has no place for and is left out, a line each.
+
+    Raises:
+        DatabaseError: when the source cannot be used or has a camera model that COLMAP 3.8 does not
+            know, or the target exists.
+    """
+    if target.exists():
+        raise DatabaseError(f"{target}: exists already and is not overwritten; give another name")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".export-", dir=target.parent) as folder:
+        new, old = Path(folder) / "new.db", Path(folder) / "old.db"
+        copy_database(source, new, FATAL)
+        require_space(old, new.stat().st_size)
+        with open_database(new) as database:
+            _refuse_new_models(database, source)
+            priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
+            notes = _left_out(database)
+        if any(prior.coordinate_system == METRIC for prior in priors):
+            notes.append("positions are metric: COLMAP 3.8 needs --SpatialMatching.is_gps 0")
+        try:
+            with closing(sqlite3.connect(old)) as connection:
+                connection.execute("ATTACH ? AS new", (str(new),))
+                connection.executescript(f"{TABLES} BEGIN; {CONTENT} COMMIT;")
+                _write_positions(connection, priors)
+                connection.commit()
+        except sqlite3.Error as error:
+            raise cannot_write(target, error) from error
+        old.replace(target)
+    return notes
+
+
+def _refuse_new_models(database: pycolmap.Database, source: Path) -> None:
+    for camera in database.read_all_cameras():
+        if int(camera.model) > LAST_MODEL:
+            raise DatabaseError(
+                f"{source}: camera {camera.camera_id} is of model {camera.model.name}, which "
+                "COLMAP 3.8 does not know; extract with another --camera-model"
+            )
+
+
+def _write_positions(connection: sqlite3.Connection, priors: Sequence[pycolmap.PosePrior]) -> None:
+    """Write positions; of GPS these are latitude, longitude and altitude."""
+    for prior in priors:
+        image_id, position = prior.corr_data_id.id, np.asarray(prior.position, np.float64)
+        connection.execute(
+            "UPDATE images SET prior_tx = ?, prior_ty = ?, prior_tz = ? WHERE image_id = ?",
+            (*position.tolist(), image_id),
+        )
+        covariance = np.asarray(prior.position_covariance, np.float64).tobytes("F")
+        system = int(prior.coordinate_system)
+        row = (image_id, position.tobytes(), system, covariance)
+        connection.execute("INSERT INTO pose_priors VALUES (?, ?, ?, ?)", row)
+
+
+def _left_out(database: pycolmap.Database) -> list[str]:
+    sift, notes = pycolmap.FeatureExtractorType.SIFT, list[str]()
+    if num_rigs := sum(rig.num_sensors() > 1 for rig in database.read_all_rigs()):
+        notes.append(f"{num_rigs} rigs are left out: each image is on its own")
+    images = [image.image_id for image in database.read_all_images()]
+    described = [i for i in images if database.exists_descriptors(i)]
+    others = sum(database.read_descriptors(i).type != sift for i in described)
+    if others:
+        notes.append(f"descriptors of {others} images are left out: they are not SIFT's")
+    return notes
