@@ -269,6 +269,40 @@ EXPORT_FORMAT = (
     _flag("--half", "float16, which rounds coordinates to 1 px and more"),
 )  # fmt: skip
 
+MODEL = _path("--model-path", "MODEL", "folder of a COLMAP model, such as out/sparse/0",
+    required=True)  # fmt: skip
+EXPORT = (
+    MODEL,
+    _path("--output-path", "FOLDER", "folder for the files; nothing in it is overwritten",
+        required=True, dest="target_path"),
+    _value("--format", "A,B,...",
+        "ply (points), text (COLMAP's), nvm, bundler, undistorted (photographs and model, for "
+        "dense reconstruction), nerfstudio (the same with transforms.json, for Gaussian splatting "
+        "too), "
+        "cameras (CSV), geojson (of a model that align put on earth) (default: ply,text,cameras)",
+        type=_words, default=("ply", "text", "cameras")),
+    _path("--image-path", "PATH",
+        "folder of the photographs, to undistort them (default: that of the run)"),
+)  # fmt: skip
+ALIGN = (
+    MODEL,
+    _path("--output-path", "MODEL", "folder for the new model, in metres; must not exist",
+        required=True, dest="target_path"),
+    OneOf(
+        _path("--gps", "DATABASE",
+            "positions by GPS that a COLMAP database holds, such as out/database.db"),
+        _path("--positions", "FILE",
+            "CSV of where photographs were taken: name and x,y,z in metres, or name and "
+            "latitude,longitude,altitude"),
+        _path("--points", "FILE",
+            "CSV of points that are marked in two photographs or more: point,image,px,py, and "
+            "x,y,z of control points in metres (px, py: from the upper left corner)"),
+    ),
+    _value("--distance", "A,B,METRES",
+        "a known distance, of two photographs or two points of --points: gives the scale alone; "
+        "may be repeated", action="append", default=[]),
+)  # fmt: skip
+
 IMAGE = Option("image", type=Path, metavar="IMAGE", help="the photograph")
 DOCTOR = (
     _path("path", "PATH", "output folder, or any COLMAP database", nargs="?"),

@@ -272,6 +272,31 @@ def export_h5(options: argparse.Namespace) -> int:
     return _printed(report)
 
 
+def export(options: argparse.Namespace) -> int:
+    from colmap_affrect.interop.export import export
+
+    written = export(
+        options.model_path, options.target_path, options.format, image_path=options.image_path
+    )
+    for name, path in written.items():
+        show(f"{name:11s} {path}")
+    return EXIT_OK
+
+
+def align(options: argparse.Namespace) -> int:
+    from colmap_affrect.interop.align import Reference, align
+
+    reference = Reference(
+        gps_database=options.gps,
+        positions_path=options.positions,
+        points_path=options.points,
+        distances=tuple(given.distance(text) for text in options.distance),
+    )
+    show(align(options.model_path, options.target_path, reference).summary())
+    show(f"model       {options.target_path}")
+    return EXIT_OK
+
+
 def doctor(options: argparse.Namespace) -> int:
     from colmap_affrect.doctor import diagnose
 

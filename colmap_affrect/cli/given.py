@@ -183,5 +183,14 @@ def changed(context: Context, stage: str, section: str, settings: Sequence[str])
     return changed
 
 
+def distance(text: str) -> tuple[str, str, float]:
+    """Read A,B,METRES."""
+    try:
+        first, second, length = text.split(",")
+        return first, second, float(length)
+    except ValueError as error:
+        raise OptionError(f"--distance {text}: expected A,B,METRES") from error
+
+
 def progress(options: argparse.Namespace) -> Progress:
     return SILENT if options.quiet else Progress(sys.stderr)

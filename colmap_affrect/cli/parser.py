@@ -43,6 +43,12 @@ EXAMPLES = (
     "      --matches-path matches.h5 --database-path new.db",
     "export-h5 --database-path any.db --features-path features.h5 \\\n"
     "      --matches-path matches.h5",
+    "export --model-path out/sparse/0 --output-path for-others --format ply,bundler",
+    "export --model-path out/sparse/0 --output-path for-others --format nerfstudio \\\n"
+    "      --image-path photos",
+    "align --model-path out/sparse/0 --output-path metric --gps out/database.db",
+    "align --model-path out/sparse/0 --output-path metric --points control.csv",
+    "align --model-path out/sparse/0 --output-path metric --distance a.jpg,b.jpg,2.5",
 )
 
 ENDING = """
@@ -151,6 +157,12 @@ COMMANDS: dict[str, Command] = {
     "export-h5": (commands.export_h5,
         "features and matches of an output folder or a database for hloc or deep-image-matching",
         (args.EXPORT_SOURCE, *args.H5_FILES, *args.EXPORT_FORMAT, args.VOLUME)),
+    "export": (commands.export,
+        "a model for other programs: points, text, NVM, Bundler, undistorted photographs, tables",
+        (*args.EXPORT, args.VOLUME)),
+    "align": (commands.align,
+        "give a model its scale and place, by GPS, control points or a known distance",
+        (*args.ALIGN, args.VOLUME)),
     "doctor": (commands.doctor,
         "look for what is wrong with results or the installation, and say what to do about it",
         (*args.DOCTOR, args.json("print JSON"), args.VOLUME)),
