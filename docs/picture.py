@@ -48,18 +48,18 @@ def main() -> None:
 
 
 def draw_model(axes: plt.Axes, model: pycolmap.Reconstruction, by_sift: set[str]) -> None:
-    """Draw points and cameras from above: seen along the mean direction of the images' y axes."""
+    """Draw points and cameras, seen from behind the photographers and above."""
     images = list(model.images.values())
     down = np.mean([image.cam_from_world().rotation.matrix()[1] for image in images], axis=0)
     ahead = np.mean([image.cam_from_world().rotation.matrix()[2] for image in images], axis=0)
     down /= np.linalg.norm(down)
     ahead -= (ahead @ down) * down
     ahead /= np.linalg.norm(ahead)
-    plane = np.stack([np.cross(down, ahead), ahead + 0.35 * -down])
+    plane = np.stack([np.cross(down, ahead), 0.8 * ahead - 0.6 * down])
     points = sorted(model.points3D.values(), key=lambda point: point.xyz @ -ahead)
     places = np.array([point.xyz for point in points]) @ plane.T
     colors = np.array([point.color for point in points]) / 255
-    axes.scatter(*places.T, s=1.2, c=colors, linewidths=0)
+    axes.scatter(*places.T, s=2.5, c=colors, linewidths=0)
     depth = np.median([np.linalg.norm(image.projection_center()) for image in images])
     for image in images:
         rotation, center = image.cam_from_world().rotation.matrix(), image.projection_center()
@@ -68,11 +68,12 @@ def draw_model(axes: plt.Axes, model: pycolmap.Reconstruction, by_sift: set[str]
         lines = np.concatenate([[point, center, point] for point in corners])
         shown = np.concatenate([corners, lines]) @ plane.T
         axes.plot(*shown.T, color=FOUND if image.name in by_sift else "#d21f3c", linewidth=1.3)
-    middle, extent = (
-        np.median(places, axis=0),
-        np.percentile(np.abs(places - np.median(places, axis=0)), 96),
-    )
-    axes.set(aspect="equal", xticks=[], yticks=[])
+    cameras = np.array([image.projection_center() for image in images]) @ plane.T
+    low = np.minimum(np.percentile(places, 2, axis=0), cameras.min(axis=0))
+    high = np.maximum(np.percentile(places, 98, axis=0), cameras.max(axis=0))
+    margin = 0.06 * (high - low)
+    axes.set(aspect="equal", xlim=(low - margin)[[0]].tolist() + (high + margin)[[0]].tolist(),
+             ylim=(low - margin)[[1]].tolist() + (high + margin)[[1]].tolist())  # fmt: skip
     axes.axis("off")
 
 
