@@ -1,8 +1,8 @@
 """Draw docs/picture.jpg from a finished comparison of the sample scene.
 
-    colmap-affrect compare --image-path sample_scenes/courtyard/images \
+colmap-affrect compare --image-path sample_scenes/courtyard/images \
         --output-path out/compare --methods sift-colmap,sift,default --seeds 0
-    python docs/picture.py out/compare
+python docs/picture.py out/compare
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def main() -> None:
     names = {key: {image.name for image in model.images.values()} for key, model in models.items()}
     photographs = sorted((ROOT / "sample_scenes/courtyard/images").glob("*.jpg"))
     figure = plt.figure(figsize=(10, 5.2), dpi=110)
-    grid = figure.add_gridspec(3, len(photographs), height_ratios=[1, 1, 4.2], hspace=0.25,
-                               wspace=0.06, left=0.01, right=0.99, top=0.94, bottom=0.0)  # fmt: skip
+    figure.subplots_adjust(0.01, 0.0, 0.99, 0.94, wspace=0.06, hspace=0.25)
+    grid = figure.add_gridspec(3, len(photographs), height_ratios=[1, 1, 4.2])
     for row, (key, title) in enumerate(
         {"sift-colmap": "COLMAP, SIFT", "default": "colmap-affrect"}.items()
     ):
