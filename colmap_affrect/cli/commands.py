@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_affrect.cli import given
 from colmap_affrect.errors import ComparisonError, OptionError
 from colmap_affrect.progress import SILENT, Progress, show
-from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK
+from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK, by_level
+from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_affrect.comparison.results import Comparison
@@ -106,7 +109,7 @@ def escalate(options: argparse.Namespace) -> int:
         report = escalate(context, chosen, overwrite=options.overwrite)
         levels = pair_levels(context)
     show(report.summary())
-    show(", ".join(f"{count} pairs by {name}" for name, count in levels.items()))
+    show(", ".join(by_level(*item) for item in levels.items()))
     return EXIT_OK
 
 
@@ -316,7 +319,9 @@ def _printed(report: StageReport | InterchangeReport) -> int:
 
 
 def _print_reconstruction(report: ReconstructionReport, options: argparse.Namespace) -> int:
-    show(report.to_json() if options.json else report.summary())
+    show(report.to_json() if options.json else report.summary(with_warnings=options.quiet))
+    if not (options.json or options.quiet):
+        show("\n".join(_next_steps(report, options.output_path)))
     why = ""
     if not report.models:
         why = "one image cannot make a model" if report.images_total == 1 else "no model was found"
@@ -326,6 +331,28 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
         show(f"error: {why}; see {options.output_path / 'report.json'}", file=sys.stderr)
         return EXIT_NO_MODEL
     return _exit_code(report.failures, options)
+
+
+def _next_steps(report: ReconstructionReport, out: Path) -> list[str]:
+    """Say where things are, and commands for what comes next."""
+    copied, begun = (Workspace(out).planned(stage) or {} for stage in ("copy", "extract"))
+    photos = copied.get("image_path") or begun.get("image_path")
+    model, page = out / "sparse" / "0", out / "report.html"
+    commands: list[list[object]] = []
+    if report.models:
+        look = ["colmap", "gui", "--import_path", model, "--database_path", out / "database.db"]
+        commands += [
+            look + (["--image_path", photos] if photos else []),
+            ["colmap-affrect", "export", "--model-path", model, "--output-path", out / "export"],
+        ]
+    if report.unregistered and photos:
+        where = ["--image-path", photos, "--output-path", out / "compare"]
+        commands.append(["colmap-affrect", "compare", *where])
+    lines = [f"results     {out}" + (f", to look at: {page}" if page.exists() else "")]
+    lines += ["next"] if commands else []
+    return lines + [
+        f"            {shlex.join([str(word) for word in words])}" for words in commands
+    ]
 
 
 def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
