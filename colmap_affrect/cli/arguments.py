@@ -70,14 +70,24 @@ RESULTS = (
 
 IMAGE_PATH = _path("--image-path", "PATH",
     "folder of the photographs, searched with its sub-folders", required=True)  # fmt: skip
+CONFIG = (
+    _path("--config", "FILE",
+        "options of an earlier run, its config.toml; those that are given here win, and with other "
+        "photographs its lists, masks and depth maps do not count"),
+    _path("--image-path", "PATH",
+        "folder of the photographs, searched with its sub-folders (default: that of --config)"),
+)  # fmt: skip
 MASKS = (
     _path("--mask-path", "FOLDER",
-        "masks, black where features are not wanted: a/b.jpg has a/b.jpg.png or a/b.png"),
+        "masks, black where features are not wanted: a/b.jpg has a/b.jpg.png or a/b.png; "
+        "photographs without one are used whole"),
     _path("--camera-mask-path", "FILE", "one mask for all images"),
 )  # fmt: skip
 CAMERAS = (
     _choice("--camera-mode", ["auto", "single", "per-folder", "per-image"],
-        "which images share a camera (default: auto, as given, else by EXIF)", default="auto"),
+        "which images share a camera (default: auto, as --cameras-path says, else those of one "
+        "body, lens, focal length and size by EXIF; without EXIF one camera each, unless matches "
+        "show that images of one size share one)", default="auto"),
     _value("--camera-model", "MODEL", "COLMAP camera model (default: SIMPLE_RADIAL)",
         default="SIMPLE_RADIAL"),
     _value("--camera-params", "A,B,...",
@@ -95,8 +105,7 @@ CAMERAS = (
         "for prints and scans that were cropped off centre)", default=""),
     _flag("--ignore-exif", "take neither focal lengths nor who shares a camera from EXIF"),
 )  # fmt: skip
-IMAGES = (
-    IMAGE_PATH,
+SELECTION = (
     _path("--image-list-path", "FILE",
         "names of the images to use, one per line, relative to --image-path"),
     *MASKS,
@@ -106,6 +115,7 @@ IMAGES = (
     _value("--max-failures", "N",
         "exit code 1 if more images than this cannot be read (default: 0)", type=int, default=0),
 )  # fmt: skip
+IMAGES = (IMAGE_PATH, *SELECTION)
 DESCRIPTORS = _flag("--database-descriptors",
     "descriptors into database.db too, as 8-bit SIFT, for COLMAP's own matchers")  # fmt: skip
 
@@ -114,7 +124,7 @@ def recipe(default: str | None = "default") -> tuple[Option, Option]:
     shown = default or "that of extract"
     text = f"one that 'recipes' lists, or the path of a TOML file (default: {shown})"
     example = "rectifier.tilt_radius=1.8" if default else "matching.max_ratio=0.8"
-    return _value("--recipe", "NAME", text, default=default), setting(example)
+    return _value("--recipe", "NAME", text), setting(example)
 
 
 def setting(example: str) -> Option:

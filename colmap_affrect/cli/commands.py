@@ -29,16 +29,17 @@ if TYPE_CHECKING:
 def run(options: argparse.Namespace) -> int:
     from colmap_affrect import pipeline
 
-    recipe = given.recipe(options)
+    record = given.record(options)
+    recipe = given.recipe(options, record)
     run_options = pipeline.RunOptions(
         recipe=recipe,
         database_descriptors=options.database_descriptors,
         extend=given.extension(options),
-        **given.inputs(options, recipe),
+        **given.inputs(options, recipe, record),
     )
     with given.executor(options) as executor:
         report = pipeline.run(
-            options.image_path,
+            options.image_path or Path(record["extract"]["image_path"]),
             options.output_path,
             run_options,
             executor=executor,
@@ -383,13 +384,13 @@ def inspect(options: argparse.Namespace) -> int:
 
 
 def recipes(options: argparse.Namespace) -> int:
-    import tomli_w
-
-    from colmap_affrect.recipes import load_recipe, recipe_names
+    from colmap_affrect.options import described_toml
+    from colmap_affrect.recipes import RecipeOptions, load_recipe, recipe_names
 
     if options.name:
         recipe = load_recipe(options.name)
-        show(tomli_w.dumps({"summary": recipe.summary, **recipe.to_mapping()}), end="")
+        values = {"summary": recipe.summary, **recipe.to_mapping()}
+        show(described_toml(RecipeOptions.from_mapping(values, options.name)), end="")
         return EXIT_OK
     for name in recipe_names():
         recipe = load_recipe(name)

@@ -21,6 +21,7 @@ EXAMPLES = (
     "run --image-path photos --output-path out --recipe depth-planes-recommended \\\n"
     "      --depth-path depth",
     "run --image-path all-photos --output-path out --extend finished/sparse/0",
+    "run --config out/config.toml --image-path other-photos --output-path out2",
     "extract --image-path photos --output-path out",
     "pairs --output-path out --pairs retrieval,sequence --num-neighbors 30",
     "match --output-path out",
@@ -112,7 +113,8 @@ Command = tuple[Callable[[argparse.Namespace], int], str, tuple[args.Option | ar
 
 COMMANDS: dict[str, Command] = {
     "run": (commands.run, "all stages: photographs in, COLMAP model out",
-        (*args.RESULTS, *args.IMAGES, args.DESCRIPTORS, *args.recipe(), args.MATCHER, args.GUIDED,
+        (*args.RESULTS, *args.CONFIG, *args.SELECTION, args.DESCRIPTORS, *args.recipe(),
+        args.MATCHER, args.GUIDED,
         *args.RESOURCES, args.SCHEDULER, *args.DEPTH, *args.PAIRS, args.PRESET,
         args.FOCAL_VOTE, *args.MAPPER,
         *args.EXTEND, args.seed(), args.json())),
