@@ -9,12 +9,17 @@ entry point, in another one.
 
 from __future__ import annotations
 
+import ast
 import difflib
+import inspect
+import itertools
+import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from typing import Any, Generic, Self, TypeVar
 
+import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
@@ -26,6 +31,8 @@ MAX_SEED = 2_000_000_000
 """COLMAP keeps seeds in 32 bits, and those of repeated mapping are larger than the one given."""
 PLAIN_NAMES = {"model": "options", "dict": "options", "tuple": "list"}
 """What pydantic's names of types are called in messages."""
+MAX_COMMENT = 96
+"""Width of comments in printed options."""
 CUSTOM = "custom"
 """Name of options that are no preset."""
 
@@ -173,6 +180,42 @@ class Registry(Generic[Part]):
         """Build the part that options belong to; ``given`` is what else parts of this kind take."""
         part: Part = self.part(options.name)(options, *given)
         return part
+
+
+def described_toml(options: Options, path: str = "") -> str:
+    """Return options as TOML, under each what the text below it in its class says, as a comment."""
+    texts = _descriptions(type(options))
+    lines, sections = [], []
+    for name, value in options.to_mapping().items():
+        inner = getattr(options, name)
+        at = f"{path}.{name}".lstrip(".")
+        if isinstance(inner, Options):
+            sections.append(f"\n[{at}]\n{described_toml(inner, at)}")
+        elif isinstance(inner, tuple) and inner and isinstance(inner[0], Options):
+            sections += [f"\n[[{at}]]\n{described_toml(item, at)}" for item in inner]
+        elif isinstance(value, dict):
+            sections.append(tomli_w.dumps({name: value}) if value else "")
+        else:
+            comment = textwrap.wrap(texts.get(name, "").replace("``", "'"), MAX_COMMENT)
+            lines += [*(f"# {line}\n" for line in comment), tomli_w.dumps({name: value})]
+    return "".join([*lines, *sections])
+
+
+def _descriptions(cls: type) -> dict[str, str]:
+    """Return the text below each field of a class and of those that it inherits from."""
+    found: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        if not issubclass(base, Options):
+            continue
+        (body,) = (node.body for node in ast.parse(_source(base)).body)  # type: ignore[attr-defined]
+        for field, text in itertools.pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                found[ast.unparse(field.target)] = " ".join(ast.literal_eval(text.value).split())
+    return found
+
+
+def _source(cls: type) -> str:
+    return textwrap.dedent(inspect.getsource(cls))
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -173,6 +173,7 @@ def run(
             options.extend.refuse_discarding(output_path)
         require_extends(mapper.options)
         existing_names(options.extend.model_path, names)
+    options.recipe.extraction.check_depth()
     resolve(options.recipe.weights, options.resources.weights_path, progress=progress)
     later = {"pairs": options.pairs, "verify": options.verification, "map": mapper.options}
     with context.workspace.locked():

@@ -103,6 +103,15 @@ class ExtractionOptions(Options):
         """Whether any rectifier reads depth maps."""
         return any(level.rectifier.uses_depth for level in self.levels)
 
+    def check_depth(self) -> None:
+        """Refuse rectifiers that read depth maps where none are given; OptionError says how."""
+        needing = [x.rectifier.name for x in self.levels if x.rectifier.uses_depth]
+        if needing and not self.depth.is_given:
+            raise OptionError(
+                f"rectifier {needing[0]} needs depth maps: give --depth-path FOLDER, or "
+                "--depth-model NAME for a monocular depth network"
+            )
+
     @property
     def _network_parts(self) -> tuple[NetworkOptions, ...]:
         covers = (level.rectifier for level in self.levels)

@@ -1,4 +1,4 @@
-"""The claims of the README on real photographs in ../shared, which the project does not hold."""
+"""The claims of BENCHMARKS.md on real photographs in ../shared, which the project does not hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scripts beside the recipes do what their README says."""
+"""The scripts beside the recipes do what their pages in docs/ say."""
 
 from __future__ import annotations
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -14,8 +15,8 @@ from typing import NoReturn, TextIO
 
 from colmap_affrect import __version__
 from colmap_affrect.cli.parser import build_parser
-from colmap_affrect.errors import AffrectError
-from colmap_affrect.project.report import EXIT_FAILED, EXIT_INTERRUPTED
+from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.project.report import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.shown import one_line
 
@@ -28,10 +29,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if not hasattr(options, "verbose"):  # a command that only prints
             return int(options.function(options))
-        with _logging(options):
+        with _no_empty_folder(options.output_path), _logging(options):
             return int(options.function(options))
+    except OptionError as error:
+        return _fail(str(error), EXIT_USAGE)
     except AffrectError as error:
         return _fail(str(error))
+    except BrokenPipeError:  # who reads what is printed has seen enough, as head has
+        return EXIT_OK
     except OSError as error:
         return _fail(
             f"{error.filename or 'input/output'}: {error.strerror or error}; when that is mended, "
@@ -47,15 +52,34 @@ def main_of_process() -> NoReturn:
 
     Python takes a moment to end; a Ctrl-C within it is too late to change anything.
     """
-    code = main()
+    try:
+        code: int | str | None = main()
+    except SystemExit as end:  # argparse: help, or wrong usage
+        code = end.code
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
 
 
-def _fail(message: str) -> int:
+def _fail(message: str, code: int = EXIT_FAILED) -> int:
     """Print one line; odd characters, out of files perhaps, must not reach the terminal."""
     print(f"error: {one_line(message)}", file=sys.stderr)
-    return EXIT_FAILED
+    return code
+
+
+@contextmanager
+def _no_empty_folder(path: Path | None) -> Iterator[None]:
+    """Remove a new output folder when the command fails before it has more than its log."""
+    is_new = path is not None and not path.exists()
+    try:
+        yield
+    except AffrectError:
+        if path and is_new and {file.name for file in path.glob("*")} <= {".lock", "run.log"}:
+            shutil.rmtree(path, ignore_errors=True)
+        raise
 
 
 @contextmanager

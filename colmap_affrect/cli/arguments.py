@@ -73,14 +73,24 @@ CONVERTED_PATH = _path(
 )
 IMAGE_PATH = _path("--image-path", "PATH",
     "folder of the photographs, searched with its sub-folders", required=True)  # fmt: skip
+CONFIG = (
+    _path("--config", "FILE",
+        "options of an earlier run, its config.toml; those that are given here win, and with other "
+        "photographs its lists, masks and depth maps do not count"),
+    _path("--image-path", "PATH",
+        "folder of the photographs, searched with its sub-folders (default: that of --config)"),
+)  # fmt: skip
 MASKS = (
     _path("--mask-path", "FOLDER",
-        "masks, black where features are not wanted: a/b.jpg has a/b.jpg.png or a/b.png"),
+        "masks, black where features are not wanted: a/b.jpg has a/b.jpg.png or a/b.png; "
+        "photographs without one are used whole"),
     _path("--camera-mask-path", "FILE", "one mask for all images"),
 )  # fmt: skip
 CAMERAS = (
     _choice("--camera-mode", ["auto", "single", "per-folder", "per-image"],
-        "which images share a camera (default: auto, as given, else by EXIF)", default="auto"),
+        "which images share a camera (default: auto, as --cameras-path says, else those of one "
+        "body, lens, focal length and size by EXIF; without EXIF one camera each, unless matches "
+        "show that images of one size share one)", default="auto"),
     _value("--camera-model", "MODEL", "COLMAP camera model (default: SIMPLE_RADIAL)",
         default="SIMPLE_RADIAL"),
     _value("--camera-params", "A,B,...",
@@ -98,8 +108,7 @@ CAMERAS = (
         "for prints and scans that were cropped off centre)", default=""),
     _flag("--ignore-exif", "take neither focal lengths nor who shares a camera from EXIF"),
 )  # fmt: skip
-IMAGES = (
-    IMAGE_PATH,
+SELECTION = (
     _path("--image-list-path", "FILE",
         "names of the images to use, one per line, relative to --image-path"),
     *MASKS,
@@ -109,6 +118,7 @@ IMAGES = (
     _value("--max-failures", "N",
         "exit code 1 if more images than this cannot be read (default: 0)", type=int, default=0),
 )  # fmt: skip
+IMAGES = (IMAGE_PATH, *SELECTION)
 DESCRIPTORS = _flag("--database-descriptors",
     "descriptors into database.db too, as 8-bit SIFT, for COLMAP's own matchers")  # fmt: skip
 
@@ -117,7 +127,7 @@ def recipe(default: str | None = "default") -> tuple[Option, Option]:
     shown = default or "that of extract"
     text = f"one that 'recipes' lists, or the path of a TOML file (default: {shown})"
     example = "rectifier.tilt_radius=1.8" if default else "matching.max_ratio=0.8"
-    return _value("--recipe", "NAME", text, default=default), setting(example)
+    return _value("--recipe", "NAME", text), setting(example)
 
 
 def setting(example: str) -> Option:
@@ -277,6 +287,39 @@ OLD_DATABASE = (
     _path("database_path", "OUT.db", "the database to make; must not exist"),
     _choice("--colmap", ["3.8"], "whose tables to write; COLMAP 3.8 to 3.13 read these",
         default="3.8"),
+)  # fmt: skip
+MODEL = _path("--model-path", "MODEL", "folder of a COLMAP model, such as out/sparse/0",
+    required=True)  # fmt: skip
+EXPORT = (
+    MODEL,
+    _path("--output-path", "FOLDER", "folder for the files; nothing in it is overwritten",
+        required=True, dest="target_path"),
+    _value("--format", "A,B,...",
+        "ply (points), text (COLMAP's), nvm, bundler, undistorted (photographs and model, for "
+        "dense reconstruction), nerfstudio (the same with transforms.json, for Gaussian splatting "
+        "too), "
+        "cameras (CSV), geojson (of a model that align put on earth) (default: ply,text,cameras)",
+        type=_words, default=("ply", "text", "cameras")),
+    _path("--image-path", "PATH",
+        "folder of the photographs, to undistort them (default: that of the run)"),
+)  # fmt: skip
+ALIGN = (
+    MODEL,
+    _path("--output-path", "MODEL", "folder for the new model, in metres; must not exist",
+        required=True, dest="target_path"),
+    OneOf(
+        _path("--gps", "DATABASE",
+            "positions by GPS that a COLMAP database holds, such as out/database.db"),
+        _path("--positions", "FILE",
+            "CSV of where photographs were taken: name and x,y,z in metres, or name and "
+            "latitude,longitude,altitude"),
+        _path("--points", "FILE",
+            "CSV of points that are marked in two photographs or more: point,image,px,py, and "
+            "x,y,z of control points in metres (px, py: from the upper left corner)"),
+    ),
+    _value("--distance", "A,B,METRES",
+        "a known distance, of two photographs or two points of --points: gives the scale alone; "
+        "may be repeated", action="append", default=[]),
 )  # fmt: skip
 
 IMAGE = Option("image", type=Path, metavar="IMAGE", help="the photograph")

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_affrect.cli import given
 from colmap_affrect.errors import ComparisonError, OptionError
 from colmap_affrect.progress import SILENT, Progress, show
-from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK
+from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK, by_level
+from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_affrect.comparison.results import Comparison
@@ -26,16 +29,17 @@ if TYPE_CHECKING:
 def run(options: argparse.Namespace) -> int:
     from colmap_affrect import pipeline
 
-    recipe = given.recipe(options)
+    record = given.record(options)
+    recipe = given.recipe(options, record)
     run_options = pipeline.RunOptions(
         recipe=recipe,
         database_descriptors=options.database_descriptors,
         extend=given.extension(options),
-        **given.inputs(options, recipe),
+        **given.inputs(options, recipe, record),
     )
     with given.executor(options) as executor:
         report = pipeline.run(
-            options.image_path,
+            options.image_path or Path(record["extract"]["image_path"]),
             options.output_path,
             run_options,
             executor=executor,
@@ -106,7 +110,7 @@ def escalate(options: argparse.Namespace) -> int:
         report = escalate(context, chosen, overwrite=options.overwrite)
         levels = pair_levels(context)
     show(report.summary())
-    show(", ".join(f"{count} pairs by {name}" for name, count in levels.items()))
+    show(", ".join(by_level(*item) for item in levels.items()))
     return EXIT_OK
 
 
@@ -282,6 +286,31 @@ def export_database(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
+def export(options: argparse.Namespace) -> int:
+    from colmap_affrect.interop.export import export
+
+    written = export(
+        options.model_path, options.target_path, options.format, image_path=options.image_path
+    )
+    for name, path in written.items():
+        show(f"{name:11s} {path}")
+    return EXIT_OK
+
+
+def align(options: argparse.Namespace) -> int:
+    from colmap_affrect.interop.align import Reference, align
+
+    reference = Reference(
+        gps_database=options.gps,
+        positions_path=options.positions,
+        points_path=options.points,
+        distances=tuple(given.distance(text) for text in options.distance),
+    )
+    show(align(options.model_path, options.target_path, reference).summary())
+    show(f"model       {options.target_path}")
+    return EXIT_OK
+
+
 def doctor(options: argparse.Namespace) -> int:
     from colmap_affrect.doctor import diagnose
 
@@ -301,7 +330,9 @@ def _printed(report: StageReport | InterchangeReport) -> int:
 
 
 def _print_reconstruction(report: ReconstructionReport, options: argparse.Namespace) -> int:
-    show(report.to_json() if options.json else report.summary())
+    show(report.to_json() if options.json else report.summary(with_warnings=options.quiet))
+    if not (options.json or options.quiet):
+        show("\n".join(_next_steps(report, options.output_path)))
     why = ""
     if not report.models:
         why = "one image cannot make a model" if report.images_total == 1 else "no model was found"
@@ -311,6 +342,28 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
         show(f"error: {why}; see {options.output_path / 'report.json'}", file=sys.stderr)
         return EXIT_NO_MODEL
     return _exit_code(report.failures, options)
+
+
+def _next_steps(report: ReconstructionReport, out: Path) -> list[str]:
+    """Say where things are, and commands for what comes next."""
+    copied, begun = (Workspace(out).planned(stage) or {} for stage in ("copy", "extract"))
+    photos = copied.get("image_path") or begun.get("image_path")
+    model, page = out / "sparse" / "0", out / "report.html"
+    commands: list[list[object]] = []
+    if report.models:
+        look = ["colmap", "gui", "--import_path", model, "--database_path", out / "database.db"]
+        commands += [
+            look + (["--image_path", photos] if photos else []),
+            ["colmap-affrect", "export", "--model-path", model, "--output-path", out / "export"],
+        ]
+    if report.unregistered and photos:
+        where = ["--image-path", photos, "--output-path", out / "compare"]
+        commands.append(["colmap-affrect", "compare", *where])
+    lines = [f"results     {out}" + (f", to look at: {page}" if page.exists() else "")]
+    lines += ["next"] if commands else []
+    return lines + [
+        f"            {shlex.join([str(word) for word in words])}" for words in commands
+    ]
 
 
 def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
@@ -349,13 +402,13 @@ def convert(options: argparse.Namespace) -> int:
 
 
 def recipes(options: argparse.Namespace) -> int:
-    import tomli_w
-
-    from colmap_affrect.recipes import load_recipe, recipe_names
+    from colmap_affrect.options import described_toml
+    from colmap_affrect.recipes import RecipeOptions, load_recipe, recipe_names
 
     if options.name:
         recipe = load_recipe(options.name)
-        show(tomli_w.dumps({"summary": recipe.summary, **recipe.to_mapping()}), end="")
+        values = {"summary": recipe.summary, **recipe.to_mapping()}
+        show(described_toml(RecipeOptions.from_mapping(values, options.name)), end="")
         return EXIT_OK
     for name in recipe_names():
         recipe = load_recipe(name)

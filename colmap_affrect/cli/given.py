@@ -7,11 +7,13 @@ import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, WorkspaceError
+from colmap_affrect.options import Options
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.project.workspace import Workspace, placeless
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap.verification import VerificationOptions
@@ -24,19 +26,57 @@ if TYPE_CHECKING:
     from colmap_affrect.stages.context import Context, Resources
 
 
-def inputs(options: argparse.Namespace, recipe: Recipe | None = None) -> dict[str, Any]:
+def record(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the options on record in --config, without places if there are other photographs."""
+    path: Path | None = options.config
+    if not path:
+        if not options.image_path:
+            raise OptionError("--image-path: give the folder of the photographs, or --config FILE")
+        return {}
+    workspace = Workspace(path.parent)
+    workspace.config = path
+    try:
+        found = workspace.recorded()
+    except WorkspaceError as error:
+        raise OptionError(f"--config {path}: of another version, or no config.toml") from error
+    if "extract" not in found:
+        raise OptionError(f"--config {path}: has no options of a run; give its config.toml")
+    if not options.image_path:
+        return found
+    return {key: placeless(value) if isinstance(value, dict) else value
+            for key, value in found.items()}  # fmt: skip
+
+
+def inputs(
+    options: argparse.Namespace,
+    recipe: Recipe | None = None,
+    record: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """Return the fields of InputOptions, which run and compare have in common."""
+    record = record or {}
+    extract = record.get("extract", {})
+    listed, database = extract.get("image_list_path"), extract.get("from_database")
     return {
-        "cameras": cameras(options),
-        "masks": masks(options),
-        "pairs": pair_options(options),
-        "verification": verification(options),
-        "mapping": mapping(options, recipe),
-        "image_list_path": options.image_list_path,
-        "from_database": options.from_database,
+        "cameras": _or_recorded(cameras(options), extract.get("cameras")),
+        "masks": _or_recorded(masks(options), extract.get("masks")),
+        "pairs": pair_options(options, record.get("pairs")),
+        "verification": verification(options, record.get("verify")),
+        "mapping": mapping(options, recipe, record.get("map")),
+        "image_list_path": options.image_list_path or (Path(listed) if listed else None),
+        "from_database": options.from_database or (Path(database) if database else None),
         "resources": resources(options),
         "focal_vote": options.focal_vote,
     }
+
+
+AnyOptions = TypeVar("AnyOptions", bound=Options)
+
+
+def _or_recorded(given: AnyOptions, recorded: Mapping[str, Any] | None) -> AnyOptions:
+    """Return what is given, or what is on record where nothing is."""
+    if not recorded or given != type(given)():
+        return given
+    return type(given).from_mapping(recorded, "--config")
 
 
 def extension(options: argparse.Namespace) -> Extension | None:
@@ -49,12 +89,20 @@ def extension(options: argparse.Namespace) -> Extension | None:
     return None
 
 
-def recipe(options: argparse.Namespace) -> Recipe:
-    from colmap_affrect.recipes import load_recipe
+def recipe(options: argparse.Namespace, record: Mapping[str, Any] | None = None) -> Recipe:
+    """Return the recipe that is named, or the one on record, with single options changed."""
+    from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe, with_settings
 
     given = {"matching.name": options.matcher, "guided.enabled": options.guided}
     settings = [f"{key}={json.dumps(value)}" for key, value in given.items() if value]
-    return load_recipe(options.recipe, [*settings, *options.set, *depth_settings(options)])
+    settings += [*options.set, *depth_settings(options)]
+    if options.recipe or not record:
+        return load_recipe(options.recipe or "default", settings)
+    sections = {"match": "matching", "escalate": "escalate", "guide": "guided"}
+    values = {sections[stage]: record[stage] for stage in sections if stage in record}
+    known = ExtractionOptions.model_fields
+    values |= {key: value for key, value in record["extract"].items() if key in known}
+    return Recipe.from_mapping(record["recipe"], with_settings(values, settings), "--config")
 
 
 def depth_settings(options: argparse.Namespace) -> list[str]:
@@ -181,6 +229,15 @@ def changed(context: Context, stage: str, section: str, settings: Sequence[str])
         raise OptionError(f"--set: only options of {section} can be changed here")
     changed: dict[str, Any] = values[section]
     return changed
+
+
+def distance(text: str) -> tuple[str, str, float]:
+    """Read A,B,METRES."""
+    try:
+        first, second, length = text.split(",")
+        return first, second, float(length)
+    except ValueError as error:
+        raise OptionError(f"--distance {text}: expected A,B,METRES") from error
 
 
 def progress(options: argparse.Namespace) -> Progress:

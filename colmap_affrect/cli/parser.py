@@ -21,6 +21,7 @@ EXAMPLES = (
     "run --image-path photos --output-path out --recipe depth-planes-recommended \\\n"
     "      --depth-path depth",
     "run --image-path all-photos --output-path out --extend finished/sparse/0",
+    "run --config out/config.toml --image-path other-photos --output-path out2",
     "extract --image-path photos --output-path out",
     "pairs --output-path out --pairs retrieval,sequence --num-neighbors 30",
     "match --output-path out",
@@ -45,6 +46,12 @@ EXAMPLES = (
     "export-h5 --database-path any.db --features-path features.h5 \\\n"
     "      --matches-path matches.h5",
     "export-database out old.db --colmap 3.8",
+    "export --model-path out/sparse/0 --output-path for-others --format ply,bundler",
+    "export --model-path out/sparse/0 --output-path for-others --format nerfstudio \\\n"
+    "      --image-path photos",
+    "align --model-path out/sparse/0 --output-path metric --gps out/database.db",
+    "align --model-path out/sparse/0 --output-path metric --points control.csv",
+    "align --model-path out/sparse/0 --output-path metric --distance a.jpg,b.jpg,2.5",
 )
 
 ENDING = """
@@ -108,7 +115,8 @@ Command = tuple[Callable[[argparse.Namespace], int], str, tuple[args.Option | ar
 
 COMMANDS: dict[str, Command] = {
     "run": (commands.run, "all stages: photographs in, COLMAP model out",
-        (*args.RESULTS, *args.IMAGES, args.DESCRIPTORS, *args.recipe(), args.MATCHER, args.GUIDED,
+        (*args.RESULTS, *args.CONFIG, *args.SELECTION, args.DESCRIPTORS, *args.recipe(),
+        args.MATCHER, args.GUIDED,
         *args.RESOURCES, args.SCHEDULER, *args.DEPTH, *args.PAIRS, args.PRESET,
         args.FOCAL_VOTE, *args.MAPPER,
         *args.EXTEND, args.seed(), args.json())),
@@ -159,6 +167,12 @@ COMMANDS: dict[str, Command] = {
     "export-database": (commands.export_database,
         "any database for COLMAP 3.8 to 3.13, as Linux distributions have them",
         (*args.OLD_DATABASE, args.VOLUME)),
+    "export": (commands.export,
+        "a model for other programs: points, text, NVM, Bundler, undistorted photographs, tables",
+        (*args.EXPORT, args.VOLUME)),
+    "align": (commands.align,
+        "give a model its scale and place, by GPS, control points or a known distance",
+        (*args.ALIGN, args.VOLUME)),
     "doctor": (commands.doctor,
         "look for what is wrong with results or the installation, and say what to do about it",
         (*args.DOCTOR, args.json("print JSON"), args.VOLUME)),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +11,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import registered_names
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.options import suggestion
+from colmap_affrect.project.tables import read_lines, read_table
 
 WIDTHS = ("sensor_width_mm", "plate_width_mm")
 COLUMNS = ("name", "camera", "model", "params", "focal_px", "focal_mm", *WIDTHS, "cx", "cy")
@@ -112,11 +111,7 @@ def _require_params(given: GivenCamera, where: str) -> None:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise OptionError(f"--cameras-path {path}: cannot be read ({reason})") from error
+    return read_lines(path, f"--cameras-path {path}")
 
 
 def _read_model(path: Path) -> dict[str, GivenCamera]:
@@ -183,30 +178,9 @@ def _read_text_model(folder: Path) -> dict[str, GivenCamera]:
 
 def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
     """Read a CSV file with a header; rows may leave cells empty."""
-    where = f"--cameras-path {path}"
-    reader = csv.reader(_lines(path), skipinitialspace=True)
-    try:
-        rows = [(reader.line_num, cells) for cells in reader]
-    except csv.Error as error:
-        raise OptionError(f"{where}, line {reader.line_num}: {error}") from error
-    header = [cell.strip() for cell in rows[0][1]] if rows else []
-    for column in header:
-        if column not in COLUMNS:
-            raise OptionError(f"{where}: unknown column '{column}'{suggestion(column, COLUMNS)}")
-    if "name" not in header or len(set(header)) < len(header):
-        raise OptionError(f"{where}: its first line must have the column 'name', and each once")
     found: dict[str, GivenCamera] = {}
     labels: dict[str, GivenCamera] = {}
-    for number, cells in rows[1:]:
-        place = f"{where}, line {number}"
-        if not any(cell.strip() for cell in cells):
-            continue
-        if len(cells) > len(header):
-            raise OptionError(
-                f"{place}: has {len(cells)} cells and the first line {len(header)}; params with "
-                'commas need quotes, "1437,1440,792,524"'
-            )
-        row = {k: cell.strip() for k, cell in zip(header, cells, strict=False) if cell.strip()}
+    for place, row in read_table(path, f"--cameras-path {path}", COLUMNS):
         name = row.get("name", "")
         if not name or name in found:
             raise OptionError(f"{place}: {f'{name} is there twice' if name else 'has no name'}")

@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import StoreError
+from colmap_affrect.errors import AffrectError, OptionError, StoreError
 from colmap_affrect.project.atomic_files import cannot_write
 
 SENSOR_BYTES = 8
@@ -84,6 +84,21 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a model that pycolmap has just written."""
     _require_written(folder)
     return pycolmap.Reconstruction(folder)
+
+
+def read_given_model(
+    folder: Path, option: str = "", error_class: type[AffrectError] = OptionError
+) -> pycolmap.Reconstruction:
+    """Read a model that the user gives, text or binary; an error names the option it came by."""
+    if all((folder / name).exists() for name in RECORDS):
+        registered_names(folder)  # pycolmap's reader may never end on a damaged file
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (RuntimeError, ValueError) as error:
+        raise error_class(
+            f"{option}{folder}: not a COLMAP model; give the folder that holds cameras, images and "
+            f"points3D as .bin or .txt ({' '.join(str(error).split())})"
+        ) from error
 
 
 def _require_written(folder: Path) -> None:

@@ -46,7 +46,7 @@ class MaskOptions(Options):
     """Where features may be, as COLMAP has it: nowhere that a mask is black."""
 
     path: str = ""
-    """Folder with a mask for every image: a/b.jpg has a/b.jpg.png or a/b.png; empty for none."""
+    """Folder of masks, a/b.jpg has a/b.jpg.png or a/b.png; images without one are used whole."""
     camera_path: str = ""
     """One mask for all images; empty for none."""
 
@@ -75,12 +75,12 @@ class Photographs:
             raise OptionError(f"--camera-mask-path {self.masks.camera_path}: no such file")
 
     def mask(self, name: str) -> Mask | None:
-        """Return the (H, W) mask of an image, None where there are no masks.
+        """Return the (H, W) mask of an image, None where it has none.
 
         Raises:
-            ImageError: when a mask is missing, cannot be read or has another size.
+            ImageError: when a mask cannot be read or has another size.
         """
-        paths = [self._mask_path(name)] if self.masks.path else []
+        paths = [path for path in self._mask_paths(name) if path.is_file()][:1]
         paths += [Path(self.masks.camera_path)] if self.masks.camera_path else []
         size, masks = header_size(self.folder / name), list[Mask]()
         for path in paths:
@@ -96,26 +96,31 @@ class Photographs:
                 )
         return np.logical_and.reduce(masks) if masks else None
 
-    def _mask_path(self, name: str) -> Path:
-        paths = self._mask_paths(name)
-        for path in paths:
-            if path.is_file():
-                return path
-        raise ImageError(
-            f"{self.folder / name}: has no mask {paths[0]}; make one (black is left out), or "
-            "leave out --mask-path"
-        )
+    def without_mask(self, names: Sequence[str]) -> list[str]:
+        """Return the images that have no mask in the folder of masks, if there is one.
+
+        Raises:
+            OptionError: when none has: it is another folder, or the names differ.
+        """
+        paths = {name: self._mask_paths(name) for name in names if self.masks.path}
+        found = [name for name in paths if not any(path.is_file() for path in paths[name])]
+        if found and len(found) == len(names):
+            raise OptionError(
+                f"--mask-path {self.masks.path}: has no mask of any image, such as "
+                f"{paths[found[0]][0]}"
+            )
+        return found
 
     def _mask_paths(self, name: str) -> list[Path]:
         """Return where the mask of an image may be, the first that is there counts."""
         folder = Path(self.masks.path)
+        if not self.masks.path:
+            return []
         return [folder / f"{name}.png", (folder / name).with_suffix(".png")]
 
     def files(self, name: str) -> list[Path]:
         """Return the files that the extraction of an image reads, as far as they are there."""
-        paths = [self.folder / name]
-        if self.masks.path:
-            paths += self._mask_paths(name)
+        paths = [self.folder / name, *self._mask_paths(name)]
         if self.masks.camera_path:
             paths.append(Path(self.masks.camera_path))
         return [path for path in paths if path.is_file()]

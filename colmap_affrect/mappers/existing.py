@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.model_files import RECORDS, registered_names
+from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import MappingError, OptionError
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 
@@ -176,7 +176,8 @@ def existing_names(model_path: Path, known: Collection[str]) -> list[str]:
     Raises:
         MappingError: when it is no model, or has images that are not known.
     """
-    return _known_names(_read(model_path), model_path, known)
+    model = read_given_model(model_path, "--extend ", MappingError)
+    return _known_names(model, model_path, known)
 
 
 def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
@@ -185,7 +186,10 @@ def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
     Raises:
         MappingError: when it is no model, or does not fit the database.
     """
-    old, path = _read(extension.model_path), extension.model_path
+    old, path = (
+        read_given_model(extension.model_path, "--extend ", MappingError),
+        extension.model_path,
+    )
     with open_database(database_path) as database:
         options = pycolmap.DatabaseCacheOptions(load_all_images=True)
         cache = pycolmap.DatabaseCache.create(database, options)
@@ -207,18 +211,6 @@ def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
 
 ImagePairs = list[tuple[pycolmap.Image, pycolmap.Image]]
 """Images of the old model and the same ones of the database."""
-
-
-def _read(path: Path) -> pycolmap.Reconstruction:
-    if all((path / name).exists() for name in RECORDS):
-        registered_names(path)  # pycolmap's reader may never end on a damaged file
-    try:
-        return pycolmap.Reconstruction(path)
-    except (RuntimeError, ValueError) as error:
-        raise MappingError(
-            f"--extend {path}: not a COLMAP model; give the folder that holds cameras, images and "
-            f"points3D as .bin or .txt ({' '.join(str(error).split())})"
-        ) from error
 
 
 def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:

@@ -20,6 +20,15 @@ FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 MAX_LINES, MAX_ADVICE = 12, 4
 """Of each list in a summary; report.json has all."""
 
+SOURCES = {
+    "exif": "from EXIF", "exif-rescaled": "from EXIF, for another size", "pairs": "from matches",
+    "guess": "guessed",
+}  # fmt: skip
+"""How a summary calls where focal lengths are from; others are called by their own names."""
+
+USUAL = "sparse, sparse mapper"
+"""Preset and mapper that a summary does not name."""
+
 
 def _some(lines: Iterable[str]) -> list[str]:
     """Return the first few lines of a list, and how many there are more."""
@@ -28,6 +37,13 @@ def _some(lines: Iterable[str]) -> list[str]:
     return (
         [*shown[:MAX_LINES], f"            and {more} more, see report.json"] if more > 1 else shown
     )
+
+
+def by_level(level: str, count: int) -> str:
+    """Say how many pairs a level of a recipe decided, by the name of its rectifier."""
+    if level in ("identity", "none"):
+        return f"{count} {'without warps' if level == 'identity' else 'not verified'}"
+    return f"{count} with warps ({level})"
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -145,6 +161,26 @@ class ModelSummary:
     def is_trustworthy(self) -> bool:
         """Whether two images or more are left that nothing speaks against."""
         return not self.doubts and len(self.registered_names) - len(self.doubtful) > 1
+
+    def summary_lines(self) -> list[str]:
+        """Return what a summary says of the largest model."""
+        lines: list[str] = []
+        lines += _some(
+            f"            {name}: focal lengths from {low:.0f} to {high:.0f} px fit as well"
+            for name, (low, high) in self.rival_focals_px.items()
+        )
+        lines += _some(
+            f"came in     {name} {item.text()}"
+            for name, item in self.arrivals.items()
+            if item.how != "tracks"
+        )
+        lines += _some(f"doubtful    {name}: {why}" for name, why in self.doubtful.items())
+        lines += [f"doubtful    the whole model: {why}" for why in self.doubts]
+        lines += [
+            f"points      {self.num_points3D}, each in {self.mean_track_length:.2f} images",
+            f"error       {self.mean_reprojection_error_px:.2f} px on average",
+        ]
+        return lines
 
 
 @dataclass(frozen=True)
@@ -275,7 +311,7 @@ class ReconstructionReport:
         """Return ``report.json`` as text."""
         return json.dumps(self.to_mapping(), indent=2, ensure_ascii=False) + "\n"
 
-    def summary(self) -> str:
+    def summary(self, *, with_warnings: bool = True) -> str:
         """Return one screen of text."""
         registered = len(self.registered_names)
         lines = [f"registered  {registered} of {self.images_total} images"]
@@ -283,49 +319,37 @@ class ReconstructionReport:
             lines += [f"extended    {len(self.extended)} were there, {len(self.added)} came in"]
             lines += [f"            new {name}" for name in self.added]
         lines += _some(f"            not {name}: {why}" for name, why in self.unregistered.items())
-        lines += [f"try         {text}" for text in self.advice[:MAX_ADVICE]]
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
-        if self.pair_levels:
-            counts = ", ".join(f"{count} by {name}" for name, count in self.pair_levels.items())
-            lines += [f"decided     {counts}"]
+        if counts := [by_level(*item) for item in self.pair_levels.items() if item[0] != "none"]:
+            lines += [f"            {', '.join(counts)}"]
         if self.contradicting_pairs:
-            counts = ", ".join(f"{n} by {name}" for name, n in self.contradicting_pairs.items())
-            lines += [f"            the model contradicts {counts}"]
+            counts = [by_level(*item) for item in self.contradicting_pairs.items()]
+            lines += [f"            the model contradicts {', '.join(counts)}"]
         if self.guided:
             before, after = self.guided["matches_before"], self.guided["matches_after"]
-            lines += [f"guided      {self.guided['pairs']} pairs, {before} to {after} inliers"]
+            lines += [
+                f"guided      {self.guided['pairs']} pairs matched again: {after} inliers, "
+                f"{before} before"
+            ]
         if self.cameras:
             sources = Counter(str(camera["source"]) for camera in self.cameras).most_common()
-            lines += [f"cameras     {', '.join(f'{n} {source}' for source, n in sources)}"]
+            texts = [f"{count} {SOURCES.get(source, source)}" for source, count in sources]
+            lines += [f"focal       {', '.join(texts)}"]
         if self.models:
-            model = self.models[0]
-            lines += _some(
-                f"            {name}: focal lengths from {low:.0f} to {high:.0f} px fit as well"
-                for name, (low, high) in model.rival_focals_px.items()
-            )
-            lines += _some(
-                f"came in     {name} {item.text()}"
-                for name, item in model.arrivals.items()
-                if item.how != "tracks"
-            )
-            lines += _some(f"doubtful    {name}: {why}" for name, why in model.doubtful.items())
-            lines += [f"doubtful    the whole model: {why}" for why in model.doubts]
-            lines += [
-                f"points      {model.num_points3D}",
-                f"track       {model.mean_track_length:.2f} images on average",
-                f"error       {model.mean_reprojection_error_px:.2f} px on average",
-            ]
+            lines += self.models[0].summary_lines()
         if len(self.models) > 1:
             sizes = ", ".join(str(len(model.registered_names)) for model in self.models)
             lines += [f"models      {len(self.models)}, of {sizes} images"]
         given = [f"{key}={value}" for key, value in self.mapping["mapper_options"].items()]
         chosen = ", ".join([self.preset, f"{self.mapping['name']} mapper", *given])
-        lines += [f"preset      {chosen}"]
-        lines += [
-            f"warning     {name}: {why}"
-            for stage in self.stages
-            for name, why in stage.warnings.items()
-        ]
+        lines += [f"preset      {chosen}"] if chosen != USUAL else []
+        if with_warnings:
+            lines += _some(f"warning     {name}: {why}" for name, why in self.warnings.items())
         seconds = "  ".join(f"{stage.name} {stage.wall_s:.1f}" for stage in self.stages)
         lines += [f"seconds     {seconds}"]
+        if self.advice:
+            lines += [
+                "try         (with another --output-path)",
+                *(f"            {text}" for text in self.advice[:MAX_ADVICE]),
+            ]
         return "\n".join(lines)

@@ -33,6 +33,8 @@ PLACES = {
 }  # fmt: skip
 """Options that say where files are: other places are no other options, what the files hold counts
 (:mod:`colmap_affrect.project.contents`). But none at all is another option."""
+GIVEN = "given"
+"""What stands in the place of such an option when options are compared."""
 INPUTS = "inputs.sha256"
 """File in sparse/ that names the verified pairs, and the extended model, they were made from."""
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
@@ -189,7 +191,9 @@ class Workspace:
             begun = [name for name in begun if STAGES.index(name) < STAGES.index(stage)]
             record = record if begun else {}
         if stage in begun:
-            difference = first_difference(_placeless(record[stage]), _placeless(options))
+            difference = first_difference(
+                placeless(record[stage], GIVEN), placeless(options, GIVEN)
+            )
             if difference:
                 raise StaleStoreError(
                     f"{self.path}: the {stage} stage was run there with {difference}; "
@@ -238,7 +242,7 @@ class Workspace:
         options = {
             stage: {key: value for key, value in values.items() if key not in LOCAL}
             for stage in stages
-            for values in (_placeless(record.get(stage, {})),)
+            for values in (placeless(record.get(stage, {}), GIVEN),)
         }
         return hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()
 
@@ -327,14 +331,14 @@ def database_files(path: Path) -> list[Path]:
     return [path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", "-journal"))]
 
 
-def _placeless(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return options that only tell of places whether there are any."""
+def placeless(options: Mapping[str, Any], there: str = "", prefix: str = "") -> dict[str, Any]:
+    """Return options without places of files; ``there`` stands where one is given."""
     found = dict(options)
     for key, value in options.items():
         if isinstance(value, Mapping):
-            found[key] = _placeless(value, f"{prefix}{key}.")
+            found[key] = placeless(value, there, f"{prefix}{key}.")
         elif value and prefix + key in PLACES:
-            found[key] = "given"
+            found[key] = there
     return found
 
 

@@ -199,6 +199,7 @@ def extract(
     if image_names:
         names = checked_names(folder, image_names, "image_names")
     inputs.check_names(names)
+    whole = inputs.photographs.without_mask(names)
     extractor = prepared_recipe(context, recipe.extraction, names)
     contents = Contents(workspace.contents)
     digests = {name: contents.digest(inputs.files(name, extractor.options)) for name in names}
@@ -212,6 +213,8 @@ def extract(
     _refuse_foreign_features(workspace, missing)
     if not (inputs.image_list_path or image_names):
         warnings |= not_named(folder, names) if inputs.from_database else left_out(folder)
+    if whole:
+        warnings["masks"] = f"{len(whole)} images have none and are used whole, as {whole[0]} is"
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
     failures = _extract_missing(context, inputs, extractor, missing, digests, warnings)

@@ -44,11 +44,8 @@ logger = logging.getLogger(__name__)
 NUM_BEST_PAIRS = 3
 """Pairs that are named for each image that was not registered."""
 
-STRONGER_RECIPES = ("on-demand", "affnet-shapes")
+STRONGER_RECIPE, LEARNED_RECIPE = "on-demand", "on-demand-learned"
 """Advised where photographs are missing; the second needs weights."""
-
-LEARNED_RECIPE = "on-demand-learned"
-"""Advised where its weights are."""
 
 
 def map_images(
@@ -300,17 +297,19 @@ def advice(
     workspace = context.workspace
     min_num_inliers = recorded_verification(workspace).min_num_inliers
     verified = _verified_by_name(workspace.database, min_num_inliers)
+    recipe, again = workspace.recipe(), "run again with"
     texts = []
     cameras, inputs = colmap_database.all_cameras(workspace.database), Inputs.recorded(workspace)
     same_size = len({(camera.width, camera.height) for camera in cameras}) == 1
     if len(cameras) > 1 and same_size and not any(c.has_prior_focal_length for c in cameras):
-        texts.append("--camera-mode single, if one camera took them: all have the same size")
-    others = [name for name in STRONGER_RECIPES if name != workspace.recipe()]
-    texts.append(f"another method, --recipe {' or '.join(others)}; compare tries several")
-    if workspace.recipe() != LEARNED_RECIPE and not missing_weights(
-        load_recipe(LEARNED_RECIPE).weights, context.resources.weights_path
-    ):
-        texts.append(f"--recipe {LEARNED_RECIPE}, where light, epoch or medium differ")
+        texts.append(f"{again} --camera-mode single, if one camera took all: they have one size")
+    if recipe not in (STRONGER_RECIPE, LEARNED_RECIPE):
+        texts.append(f"{again} --recipe {STRONGER_RECIPE}, which tries more warps for those")
+    if recipe != LEARNED_RECIPE:
+        weights = load_recipe(LEARNED_RECIPE).weights
+        gone = missing_weights(weights, context.resources.weights_path)
+        fetch = f" (first: colmap-affrect weights fetch {' '.join(weights)})" if gone else ""
+        texts.append(f"{again} --recipe {LEARNED_RECIPE}, if light or age differ{fetch}")
     between = [
         f"{name} and {max(inside, key=lambda other: partners[other])}"
         for name, partners in verified.items()
@@ -319,7 +318,7 @@ def advice(
     places = f"between {', between '.join(between)}" if between else "that show the missing places"
     texts.append(f"more photographs {places}")
     if models and models[0].doubtful and not (inputs.masks.path or inputs.masks.camera_path):
-        texts.append("--mask-path, where something moves, repeats or is written over photographs")
+        texts.append(f"{again} --mask-path, where something moves, repeats or is written over them")
     return tuple(texts)
 
 

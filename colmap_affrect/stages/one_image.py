@@ -27,7 +27,7 @@ from colmap_affrect.data import (
     RectificationPlan,
     in_mask,
 )
-from colmap_affrect.errors import DepthError, ImageError, OptionError
+from colmap_affrect.errors import DepthError, ImageError
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
 from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.geometry.affine import transform_frames
@@ -334,6 +334,7 @@ def prepare(
     folder of depth maps has none of the images.
     """
     resources = resources or Resources()
+    options.check_depth()
     weights = resolve(options.weights, resources.weights_path, progress=progress)
     network = NetworkContext(weights, _device(options, resources))
     levels = options.levels
@@ -342,12 +343,6 @@ def prepare(
     }
     depth = None
     if options.uses_depth:
-        if not options.depth.is_given:
-            needing = next(x.rectifier.name for x in levels if x.rectifier.uses_depth)
-            raise OptionError(
-                f"rectifier {needing} needs depth maps: give --depth-path FOLDER, or "
-                "--depth-model NAME for a monocular depth network"
-            )
         depth_context = DepthContext(resources.depth_cache_path, network.device)
         depth = DEPTH_SOURCES.make(options.depth, depth_context)
         if image_names is not None:

@@ -1,4 +1,4 @@
-"""The commands that the README names start, and the functions whose time they take exist."""
+"""The commands that BENCHMARKS.md names start, and the functions whose time they take exist."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import pytest
 from speed_by_core import STAGES
 
 ROOT = Path(__file__).parents[2]
-SCRIPTS = sorted(set(re.findall(r"tests/benchmarks/\w+\.py", (ROOT / "README.md").read_text())))
+SCRIPTS = sorted(set(re.findall(r"tests/benchmarks/\w+\.py", (ROOT / "BENCHMARKS.md").read_text())))
 
 
-def test_the_readme_names_benchmarks() -> None:
+def test_benchmarks_are_named() -> None:
     assert "tests/benchmarks/speed.py" in SCRIPTS
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_benchmark_of_the_readme_starts(script: str) -> None:
+def test_benchmark_starts(script: str) -> None:
     command = [sys.executable, script, "--help"]
     assert (
         "usage:"

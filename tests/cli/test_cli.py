@@ -68,7 +68,7 @@ def test_help_has_options_and_examples(command: list[str], call: Call) -> None:
 def test_each_command_has_examples_of_its_own_that_it_understands() -> None:
     parser = build_parser()
     assert {example.split()[0] for example in EXAMPLES} == {
-        *COMMANDS, "convert", "import-h5", "export-h5", "export-database",
+        *COMMANDS, "convert", "import-h5", "export-h5", "export-database", "export", "align",
     }  # fmt: skip
     for example in EXAMPLES:
         parser.parse_args(example.replace("\\\n", " ").split())
@@ -196,11 +196,15 @@ def test_long_options_are_accepted_with_underscores(
 def test_failure_prints_one_line_and_leaves_the_traceback_in_the_log(
     tmp_path: Path, call: Call
 ) -> None:
-    done = call("run", "--image-path", tmp_path / "none", "--output-path", tmp_path / "out")
+    arguments = ["run", "--image-path", tmp_path / "none", "--output-path", tmp_path / "out"]
+    done = call(*arguments)
     assert (done.code, done.stdout) == (1, "")
     assert done.stderr == [
         f"error: {tmp_path / 'none'}: no such folder; give the folder of the photographs"
     ]
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "out").mkdir()
+    call(*arguments)
     log = (tmp_path / "out" / "run.log").read_text()
     assert "Traceback" in log
     assert "ImageError" in log
@@ -292,8 +296,8 @@ def test_preset_mapper_and_its_options_are_in_the_report_and_on_record(
     [
         (["--preset", "dense"], 2, "invalid choice: 'dense'"),
         (["--mapper-options"], 2, "expected at least one argument"),
-        (["--mapper-options", "min_model_size"], 1, "min_model_size: expected KEY=VALUE"),
-        (["--mapper-options", "__import__('os')=1"], 1, "pycolmap has no such option"),
+        (["--mapper-options", "min_model_size"], 2, "min_model_size: expected KEY=VALUE"),
+        (["--mapper-options", "__import__('os')=1"], 2, "pycolmap has no such option"),
     ],
 )
 def test_wrong_mapping_options_are_said_before_any_image_is_read(

@@ -59,7 +59,7 @@ def test_table_gives_as_much_as_is_known(tmp_path: Path) -> None:
         (["name,focal_px", ",3"], "line 2: has no name"),
         (
             ["name,focal_px", "a,3,4"],
-            "line 2: has 3 cells and the first line 2; params with commas",
+            "line 2: has 3 cells and the first line 2; values with commas",
         ),
         (["name,focal_px", "a,long"], "line 2: focal_px long: not numbers"),
         (["name,focal_px", "a,35mm"], "line 2: focal_px 35mm: not numbers"),

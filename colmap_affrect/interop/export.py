@@ -1,0 +1,290 @@
+"""A COLMAP model for other programs: points, text, NVM, Bundler, flat photographs, tables."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import read_given_model
+from colmap_affrect.colmap.poses import model_poses
+from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.interop.georeference import Georeference
+from colmap_affrect.options import suggestion
+from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.report import csv_text
+from colmap_affrect.project.workspace import Workspace
+
+Array = NDArray[np.float64]
+
+DENSE = "dense"
+"""Folder of undistorted photographs with their model, as COLMAP's dense reconstruction has it."""
+
+NO_EXTRA: dict[str, float] = {"k1": 0.0, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0}
+"""Distortion of undistorted photographs, by nerfstudio's names."""
+
+RADIAL_MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2}
+"""Camera models that Bundler's and NVM's radial terms can tell, and how many terms they have."""
+
+NVM_TERMS, BUNDLER_TERMS = 1, 2
+
+FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])
+"""From COLMAP's camera (y down, looks along z) to that of OpenGL, Bundler and nerfstudio."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is exported.
+
+    Attributes:
+        path: folder of the model.
+        model: its content.
+        image_path: folder of the photographs; None if it is not known.
+    """
+
+    path: Path
+    model: pycolmap.Reconstruction
+    image_path: Path | None
+
+    def images(self) -> list[pycolmap.Image]:
+        """Return the registered images by name."""
+        images = (self.model.image(image_id) for image_id in self.model.reg_image_ids())
+        return sorted(images, key=lambda image: str(image.name))
+
+    def tracks(self) -> Iterator[tuple[pycolmap.Point3D, list[tuple[int, int, Array]]]]:
+        """Yield points with, for each image that sees it: its place in images(), keypoint, x y."""
+        images = self.images()
+        places = {image.image_id: place for place, image in enumerate(images)}
+        for _, point in sorted(self.model.points3D.items()):
+            seen = []
+            for element in point.track.elements:
+                place = places[element.image_id]
+                keypoint = images[place].points2D[element.point2D_idx].xy
+                seen.append((place, element.point2D_idx, keypoint))
+            yield point, seen
+
+
+def export(
+    model_path: Path,
+    output_path: Path,
+    formats: Sequence[str],
+    *,
+    image_path: Path | None = None,
+) -> dict[str, Path]:
+    """Write a model in some formats.
+
+    Args:
+        model_path: folder of a COLMAP model.
+        output_path: folder for the files, made if missing; nothing in it is overwritten.
+        formats: keys of ``FORMATS``.
+        image_path: folder of the photographs, for undistorted ones; by default as the run
+            that made the model has it on record.
+
+    Returns:
+        What was written, by format.
+
+    Raises:
+        AffrectError: when a format cannot hold the model, or a file exists.
+    """
+    for name in formats:
+        if name not in FORMATS:
+            raise OptionError(f"--format {name}: unknown{suggestion(name, FORMATS)}")
+    source = Source(
+        model_path, read_given_model(model_path), image_path or _recorded_images(model_path)
+    )
+    output_path.mkdir(parents=True, exist_ok=True)
+    return {name: FORMATS[name](source, output_path) for name in dict.fromkeys(formats)}
+
+
+def _recorded_images(model_path: Path) -> Path | None:
+    """Return where the photographs of a run are, if the model is that of a run."""
+    folder = model_path.resolve().parent.parent
+    recorded = Workspace(folder).planned("extract") or {}
+    return Path(recorded["image_path"]) if "image_path" in recorded else None
+
+
+def _new(path: Path) -> Path:
+    if path.exists():
+        raise OptionError(f"{path}: exists, and is left as it is; use another --output-path")
+    return path
+
+
+def _points(source: Source, folder: Path) -> Path:
+    path = _new(folder / "points3D.ply")
+    source.model.export_PLY(path)
+    return path
+
+
+def _text(source: Source, folder: Path) -> Path:
+    path = _new(folder / "text")
+    path.mkdir()
+    source.model.write_text(path)
+    return path
+
+
+def _radial(source: Source, image: pycolmap.Image, num_terms: int, name: str) -> tuple[Any, Array]:
+    """Return the camera of an image and its radial terms, with zeros for those it has not."""
+    camera = source.model.cameras[image.camera_id]
+    known = RADIAL_MODELS.get(camera.model.name)
+    if known is None or known > num_terms:
+        raise OptionError(
+            f"{name}: cannot hold the camera of {image.name} ({camera.model.name}); export "
+            f"'undistorted' first, and then the model in its folder {DENSE}/sparse"
+        )
+    terms = np.zeros(num_terms)
+    terms[:known] = camera.params[len(camera.params) - known :] if known else []
+    return camera, terms
+
+
+def _nvm(source: Source, folder: Path) -> Path:
+    """Write VisualSFM's file: keypoints from the principal point, k with the other sign."""
+    path, images = _new(folder / "model.nvm"), source.images()
+    lines, centers = ["NVM_V3", "", str(len(images))], []
+    for image in images:
+        camera, terms = _radial(source, image, NVM_TERMS, "NVM")
+        if any(character.isspace() for character in image.name):
+            raise OptionError(f"NVM: cannot hold the name '{image.name}', which has a space")
+        centers.append(np.array([camera.principal_point_x, camera.principal_point_y]))
+        pose = image.cam_from_world()
+        x, y, z, w = pose.rotation.quat
+        values = [camera.mean_focal_length(), w, x, y, z, *image.projection_center(), -terms[0], 0]
+        lines.append(f"{image.name} {_numbers(values)}")
+    lines += ["", str(source.model.num_points3D())]
+    for point, seen in source.tracks():
+        keypoints = [
+            f"{place} {index} {_numbers(xy - centers[place])}" for place, index, xy in seen
+        ]
+        colour = " ".join(map(str, point.color))
+        lines.append(f"{_numbers(point.xyz)} {colour} {len(seen)} {' '.join(keypoints)}")
+    replace_text(path, "\n".join(lines) + "\n")
+    return path
+
+
+def _bundler(source: Source, folder: Path) -> Path:
+    """Write Bundler's file, whose cameras look along -z, and the list of its photographs."""
+    path, images = _new(folder / "bundle.out"), source.images()
+    lines = ["# Bundle file v0.3", f"{len(images)} {source.model.num_points3D()}"]
+    centers = []
+    for image in images:
+        camera, terms = _radial(source, image, BUNDLER_TERMS, "Bundler")
+        centers.append(np.array([camera.principal_point_x, camera.principal_point_y]))
+        matrix = FLIP_Y_Z @ image.cam_from_world().matrix()
+        lines.append(_numbers([camera.mean_focal_length(), *terms]))
+        lines += [_numbers(row) for row in matrix[:, :3]]
+        lines.append(_numbers(matrix[:, 3]))
+    for point, seen in source.tracks():
+        lines += [_numbers(point.xyz), " ".join(map(str, point.color))]
+        views = [
+            f"{place} {index} {_numbers((xy - centers[place]) * [1, -1])}"
+            for place, index, xy in seen
+        ]
+        lines.append(f"{len(views)} {' '.join(views)}")
+    replace_text(path, "\n".join(lines) + "\n")
+    replace_text(folder / "bundle.list.txt", "".join(f"{image.name}\n" for image in images))
+    return path
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{float(value):.12g}" for value in values)
+
+
+def _undistorted(source: Source, folder: Path) -> Path:
+    """Write undistorted photographs with their model, ready for COLMAP's patch_match_stereo."""
+    path = _new(folder / DENSE)
+    if source.image_path is None:
+        raise OptionError("--image-path: give the folder of the photographs, to undistort them")
+    for image in source.images():
+        if not (source.image_path / image.name).is_file():
+            raise ImageError(
+                f"{source.image_path / image.name}: no such photograph; give --image-path"
+            )
+    pycolmap.undistort_images(path, source.path, source.image_path)
+    return path
+
+
+def _nerfstudio(source: Source, folder: Path) -> Path:
+    """Add to undistorted photographs what nerfstudio and Gaussian splatting read."""
+    path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
+    _new(path / "transforms.json")
+    flat = Source(path, pycolmap.Reconstruction(path / "sparse"), None)
+    frames = []
+    for image in flat.images():
+        camera, pose = flat.model.cameras[image.camera_id], np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        pose[:3, :3] = pose[:3, :3] @ FLIP_Y_Z
+        frames.append({
+            "file_path": f"images/{image.name}",
+            "transform_matrix": pose.tolist(),
+            "fl_x": camera.focal_length_x, "fl_y": camera.focal_length_y,
+            "cx": camera.principal_point_x, "cy": camera.principal_point_y,
+            "w": camera.width, "h": camera.height, **NO_EXTRA,
+        })  # fmt: skip
+    flat.model.export_PLY(path / "points3D.ply")
+    (path / "sparse" / "0").mkdir(exist_ok=True)  # where Gaussian splatting looks
+    flat.model.write(path / "sparse" / "0")
+    content = {"camera_model": "OPENCV", "ply_file_path": "points3D.ply", "frames": frames}
+    replace_text(path / "transforms.json", json.dumps(content, indent=1) + "\n")
+    return path / "transforms.json"
+
+
+def _cameras(source: Source, folder: Path) -> Path:
+    """Write a table: a row for each photograph, with its camera, where it stands and looks."""
+    path, place = _new(folder / "cameras.csv"), Georeference.read(source.path)
+    rows: list[dict[str, Any]] = []
+    for image in source.images():
+        camera, pose = source.model.cameras[image.camera_id], image.cam_from_world()
+        qx, qy, qz, qw = pose.rotation.quat.tolist()
+        x, y, z = center = image.projection_center()
+        rows.append({
+            "name": image.name, "x": x, "y": y, "z": z, "qw": qw, "qx": qx, "qy": qy, "qz": qz,
+            "num_points": image.num_points3D, "camera": image.camera_id,
+            "camera_model": camera.model.name, "width": camera.width, "height": camera.height,
+            "focal_px": camera.mean_focal_length(),
+            "params": " ".join(f"{value:.9g}" for value in camera.params),
+        })  # fmt: skip
+        if place:
+            rows[-1] |= zip(
+                ("latitude", "longitude", "altitude_m"), place.on_earth(center), strict=True
+            )
+    replace_text(path, csv_text(rows))
+    return path
+
+
+def _geojson(source: Source, folder: Path) -> Path:
+    """Write where photographs were taken, for maps, with the direction that they look to."""
+    path, place = _new(folder / "cameras.geojson"), Georeference.read(source.path)
+    if place is None:
+        raise OptionError(
+            f"{source.path}: has no place on earth, which GeoJSON needs; align it first by "
+            "'colmap-affrect align' with --gps, or positions with latitude and longitude"
+        )
+    features = []
+    for name, (rotation, translation) in sorted(model_poses(source.model).items()):
+        latitude, longitude, altitude = place.on_earth(-rotation.T @ translation)
+        east, north, _ = rotation[2]
+        heading = float(np.degrees(np.arctan2(east, north)) % 360.0)
+        point = {"type": "Point", "coordinates": [longitude, latitude, altitude]}
+        about = {"name": name, "heading_deg": heading}
+        features.append({"type": "Feature", "geometry": point, "properties": about})
+    content = {"type": "FeatureCollection", "features": features}
+    replace_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    return path
+
+
+FORMATS: dict[str, Callable[[Source, Path], Path]] = {
+    "ply": _points,
+    "text": _text,
+    "nvm": _nvm,
+    "bundler": _bundler,
+    "undistorted": _undistorted,
+    "nerfstudio": _nerfstudio,
+    "cameras": _cameras,
+    "geojson": _geojson,
+}
+"""What writes each format; ``undistorted`` comes before ``nerfstudio``, which uses its folder."""

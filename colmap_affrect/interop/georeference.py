@@ -1,0 +1,70 @@
+"""Where on earth a model is: beside COLMAP's files, which have no place for that."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.errors import StoreError
+from colmap_affrect.project.atomic_files import replace_text
+
+FILE_NAME = "georeference.json"
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """A model in metres whose x, y, z point east, north and up, and where its origin is (WGS 84).
+
+    Attributes:
+        latitude: of the origin, degrees.
+        longitude: of the origin, degrees.
+        altitude: of the origin, metres above the ellipsoid, or as GPS has it.
+    """
+
+    latitude: float
+    longitude: float
+    altitude: float
+
+    @classmethod
+    def middle_of(cls, positions: ArrayLike) -> Self:
+        """Put the origin into the middle of some latitudes, longitudes and altitudes."""
+        return cls(*np.mean(np.asarray(positions, float), axis=0).tolist())
+
+    @classmethod
+    def read(cls, model_path: Path) -> Self | None:
+        """Return what is on record beside a model, None if there is nothing."""
+        path = model_path / FILE_NAME
+        if not path.exists():
+            return None
+        try:
+            values = json.loads(path.read_text(encoding="utf-8"))
+            return cls(**{name: float(values[name]) for name in cls.__dataclass_fields__})
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise StoreError(f"{path}: damaged ({error}); align the model again") from error
+
+    def write(self, model_path: Path) -> None:
+        """Put it on record beside a model."""
+        replace_text(model_path / FILE_NAME, json.dumps(asdict(self), indent=1) + "\n")
+
+    def in_metres(self, positions: ArrayLike) -> NDArray[np.float64]:
+        """Return metres east, north and up of the origin for latitudes, longitudes, altitudes."""
+        origin = (self.latitude, self.longitude, self.altitude)
+        found: NDArray[np.float64] = _transform().ellipsoid_to_enu(positions, *origin)
+        return found
+
+    def on_earth(self, point: ArrayLike) -> tuple[float, float, float]:
+        """Return latitude, longitude and altitude of a point of the model."""
+        origin = (self.latitude, self.longitude, self.altitude)
+        found = _transform().enu_to_ellipsoid(np.asarray(point, float)[None], *origin)
+        latitude, longitude, altitude = found[0].tolist()
+        return latitude, longitude, altitude
+
+
+def _transform() -> pycolmap.GPSTransform:
+    return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)

@@ -1,0 +1,141 @@
+"""Alignment undoes a similarity that is known, and refuses what leaves it open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import Call
+from exported_model import write_model
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.interop.align import Reference, align
+from colmap_affrect.interop.georeference import Georeference
+
+ORIGIN = Georeference(49.5, 15.25, 300.0)
+TRUE_FROM_OLD = pycolmap.Sim3d(
+    2.5, pycolmap.Rotation3d(np.array([0.3, -1.2, 0.7])), np.array([10.0, -4.0, 2.0])
+)
+
+
+def centers(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    return {image.name: image.projection_center() for image in model.images.values()}
+
+
+def true_centers(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    return {name: TRUE_FROM_OLD * center for name, center in centers(model).items()}
+
+
+def marks(model: pycolmap.Reconstruction) -> list[str]:
+    """Rows of three control points, each marked in two photographs of its own choice."""
+    rows = ["point,image,px,py,x,y,z"]
+    for name, point_id, pair in (("p", 1, (0, 1)), ("q", 20, (1, 2)), ("r", 40, (3, 0))):
+        place = model.points3D[point_id].xyz
+        true = ",".join(map(str, TRUE_FROM_OLD * place))
+        for index, cells in zip(pair, (true, ",,"), strict=True):
+            image = model.images[index + 1]
+            x, y = image.points2D[point_id - 1].xy
+            rows.append(f"{name},{image.name},{x},{y},{cells}")
+    return rows
+
+
+def test_control_points_give_scale_rotation_and_place(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "model")
+    table = tmp_path / "points.csv"
+    table.write_text("\n".join(marks(model)))
+    done = align(tmp_path / "model", tmp_path / "new", Reference(points_path=table))
+    assert done.scale == pytest.approx(2.5, rel=1e-6)
+    assert max(done.residuals.values()) < 1e-5
+    new = pycolmap.Reconstruction(tmp_path / "new")
+    for name, center in centers(new).items():
+        np.testing.assert_allclose(center, true_centers(model)[name], atol=1e-5)
+    assert not (tmp_path / "new" / "georeference.json").exists()
+
+
+def test_positions_on_earth_become_metres_east_north_and_up(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "model")
+    table, rows = tmp_path / "positions.csv", ["name,latitude,longitude,altitude"]
+    for name, place in true_centers(model).items():
+        rows.append(",".join([name, *map(repr, ORIGIN.on_earth(place))]))
+    table.write_text("\n".join(rows))
+    done = align(tmp_path / "model", tmp_path / "new", Reference(positions_path=table))
+    assert done.scale == pytest.approx(2.5, rel=1e-5)
+    new = pycolmap.Reconstruction(tmp_path / "new")
+    place = Georeference.read(tmp_path / "new")
+    assert place == done.georeference
+    for name, true in true_centers(model).items():
+        expected, found = ORIGIN.on_earth(true), place.on_earth(centers(new)[name])
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+        np.testing.assert_allclose(found[:2], expected[:2], atol=1e-8)
+
+
+def test_positions_of_a_database_are_taken_from_its_priors(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "model")
+    with pycolmap.Database.open(tmp_path / "gps.db") as database:
+        database.write_camera(model.cameras[1])
+        for name, true in true_centers(model).items():
+            image_id = database.write_image(pycolmap.Image(name=name, camera_id=1))
+            image = database.read_image(image_id)
+            database.write_pose_prior(
+                pycolmap.PosePrior(
+                    corr_data_id=image.data_id,
+                    position=np.array(ORIGIN.on_earth(true)),
+                    coordinate_system=pycolmap.PosePriorCoordinateSystem.WGS84,
+                )
+            )
+    reference = Reference(gps_database=tmp_path / "gps.db")
+    assert align(tmp_path / "model", tmp_path / "new", reference).scale == pytest.approx(2.5)
+
+
+def test_distances_of_photographs_and_marked_points_give_the_scale(
+    tmp_path: Path, call: Call
+) -> None:
+    model = write_model(tmp_path / "model")
+    table = tmp_path / "points.csv"
+    table.write_text("\n".join(marks(model)))
+    true = true_centers(model)
+    length = np.linalg.norm(true["a.png"] - true["d.png"])
+    between = np.linalg.norm(model.points3D[1].xyz - model.points3D[40].xyz) * 2.5
+    done = call(
+        "align", "--model-path", tmp_path / "model", "--output-path", tmp_path / "new",
+        "--points", table, "--distance", f"a.png,d.png,{length}", "--distance", f"p,r,{between}",
+    )  # fmt: skip
+    assert (done.code, done.stderr) == (0, [])
+    assert done.stdout.startswith("scale       2.5 metres")
+    new = centers(pycolmap.Reconstruction(tmp_path / "new"))
+    assert np.linalg.norm(new["a.png"] - new["d.png"]) == pytest.approx(length)
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("name,x,y,z\na.png,0,0,0\nb.png,1,1,1\nd.png,2,2,2", "lie on one line"),
+        ("name,x,y,z\na.png,0,0,0\nb.png,1,1,1", "of 2 photographs"),
+        ("name,x,y,z\na.png,0,0\nb.png,1,1,1", "line 2: z is missing"),
+        ("name,x,y\na.png,0,nan\n", "y is not finite"),
+        ("name,x,h\n", "unknown column 'h'"),
+    ],
+)
+def test_positions_that_leave_the_model_open_are_refused(
+    tmp_path: Path, rows: str, message: str
+) -> None:
+    write_model(tmp_path / "model")
+    table = tmp_path / "positions.csv"
+    table.write_text(rows)
+    with pytest.raises(OptionError, match=message):
+        align(tmp_path / "model", tmp_path / "new", Reference(positions_path=table))
+    assert not (tmp_path / "new").exists()
+
+
+def test_nothing_is_overwritten_and_no_model_is_said(tmp_path: Path) -> None:
+    write_model(tmp_path / "model")
+    reference = Reference(distances=(("a.png", "b.png", 1.0),))
+    with pytest.raises(OptionError, match="exists, and is left"):
+        align(tmp_path / "model", tmp_path / "model", reference)
+    with pytest.raises(AffrectError, match="not a COLMAP model"):
+        align(tmp_path, tmp_path / "new", reference)
+    wrong = Reference(positions_path=tmp_path / "x", distances=reference.distances)
+    with pytest.raises(OptionError, match="leave it out"):
+        align(tmp_path / "model", tmp_path / "new", wrong)

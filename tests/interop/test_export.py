@@ -1,0 +1,157 @@
+"""Exported models: read back by hand, in the conventions of the programs that they are for."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import Call
+from exported_model import NAMES, write_model, write_photographs
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.interop.export import FORMATS, export
+from colmap_affrect.interop.georeference import Georeference
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> pycolmap.Reconstruction:
+    return write_model(tmp_path / "model")
+
+
+def projected(model: pycolmap.Reconstruction, name: str, point: np.ndarray) -> np.ndarray:
+    image = model.find_image_with_name(name)
+    return model.cameras[image.camera_id].img_from_cam(image.cam_from_world() * point)
+
+
+@pytest.mark.usefixtures("model")
+def test_points_and_text_hold_the_model(tmp_path: Path) -> None:
+    export(tmp_path / "model", tmp_path / "out", ["ply", "text"])
+    text = pycolmap.Reconstruction(tmp_path / "out" / "text")
+    assert (text.num_reg_images(), text.num_points3D()) == (4, 60)
+    ply = (tmp_path / "out" / "points3D.ply").read_bytes()
+    assert ply.startswith(b"ply")
+    assert b"element vertex 60" in ply
+
+
+@pytest.mark.skipif(not shutil.which("colmap"), reason="COLMAP's command is not installed")
+@pytest.mark.usefixtures("model")
+def test_another_colmap_reads_the_text(tmp_path: Path) -> None:
+    export(tmp_path / "model", tmp_path / "out", ["text"])
+    command = ["colmap", "model_analyzer", "--path", str(tmp_path / "out" / "text")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "Registered images: 4" in done.stdout + done.stderr
+    assert "Points: 60" in done.stdout + done.stderr
+
+
+@pytest.mark.usefixtures("model")
+def test_bundler_projects_points_where_their_keypoints_are(tmp_path: Path) -> None:
+    path = export(tmp_path / "model", tmp_path / "out", ["bundler"])["bundler"]
+    numbers = [np.fromstring(line, sep=" ") for line in path.read_text().splitlines()[2:]]
+    cameras, points = numbers[: 4 * 5], numbers[4 * 5 :]
+    for place, color, views in zip(*[iter(points)] * 3, strict=True):
+        assert color[2] == 250
+        for view in views[1:].reshape(-1, 4):
+            focal, *rows, shift = cameras[5 * int(view[0]) : 5 * int(view[0]) + 5]
+            x, y, z = np.array(rows) @ place + shift
+            flat = -np.array([x, y]) / z
+            scale = 1.0 + focal[1] * (flat @ flat)
+            np.testing.assert_allclose(focal[0] * scale * flat, view[2:], atol=1e-6)
+    assert (tmp_path / "out" / "bundle.list.txt").read_text().split() == sorted(NAMES)
+
+
+def test_nvm_has_centres_and_keypoints_from_the_principal_point(
+    tmp_path: Path, model: pycolmap.Reconstruction
+) -> None:
+    path = export(tmp_path / "model", tmp_path / "out", ["nvm"])["nvm"]
+    lines = path.read_text().splitlines()
+    assert lines[:3] == ["NVM_V3", "", "4"]
+    name, focal, *values = lines[3].split()
+    w, x, y, z, *center, k, _ = map(float, values)
+    image = model.find_image_with_name(name)
+    assert (float(focal), k) == (150.0, -0.05)
+    np.testing.assert_allclose(center, image.projection_center())
+    np.testing.assert_allclose([x, y, z, w], image.cam_from_world().rotation.quat)
+    point = lines[9].split()
+    assert point[6:8] == ["4", "0"]
+    place = np.array(point[:3], float)
+    keypoint = np.array(point[9:11], float) + np.array([75.0, 66.0])
+    np.testing.assert_allclose(keypoint, projected(model, name, place), atol=1e-6)
+
+
+@pytest.mark.usefixtures("model")
+def test_transforms_are_of_cameras_that_look_along_minus_z_with_y_up(tmp_path: Path) -> None:
+    write_photographs(tmp_path / "photos")
+    formats = ["undistorted", "nerfstudio"]
+    written = export(tmp_path / "model", tmp_path / "out", formats, image_path=tmp_path / "photos")
+    dense = written["undistorted"]
+    flat = pycolmap.Reconstruction(dense / "sparse")
+    frames = json.loads(written["nerfstudio"].read_text())["frames"]
+    assert len(frames) == 4
+    point = np.array([0.4, -0.3, 6.0])
+    for frame in frames:
+        assert (dense / frame["file_path"]).is_file()
+        x, y, z, _ = np.linalg.inv(frame["transform_matrix"]) @ [*point, 1.0]
+        u = frame["cx"] + frame["fl_x"] * x / -z
+        v = frame["cy"] - frame["fl_y"] * y / -z
+        name = frame["file_path"].removeprefix("images/")
+        np.testing.assert_allclose([u, v], projected(flat, name, point), atol=1e-6)
+    assert pycolmap.Reconstruction(dense / "sparse" / "0").num_points3D() == 60
+
+
+def test_table_has_harmless_cells_and_map_the_direction_of_view(tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera.create_from_model_name(1, "PINHOLE", 100.0, 160, 120)
+    )
+    east = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], float)  # right is south, down is down
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(east), -east @ np.array([1000.0, 20.0, 5.0]))
+    image = pycolmap.Image(name="=1+1.png", camera_id=1, image_id=1)
+    model.add_image_with_trivial_frame(image, pose)
+    (tmp_path / "model").mkdir()
+    model.write(tmp_path / "model")
+    with pytest.raises(OptionError, match="has no place on earth"):
+        export(tmp_path / "model", tmp_path / "out", ["geojson"])
+    Georeference(50.0, 14.0, 200.0).write(tmp_path / "model")
+    written = export(tmp_path / "model", tmp_path / "out", ["geojson", "cameras"])
+    (feature,) = json.loads(written["geojson"].read_text())["features"]
+    assert feature["properties"] == {"name": "=1+1.png", "heading_deg": pytest.approx(90.0)}
+    longitude, latitude, altitude = feature["geometry"]["coordinates"]
+    assert longitude == pytest.approx(14.0 + 1000 / 71_695, abs=1e-5)  # metres of a degree there
+    assert latitude == pytest.approx(50.0 + 20 / 111_229, abs=1e-5)
+    assert altitude == pytest.approx(205.0, abs=0.1)
+    (row,) = csv.DictReader(written["cameras"].read_text().splitlines())
+    assert row["name"] == "'=1+1.png"
+    assert (float(row["x"]), float(row["focal_px"])) == (pytest.approx(1000.0), 100.0)
+    assert float(row["longitude"]) == pytest.approx(longitude)
+
+
+def test_what_a_format_cannot_hold_is_said(tmp_path: Path) -> None:
+    write_model(tmp_path / "model", "OPENCV")
+    for name in ("nvm", "bundler"):
+        with pytest.raises(OptionError, match=r"OPENCV.*undistorted"):
+            export(tmp_path / "model", tmp_path / "out", [name])
+    with pytest.raises(OptionError, match="did you mean 'bundler'"):
+        export(tmp_path / "model", tmp_path / "out", ["bundle"])
+    with pytest.raises(OptionError, match="--image-path: give the folder"):
+        export(tmp_path / "model", tmp_path / "out", ["undistorted"])
+    with pytest.raises(ImageError, match=r"a\.png: no such photograph"):
+        export(tmp_path / "model", tmp_path / "out", ["undistorted"], image_path=tmp_path)
+    export(tmp_path / "model", tmp_path / "out", ["cameras"])
+    with pytest.raises(OptionError, match="exists, and is left as it is"):
+        export(tmp_path / "model", tmp_path / "out", ["cameras"])
+
+
+def test_command_names_what_it_wrote(tmp_path: Path, call: Call) -> None:
+    write_model(tmp_path / "model")
+    done = call("export", "--model-path", tmp_path / "model", "--output-path", tmp_path / "out")
+    assert (done.code, done.stderr) == (0, [])
+    assert [line.split()[0] for line in done.stdout.splitlines()] == ["ply", "text", "cameras"]
+    assert all(Path(line.split()[1]).exists() for line in done.stdout.splitlines())
+    help_text = call("export", "--help").stdout
+    assert all(name in help_text for name in FORMATS)
