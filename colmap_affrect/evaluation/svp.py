@@ -14,9 +14,8 @@ so are their depth maps. Names in the lists and files may differ in their suffix
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,14 +48,13 @@ MAX_NOT_UNIT = 1e-3
 """Largest deviation of the length of a quaternion from 1."""
 
 
-@dataclass(frozen=True)
 class Svp(PosedScenes):
     """Share of pairs with a rotation error below 5 degrees, by relative rotation."""
 
-    name = "svp"
-    category_title = "relative rotation, from [deg]"
-    scene_pattern = f"*{PAIR_LIST_SUFFIX}"
-    dataset_title = "the Strong ViewPoint Changes dataset"
+    name: ClassVar[str] = "svp"
+    category_title: ClassVar[str] = "relative rotation, from [deg]"
+    scene_pattern: ClassVar[str] = f"*{PAIR_LIST_SUFFIX}"
+    dataset_title: ClassVar[str] = "the Strong ViewPoint Changes dataset"
 
     def load_scene(self, list_path: Path) -> Dataset:
         """Read a scene by its list of pairs."""
