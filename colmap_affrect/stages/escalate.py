@@ -60,7 +60,7 @@ from colmap_affrect.stages.extract import (
 from colmap_affrect.stages.guide import restore_exact
 from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, recorded_matching
 from colmap_affrect.stages.one_image import ImageExtractor
-from colmap_affrect.stages.one_pair import iterate_matches
+from colmap_affrect.stages.one_pair import Matching, iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import extracted_px, recorded_verification, verify_new
 
@@ -346,16 +346,10 @@ class Escalation:
         self, pairs: Sequence[Pair], level: int
     ) -> Generator[PairMatches, None, None]:
         chosen = self.extraction.levels[level]
-        return iterate_matches(
-            pairs,
-            self.features,
-            chosen.matching or self.matching,
-            level,
-            self.context.resources,
-            self.context.executor,
-            chosen.features.name,
-            chosen.base,
-        )
+        options, extractor = chosen.matching or self.matching, chosen.features.name
+        resources, executor = self.context.resources, self.context.executor
+        matching = Matching(self.features, options, level, chosen.base, extractor, resources)
+        return iterate_matches(pairs, matching, executor)
 
     def _images_to_extend(self, pairs: Sequence[Pair], level: int) -> list[str]:
         names = sorted({name for pair in pairs for name in pair})

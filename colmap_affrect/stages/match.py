@@ -16,7 +16,7 @@ from colmap_affrect.project.stores import PairMatches, pair_key
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import recorded_extraction, write_images_and_keypoints
-from colmap_affrect.stages.one_pair import iterate_matches
+from colmap_affrect.stages.one_pair import Matching, iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
 
 PAIRS_PER_WRITE = 64
@@ -70,21 +70,13 @@ def match_pairs(
     advance: Callable[[int], None],
 ) -> None:
     """Match pairs by the features that every image has, and store them batch by batch."""
+    extractor = recorded_extraction(context.workspace).features.name
+    matching = Matching(context.features, options, extractor=extractor, resources=context.resources)
     matches = context.matches
     batch: list[PairMatches] = []
     written = time.monotonic()
     try:
-        with closing(
-            iterate_matches(
-                pairs,
-                context.features,
-                options,
-                0,
-                context.resources,
-                context.executor,
-                recorded_extraction(context.workspace).features.name,
-            )
-        ) as found_pairs:
+        with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
             for found in found_pairs:
                 batch.append(found)
                 advance(1)

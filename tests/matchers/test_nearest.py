@@ -10,9 +10,9 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from colmap_affrect.matchers import nearest
+from colmap_affrect.matchers.base import Matches
 from colmap_affrect.matchers.nearest import (
     NearestOptions,
-    PutativeMatches,
     match_features,
     matchable,
 )
@@ -89,7 +89,7 @@ def slow_matches(
     return sorted(kept)
 
 
-def run(first: Features, second: Features, options: NearestOptions) -> PutativeMatches:
+def run(first: Features, second: Features, options: NearestOptions) -> Matches:
     """Match two sets of (descriptors, keypoints)."""
     return match_features(matchable(*first, options), matchable(*second, options), options)
 
@@ -123,7 +123,7 @@ def test_match_features_equals_plain_loops(
     expected = slow_matches(first, second, options)
     actual = run(first, second, options)
     assert actual.indices.tolist() == [[row, target] for row, target, _ in expected]
-    assert_allclose(actual.ratios, [ratio for *_, ratio in expected], atol=RATIO_ERROR)
+    assert_allclose(actual.scores, [1 - ratio for *_, ratio in expected], atol=RATIO_ERROR)
 
 
 @pytest.mark.parametrize("count1", [0, 1, 7])
@@ -134,9 +134,9 @@ def test_match_features_of_empty_or_single_features_has_the_layout_of_matches(
     first = (unit_rows(np.random.default_rng(0).random((count1, 8)) + 1), np.zeros((count1, 2)))
     second = (np.eye(8, dtype=np.float32)[:count2], np.zeros((count2, 2)))
     matches = run(first, second, NearestOptions())
-    assert matches.indices.shape == (len(matches.ratios), 2)
+    assert matches.indices.shape == (len(matches.scores), 2)
     assert matches.indices.dtype == np.int64
-    assert matches.ratios.dtype == np.float32
+    assert matches.scores.dtype == np.float32
     assert len(matches.indices) <= min(count1, count2)
 
 
@@ -150,7 +150,7 @@ def test_match_features_gives_the_same_result_in_chunks_of_any_size(
     monkeypatch.setattr(nearest, "CHUNK_ELEMENTS", chunk_elements)
     chunked = run(first, second, NearestOptions(max_ratio=0.95))
     np.testing.assert_array_equal(chunked.indices, whole.indices)
-    assert_allclose(chunked.ratios, whole.ratios, atol=RATIO_ERROR)
+    assert_allclose(chunked.scores, whole.scores, atol=RATIO_ERROR)
 
 
 def spread(count: int) -> NDArray[np.float64]:
@@ -183,7 +183,7 @@ def test_match_features_does_not_count_the_same_place_as_second_neighbour() -> N
     options = NearestOptions(min_contrast_distance_px=10.0)
     matches = run(first, second, options)
     assert matches.indices.tolist() == [[0, 0], [1, 2]]
-    assert_allclose(matches.ratios[0], chord(2.0) / chord(68.0), rtol=1e-2)
+    assert_allclose(1 - matches.scores[0], chord(2.0) / chord(68.0), rtol=1e-2)
     # With a smaller radius the neighbour 7.2 px away is a competitor again.
     strict = options.changed(min_contrast_distance_px=7.0)
     assert run(first, second, strict).indices.tolist() == [[1, 2]]
