@@ -5,11 +5,12 @@ COLMAP's database has one flag for a focal length, that somebody knows it. Here 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+from pydantic import TypeAdapter, ValidationError
 
 from colmap_affrect.errors import WorkspaceError
 from colmap_affrect.project.atomic_files import replace_text
@@ -83,6 +84,9 @@ class CameraRecord:
         return {"focal", "distortion"} <= set(self.given)
 
 
+_RECORDS = TypeAdapter(dict[int, CameraRecord])
+
+
 def read_camera_records(path: Path) -> dict[int, CameraRecord]:
     """Return the records by camera id of the database; none where there is no file.
 
@@ -90,23 +94,18 @@ def read_camera_records(path: Path) -> dict[int, CameraRecord]:
         WorkspaceError: when the file is damaged.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return {int(key): _from_mapping(values) for key, values in content.items()}
+        return _RECORDS.validate_json(path.read_bytes())
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise WorkspaceError(f"{path}: damaged ({error}); remove it") from error
-
-
-def _from_mapping(values: Mapping[str, Any]) -> CameraRecord:
-    lists = {key: tuple(values[key]) for key in ("names", "size", "given")}
-    return CameraRecord(**{**values, **lists})
+    except (OSError, ValidationError) as error:
+        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise WorkspaceError(f"{path}: damaged ({reason}); remove it") from error
 
 
 def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
     """Replace the file as a whole."""
-    content = {str(key): asdict(records[key]) for key in sorted(records)}
-    replace_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    content = _RECORDS.dump_json(dict(sorted(records.items())), indent=1)
+    replace_text(path, content.decode() + "\n")
 
 
 def notable_lines(records: Iterable[CameraRecord]) -> list[str]:

@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import StoreError
+from colmap_affrect.errors import AffrectError, StoreError
 from colmap_affrect.project.atomic_files import cannot_write
 
 SENSOR_BYTES = 8
@@ -78,6 +78,24 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     folder.mkdir()
     model.write(folder)
     _require_written(folder)
+
+
+def read_foreign_model(
+    folder: Path, called: str, error_type: type[AffrectError]
+) -> pycolmap.Reconstruction:
+    """Read a model that anybody made, text or binary; ``called`` begins the line of the error.
+
+    StoreError when one of its binary files, which are walked through first, is damaged.
+    """
+    if all((folder / name).exists() for name in RECORDS):
+        registered_names(folder)
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (RuntimeError, ValueError) as error:
+        raise error_type(
+            f"{called}: not a COLMAP model; give the folder that holds cameras, images and "
+            f"points3D as .bin or .txt ({' '.join(str(error).split())})"
+        ) from error
 
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
@@ -147,11 +165,11 @@ RECORDS: dict[str, Callable[[_Reader], str | None]] = {
 """The files of a model, and what steps over one record of each."""
 
 
-def num_long_tracks(folder: Path) -> dict[str, int]:
-    """Return how many points that three images or more see each image of a model sees."""
-    model = pycolmap.Reconstruction(folder)
-    counts: Counter[int] = Counter()
-    for point in model.points3D.values():
-        if point.track.length() > 2:
-            counts.update({element.image_id for element in point.track.elements})
-    return {image.name: counts[image_id] for image_id, image in model.images.items()}
+def num_long_tracks(model: pycolmap.Reconstruction) -> Counter[int]:
+    """Return how many points that three images or more see each image sees, by its id."""
+    return Counter(
+        image_id
+        for point in model.points3D.values()
+        if len(images := {element.image_id for element in point.track.elements}) > 2
+        for image_id in images
+    )

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import read_foreign_model
 from colmap_affrect.errors import ComparisonError
 
 Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -90,14 +91,7 @@ class PoseScores:
 
 def read_poses(model_path: Path) -> Poses:
     """Read the poses of a COLMAP model, text or binary; ComparisonError when it has none."""
-    try:
-        model = pycolmap.Reconstruction(model_path)
-    except (RuntimeError, ValueError) as error:
-        raise ComparisonError(
-            f"{model_path}: not a COLMAP model; give the folder that holds cameras, images and "
-            f"points3D as .bin or .txt ({' '.join(str(error).split())})"
-        ) from error
-    poses = model_poses(model)
+    poses = model_poses(read_foreign_model(model_path, str(model_path), ComparisonError))
     if not poses:
         raise ComparisonError(f"{model_path}: the model has no images with poses")
     return poses

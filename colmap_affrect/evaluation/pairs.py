@@ -95,12 +95,9 @@ class Pairs(HomographyProtocol, CorrespondenceProtocol, RelativePoseProtocol):
 
     def load(self, dataset_path: Path) -> Dataset:
         """See :class:`EvaluationProtocol`."""
-        entries, offset_px = _read_list(dataset_path / LIST)
-
-        def load_pair(entry: Mapping[str, Any]) -> Dataset:
-            return _Entry(entry, dataset_path, offset_px, self.check_truth).load()
-
-        dataset = Dataset.united(map_ordered(load_pair, entries, available_cores()))
+        listed, offset_px = _read_list(dataset_path / LIST)
+        entries = [_Entry(each, dataset_path, offset_px, self.check_truth) for each in listed]
+        dataset = Dataset.united(map_ordered(_Entry.load, entries, available_cores()))
         posed = [pair for pair in dataset.pairs if isinstance(pair.truth, tuple)]
         notes = pose_contradictions(posed) if self.check_truth and posed else []
         return Dataset(dataset.pairs, (*dataset.notes, *notes))

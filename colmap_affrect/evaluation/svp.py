@@ -74,6 +74,9 @@ class Svp(PosedScenes):
         pairs = posed_pairs(
             listed_names, posed, lambda names: f"{CATEGORY_DEG * difficulty(poses, *names)}°"
         )
+        left = {int(category_start(pair.category)) // CATEGORY_DEG for pair in pairs}
+        wanted = {pair.difficulty for pair in listed if pair.difficulty is not None}
+        empty = ", ".join(f"{tens * CATEGORY_DEG}°" for tens in sorted(wanted - left))
         names = list(dict.fromkeys(name for pair in listed_names for name in pair))
         lacking = {n: faults.get(n, "not in images.txt") for n in names if n not in cameras}
         bad = [f"line {number}" for number in bad_lines]
@@ -83,7 +86,7 @@ class Svp(PosedScenes):
             *_difficulty_notes(listed, poses),
             *_size_notes(pairs),
             *(pose_contradictions(pairs) if self.check_truth else ()),
-            *_empty_notes(listed, pairs),
+            *([f"no pairs are left from {empty}"] if empty else []),
         ]
         return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
 
@@ -198,14 +201,6 @@ def _size_notes(pairs: Sequence[EvaluationPair]) -> list[str]:
         if size and size != (posed.camera.width, posed.camera.height)
     ]
     return counted(wrong, "images are of another size than their intrinsics", wrong)
-
-
-def _empty_notes(listed: Sequence[ListedPair], pairs: Sequence[EvaluationPair]) -> list[str]:
-    """Name the listed categories of which no pair is left."""
-    wanted = {pair.difficulty for pair in listed if pair.difficulty is not None}
-    left = {int(category_start(pair.category)) // CATEGORY_DEG for pair in pairs}
-    empty = ", ".join(f"{tens * CATEGORY_DEG}°" for tens in sorted(wanted - left))
-    return [f"no pairs are left from {empty}"] if empty else []
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:

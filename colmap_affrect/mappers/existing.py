@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.model_files import RECORDS, registered_names
+from colmap_affrect.colmap.model_files import read_foreign_model
 from colmap_affrect.errors import MappingError, OptionError
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 
@@ -210,15 +210,7 @@ ImagePairs = list[tuple[pycolmap.Image, pycolmap.Image]]
 
 
 def _read(path: Path) -> pycolmap.Reconstruction:
-    if all((path / name).exists() for name in RECORDS):
-        registered_names(path)  # pycolmap's reader may never end on a damaged file
-    try:
-        return pycolmap.Reconstruction(path)
-    except (RuntimeError, ValueError) as error:
-        raise MappingError(
-            f"--extend {path}: not a COLMAP model; give the folder that holds cameras, images and "
-            f"points3D as .bin or .txt ({' '.join(str(error).split())})"
-        ) from error
+    return read_foreign_model(path, f"--extend {path}", MappingError)
 
 
 def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:

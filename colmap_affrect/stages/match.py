@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from typing import Any
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.features.weights import digests_by_name, resolve
@@ -36,12 +35,6 @@ def recorded_matching(workspace: Workspace) -> MatcherOptions:
     return options
 
 
-def _with_weights(context: Context, options: MatcherOptions) -> dict[str, Any]:
-    """Return options for the record, with the digests of the files of weights, if any."""
-    digests = digests_by_name(resolve(options.weights, context.resources.weights_path))
-    return options.to_mapping() | ({WEIGHTS: digests} if digests else {})
-
-
 def match(
     context: Context, options: MatcherOptions | None = None, *, overwrite: bool = False
 ) -> StageReport:
@@ -54,7 +47,9 @@ def match(
     context.resources.require_device()
     pairs = listed_pairs(context)
     options = options or recorded_matching(context.workspace)
-    context.workspace.record_options("match", _with_weights(context, options), overwrite=overwrite)
+    digests = digests_by_name(resolve(options.weights, context.resources.weights_path))
+    record = options.to_mapping() | ({WEIGHTS: digests} if digests else {})
+    context.workspace.record_options("match", record, overwrite=overwrite)
     done = context.matches.complete(pair_key(*pair) for pair in pairs)
     missing = [pair for pair in pairs if pair_key(*pair) not in done]
     with context.progress.stage("match", len(missing), "pairs") as advance:

@@ -169,13 +169,6 @@ def chord(degrees: float) -> float:
     return float(2 * np.sin(np.deg2rad(degrees) / 2))
 
 
-def test_match_features_rejects_ambiguity_on_the_side_of_the_second_image() -> None:
-    # Seen from image 1 the match is clear; its partner has two nearly equal neighbours.
-    first = (by_angles(12.0, 7.9, 79.0), spread(3))
-    second = (by_angles(10.0, 80.0), spread(2))
-    assert run(first, second, NearestOptions()).indices.tolist() == [[2, 1]]
-
-
 def test_match_features_does_not_count_the_same_place_as_second_neighbour() -> None:
     first = (by_angles(10.0, 80.0), spread(2))
     keypoints2 = np.array([[40.0, 40.0], [46.0, 44.0], [300.0, 5.0]])
@@ -187,26 +180,6 @@ def test_match_features_does_not_count_the_same_place_as_second_neighbour() -> N
     # With a smaller radius the neighbour 7.2 px away is a competitor again.
     strict = options.changed(min_contrast_distance_px=7.0)
     assert run(first, second, strict).indices.tolist() == [[1, 2]]
-
-
-def test_match_features_keeps_the_better_of_two_matches_at_the_same_places() -> None:
-    keypoints1 = np.array([[20.0, 30.0], [21.0, 30.5], [200.0, 9.0]])
-    keypoints2 = np.array([[120.0, 60.0], [119.0, 61.0], [500.0, 9.0]])
-    first = (by_angles(10.0, 40.0, 85.0), keypoints1)
-    second = (by_angles(11.5, 40.5, 84.0), keypoints2)
-    matches = run(first, second, NearestOptions(duplicate_radius_px=2.0))
-    assert matches.indices.tolist() == [[1, 1], [2, 2]]
-    both = run(first, second, NearestOptions(duplicate_radius_px=1.0))
-    assert both.indices.tolist() == [[0, 0], [1, 1], [2, 2]]
-
-
-def test_match_features_keeps_a_match_near_a_dropped_one_only() -> None:
-    # The second is near the better first, the third near the second but not the first.
-    places = np.array([[20.0, 30.0], [21.5, 30.0], [23.0, 30.0]])
-    first = (by_angles(10.0, 40.0, 70.0), places)
-    second = (by_angles(10.2, 40.5, 70.9), places)
-    matches = run(first, second, NearestOptions(duplicate_radius_px=2.0))
-    assert matches.indices.tolist() == [[0, 0], [2, 2]]
 
 
 def test_match_features_does_not_wrap_indices_of_40000_keypoints() -> None:
