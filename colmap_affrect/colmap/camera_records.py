@@ -15,6 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 from colmap_affrect.errors import WorkspaceError
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.shown import such_as
 
 Source = Literal["given", "exif", "exif-rescaled", "pairs", "guess"]
 """By the user; by EXIF as it is, or scaled to a photograph that was shrunk; by the votes of
@@ -28,9 +29,6 @@ TRUSTED: tuple[Source, ...] = ("given", "exif", "exif-rescaled")
 
 MAX_LINES = 5
 """Groups of cameras that are logged."""
-
-MAX_NAMES = 3
-"""Images that are named of a camera."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,6 @@ def notable_lines(records: Iterable[CameraRecord]) -> list[str]:
 def _line(records: Sequence[CameraRecord]) -> str:
     """Say what was decided for cameras of one source and story."""
     names = [name for record in records for name in record.names]
-    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
     first = records[0]
     spread = (
         f" ({first.low_px:.0f} to {first.high_px:.0f})" if first.low_px and first.high_px else ""
@@ -130,6 +127,6 @@ def _line(records: Sequence[CameraRecord]) -> str:
     focals = sorted({round(record.focal_px) for record in records})
     focal = f"{focals[0]}" if len(focals) == 1 else f"{focals[0]} to {focals[-1]}"
     return (
-        f"{', '.join(names[:MAX_NAMES])}{more}: focal length {focal} px"
+        f"{such_as(names)}: focal length {focal} px"
         f"{spread if len(records) == 1 else ''}, {first.source}: {first.why}"
     )
