@@ -17,7 +17,7 @@ import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -35,13 +35,6 @@ MAX_COMMENT = 96
 """Width of comments in printed options."""
 CUSTOM = "custom"
 """Name of options that are no preset."""
-
-
-def preset_values(preset: str, colmap: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what a preset sets: nothing for ours, the values given for COLMAP's."""
-    if preset not in PRESETS:
-        raise OptionError(f"preset {preset!r} is not one of {', '.join(PRESETS)}")
-    return colmap if preset == "colmap" else {}
 
 
 def within(low: float, high: float) -> Any:
@@ -112,6 +105,27 @@ class Options(BaseModel):
                 expected = PLAIN_NAMES.get(expected, expected)
                 return f"{place}: expected {expected}, got {type(given).__name__} ({given!r})"
         return f"{place}={given!r}: {error['msg']}"
+
+
+class PresetOptions(Options):
+    """Options whose defaults are the preset ``sparse``."""
+
+    COLMAP: ClassVar[Mapping[str, Any]] = {}
+    """The preset ``colmap``: COLMAP's own defaults."""
+    OF_NO_PRESET: ClassVar[tuple[str, ...]] = ("random_seed", "mapper_options")
+
+    @classmethod
+    def preset(cls, preset: str, **values: Any) -> Self:
+        """Return the options of a preset, ``sparse`` or ``colmap``, and others given."""
+        if preset not in PRESETS:
+            raise OptionError(f"preset {preset!r} is not one of {', '.join(PRESETS)}")
+        return cls(**{**(cls.COLMAP if preset == "colmap" else {}), **values})
+
+    @property
+    def preset_name(self) -> str:
+        """Name of the preset that these options are, ``mapper_options`` apart, else ``custom``."""
+        own = {k: value for k, value in self if k in self.OF_NO_PRESET}
+        return next((name for name in PRESETS if self == self.preset(name, **own)), CUSTOM)
 
 
 class PartOptions(Options):

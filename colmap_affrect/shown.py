@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+MAX_NAMES = 3
+"""Examples in a line."""
+
 
 def shown(text: str) -> str:
     r"""Write characters that do not print, or turn text round, as JSON does; lines stay lines.
@@ -28,3 +33,14 @@ def one_line(text: str) -> str:
     'a\\u000ab'
     """
     return shown(text).replace("\n", _escaped("\n"))
+
+
+def such_as(names: Iterable[str]) -> str:
+    """Return the first few names.
+
+    >>> such_as(["a", "b", "c", "d", "e"])
+    'a, b, c and 2 more'
+    """
+    listed = list(names)
+    more = f" and {len(listed) - MAX_NAMES} more" if len(listed) > MAX_NAMES else ""
+    return ", ".join(listed[:MAX_NAMES]) + more

@@ -5,15 +5,17 @@ COLMAP's database has one flag for a focal length, that somebody knows it. Here 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+from pydantic import TypeAdapter, ValidationError
 
 from colmap_affrect.errors import WorkspaceError
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.shown import such_as
 
 Source = Literal["given", "exif", "exif-rescaled", "pairs", "guess"]
 """By the user; by EXIF as it is, or scaled to a photograph that was shrunk; by the votes of
@@ -27,9 +29,6 @@ TRUSTED: tuple[Source, ...] = ("given", "exif", "exif-rescaled")
 
 MAX_LINES = 5
 """Groups of cameras that are logged."""
-
-MAX_NAMES = 3
-"""Images that are named of a camera."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +82,9 @@ class CameraRecord:
         return {"focal", "distortion"} <= set(self.given)
 
 
+_RECORDS = TypeAdapter(dict[int, CameraRecord])
+
+
 def read_camera_records(path: Path) -> dict[int, CameraRecord]:
     """Return the records by camera id of the database; none where there is no file.
 
@@ -90,23 +92,18 @@ def read_camera_records(path: Path) -> dict[int, CameraRecord]:
         WorkspaceError: when the file is damaged.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return {int(key): _from_mapping(values) for key, values in content.items()}
+        return _RECORDS.validate_json(path.read_bytes())
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise WorkspaceError(f"{path}: damaged ({error}); remove it") from error
-
-
-def _from_mapping(values: Mapping[str, Any]) -> CameraRecord:
-    lists = {key: tuple(values[key]) for key in ("names", "size", "given")}
-    return CameraRecord(**{**values, **lists})
+    except (OSError, ValidationError) as error:
+        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise WorkspaceError(f"{path}: damaged ({reason}); remove it") from error
 
 
 def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
     """Replace the file as a whole."""
-    content = {str(key): asdict(records[key]) for key in sorted(records)}
-    replace_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    content = _RECORDS.dump_json(dict(sorted(records.items())), indent=1)
+    replace_text(path, content.decode() + "\n")
 
 
 def notable_lines(records: Iterable[CameraRecord]) -> list[str]:
@@ -123,7 +120,6 @@ def notable_lines(records: Iterable[CameraRecord]) -> list[str]:
 def _line(records: Sequence[CameraRecord]) -> str:
     """Say what was decided for cameras of one source and story."""
     names = [name for record in records for name in record.names]
-    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
     first = records[0]
     spread = (
         f" ({first.low_px:.0f} to {first.high_px:.0f})" if first.low_px and first.high_px else ""
@@ -131,6 +127,6 @@ def _line(records: Sequence[CameraRecord]) -> str:
     focals = sorted({round(record.focal_px) for record in records})
     focal = f"{focals[0]}" if len(focals) == 1 else f"{focals[0]} to {focals[-1]}"
     return (
-        f"{', '.join(names[:MAX_NAMES])}{more}: focal length {focal} px"
+        f"{such_as(names)}: focal length {focal} px"
         f"{spread if len(records) == 1 else ''}, {first.source}: {first.why}"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -85,8 +85,14 @@ class CameraVote:
         unknown = [key for key, record in self.records.items() if record.source == "guess"]
         self.tied = {key: key for key in unknown}
         if self.may_share:
-            for same_size in self._classes(unknown):
-                self._decide_sharing(same_size)
+            sizes: dict[tuple[int, ...], list[int]] = defaultdict(list)
+            for key in unknown:
+                if "principal-point" not in self.records[key].given:
+                    # some may have been turned by 90 degrees
+                    sizes[tuple(sorted(self.records[key].size))].append(key)
+            for same_size in sizes.values():
+                if len(same_size) > 1:
+                    self._decide_sharing(same_size)
         known = {
             key: record.focal_px / max(record.size)
             for key, record in self.records.items()
@@ -104,14 +110,6 @@ class CameraVote:
             estimate = outcome.estimates[first]
             records[keys[0]] = self._record(keys, estimate, num_votes[first])
         return records
-
-    def _classes(self, unknown: Sequence[int]) -> Iterator[list[int]]:
-        """Yield cameras of one size, of which some may have been turned by 90 degrees."""
-        sizes: dict[tuple[int, ...], list[int]] = defaultdict(list)
-        for key in unknown:
-            if "principal-point" not in self.records[key].given:
-                sizes[tuple(sorted(self.records[key].size))].append(key)
-        yield from (keys for keys in sizes.values() if len(keys) > 1)
 
     def _decide_sharing(self, same_size: Sequence[int]) -> None:
         difference = log_evidence_for_sharing(self.pairs, same_size) or 0.0

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -258,26 +257,10 @@ def camera_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
     return matrix
 
 
-@dataclass(frozen=True)
-class ImageCamera:
-    """Camera of an image of a database.
-
-    Attributes:
-        size: (width, height) in px.
-        matrix: (3, 3) intrinsics in pixel-centre px, without distortion.
-    """
-
-    size: tuple[int, int]
-    matrix: NDArray[np.float64]
-
-
-def read_cameras(path: Path) -> dict[str, ImageCamera]:
+def read_cameras(path: Path) -> dict[str, pycolmap.Camera]:
     """Return the camera of every image of a database by image name."""
     with open_database(path) as database:
-        cameras = {
-            camera.camera_id: ImageCamera((camera.width, camera.height), camera_matrix(camera))
-            for camera in database.read_all_cameras()
-        }
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
         return {image.name: cameras[image.camera_id] for image in database.read_all_images()}
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import registered_names
+from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.project.tables import read_lines, read_table
@@ -119,16 +119,7 @@ def _read_model(path: Path) -> dict[str, GivenCamera]:
     folder = path if path.is_dir() else path.parent
     if (folder / "cameras.txt").is_file() and path.name != "cameras.bin":
         return _read_text_model(folder)
-    if (folder / "rigs.bin").is_file():
-        registered_names(folder)  # damaged files may keep pycolmap busy for ever
-    try:
-        model = pycolmap.Reconstruction(folder)
-    except (RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise OptionError(
-            f"--cameras-path {path}: no COLMAP model, which has cameras.txt and images.txt, or the "
-            f"same as .bin ({reason})"
-        ) from error
+    model = read_given_model(folder, "--cameras-path ")
     cameras = {
         key: GivenCamera(
             camera.model_name,

@@ -122,8 +122,10 @@ class InitialCameras:
             for name, size in sizes.items():
                 first, expected = next(iter(sizes.items()))
                 if size != expected:
+                    by_mode = group[0] in ("single", "per-folder")
+                    who = f"--camera-mode {group[0]}" if by_mode else self.given(name).where
                     raise OptionError(
-                        f"{self._who_groups(group, name)}: {first} is {expected[0]} x "
+                        f"{who}: {first} is {expected[0]} x "
                         f"{expected[1]} px, {name} is {size[0]} x {size[1]} px; images that share "
                         "a camera must have one size"
                     )
@@ -133,11 +135,6 @@ class InitialCameras:
                         f"{given.where}: its camera is of {given.size[0]} x {given.size[1]} px, "
                         f"and {name} has {size[0]} x {size[1]} px; give cameras of these images"
                     )
-
-    def _who_groups(self, group: Group, name: str) -> str:
-        if group[0] in ("single", "per-folder"):
-            return f"--camera-mode {group[0]}"
-        return self.given(name).where
 
     def _given_of(self, names: Sequence[str]) -> GivenCamera:
         """Return what the user says of the one camera of some images."""
@@ -169,7 +166,8 @@ class InitialCameras:
             parts.append("distortion")
         camera.has_prior_focal_length = source in TRUSTED
         focal = _focal(camera)
-        if source == "given" and focal and not _is_plausible(focal / longer):
+        low, high = PLAUSIBLE_FOCALS
+        if source == "given" and focal and not low <= focal / longer <= high:
             why = f"{focal / longer:.2g} longer sides; is it in px of the stored files?"
         return camera, CameraRecord(
             tuple(sorted(names)), source, focal, why=why, size=size, given=tuple(parts)
@@ -197,7 +195,11 @@ class InitialCameras:
         """Return the focal length that EXIF gives images of one camera; first that has one."""
         if self.options.ignore_exif:
             return ExifFocal(None, why="EXIF is ignored")
-        found = [_checked_focal(tags) for tags in map(self._read, names) if tags]
+        found = []
+        for tags in filter(None, map(self._read, names)):
+            make, model, _ = tags.body
+            width_mm = sensor_width_mm(make, model) if tags.focal_mm else None
+            found.append(exif_focal(tags, width_mm))
         trusted = [focal for focal in found if focal.focal_px]
         if not trusted:
             return found[0] if found else ExifFocal(None, why="no readable header")
@@ -224,12 +226,6 @@ class InitialCameras:
         return camera_matrix(self.camera(same, size)[0])
 
 
-def _checked_focal(tags: CameraTags) -> ExifFocal:
-    make, model, _ = tags.body
-    width = sensor_width_mm(make, model) if tags.focal_mm else None
-    return exif_focal(tags, width)
-
-
 @cache
 def sensor_width_mm(make: str, model: str) -> float | None:
     """Return the longer side of the sensor of a camera model that COLMAP knows, else None.
@@ -249,10 +245,6 @@ def sensor_width_mm(make: str, model: str) -> float | None:
 
 def _focal(camera: pycolmap.Camera) -> float:
     return float(camera.mean_focal_length()) if len(camera.focal_length_idxs()) else 0.0
-
-
-def _is_plausible(longer_sides: float) -> bool:
-    return PLAUSIBLE_FOCALS[0] <= longer_sides <= PLAUSIBLE_FOCALS[1]
 
 
 def import_images(

@@ -162,11 +162,11 @@ RECORDS: dict[str, Callable[[_Reader], str | None]] = {
 """The files of a model, and what steps over one record of each."""
 
 
-def num_long_tracks(folder: Path) -> dict[str, int]:
-    """Return how many points that three images or more see each image of a model sees."""
-    model = pycolmap.Reconstruction(folder)
-    counts: Counter[int] = Counter()
-    for point in model.points3D.values():
-        if point.track.length() > 2:
-            counts.update({element.image_id for element in point.track.elements})
-    return {image.name: counts[image_id] for image_id, image in model.images.items()}
+def num_long_tracks(model: pycolmap.Reconstruction) -> Counter[int]:
+    """Return how many points that three images or more see each image sees, by its id."""
+    return Counter(
+        image_id
+        for point in model.points3D.values()
+        if len(images := {element.image_id for element in point.track.elements}) > 2
+        for image_id in images
+    )

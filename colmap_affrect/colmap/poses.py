@@ -91,8 +91,7 @@ class PoseScores:
 
 def read_poses(model_path: Path) -> Poses:
     """Read the poses of a COLMAP model, text or binary; ComparisonError when it has none."""
-    model = read_given_model(model_path, error_class=ComparisonError)
-    poses = model_poses(model)
+    poses = model_poses(read_given_model(model_path, error_class=ComparisonError))
     if not poses:
         raise ComparisonError(f"{model_path}: the model has no images with poses")
     return poses

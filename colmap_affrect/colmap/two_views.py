@@ -114,6 +114,12 @@ def decomposed_homography(
     ]
 
 
+def homography_matrix(geometry: pycolmap.TwoViewGeometry) -> NDArray[np.float64] | None:
+    """Return the (3, 3) homography of a geometry, None where there is none."""
+    has_one = geometry.H is not None and np.any(geometry.H)
+    return np.asarray(geometry.H, np.float64) if has_one else None
+
+
 def homography_of(
     geometry: pycolmap.TwoViewGeometry,
     keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
@@ -131,10 +137,9 @@ def homography_of(
         tolerance_px: how near to the place in image 2 is explained.
         min_off_plane: so many inliers off the plane determine the geometry.
     """
-    homography = geometry.H
-    if homography is None or not np.any(homography):
+    homography = homography_matrix(geometry)
+    if homography is None:
         return None
-    homography = np.asarray(homography, np.float64)
     first, second = np.asarray(geometry.inlier_matches, np.int64).T
     places = project(homography, np.asarray(keypoints[0][first, :2], np.float64))
     errors = np.linalg.norm(places - keypoints[1][second, :2], axis=1)

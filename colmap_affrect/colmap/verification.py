@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from colmap_affrect.colmap.database import (
 from colmap_affrect.colmap.native_options import Plain, differences
 from colmap_affrect.colmap.pair_significance import significance, telling_shapes
 from colmap_affrect.geometry.affine import homography_errors
-from colmap_affrect.options import CUSTOM, MAX_SEED, PRESETS, Options, preset_values, within
+from colmap_affrect.options import MAX_SEED, PresetOptions, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 logger = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ NUM_CACHED_IMAGES = 256
 """As COLMAP keeps: 80 MB of 13,000 keypoints each."""
 
 
-class VerificationOptions(Options):
+class VerificationOptions(PresetOptions):
     """Two-view geometry, by default the sparse preset (names as in pycolmap)."""
 
     max_error_px: Annotated[float, within(0.01, 1000.0)] = 3.0
@@ -62,18 +62,6 @@ class VerificationOptions(Options):
         "max_num_trials": 10000,
         "ransac_min_inlier_ratio": 0.25,
     }
-    """The preset ``colmap``: COLMAP's own defaults."""
-
-    @classmethod
-    def preset(cls, preset: str, **values: Any) -> Self:
-        """Return the options of a preset, ``sparse`` or ``colmap``, and others given."""
-        return cls(**{**preset_values(preset, cls.COLMAP), **values})
-
-    @property
-    def preset_name(self) -> str:
-        """Name of the preset that these options are, else ``custom``."""
-        seed = {"random_seed": self.random_seed}
-        return next((name for name in PRESETS if self == self.preset(name, **seed)), CUSTOM)
 
 
 REJECTED = (
@@ -194,6 +182,10 @@ def of_pair(extracted_px: ExtractedPx, ids: tuple[int, int]) -> int | None:
     return extracted_px.get(ids) if isinstance(extracted_px, Mapping) else extracted_px
 
 
+_Task = tuple[tuple[int, int], tuple[Side, Side], NDArray[np.integer]]
+"""A pair of image ids, its images and raw matches."""
+
+
 def verify(
     path: Path,
     options: VerificationOptions,
@@ -216,16 +208,30 @@ def verify(
         return
     require_database_space(path, len(todo))
     with open_database(path) as database:
-        reader = _PairReader(database)
-        if options.min_significance:
-            reader.warn_of_missing_shapes(todo, path)
+        cameras = read_image_cameras(database)
+
+        @lru_cache(NUM_CACHED_IMAGES)
+        def side(image_id: int) -> Side:
+            keypoints = np.asarray(database.read_keypoints(image_id), np.float32)
+            return Side(cameras[image_id], keypoints)
+
+        if options.min_significance and any(
+            telling_shapes(side(image_id).keypoints) is None for image_id in todo[0]
+        ):
+            logger.warning(
+                "%s: keypoints have no shapes; pairs need more inliers to count as verified", path
+            )
 
         def estimate(task: _Task) -> tuple[tuple[int, int], pycolmap.TwoViewGeometry]:
-            size_px = of_pair(extracted_px, task.ids)
-            return task.ids, estimate_geometry(task.sides, task.matches, options, size_px)
+            ids, sides, matches = task
+            size_px = of_pair(extracted_px, ids)
+            return ids, estimate_geometry(sides, matches, options, size_px)
 
         done: list[tuple[tuple[int, int], pycolmap.TwoViewGeometry]] = []
-        tasks = map(reader.task, todo)
+        tasks = (
+            ((one, two), (side(one), side(two)), database.read_matches(one, two))
+            for one, two in todo
+        )
         try:
             for item in map_ordered(estimate, tasks, available_cores()):
                 done.append(item)
@@ -247,38 +253,6 @@ def _write(
     if advance:
         advance(len(done))
     done.clear()
-
-
-@dataclass(frozen=True)
-class _Task:
-    ids: tuple[int, int]
-    sides: tuple[Side, Side]
-    matches: NDArray[np.integer]
-
-
-class _PairReader:
-    """Reads what the verification of pairs needs; the images used last are kept."""
-
-    def __init__(self, database: pycolmap.Database) -> None:
-        self._database = database
-        self._cameras = read_image_cameras(database)
-        self._side = lru_cache(NUM_CACHED_IMAGES)(self._read_side)
-
-    def _read_side(self, image_id: int) -> Side:
-        keypoints = np.asarray(self._database.read_keypoints(image_id), np.float32)
-        return Side(self._cameras[image_id], keypoints)
-
-    def task(self, ids: tuple[int, int]) -> _Task:
-        """Read a pair."""
-        sides = (self._side(ids[0]), self._side(ids[1]))
-        return _Task(ids, sides, self._database.read_matches(*ids))
-
-    def warn_of_missing_shapes(self, pairs: Sequence[tuple[int, int]], path: Path) -> None:
-        """Say it when keypoints of the first pair have none, or all the same."""
-        if pairs and any(telling_shapes(self._side(i).keypoints) is None for i in pairs[0]):
-            logger.warning(
-                "%s: keypoints have no shapes; pairs need more inliers to count as verified", path
-            )
 
 
 def read_image_cameras(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:

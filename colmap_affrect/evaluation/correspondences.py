@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from statistics import fmean, median_low
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.evaluation.protocol import EvaluationPair, PairResult, PairScore
-from colmap_affrect.evaluation.two_views import Points, RansacSettings, symmetric_epipolar_distances
+from colmap_affrect.evaluation.protocol import (
+    POSITIVE,
+    EvaluationPair,
+    EvaluationProtocol,
+    PairResult,
+    PairScore,
+)
+from colmap_affrect.evaluation.two_views import Points, symmetric_epipolar_distances
+from colmap_affrect.options import within
 
 WXBS_THRESHOLDS_PX = tuple(range(20))
 """The score of WxBS is the mean over these of the share of correspondences that agree."""
@@ -19,15 +26,13 @@ WXBS_THRESHOLDS_PX = tuple(range(20))
 SHOWN_THRESHOLDS_PX = (1, 2, 3, 5, 10, 20)
 
 
-@dataclass(frozen=True)
-class CorrespondenceProtocol(RansacSettings):
-    """Score of matches by the fundamental matrix that they give by OpenCV's USAC_MAGSAC.
+class CorrespondenceProtocol(EvaluationProtocol):
+    """Score of matches by the fundamental matrix that they give by OpenCV's USAC_MAGSAC."""
 
-    Attributes:
-        num_estimates: of so many orders of the matches the one of median error counts.
-    """
-
-    num_estimates: int = 5
+    epipolar_threshold_px: Annotated[float, POSITIVE] = 1.0
+    """Largest noise that USAC_MAGSAC reckons with for fundamental matrices."""
+    num_magsac_estimates: Annotated[int, within(1, 1_000_000_000)] = 5
+    """Of so many orders of the matches the one of median error counts."""
 
     def score(
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
@@ -37,14 +42,27 @@ class CorrespondenceProtocol(RansacSettings):
         ``error`` is the median of their symmetric epipolar distances in px. Details:
         ``wxbs_score``, and ``recall_Kpx``, the share of them within K px.
         """
-        ransac = self.ransac(cv2.USAC_MAGSAC, self.threshold_px, random_seed)
+        ransac = self.ransac(cv2.USAC_MAGSAC, self.epipolar_threshold_px, random_seed)
         found = []
-        for number, reseeded in enumerate(ransac.reseeded(self.num_estimates)):
+        for number, reseeded in enumerate(ransac.reseeded(self.num_magsac_estimates)):
             matrix, num_inliers = reseeded.fundamental_matrix(points1, points2)
             distances = symmetric_epipolar_distances(matrix, *np.hsplit(pair.truth, 2))
             found.append((float(np.median(distances)), num_inliers, number, distances))
         error, num_inliers, _, distances = median_low(found)
         return PairScore(error, num_inliers, None, recalls(distances))
+
+    def success(self, score: PairScore) -> float:
+        """Return the score of WxBS."""
+        return score.details["wxbs_score"]
+
+    def settings(self) -> dict[str, Any]:
+        """See :class:`EvaluationProtocol`."""
+        return {
+            "correspondences": "OpenCV USAC_MAGSAC fundamental matrix; error: median symmetric "
+            "epipolar distance sqrt(d1^2 + d2^2), px; WxBS score: mean over thresholds 0, 1, ... "
+            "19 px of the share of correspondences within",
+            **super().settings(),
+        }
 
 
 def recalls(distances_px: NDArray[np.float64]) -> dict[str, float]:

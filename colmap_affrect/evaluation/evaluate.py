@@ -277,6 +277,11 @@ class _Run:
         cost = ImageCost.mean(costs)
         seconds = sum(cost.total_s for cost in costs) + sum(result.seconds for result in results)
         seed = self.options.random_seed
+        timed = [result.seconds_by_step for result in results if result.seconds_by_step]
+        per_pair = {
+            step: math.fsum(seconds[step] for seconds in timed) / max(1, len(timed))
+            for step in PAIR_STEPS
+        }
         successes = self._successes(results)
         p_value = None
         if baseline is not None and baseline is not results:
@@ -295,7 +300,7 @@ class _Run:
             p_value=p_value,
             num_images=len(costs),
             complexity=cost.complexity(),
-            seconds_per_step={**cost.seconds(), **_seconds_per_pair(results)},
+            seconds_per_step={**cost.seconds(), **per_pair},
             failures=self.features.failures,
             warnings=self.features.warnings,
             pairs=tuple(results),
@@ -303,15 +308,6 @@ class _Run:
 
     def _successes(self, results: Sequence[PairResult]) -> NDArray[np.float64]:
         return np.array([self.protocol.success(result) for result in results])
-
-
-def _seconds_per_pair(results: Sequence[PairResult]) -> dict[str, float]:
-    """Return mean seconds by step, of the pairs that were matched."""
-    timed = [result.seconds_by_step for result in results if result.seconds_by_step]
-    return {
-        step: math.fsum(seconds[step] for seconds in timed) / max(1, len(timed))
-        for step in PAIR_STEPS
-    }
 
 
 def _intervals(

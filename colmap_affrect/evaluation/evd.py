@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 from colmap_affrect.errors import EvaluationError
 from colmap_affrect.evaluation.homographies import HomographyProtocol, checked_homography
@@ -19,7 +19,6 @@ from colmap_affrect.evaluation.protocol import (
     Dataset,
     EvaluationImage,
     EvaluationPair,
-    PairScore,
     read_numbers,
     with_truth,
 )
@@ -27,23 +26,13 @@ from colmap_affrect.evaluation.truth_checks import true_homography
 from colmap_affrect.images.reading import IMAGE_SUFFIXES
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
-SUCCESS_PX = 5.0
 NUM_PAPER_PAIRS = 15
 
 
-@dataclass(frozen=True)
 class Evd(HomographyProtocol):
-    """Number of pairs with a homography error below 1, 2, 3, 5, 10 and 20 px.
+    """Number of pairs with a homography error below 1, 2, 3, 5, 10 and 20 px."""
 
-    Attributes:
-        check_truth: see whether the images confirm the homographies.
-    """
-
-    name = "evd"
-    error_title = "mean reprojection error of the visible part (px)"
-    category_title = ""
-
-    check_truth: bool = True
+    name: ClassVar[str] = "evd"
 
     def load(self, dataset_path: Path) -> Dataset:
         """See :class:`EvaluationProtocol`."""
@@ -72,14 +61,6 @@ class Evd(HomographyProtocol):
             return replace(pair, truth=truth), doubts
 
         return with_truth(pair, [*paths, homography_path], read)
-
-    def success(self, score: PairScore) -> float:
-        """1 if the error is below 5 px."""
-        return float(score.error < SUCCESS_PX)
-
-    def settings(self) -> dict[str, Any]:
-        """See :class:`EvaluationProtocol`."""
-        return {"success": f"error < {SUCCESS_PX:g} px", **super().settings()}
 
 
 def _extreme_views(folder: Path) -> list[tuple[EvaluationPair, Path]]:

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from statistics import median_low
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import cv2
 import numpy as np
@@ -20,13 +20,16 @@ from numpy.typing import NDArray
 from colmap_affrect.conventions import is_inside
 from colmap_affrect.errors import EvaluationError
 from colmap_affrect.evaluation.protocol import (
+    POSITIVE,
     EvaluationPair,
+    EvaluationProtocol,
     PairResult,
     PairScore,
     finite_numbers,
 )
-from colmap_affrect.evaluation.two_views import Points, RansacSettings
+from colmap_affrect.evaluation.two_views import Points
 from colmap_affrect.geometry.affine import project
+from colmap_affrect.options import within
 
 Homography = NDArray[np.float64]
 Size = tuple[int, int]
@@ -72,17 +75,17 @@ class TrueHomography:
         return float(transfer_errors(signed, self.visible, target).mean())
 
 
-@dataclass(frozen=True)
-class HomographyProtocol(RansacSettings):
-    """Score of matches by the homography that they give, as the paper and as we recommend.
+class HomographyProtocol(EvaluationProtocol):
+    """Score of matches by the homography that they give, as the paper and as we recommend."""
 
-    Attributes:
-        magsac_threshold_px: largest noise that OpenCV's USAC_MAGSAC reckons with.
-        num_magsac_estimates: of so many orders of the matches the one of median error counts.
-    """
+    error_title: ClassVar[str] = "mean reprojection error of the visible part (px)"
 
-    magsac_threshold_px: float = 5.0
-    num_magsac_estimates: int = 5
+    magsac_threshold_px: Annotated[float, POSITIVE] = 5.0
+    """Largest noise that OpenCV's USAC_MAGSAC reckons with."""
+    num_magsac_estimates: Annotated[int, within(1, 1_000_000_000)] = 5
+    """Of so many orders of the matches the one of median error counts."""
+    max_error_px: Annotated[float, POSITIVE] = 5.0
+    """A homography counts below this error."""
 
     def score(
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
@@ -109,6 +112,10 @@ class HomographyProtocol(RansacSettings):
             },
         )
 
+    def success(self, score: PairScore) -> float:
+        """1 if the error is below the limit."""
+        return float(score.error < self.max_error_px)
+
     def summarize(self, results: Sequence[PairResult]) -> dict[str, float]:
         """Count the pairs whose error is below each of ``THRESHOLDS_PX``, for both estimators."""
         errors = {
@@ -124,12 +131,12 @@ class HomographyProtocol(RansacSettings):
     def settings(self) -> dict[str, Any]:
         """Return everything that decides the errors, and what they are."""
         return {
-            "error": "mean over the visible part of image 1, every 4th pixel in x and y, of the "
-            "Euclidean distance in image 2 between truth and estimate, px",
+            "homography_error": "mean over the visible part of image 1, every 4th pixel in x and "
+            "y, of the Euclidean distance in image 2 between truth and estimate, px",
             "visible_part": "the pixels of image 1 that the truth carries into image 2",
-            "estimator": "OpenCV RANSAC",
+            "homography_estimator": "OpenCV RANSAC",
             "correct_px": CORRECT_PX,
-            **asdict(self),
+            **super().settings(),
         }
 
 

@@ -18,9 +18,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import h5py
 import numpy as np
@@ -59,14 +58,13 @@ MAX_QUATERNION_ERROR = 1e-3
 """Largest difference of an element of R from that of the quaternion beside it."""
 
 
-@dataclass(frozen=True)
 class Imc(PosedScenes):
     """Share of pairs with a rotation error below 5 degrees, by covisibility."""
 
-    name = "imc"
-    category_title = "covisibility, from"
-    scene_pattern = f"{SET_FOLDER}/{LIST_FOLDER}"
-    dataset_title = "the Phototourism sets"
+    name: ClassVar[str] = "imc"
+    category_title: ClassVar[str] = "covisibility, from"
+    scene_pattern: ClassVar[str] = f"{SET_FOLDER}/{LIST_FOLDER}"
+    dataset_title: ClassVar[str] = "the Phototourism sets"
 
     def load_scene(self, lists_path: Path) -> Dataset:
         """Read a scene by the folder of its lists of pairs."""

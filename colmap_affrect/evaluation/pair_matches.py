@@ -29,7 +29,7 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.climbing import insecure_images
-from colmap_affrect.stages.one_pair import CachedMatcher
+from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 
 VERIFICATION_SEED = 0
 
@@ -121,15 +121,16 @@ class PairMatcher:
         """Yield the best matches of each pair so far, with a result if it need not climb on."""
         extraction = self.recipe.extraction
         chosen = extraction.levels[level]
-        prepared = CachedMatcher(
+        matching = Matching(
             self.features.store,
             chosen.matching or self.recipe.matching,
-            level=level,
-            max_num_features=self.max_num_keypoints,
-            resources=self.features.resources,
-            extractor=chosen.features.name,
-            base=chosen.base,
+            level,
+            chosen.base,
+            chosen.features.name,
+            self.features.resources,
+            self.max_num_keypoints,
         )
+        prepared = CachedMatcher(matching)
         sizes = self.features.store.image_sizes()
 
         def match(pair: EvaluationPair) -> tuple[MatchedPair, Result | None]:

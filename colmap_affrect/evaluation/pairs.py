@@ -30,9 +30,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,7 @@ from colmap_affrect.evaluation.protocol import (
     Dataset,
     EvaluationImage,
     EvaluationPair,
+    EvaluationProtocol,
     PairResult,
     PairScore,
     finite_numbers,
@@ -66,7 +67,7 @@ from colmap_affrect.evaluation.truth_checks import (
     size_of,
     true_homography,
 )
-from colmap_affrect.evaluation.two_views import Points, RansacSettings
+from colmap_affrect.evaluation.two_views import Points
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
@@ -85,38 +86,18 @@ MAX_OFF_CENTRE = 0.25
 """A principal point further from the middle, in image sizes, does not fit the image."""
 
 
-@dataclass(frozen=True)
-class Pairs(RansacSettings):
-    """Homographies, epipolar geometries and relative poses of any pairs.
+class Pairs(HomographyProtocol, CorrespondenceProtocol, RelativePoseProtocol):
+    """Homographies, epipolar geometries and relative poses of any pairs."""
 
-    Attributes:
-        magsac_threshold_px: largest noise that USAC_MAGSAC reckons with for homographies.
-        epipolar_threshold_px: the same for fundamental matrices.
-        num_magsac_estimates: of so many orders of the matches the one of median error counts.
-        max_error_px: a homography counts below this error.
-        max_error_deg: a pose counts below this rotation error.
-        check_truth: see whether the images confirm the truth.
-    """
-
-    name = "pairs"
-    error_title = "error (px; poses: degrees)"
-    category_title = "category"
-
-    magsac_threshold_px: float = 5.0
-    epipolar_threshold_px: float = 1.0
-    num_magsac_estimates: int = 5
-    max_error_px: float = 5.0
-    max_error_deg: float = 5.0
-    check_truth: bool = True
+    name: ClassVar[str] = "pairs"
+    error_title: ClassVar[str] = "error (px; poses: degrees)"
+    category_title: ClassVar[str] = "category"
 
     def load(self, dataset_path: Path) -> Dataset:
         """See :class:`EvaluationProtocol`."""
-        entries, offset_px = _read_list(dataset_path / LIST)
-
-        def load_pair(entry: Mapping[str, Any]) -> Dataset:
-            return _Entry(entry, dataset_path, offset_px, self.check_truth).load()
-
-        dataset = Dataset.united(map_ordered(load_pair, entries, available_cores()))
+        listed, offset_px = _read_list(dataset_path / LIST)
+        entries = [_Entry(each, dataset_path, offset_px, self.check_truth) for each in listed]
+        dataset = Dataset.united(map_ordered(_Entry.load, entries, available_cores()))
         posed = [pair for pair in dataset.pairs if isinstance(pair.truth, tuple)]
         notes = pose_contradictions(posed) if self.check_truth and posed else []
         return Dataset(dataset.pairs, (*dataset.notes, *notes))
@@ -125,39 +106,19 @@ class Pairs(RansacSettings):
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
     ) -> PairScore:
         """See :class:`EvaluationProtocol`."""
-        protocol: HomographyProtocol | CorrespondenceProtocol | RelativePoseProtocol
+        kind: type[EvaluationProtocol] = CorrespondenceProtocol
         if isinstance(pair.truth, TrueHomography):
-            protocol = self._homographies
+            kind = HomographyProtocol
         elif isinstance(pair.truth, tuple):
-            protocol = self._poses
-        else:
-            protocol = CorrespondenceProtocol(
-                self.epipolar_threshold_px, *self._limits, self.num_magsac_estimates
-            )
-        return protocol.score(pair, points1, points2, random_seed)
-
-    @property
-    def _limits(self) -> tuple[float, int]:
-        return self.confidence, self.max_num_iterations
-
-    @property
-    def _homographies(self) -> HomographyProtocol:
-        return HomographyProtocol(
-            self.threshold_px, *self._limits, self.magsac_threshold_px, self.num_magsac_estimates
-        )
-
-    @property
-    def _poses(self) -> RelativePoseProtocol:
-        return RelativePoseProtocol(
-            self.threshold_px, *self._limits, max_error_deg=self.max_error_deg
-        )
+            kind = RelativePoseProtocol
+        return kind.score(self, pair, points1, points2, random_seed)
 
     def success(self, score: PairScore) -> float:
         """1 if the error is below the limit of its kind; for correspondences the score of WxBS."""
         if "wxbs_score" in score.details:
-            return score.details["wxbs_score"]
+            return CorrespondenceProtocol.success(self, score)
         is_pose = "direction_error_deg" in score.details
-        return float(score.error < (self.max_error_deg if is_pose else self.max_error_px))
+        return (RelativePoseProtocol if is_pose else HomographyProtocol).success(self, score)
 
     def summarize(self, results: Sequence[PairResult]) -> dict[str, float]:
         """See :class:`EvaluationProtocol`; a table for each kind of truth that there is.
@@ -170,7 +131,7 @@ class Pairs(RansacSettings):
 
         columns: dict[str, float] = {}
         if homographies := having("magsac_error"):
-            counts = self._homographies.summarize(homographies)
+            counts = super().summarize(homographies)
             columns |= {f"homographies: {name}": count for name, count in counts.items()}
         if marked := having("wxbs_score"):
             columns |= {
@@ -179,20 +140,9 @@ class Pairs(RansacSettings):
         if poses := having("direction_error_deg"):
             columns |= {
                 f"poses, {name}" if GROUP in name else f"poses{GROUP}{name}": share
-                for name, share in self._poses.columns(poses, {}).items()
+                for name, share in self.columns(poses, {}).items()
             }
         return columns
-
-    def settings(self) -> dict[str, Any]:
-        """See :class:`EvaluationProtocol`."""
-        return {
-            "homographies": self._homographies.settings(),
-            "correspondences": "OpenCV USAC_MAGSAC fundamental matrix; error: median symmetric "
-            "epipolar distance sqrt(d1^2 + d2^2), px; WxBS score: mean over thresholds 0, 1, ... "
-            "19 px of the share of correspondences within",
-            "poses": self._poses.settings(),
-            **asdict(self),
-        }
 
 
 def _read_list(path: Path) -> tuple[list[Mapping[str, Any]], float]:

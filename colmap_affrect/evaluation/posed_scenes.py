@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
 
@@ -22,7 +21,6 @@ Names = tuple[str, str]
 """Of the images of a pair, without suffix."""
 
 
-@dataclass(frozen=True)
 class PosedScenes(RelativePoseProtocol):
     """A protocol whose dataset is a scene or a folder of scenes."""
 

@@ -6,16 +6,20 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Protocol, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
 from colmap_affrect.errors import AffrectError, EvaluationError
+from colmap_affrect.evaluation.two_views import Points, Ransac
+from colmap_affrect.options import Options, within
 
 Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value is None else value)]
 """Infinite where JSON has null."""
+
+POSITIVE = within(1e-6, 1e9)
 
 GROUP = ": "
 """Separates the name of a table from that of its column in the names of columns."""
@@ -118,52 +122,62 @@ class Dataset:
         )
 
 
-class EvaluationProtocol(Protocol):
+class EvaluationProtocol(Options):
     """Loads a dataset, scores matches, and sums up, as one of the paper's tables does.
 
-    Implementations are frozen dataclasses of their settings, named in ``registry.PROTOCOLS``, that
-    can be made without arguments. What follows ``name`` are class variables.
-
-    Attributes:
-        name: as the command line has it.
-        error_title: what the error of a score is, with its unit, for axes of plots.
-        category_title: what the categories are, for axes of plots; empty without categories.
+    A class variable ``error_title`` says what the error of a score is, with its unit, and
+    ``category_title`` what the categories are, empty without: both for axes of plots.
     """
 
-    name: str
-    error_title: str
-    category_title: str
+    name: ClassVar[str]
+    """As the command line has it."""
+    error_title: ClassVar[str]
+    category_title: ClassVar[str] = ""
+
+    threshold_px: Annotated[float, POSITIVE] = 0.5
+    """Of an inlier of plain RANSAC (the paper: 0.5)."""
+    confidence: Annotated[float, within(1e-6, 1.0)] = 0.9999
+    """At which estimators may end."""
+    max_num_iterations: Annotated[int, within(1, 1_000_000_000)] = 100_000
+    """Of estimators, as the paper says; 1000 gave its numbers of relative poses, for the function
+    of OpenCV that its code called takes no number."""
+    check_truth: bool = True
+    """See whether the images confirm the truth."""
+
+    def ransac(self, method: int, threshold: float, random_seed: int) -> Ransac:
+        """Return how to look for a model."""
+        return Ransac(method, threshold, self.confidence, self.max_num_iterations, random_seed)
 
     def load(self, dataset_path: Path) -> Dataset:
         """Find the pairs of a dataset; EvaluationError when the layout is another one."""
+        raise NotImplementedError
 
     def score(
-        self,
-        pair: EvaluationPair,
-        points1: NDArray[np.float64],
-        points2: NDArray[np.float64],
-        random_seed: int,
+        self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
     ) -> PairScore:
         """Score (M, 2) and (M, 2) matched points, pixel-centre px of the stored images."""
+        raise NotImplementedError
 
     def success(self, score: PairScore) -> float:
         """Return how far a pair counts as matched, in [0, 1]: 1 or 0 where there is a threshold.
 
         Plots and intervals are of its mean; the test against the baseline compares it pair by pair.
         """
+        raise NotImplementedError
 
     def summarize(self, results: Sequence[PairResult]) -> dict[str, float]:
         """Return the columns of the protocol's table by name, in order (counts or shares).
 
         Failed pairs are among the results. A name ``group: column`` puts the column into a
         table of its own. The frame adds the column ``seconds``, all time that the recipe took.
-        Names are those of ``published.published`` where the paper has the same number: ``evd`` has
-        ``< 1 px``, ``< 2 px``, ``< 3 px``, ``< 5 px``, ``< 10 px`` and ``< 20 px`` (numbers of
-        pairs) and ``seconds``. Of an empty sequence all columns are 0.
+        Names are those of ``published.published`` where the paper has the same number. Of an empty
+        sequence all columns are 0.
         """
+        raise NotImplementedError
 
     def settings(self) -> dict[str, Any]:
         """Return everything that decides scores, for the record."""
+        return self.model_dump(mode="json", exclude={"check_truth"})
 
 
 def with_truth(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+import tomllib
+from collections.abc import Mapping, Sequence
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.evaluation.evd import Evd
@@ -12,46 +11,26 @@ from colmap_affrect.evaluation.imc import Imc
 from colmap_affrect.evaluation.pairs import Pairs
 from colmap_affrect.evaluation.protocol import EvaluationProtocol
 from colmap_affrect.evaluation.svp import Svp
-from colmap_affrect.options import suggestion
 
-PROTOCOLS: Mapping[str, Callable[..., EvaluationProtocol]] = {
-    "evd": Evd,
-    "svp": Svp,
-    "imc": Imc,
-    "pairs": Pairs,
+PROTOCOLS: Mapping[str, type[EvaluationProtocol]] = {
+    protocol.name: protocol for protocol in (Evd, Svp, Imc, Pairs)
 }
 
 
 def make_protocol(name: str, settings: Sequence[str] = ()) -> EvaluationProtocol:
-    """Return a protocol, some of its fields changed by ``KEY=VALUE``.
+    """Return a protocol, some of its options changed by ``KEY=VALUE``.
 
-    Raises OptionError for an unknown protocol or setting, or a value of the wrong type.
+    Raises OptionError for an unknown protocol or option, or a value that it cannot have.
     """
     if name not in PROTOCOLS:
         raise OptionError(f"unknown protocol '{name}': known are {', '.join(PROTOCOLS)}")
-    protocol: Any = PROTOCOLS[name]()
-    known = {field.name: getattr(protocol, field.name) for field in dataclasses.fields(protocol)}
-    changes = {}
+    values = {}
     for setting in settings:
         key, separator, text = (part.strip() for part in setting.partition("="))
         if not separator:
             raise OptionError(f"{setting}: expected KEY=VALUE")
-        if key not in known:
-            raise OptionError(f"{name} has no setting '{key}'{suggestion(key, known)}")
-        changes[key] = _value(text, known[key], f"{name}: {setting}")
-    changed: EvaluationProtocol = dataclasses.replace(protocol, **changes)
-    return changed
-
-
-def _value(text: str, default: Any, where: str) -> Any:
-    if isinstance(default, bool):
-        if text not in ("true", "false"):
-            raise OptionError(f"{where}: expected true or false")
-        return text == "true"
-    try:
-        value = type(default)(text)
-    except ValueError as error:
-        raise OptionError(f"{where}: expected {type(default).__name__}") from error
-    if not 0 < value < float("inf"):
-        raise OptionError(f"{where}: must be positive")
-    return value
+        try:
+            values[key] = tomllib.loads(f"value = {text}")["value"]
+        except ValueError:
+            values[key] = text
+    return PROTOCOLS[name].from_mapping(values, name)

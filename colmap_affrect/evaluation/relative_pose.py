@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median_low
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import cv2
 import numpy as np
@@ -21,12 +21,15 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, area_under_curve, pose_errors, relative_pose
 from colmap_affrect.conventions import colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.evaluation.protocol import (
+    POSITIVE,
     EvaluationImage,
     EvaluationPair,
+    EvaluationProtocol,
     PairResult,
     PairScore,
 )
-from colmap_affrect.evaluation.two_views import Points, Ransac, RansacSettings, sampson_distances
+from colmap_affrect.evaluation.two_views import Points, Ransac, sampson_distances
+from colmap_affrect.options import within
 
 CORRECT_PX = 3.0
 """A match agrees with a pose up to this Sampson distance."""
@@ -76,34 +79,29 @@ def rotation_angle_deg(rotation: NDArray[np.float64]) -> float:
     return pose_errors((rotation, nothing), (np.eye(3), nothing))[0]
 
 
-@dataclass(frozen=True)
-class RelativePoseProtocol(RansacSettings):
+class RelativePoseProtocol(EvaluationProtocol):
     """Score of matches by the relative pose that they give, the intrinsics being known.
 
     Two estimators: the paper's, plain RANSAC, whose result is one sample of five matches, and a
     recommended one, OpenCV's GC-RANSAC (``USAC_ACCURATE``), which refines on all inliers. Distances
     of points from epipolar lines are in px by the mean focal length of the two cameras.
-
-    Attributes:
-        use_distortion: whether the lenses are straightened out; the paper's code did not.
-        gc_threshold_px: of an inlier of GC-RANSAC; as in verification by default.
-        num_gc_estimates: of so many orders of the matches the one of median error counts.
-        max_error_deg: rotation error below which a pair counts.
-        check_truth: see whether the images confirm the poses.
     """
 
-    use_distortion: bool = True
-    gc_threshold_px: float = 3.0
-    num_gc_estimates: int = 5
-    max_error_deg: float = 5.0
-    check_truth: bool = True
+    error_title: ClassVar[str] = "rotation error [deg]"
 
-    error_title = "rotation error [deg]"
+    use_distortion: bool = True
+    """Whether the lenses are straightened out; the paper's code did not."""
+    gc_threshold_px: Annotated[float, POSITIVE] = 3.0
+    """Of an inlier of GC-RANSAC; as in verification by default."""
+    num_gc_estimates: Annotated[int, within(1, 1_000_000_000)] = 5
+    """Of so many orders of the matches the one of median error counts."""
+    max_error_deg: Annotated[float, POSITIVE] = 5.0
+    """Rotation error below which a pair counts."""
 
     def settings(self) -> dict[str, Any]:
         """Return everything that decides scores."""
-        deciding = {key: value for key, value in asdict(self).items() if key != "check_truth"}
-        return {"estimators": "OpenCV findEssentialMat, RANSAC and USAC_ACCURATE", **deciding}
+        estimators = "OpenCV findEssentialMat, RANSAC and USAC_ACCURATE"
+        return {"estimators": estimators, **super().settings()}
 
     def score(
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
@@ -175,7 +173,8 @@ class RelativePoseProtocol(RansacSettings):
         columns: dict[str, float] = {}
         for group, prefix in ESTIMATORS.items():
             for title, members, limit in shares:
-                columns[group + title] = _share_below(limit, _errors(members, prefix))
+                below = [rotation < limit for rotation, _ in _errors(members, prefix)]
+                columns[group + title] = sum(below) / max(1, len(below))
             errors = _errors(results, prefix)
             area = area_under_curve(map(max, errors), len(errors), MAX_AUC_ERROR_DEG)
             columns[f"{group}pose AUC {MAX_AUC_ERROR_DEG:g}°"] = area
@@ -191,11 +190,6 @@ def _errors(results: Sequence[PairResult], prefix: str) -> list[tuple[float, flo
         )
         for result in results
     ]
-
-
-def _share_below(limit_deg: float, errors: Sequence[tuple[float, float]]) -> float:
-    """Return the share of rotation errors below a limit."""
-    return sum(rotation < limit_deg for rotation, _ in errors) / len(errors) if errors else 0.0
 
 
 def category_start(category: str) -> float:

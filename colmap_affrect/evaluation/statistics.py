@@ -49,7 +49,9 @@ def paired_test(
     differing = first != second
     differences = first[differing] - second[differing]
     count = len(differences)
-    ranks = _mean_ranks(np.abs(differences))
+    # From 1; equal ones share the mean of their ranks.
+    _, group, sizes = np.unique(np.abs(differences), return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(sizes) - (sizes - 1) / 2)[group]
     observed = abs(float(np.sign(differences) @ ranks))
     if count <= MAX_ENUMERATED:
         signs = np.array(list(itertools.product((-1.0, 1.0), repeat=count)))
@@ -60,9 +62,3 @@ def paired_test(
         for _ in range(NUM_RANDOM_SIGNS)
     )
     return (at_least + 1) / (NUM_RANDOM_SIGNS + 1)
-
-
-def _mean_ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rank (N,) values from 1; equal ones share the mean of their ranks."""
-    _, group, sizes = np.unique(values, return_inverse=True, return_counts=True)
-    return np.asarray((np.cumsum(sizes) - (sizes - 1) / 2)[group])

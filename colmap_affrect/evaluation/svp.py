@@ -14,9 +14,8 @@ so are their depth maps. Names in the lists and files may differ in their suffix
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,14 +48,13 @@ MAX_NOT_UNIT = 1e-3
 """Largest deviation of the length of a quaternion from 1."""
 
 
-@dataclass(frozen=True)
 class Svp(PosedScenes):
     """Share of pairs with a rotation error below 5 degrees, by relative rotation."""
 
-    name = "svp"
-    category_title = "relative rotation, from [deg]"
-    scene_pattern = f"*{PAIR_LIST_SUFFIX}"
-    dataset_title = "the Strong ViewPoint Changes dataset"
+    name: ClassVar[str] = "svp"
+    category_title: ClassVar[str] = "relative rotation, from [deg]"
+    scene_pattern: ClassVar[str] = f"*{PAIR_LIST_SUFFIX}"
+    dataset_title: ClassVar[str] = "the Strong ViewPoint Changes dataset"
 
     def load_scene(self, list_path: Path) -> Dataset:
         """Read a scene by its list of pairs."""
@@ -76,6 +74,9 @@ class Svp(PosedScenes):
         pairs = posed_pairs(
             listed_names, posed, lambda names: f"{CATEGORY_DEG * difficulty(poses, *names)}°"
         )
+        left = {int(category_start(pair.category)) // CATEGORY_DEG for pair in pairs}
+        wanted = {pair.difficulty for pair in listed if pair.difficulty is not None}
+        empty = ", ".join(f"{tens * CATEGORY_DEG}°" for tens in sorted(wanted - left))
         names = list(dict.fromkeys(name for pair in listed_names for name in pair))
         lacking = {n: faults.get(n, "not in images.txt") for n in names if n not in cameras}
         bad = [f"line {number}" for number in bad_lines]
@@ -85,7 +86,7 @@ class Svp(PosedScenes):
             *_difficulty_notes(listed, poses),
             *_size_notes(pairs),
             *(pose_contradictions(pairs) if self.check_truth else ()),
-            *_empty_notes(listed, pairs),
+            *([f"no pairs are left from {empty}"] if empty else []),
         ]
         return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
 
@@ -200,14 +201,6 @@ def _size_notes(pairs: Sequence[EvaluationPair]) -> list[str]:
         if size and size != (posed.camera.width, posed.camera.height)
     ]
     return counted(wrong, "images are of another size than their intrinsics", wrong)
-
-
-def _empty_notes(listed: Sequence[ListedPair], pairs: Sequence[EvaluationPair]) -> list[str]:
-    """Name the listed categories of which no pair is left."""
-    wanted = {pair.difficulty for pair in listed if pair.difficulty is not None}
-    left = {int(category_start(pair.category)) // CATEGORY_DEG for pair in pairs}
-    empty = ", ".join(f"{tens * CATEGORY_DEG}°" for tens in sorted(wanted - left))
-    return [f"no pairs are left from {empty}"] if empty else []
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:

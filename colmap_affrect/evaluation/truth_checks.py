@@ -46,12 +46,10 @@ from colmap_affrect.matchers.nearest import (
 )
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.recipes import load_recipe
+from colmap_affrect.shown import such_as
 from colmap_affrect.stages.one_image import extract_image, prepare
 
 CHECK_RECIPE = "unrectified-rootsift"
-
-MAX_NAMES = 3
-"""Examples in a note."""
 
 MAX_NOT_ORTHONORMAL = 1e-3
 """Largest element of R Rᵀ - I of what passes for a rotation."""
@@ -94,17 +92,6 @@ POSE_MISTAKES: dict[str, Callable[[Pose], Pose]] = {
 def counted(items: Sequence[object], what: str, examples: Iterable[str]) -> list[str]:
     """Return a note of how many there are of something, with examples; nothing of nothing."""
     return [f"{len(items)} {what}: {such_as(examples)}"] if items else []
-
-
-def such_as(names: Iterable[str]) -> str:
-    """Return the first few names, for people.
-
-    >>> such_as(["a", "b", "c", "d", "e"])
-    'a, b, c and 2 more'
-    """
-    listed = list(names)
-    more = f" and {len(listed) - MAX_NAMES} more" if len(listed) > MAX_NAMES else ""
-    return ", ".join(listed[:MAX_NAMES]) + more
 
 
 def rotation_fault(rotation: NDArray[np.float64]) -> str:

@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap.poses import Pose
+from colmap_affrect.geometry.epipolar import epipolar_lines, sampson_errors
+from colmap_affrect.geometry.two_views import essential_matrix, homogeneous
 
 Points = NDArray[np.float64]
 Matrix = NDArray[np.float64]
-
-PAPER_MAX_NUM_ITERATIONS = 100_000
-"""What the paper says."""
 
 MIN_HOMOGRAPHY_MATCHES = 4
 MIN_FUNDAMENTAL_MATCHES = 8
@@ -115,26 +114,6 @@ class Ransac:
         return pose, inliers
 
 
-@dataclass(frozen=True)
-class RansacSettings:
-    """What every protocol that estimates geometry can be told.
-
-    Attributes:
-        threshold_px: of an inlier of plain RANSAC (the paper: 0.5).
-        confidence: at which estimators may end.
-        max_num_iterations: of estimators; 1000 gave the paper's numbers of relative poses, for
-            the function of OpenCV that its code called takes no number.
-    """
-
-    threshold_px: float = 0.5
-    confidence: float = 0.9999
-    max_num_iterations: int = PAPER_MAX_NUM_ITERATIONS
-
-    def ransac(self, method: int, threshold: float, random_seed: int) -> Ransac:
-        """Return how to look for a model."""
-        return Ransac(method, threshold, self.confidence, self.max_num_iterations, random_seed)
-
-
 def symmetric_epipolar_distances(
     matrix: Matrix | None, points1: Points, points2: Points
 ) -> NDArray[np.float64]:
@@ -144,7 +123,9 @@ def symmetric_epipolar_distances(
     """
     if matrix is None:
         return np.full(len(points1), np.inf)
-    residuals, slopes1, slopes2 = _epipolar_terms(matrix, points1, points2)
+    lines1, lines2 = epipolar_lines(matrix, points1, points2)
+    residuals = (homogeneous(points2) * lines2).sum(axis=1)
+    slopes1, slopes2 = (np.square(lines[:, :2]).sum(axis=1) for lines in (lines1, lines2))
     with np.errstate(divide="ignore", invalid="ignore"):
         distances = np.abs(residuals) * np.sqrt(1.0 / slopes1 + 1.0 / slopes2)
     return np.asarray(np.nan_to_num(distances, nan=np.inf))
@@ -153,22 +134,8 @@ def symmetric_epipolar_distances(
 def sampson_distances(pose: Pose, rays1: Points, rays2: Points) -> NDArray[np.float64]:
     """Return (N,) first-order distances of (N, 2) x/z, y/z from a camera2_from_camera1.
 
-    In units of the focal length; infinite where they are not defined.
+    In units of the focal length; infinite where they are not defined, as without a baseline.
     """
-    rotation, (x, y, z) = pose
-    essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ rotation
-    residuals, slopes1, slopes2 = _epipolar_terms(essential, rays1, rays2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distances = np.abs(residuals) / np.sqrt(slopes2 + slopes1)
-    return np.asarray(np.nan_to_num(distances, nan=np.inf))
-
-
-def _epipolar_terms(
-    matrix: Matrix, points1: Points, points2: Points
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return x2' M x1 of (N, 2) points, and the squared slopes of their lines in images 1 and 2."""
-    ones = np.ones((len(points1), 1))
-    first, second = np.hstack([points1, ones]), np.hstack([points2, ones])
-    lines2, lines1 = first @ matrix.T, second @ matrix
-    slopes1, slopes2 = (np.square(lines[:, :2]).sum(axis=1) for lines in (lines1, lines2))
-    return (second * lines2).sum(axis=1), slopes1, slopes2
+    if not pose[1].any():
+        return np.full(len(rays1), np.inf)
+    return np.nan_to_num(sampson_errors(essential_matrix(*pose), rays1, rays2), nan=np.inf)

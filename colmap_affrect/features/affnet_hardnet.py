@@ -10,7 +10,6 @@ Patches are sampled from a pyramid whose level has steps of 1 to 2 px.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -182,21 +181,16 @@ class AffNetHardNet:
         import torch
         from torch.nn.functional import pad
 
+        from colmap_affrect.features.networks import arithmetic
+
         size = self.options.batch_size
         outputs = []
-        with self._arithmetic():
+        with arithmetic(self.options.dtype, self.device):
             for begin in range(0, len(patches), size):
                 batch = patches[begin : begin + size]
                 filled = pad(batch, (0, 0, 0, 0, 0, 0, 0, -len(batch) % BATCH_MULTIPLE))
                 outputs.append(network(filled)[: len(batch)].float())
         return np.asarray(torch.cat(outputs).cpu().numpy())
-
-    def _arithmetic(self) -> AbstractContextManager[object]:
-        if self.options.dtype == "float32":
-            return nullcontext()
-        import torch
-
-        return torch.autocast(self.device.type, getattr(torch, self.options.dtype))
 
 
 class _Patches:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -46,6 +46,11 @@ class LearnedOptions(FeatureOptions):
     dtype: Literal["float32", "float16", "bfloat16"] = "float32"
     """Arithmetic of the network on a GPU; on a CPU it is ``float32``."""
 
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Key of the file of weights."""
+        return (self.name,)
+
 
 class AlikedOptions(LearnedOptions):
     """Features ``aliked`` (Zhao et al. 2023)."""
@@ -69,11 +74,6 @@ class DiskOptions(LearnedOptions):
     score_threshold: Annotated[float, within(0.0, 1e6)] = 0.0
     """Scores are above it."""
 
-    @property
-    def weights(self) -> tuple[str, ...]:
-        """Key of the file of weights."""
-        return ("disk",)
-
 
 class XFeatOptions(LearnedOptions):
     """Features ``xfeat`` (Potje et al. 2024)."""
@@ -82,11 +82,6 @@ class XFeatOptions(LearnedOptions):
     score_threshold: Annotated[float, within(0.0, 1.0)] = 0.05
     """Scores are above it, before they are weighted by reliability."""
 
-    @property
-    def weights(self) -> tuple[str, ...]:
-        """Key of the file of weights."""
-        return ("xfeat",)
-
 
 class LearnedFeatures(ABC):
     """A network on one view after another; its class says how it is called."""
@@ -94,11 +89,13 @@ class LearnedFeatures(ABC):
     descriptor_size: int
 
     def __init__(self, options: LearnedOptions, context: NetworkContext) -> None:
-        """Keep the options; classes load the network, as :mod:`.networks` says."""
+        """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import resolve_device
 
-        self.limit, self.dtype = options.max_num_features, options.dtype
-        self.device = resolve_device(context.device)
+        self.limit, self.device = options.max_num_features, resolve_device(context.device)
+        self.dtype = "float32" if self.device.type == "cpu" else options.dtype
+        (key,) = options.weights
+        self.network: Any = self._load(options, context.weights[key], context.device)
 
     def detect(self, view: View) -> LocalFeatures:
         """Detect and describe, by falling response; none for views under 8 px.
@@ -111,9 +108,11 @@ class LearnedFeatures(ABC):
             return LocalFeatures.empty(self.descriptor_size)
         import torch
 
+        from colmap_affrect.features.networks import arithmetic
+
         allowed = np.ones(image.shape[:2], dtype=bool) if mask is None else mask > 0
         best = _Best(allowed, self.limit)
-        with torch.inference_mode(), self._arithmetic():
+        with torch.inference_mode(), arithmetic(self.dtype, self.device):
             found = self._run(_pixels(image).to(self.device), best)
         points, responses, descriptors = (_array(values) for values in found)
         lafs = lafs_from_keypoints(points, np.full(len(points), RADIUS_PX), np.zeros(len(points)))
@@ -127,15 +126,12 @@ class LearnedFeatures(ABC):
         return list(detected)
 
     @abstractmethod
+    def _load(self, options: Any, path: Path, device: str) -> Any:
+        """Return the network with the weights in a file."""
+
+    @abstractmethod
     def _run(self, pixels: Tensor, best: _Best) -> Found:
         """Return the best features of a (1, 3, H, W) view in [0, 1]."""
-
-    def _arithmetic(self) -> AbstractContextManager[object]:
-        if self.dtype == "float32" or self.device.type == "cpu":
-            return nullcontext()
-        import torch
-
-        return torch.autocast(self.device.type, getattr(torch, self.dtype))
 
 
 class Aliked(LearnedFeatures):
@@ -147,15 +143,10 @@ class Aliked(LearnedFeatures):
     Options = AlikedOptions
     descriptor_size = 128
 
-    def __init__(self, options: AlikedOptions, context: NetworkContext) -> None:
-        """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
+    def _load(self, options: AlikedOptions, path: Path, device: str) -> Any:
         from colmap_affrect.features.networks import load_aliked
 
-        super().__init__(options, context)
-        (key,) = options.weights
-        self.network: Any = load_aliked(
-            key, options.score_threshold, context.weights[key], context.device
-        )
+        return load_aliked(options.weights[0], options.score_threshold, path, device)
 
     def _run(self, pixels: Tensor, best: _Best) -> Found:
         features, scores = self.network.extract_dense_map(pixels)
@@ -177,13 +168,11 @@ class Disk(LearnedFeatures):
     Options = DiskOptions
     descriptor_size = 128
 
-    def __init__(self, options: DiskOptions, context: NetworkContext) -> None:
-        """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
+    def _load(self, options: DiskOptions, path: Path, device: str) -> Any:
         from colmap_affrect.features.networks import load_disk
 
-        super().__init__(options, context)
         self.score_threshold = options.score_threshold
-        self.network: Any = load_disk(context.weights["disk"], context.device)
+        return load_disk(path, device)
 
     def _run(self, pixels: Tensor, best: _Best) -> Found:
         from torch.nn.functional import pad
@@ -210,14 +199,10 @@ class XFeat(LearnedFeatures):
     Options = XFeatOptions
     descriptor_size = 64
 
-    def __init__(self, options: XFeatOptions, context: NetworkContext) -> None:
-        """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
+    def _load(self, options: XFeatOptions, path: Path, device: str) -> Any:
         from colmap_affrect.features.networks import load_xfeat
 
-        super().__init__(options, context)
-        self.network: Any = load_xfeat(
-            options.score_threshold, context.weights["xfeat"], context.device
-        )
+        return load_xfeat(options.score_threshold, path, device)
 
     def _run(self, pixels: Tensor, best: _Best) -> Found:
         height, width = pixels.shape[2:]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -49,6 +50,13 @@ def resolve_device(name: str) -> torch.device:
     if device.type == "mps" and not torch.backends.mps.is_available():
         raise DeviceError(f"--device {name}: torch finds no MPS device; use --device cpu or auto")
     return device
+
+
+def arithmetic(dtype: str, device: torch.device) -> AbstractContextManager[object]:
+    """Return a context in which networks compute with numbers of a type, ``float32`` for one."""
+    if dtype == "float32":
+        return nullcontext()
+    return torch.autocast(device.type, getattr(torch, dtype))
 
 
 def load_affnet(path: Path, device: str) -> feature.LAFAffNetShapeEstimator:

@@ -95,7 +95,7 @@ def log_evidence(
         beside = np.stack(np.meshgrid(BESIDE * focals1[best], BESIDE * focals2[best]))
         nearby = _Fit(pair, *beside.reshape(2, -1), is_essential=True)
         misfit = nearby.costs.min() - fundamental.costs[0]
-    found = -essential.costs - 0.5 * essential.log_determinants()
+    found = -essential.costs - 0.5 * np.linalg.slogdet(essential.hessians)[1]
     if misfit > max_misfit or not np.isfinite(found).all():
         return np.zeros(len(focals1))
     return np.asarray(found - found.max())
@@ -126,19 +126,16 @@ class _Fit:
         self._free = np.flatnonzero(self._free)
         self._squares = [(points**2).sum(axis=1) for points in (pair.points1, pair.points2)]
         self.costs = np.zeros(0)
-        self._hessians = np.zeros(0)
+        self.hessians = np.zeros(0)
         self._minimize()
-
-    def log_determinants(self) -> Array:
-        """Return those of the second derivatives by all that is integrated out."""
-        return np.asarray(np.linalg.slogdet(self._hessians)[1])
 
     def _minimize(self) -> None:
         damping = np.full(len(self._state), 1e-3)
         current = self._evaluate(self._left, self._right, self._state)
         for step in range(MAX_NUM_STEPS):
             hessians, gradients = self._derivatives(current)
-            damped = hessians + _diagonals(damping[:, None] * _diagonal(hessians) + 1e-9)
+            diagonals = damping[:, None] * np.einsum("gii->gi", hessians) + 1e-9
+            damped = hessians + diagonals[..., None] * np.eye(diagonals.shape[1])
             moves = np.zeros_like(self._state)
             moves[:, self._free] = -np.linalg.solve(damped, gradients[..., None])[..., 0]
             state = self._state + moves
@@ -154,7 +151,7 @@ class _Fit:
             current = current.replaced(better, proposed)
             if step > 3 and gains.max() < MIN_GAIN:
                 break
-        self.costs, self._hessians = current.costs, self._derivatives(current)[0]
+        self.costs, self.hessians = current.costs, self._derivatives(current)[0]
 
     def _evaluate(self, left: Array, right: Array, state: Array) -> _Residuals:
         pair = self._pair
@@ -219,13 +216,11 @@ class _Residuals:
 
     def replaced(self, where: NDArray[np.bool_], other: _Residuals) -> _Residuals:
         """Return a copy with some focals as in another one."""
-        fields = vars(self)
-        return _Residuals(
-            **{
-                name: np.where(where.reshape(-1, *[1] * (old.ndim - 1)), vars(other)[name], old)
-                for name, old in fields.items()
-            }
-        )
+        values = {
+            name: np.where(where.reshape(-1, *[1] * (old.ndim - 1)), vars(other)[name], old)
+            for name, old in vars(self).items()
+        }
+        return _Residuals(**values)
 
 
 def _rays(points: Array, inverse: Array) -> Array:
@@ -241,11 +236,3 @@ def _rotations(turns: Array) -> Array:
     cross -= np.swapaxes(cross, 1, 2)
     half = 0.5 * np.sinc(angles / (2 * np.pi)) ** 2
     return np.asarray(np.eye(3) + np.sinc(angles / np.pi) * cross + half * cross @ cross)
-
-
-def _diagonal(matrices: Array) -> Array:
-    return np.asarray(np.einsum("gii->gi", matrices))
-
-
-def _diagonals(values: Array) -> Array:
-    return np.asarray(values[..., None] * np.eye(values.shape[1]))

@@ -41,7 +41,10 @@ def rotation_share(points1: Array, points2: Array, sizes: tuple[Size, Size], err
         error: explained are matches at most so far off in image 2, px.
     """
     points1, points2 = _some(points1), _some(points2)
-    spreads = [_spread(points) for points in (points1, points2)]
+    spreads = [  # which outliers do not change
+        float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+        for points in (points1, points2)
+    ]
     zooms = {1.0, spreads[1] / spreads[0]} if min(spreads) else {1.0}
     centers = [np.array(size) / 2 for size in sizes]
     shares = (
@@ -64,11 +67,6 @@ def _share_of(points1: Array, points2: Array, focal: float, zoom: float, error: 
         errors = np.linalg.norm(turned[:, :2] / depths * focal * zoom - points2, axis=1)
         kept = errors <= max(error, float(np.median(errors)))
     return float((errors <= error).mean())
-
-
-def _spread(points: Array) -> float:
-    """Return the median distance from the median point, which outliers do not change."""
-    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
 def _rays(points: Array) -> Array:

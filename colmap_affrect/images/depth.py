@@ -255,14 +255,20 @@ class MonocularDepth:
         kind = "inverse" if self._kind == "z" and prediction.inverse else self._kind
         values = prediction.values
         if kind == "inverse":
-            values = _relative_to_largest(values)
+            largest = np.nanmax(values, initial=0.0)
+            far = values <= MIN_DISPARITY_FRAC * largest
+            values = np.asarray(np.where(far, np.nan, values) / largest, dtype=np.float32)
         try:
             return _z_depth(values, kind, photograph)
         except UnusableMap as error:
             raise DepthError(f"{photograph.name}: depth by {self._model}: {error}") from error
 
     def _prediction(self, photograph: Photograph) -> _Prediction:
-        image = _read_rgb(photograph)
+        if photograph.path is None:
+            gray = shrink_to(photograph.gray, NETWORK_IMAGE_SIZE_PX)
+            image = np.stack([gray] * 3, axis=-1)
+        else:
+            image = read_color(photograph.path, NETWORK_IMAGE_SIZE_PX)
         pixels = hashlib.sha256(image.tobytes() + str(image.shape).encode()).hexdigest()
         file = self._cache_file(photograph.name)
         kept = _read_prediction(file, self._model, pixels) if file else None
@@ -324,13 +330,6 @@ def predicts_inverse_depth(config: Any) -> bool:
     return bool(config.model_type == "dpt" and not config.add_projection)
 
 
-def _relative_to_largest(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Divide by the largest value; what is far below it becomes NaN."""
-    largest = np.nanmax(disparity, initial=0.0)
-    known = disparity > MIN_DISPARITY_FRAC * largest
-    return np.asarray(np.where(known, disparity, np.nan) / largest, dtype=np.float32)
-
-
 def _z_depth(
     values: NDArray[np.floating], kind: str, photograph: Photograph
 ) -> NDArray[np.float32]:
@@ -367,14 +366,6 @@ def _require_same_aspect(values: NDArray[np.floating], photograph: Photograph) -
             "height): not of this photograph, or turned; map and photograph must have the same "
             "aspect as stored, EXIF orientation is not applied"
         )
-
-
-def _read_rgb(photograph: Photograph) -> NDArray[np.uint8]:
-    """Read a photograph as (h, w, 3) uint8 for a network; EXIF orientation is not applied."""
-    if photograph.path is not None:
-        return read_color(photograph.path, NETWORK_IMAGE_SIZE_PX)
-    gray = shrink_to(photograph.gray, NETWORK_IMAGE_SIZE_PX)
-    return np.stack([gray] * 3, axis=-1)
 
 
 def _read_prediction(file: Path, model: str, pixels: str) -> _Prediction | None:

@@ -191,7 +191,8 @@ def exif_focal(tags: CameraTags, sensor_width_mm: float | None = None) -> ExifFo
     if tags.absurd:
         problem = f"EXIF has an absurd {' and '.join(tags.absurd)}"
     else:
-        problem = "EXIF has no focal length that can be converted to px" if _speaks(tags) else ""
+        speaks = tags.focal_mm or tags.equivalent_mm
+        problem = "EXIF has no focal length that can be converted to px" if speaks else ""
     stated = _statements(tags, sensor_width_mm)
     longer = max(tags.size)
     low, high = PLAUSIBLE_FOCALS
@@ -201,10 +202,6 @@ def exif_focal(tags: CameraTags, sensor_width_mm: float | None = None) -> ExifFo
         wrong = f"EXIF's {key} would be a focal length of {focal / longer:.2g} longer sides"
         return ExifFocal(None, why=wrong if stated else problem or "no EXIF focal length")
     return _reconciled(tags, stated, plausible)
-
-
-def _speaks(tags: CameraTags) -> bool:
-    return bool(tags.focal_mm or tags.equivalent_mm)
 
 
 def _sizes(tags: CameraTags) -> str:
@@ -218,15 +215,12 @@ def _statements(tags: CameraTags, sensor_width_mm: float | None) -> dict[str, fl
     if tags.equivalent_mm:
         found[EQUIVALENT] = tags.equivalent_mm / FILM_DIAGONAL_MM * math.hypot(*tags.size)
     if tags.focal_mm and tags.zoom == 1.0:
-        if tags.px_per_mm and _is_square(*tags.px_per_mm):
-            found[RESOLUTION] = tags.focal_mm * tags.px_per_mm[0] * tags.scale
+        across, down = tags.px_per_mm or (0.0, None)
+        if across and (down is None or _agree(across, down)):
+            found[RESOLUTION] = tags.focal_mm * across * tags.scale
         if sensor_width_mm:
             found[SENSOR] = tags.focal_mm / sensor_width_mm * max(tags.size)
     return found
-
-
-def _is_square(across: float, down: float | None) -> bool:
-    return down is None or 1 / MAX_CONTRADICTION <= across / down <= MAX_CONTRADICTION
 
 
 def _reconciled(

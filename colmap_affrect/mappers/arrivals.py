@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
@@ -95,22 +96,12 @@ def _tied_by_guided_matches(model: pycolmap.Reconstruction, task: MappingTask) -
             if (first, second) not in guided:
                 links[ids[0], first].append((ids[1], second))
                 links[ids[1], second].append((ids[0], first))
+    seen = num_long_tracks(model)
     tied = Counter(
         feature[0]
         for feature, others in links.items()
         if len(others) > 1 or len(links[others[0]]) > 1
     )
     return {
-        image_id
-        for image_id in points
-        if tied[image_id] < MIN_THREE_VIEW_POINTS <= _num_three_view(model, image_id)
+        image_id for image_id in points if tied[image_id] < MIN_THREE_VIEW_POINTS <= seen[image_id]
     }
-
-
-def _num_three_view(model: pycolmap.Reconstruction, image_id: int) -> int:
-    """Count the points of an image that two others see as well."""
-    return sum(
-        model.point3D(point.point3D_id).track.length() > 2
-        for point in model.images[image_id].points2D
-        if point.has_point3D()
-    )

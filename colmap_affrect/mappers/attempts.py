@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
-from colmap_affrect.colmap.model_files import registered_names, write_model
+from colmap_affrect.colmap.model_files import num_long_tracks, registered_names, write_model
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.arrivals import arrivals, read_arrivals, write_arrivals
@@ -165,12 +164,7 @@ class _Attempts:
 
 def _is_well_tied(model: pycolmap.Reconstruction) -> bool:
     """Tell whether all images see enough points of three images, which know focal lengths."""
-    counts = Counter(
-        image_id
-        for point in model.points3D.values()
-        if len(images := {element.image_id for element in point.track.elements}) > 2
-        for image_id in images
-    )
+    counts = num_long_tracks(model)
     return all(counts[image_id] >= MIN_NUM_TRACKS for image_id in model.reg_image_ids())
 
 

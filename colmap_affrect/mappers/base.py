@@ -9,21 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from colmap_affrect.options import (
-    CUSTOM,
-    MAX_SEED,
-    PRESETS,
-    PartOptions,
-    Registry,
-    preset_values,
-    within,
-)
+from colmap_affrect.options import MAX_SEED, PartOptions, PresetOptions, Registry, within
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap import pycolmap
@@ -31,7 +23,7 @@ if TYPE_CHECKING:
     from colmap_affrect.mappers.existing import ExistingModel
 
 
-class MapperOptions(PartOptions):
+class MapperOptions(PartOptions, PresetOptions):
     """Base of the options of all mappers, by default the sparse preset (names as in pycolmap)."""
 
     ignore_two_view_tracks: bool = False
@@ -50,20 +42,6 @@ class MapperOptions(PartOptions):
 
     extends: ClassVar[bool] = False
     """The mapper can register images into an existing model, ``MappingTask.extend``."""
-
-    COLMAP: ClassVar[Mapping[str, Any]] = {}
-    """The preset ``colmap``: COLMAP's own defaults."""
-
-    @classmethod
-    def preset(cls, preset: str, **values: Any) -> Self:
-        """Return the options of a preset, ``sparse`` or ``colmap``, and others given."""
-        return cls(**{**preset_values(preset, cls.COLMAP), **values})
-
-    @property
-    def preset_name(self) -> str:
-        """Name of the preset that these options are, ``mapper_options`` apart, else ``custom``."""
-        free = {"random_seed": self.random_seed, "mapper_options": self.mapper_options}
-        return next((name for name in PRESETS if self == self.preset(name, **free)), CUSTOM)
 
 
 DepthLookup = Callable[[str, NDArray[np.floating]], NDArray[np.float64]]

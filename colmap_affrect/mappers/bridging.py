@@ -155,7 +155,9 @@ class Bridges:
     def _to_model(self, part: Part, other: Part, index: int) -> Iterator[Hypothesis]:
         """Yield bridges to a model: by a common image, and by pairs between both."""
         for common in part.poses.keys() & other.poses.keys():
-            estimate = self._scale_of_common(part, other, common)
+            places = other.known_depths(common)
+            radius = RADIUS_FRAC * _longer_side(part.cameras[common])
+            estimate = _trusted(scale_between(part.known_depths(common), places, radius))
             if estimate is not None:
                 yield from self._moved(part, other, index, (common, common), estimate, IDENTITY)
         for pair in self.graph.pairs:
@@ -211,18 +213,11 @@ class Bridges:
         if hypothesis is not None:
             yield hypothesis
 
-    def _scale_of_common(self, part: Part, other: Part, image_id: int) -> ScaleEstimate | None:
-        camera = part.cameras[image_id]
-        radius = RADIUS_FRAC * max(camera.width, camera.height)
-        known, places = part.known_depths(image_id), other.known_depths(image_id)
-        return _trusted(scale_between(known, places, radius))
-
     def _scale(
         self, part: Part, image_id: int, side: int, relative: RelativePose
     ) -> ScaleEstimate | None:
         """Compare the depths of a pair in an image with those that a model knows there."""
-        camera = part.cameras[image_id]
-        radius = RADIUS_FRAC * max(camera.width, camera.height)
+        radius = RADIUS_FRAC * _longer_side(part.cameras[image_id])
         depths = relative.depths.first if side == 0 else relative.depths.second
         in_front = relative.depths.in_front
         places = self.graph.keypoints[image_id][relative.matches[in_front, side]]
@@ -297,6 +292,10 @@ class Bridges:
 
 
 IDENTITY: Pose = (np.eye(3), np.zeros(3))
+
+
+def _longer_side(camera: pycolmap.Camera) -> int:
+    return max(camera.width, camera.height)
 
 
 def _trusted(estimate: ScaleEstimate | None) -> ScaleEstimate | None:

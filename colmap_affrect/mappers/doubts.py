@@ -146,9 +146,7 @@ def _image_doubts(model: MappedModel, graph: PairGraph, task: MappingTask) -> Do
         agreement = agreeing / total if total else 1.0
         found = [
             *([] if image.camera_id in given else _camera_doubts(_camera(image))),
-            *_observation_doubts(image.num_points3D),
-            *_agreement_doubts(agreement),
-            *_angle_doubts([near for near, _ in angles[image_id]]),
+            *_support_doubts(image.num_points3D, agreement, [near for near, _ in angles[image_id]]),
             *_bridge_doubts(bridges.get(image.name)),
         ]
         if found:
@@ -170,23 +168,18 @@ def _camera_doubts(camera: pycolmap.Camera) -> Iterator[tuple[str, bool]]:
         yield "the distortion of its lens is extreme", wrong
 
 
-def _observation_doubts(num: int) -> Iterator[tuple[str, bool]]:
+def _support_doubts(
+    num: int, agreement: float, angles: Sequence[float]
+) -> Iterator[tuple[str, bool]]:
+    """Doubt what few points hold, what pairs disagree with, and points seen from all sides."""
     if num < MIN_OBSERVATIONS:
         yield f"only {num} points hold it", num < TOO_FEW_OBSERVATIONS
-
-
-def _agreement_doubts(share: float) -> Iterator[tuple[str, bool]]:
-    if share < MIN_AGREEMENT:
-        text = f"only {share:.0%} of the matches of its verified pairs agree with its pose"
-        yield text, share < NO_AGREEMENT
-
-
-def _angle_doubts(angles: Sequence[float]) -> Iterator[tuple[str, bool]]:
+    if agreement < MIN_AGREEMENT:
+        text = f"only {agreement:.0%} of the matches of its verified pairs agree with its pose"
+        yield text, agreement < NO_AGREEMENT
     if len(angles) >= TOO_FEW_OBSERVATIONS and np.median(angles) > MAX_ANGLE_DEG:
-        yield (
-            f"most of its points are seen from directions {np.median(angles):.0f} degrees apart",
-            False,
-        )
+        apart = f"{np.median(angles):.0f} degrees apart"
+        yield f"most of its points are seen from directions {apart}", False
 
 
 def _bridge_doubts(bridge: Bridge | None) -> Iterator[tuple[str, bool]]:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,7 +52,10 @@ def check_loops(graph: PairGraph, random_seed: int) -> Loops:
     errors: dict[Ids, float] = {}
     for _ in range(MAX_ROUNDS):
         rotations = _averaged(poses, weights, graph.cache, random_seed)
-        chosen = {ids: _by_error(ids, found, rotations) for ids, found in poses.items()}
+        chosen = {}
+        for ids, found in poses.items():
+            rounded = [round(_error_deg(ids, one, rotations)) for one in found]
+            chosen[ids] = [found[i] for i in np.argsort(rounded, kind="stable")]  # ties stay
         errors = {ids: _error_deg(ids, found[0], rotations) for ids, found in chosen.items()}
         changed = any(chosen[ids][0] is not poses[ids][0] for ids in poses)
         poses = chosen
@@ -91,13 +95,6 @@ def _averaged(
     return rotations
 
 
-def _by_error(
-    ids: Ids, found: list[RelativePose], rotations: Mapping[int, NDArray[np.float64]]
-) -> list[RelativePose]:
-    """Sort poses by their distance from the averaged rotations; the first one wins ties."""
-    return sorted(found, key=lambda relative: round(_error_deg(ids, relative, rotations)))
-
-
 def _error_deg(
     ids: Ids, relative: RelativePose, rotations: Mapping[int, NDArray[np.float64]]
 ) -> float:
@@ -110,20 +107,11 @@ def _error_deg(
 
 def _dispensable(wrong: Iterable[Ids], pairs: Iterable[Ids]) -> list[Ids]:
     """Return the wrong pairs without which their images are still tied to each other."""
-    kept, dropped = set(pairs), []
+    graph, dropped = nx.Graph(list(pairs)), []
     for ids in wrong:
-        kept.discard(ids)
-        if _tied(ids, kept):
+        graph.remove_edge(*ids)
+        if nx.has_path(graph, *ids):
             dropped.append(ids)
         else:
-            kept.add(ids)
+            graph.add_edge(*ids)
     return dropped
-
-
-def _tied(ids: Ids, pairs: set[Ids]) -> bool:
-    """Tell whether pairs lead from one image to the other."""
-    reached, size = {ids[0]}, 0
-    while len(reached) > size and ids[1] not in reached:
-        size = len(reached)
-        reached |= {image for pair in pairs if reached & set(pair) for image in pair}
-    return ids[1] in reached

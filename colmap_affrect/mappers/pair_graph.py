@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.poses import Pose, relative_pose
-from colmap_affrect.colmap.two_views import decomposed_homography
+from colmap_affrect.colmap.two_views import decomposed_homography, homography_matrix
 from colmap_affrect.geometry.epipolar import sampson_errors
 from colmap_affrect.geometry.two_views import (
     Depths,
@@ -122,7 +122,11 @@ class PairGraph:
             cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
             pair_ids, geometries = database.read_two_view_geometries()
             pairs = _strongest(
-                _verified(pycolmap.pair_id_to_image_pair(pair_id), geometry)
+                VerifiedPair(
+                    pycolmap.pair_id_to_image_pair(pair_id),
+                    np.asarray(geometry.inlier_matches, np.int64),
+                    homography_matrix(geometry),
+                )
                 for pair_id, geometry in zip(pair_ids, geometries, strict=True)
                 if len(geometry.inlier_matches) >= min_num_matches
             )
@@ -280,13 +284,6 @@ def _agrees(
     sides = depths.in_front | (depths.angles_deg < MIN_ANGLE_DEG)
     tolerance = max(MAX_ERROR_PX, *(MAX_ERROR * max(c.width, c.height) for c in cameras))
     return (errors <= tolerance) & sides, depths
-
-
-def _verified(ids: tuple[int, int], geometry: pycolmap.TwoViewGeometry) -> VerifiedPair:
-    homography = None if geometry.H is None else np.asarray(geometry.H, np.float64)
-    if homography is not None and not np.any(homography):
-        homography = None
-    return VerifiedPair(ids, np.asarray(geometry.inlier_matches, np.int64), homography)
 
 
 def _strongest(pairs: Iterable[VerifiedPair]) -> list[VerifiedPair]:

@@ -84,6 +84,16 @@ class Matches:
     scores: NDArray[np.float32]
 
 
+ROUNDING = np.float32(1e-6)
+"""Similarities closer to 1 than this are equal: two copies of a descriptor have ratio 1."""
+
+
+def distance_ratios(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the ratios of distances of unit vectors with these similarities."""
+    distances = (np.maximum(1.0 - similarity, ROUNDING) for similarity in (first, second))
+    return np.asarray(np.sqrt(np.divide(*distances)))
+
+
 class Matcher(Protocol):
     """Matches pairs of images; called with its ``Options`` and a :class:`MatcherContext`."""
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from colmap_affrect.geometry.affine import project, transform_frames
 from colmap_affrect.geometry.epipolar import common_sign, direction_cosines, epipolar_lines
 from colmap_affrect.geometry.shapes import vary_singly
+from colmap_affrect.matchers.base import distance_ratios
 from colmap_affrect.options import Options, within
 
 Array = NDArray[np.float64]
@@ -350,14 +351,9 @@ def nearest_allowed(
         alike = np.flatnonzero(value > options.min_cosine)
         points2, others = second.points[columns], similarity[alike]
         others[_within(points2[best[alike]], points2, options.min_contrast_distance_px)] = -1.0
-        ratios = _ratios(value[alike], others.max(axis=1))
+        # A second neighbour that is missing is an opposite one.
+        ratios = distance_ratios(value[alike], others.max(axis=1))
         accepted[rows[alike]] = ratios < options.max_ratio
     kept = np.flatnonzero(accepted)
     kept = kept[backward[forward[kept]] == kept]
     return np.stack([kept, forward[kept]], axis=1)
-
-
-def _ratios(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return ratios of distances; a second neighbour that is missing is an opposite one."""
-    distances = (np.maximum(1.0 - similarity, 1e-6) for similarity in (first, second))
-    return np.asarray(np.sqrt(np.divide(*distances)))

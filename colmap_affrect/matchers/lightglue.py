@@ -224,12 +224,14 @@ class LightGlue:
         return united(parts, first.keypoints, second.keypoints)
 
     def _match_views(self, first: PreparedView, second: PreparedView) -> Matches:
+        import torch
+
         if not len(first.rows) or not len(second.rows):
             return NO_MATCHES
         pair = {"image0": first.inputs, "image1": second.inputs}
         rows, columns, scores = unless_gpu_is_full_or_say(
             lambda: self._run(self._network, pair, self._device),
-            lambda: self._run(self._network_on_cpu, pair, _cpu()),
+            lambda: self._run(self._network_on_cpu, pair, torch.device("cpu")),
         )
         return Matches(np.stack([first.rows[rows], second.rows[columns]], axis=1), scores)
 
@@ -258,12 +260,6 @@ class LightGlue:
 
 
 NO_MATCHES = Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
-
-
-def _cpu() -> torch.device:
-    import torch
-
-    return torch.device("cpu")
 
 
 def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) -> torch.nn.Module:

@@ -22,6 +22,7 @@ from colmap_affrect.matchers.base import (
     MatcherContext,
     MatcherOptions,
     Matches,
+    distance_ratios,
     unless_gpu_is_full_or_say,
 )
 from colmap_affrect.matchers.duplicates import without_duplicates
@@ -41,9 +42,6 @@ CHUNK_ROWS = 1 << 12
 
 NO_LIMIT = 2.0
 """No ratio is larger than 1."""
-
-ROUNDING = np.float32(1e-6)
-"""Similarities closer to 1 than this are equal: two copies of a descriptor have ratio 1."""
 
 
 class NearestOptions(MatcherOptions):
@@ -82,13 +80,12 @@ class NearestNeighbors:
         )
 
     def match(self, first: MatchableImage, second: MatchableImage) -> Matches:
-        """Match two images; the score is 1 minus the ratio of distances."""
+        """Match two images."""
         exact = [replace(image, coarse=None) for image in (first, second)]
-        found = unless_gpu_is_full_or_say(
+        return unless_gpu_is_full_or_say(
             partial(match_features, first, second, self.options),
             partial(match_features, exact[0], exact[1], self.options),
         )
-        return Matches(found.indices, 1.0 - found.ratios)
 
 
 @dataclass(frozen=True)
@@ -114,19 +111,6 @@ class MatchableImage:
         return sum(array.nbytes for array in kept) + (self.coarse.nbytes if self.coarse else 0)
 
 
-@dataclass(frozen=True)
-class PutativeMatches:
-    """Matches before geometric verification.
-
-    Attributes:
-        indices: (M, 2) int64 feature indices in image 1 and 2, by row of image 1.
-        ratios: (M,) float32 larger of the two distance ratios, smaller is better.
-    """
-
-    indices: NDArray[np.int64]
-    ratios: NDArray[np.float32]
-
-
 def matchable(
     descriptors: NDArray[np.floating],
     keypoints: NDArray[np.floating],
@@ -148,10 +132,13 @@ def matchable(
 
 def match_features(
     image1: MatchableImage, image2: MatchableImage, options: NearestOptions
-) -> PutativeMatches:
-    """Match two images; see the module docstring. Either may have no features."""
+) -> Matches:
+    """Match two images; see the module docstring. Either may have no features.
+
+    The score is 1 minus the larger of the ratios of distances.
+    """
     if not len(image1.descriptors) or not len(image2.descriptors):
-        return PutativeMatches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
+        return Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
     everything = np.arange(len(image1.descriptors))
     forward, ratios = _nearest(image1, everything, image2, options.max_ratio)
     rows = np.flatnonzero(ratios < options.max_ratio)
@@ -163,8 +150,11 @@ def match_features(
     if options.ratio_both_ways:
         worst = np.maximum(worst, back_ratios[back])
     keep = mutual & (worst < options.max_ratio)
-    matches = PutativeMatches(np.stack([rows, targets[back]], axis=1)[keep], worst[keep])
-    return _without_duplicates(matches, image1, image2, options.duplicate_radius_px)
+    rows, columns, worst = rows[keep], targets[back][keep], worst[keep]
+    order = np.argsort(worst, kind="stable")
+    places = image1.keypoints[rows[order]], image2.keypoints[columns[order]]
+    kept = np.sort(order[without_duplicates(*places, options.duplicate_radius_px)])
+    return Matches(np.stack([rows, columns], axis=1)[kept], 1.0 - worst[kept])
 
 
 def _nearest(
@@ -214,7 +204,7 @@ def _nearest_of_listed(
     second = np.maximum.reduceat(without_rivals, starts)
     doubtful = short.doubtful.copy()
     doubtful[rows[rivals == short.runners_up[rows]]] = True
-    return nearest, _ratios(first, second), doubtful
+    return nearest, distance_ratios(first, second), doubtful
 
 
 def _places(
@@ -244,22 +234,5 @@ def _nearest_of_all(
         first = similarity[np.arange(len(chunk)), best]
         similarity[image.rivals.of(best)] = -1.0
         nearest[begin : begin + step] = best
-        ratios[begin : begin + step] = _ratios(first, similarity.max(axis=1))
+        ratios[begin : begin + step] = distance_ratios(first, similarity.max(axis=1))
     return nearest, ratios
-
-
-def _ratios(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the ratios of distances of unit vectors with these similarities."""
-    distances = (np.maximum(1.0 - similarity, ROUNDING) for similarity in (first, second))
-    return np.asarray(np.sqrt(np.divide(*distances)))
-
-
-def _without_duplicates(
-    matches: PutativeMatches, image1: MatchableImage, image2: MatchableImage, radius_px: float
-) -> PutativeMatches:
-    """Drop matches that have a better one within ``radius_px`` at both ends."""
-    order = np.argsort(matches.ratios, kind="stable")
-    rows, columns = matches.indices[order].T
-    keep = without_duplicates(image1.keypoints[rows], image2.keypoints[columns], radius_px)
-    kept = np.sort(order[keep])
-    return PutativeMatches(matches.indices[kept], matches.ratios[kept])

@@ -7,14 +7,17 @@ A rectifier of another package becomes known by an entry point of the group
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, SerializeAsAny
 
 from colmap_affrect.data import Photograph, RectificationPlan
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.base import SHAPES, ShapeOptions, ShapeSource
 from colmap_affrect.features.shapes.second_moment import SecondMomentOptions
+from colmap_affrect.geometry.tilts import Cover, cover_shapes
 from colmap_affrect.images.depth import DepthSource
 from colmap_affrect.options import PartOptions, Registry, within
 
@@ -37,18 +40,6 @@ class RectifierInputs:
 
     shapes: ShapeSource | None = None
     depth: DepthSource | None = None
-
-    def required_shapes(self) -> ShapeSource:
-        """Return the shape source; OptionError when there is none."""
-        if self.shapes is None:
-            raise OptionError("the rectifier needs affine shapes: name a shape_source")
-        return self.shapes
-
-    def required_depth(self) -> DepthSource:
-        """Return the depth source; OptionError when there is none."""
-        if self.depth is None:
-            raise OptionError("the rectifier needs depth maps: give a folder or a depth network")
-        return self.depth
 
 
 class RectifierOptions(PartOptions):
@@ -81,6 +72,38 @@ class CoverOptions(AffineWarpOptions):
     """Share of the shapes that the balls must hold. Paper: 0.95."""
     max_num_rectifications: Annotated[int, within(0, 192)] = 8
     """Upper bound on the covering maps."""
+
+    def cover(
+        self, metrics: NDArray[np.floating], votes: NDArray[np.floating] | None = None
+    ) -> Cover:
+        """Cover (N, 3) metrics, each with one vote unless (N,) votes are given."""
+        return cover_shapes(
+            metrics,
+            np.ones(len(metrics)) if votes is None else votes,
+            radius=self.tilt_radius,
+            max_tilt=self.max_tilt,
+            covered_frac=self.covered_frac,
+            max_num_centers=self.max_num_rectifications,
+        )
+
+
+class WithInputs:
+    """Base of our rectifiers: what their options ask for is there, as ``shapes`` and ``depth``."""
+
+    shapes: ShapeSource
+    depth: DepthSource
+
+    def __init__(self, options: Any, inputs: RectifierInputs) -> None:
+        """Keep options and inputs; OptionError when an input is missing."""
+        self.options = options
+        if isinstance(options, CoverOptions):
+            if inputs.shapes is None:
+                raise OptionError("the rectifier needs affine shapes: name a shape_source")
+            self.shapes = inputs.shapes
+        if options.uses_depth:
+            if inputs.depth is None:
+                raise OptionError("the rectifier needs depth maps: give a folder or a network")
+            self.depth = inputs.depth
 
 
 RECTIFIERS: Registry[Rectifier] = Registry(

@@ -10,10 +10,9 @@ from typing import Annotated, Literal
 import numpy as np
 
 from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan, ShapeGrid
-from colmap_affrect.geometry.tilts import cover_shapes
 from colmap_affrect.images.masks import connected_groups
 from colmap_affrect.options import within
-from colmap_affrect.rectifiers.base import CoverOptions, RectifierInputs
+from colmap_affrect.rectifiers.base import CoverOptions, WithInputs
 from colmap_affrect.rectifiers.regions import Region, affine_rectification
 
 GAP_BLOCKS = 5
@@ -31,15 +30,10 @@ class DenseShapesOptions(CoverOptions):
     image are left out. 0: all of a region in one warp (the paper)."""
 
 
-class DenseShapes:
+class DenseShapes(WithInputs):
     """Regions of similar shape, one affine map for each (the paper's DenseAffNet)."""
 
     Options = DenseShapesOptions
-
-    def __init__(self, options: DenseShapesOptions, sources: RectifierInputs) -> None:
-        """See :mod:`colmap_affrect.rectifiers.base`."""
-        self.options = options
-        self.shapes = sources.required_shapes()
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan one warp for each place of each region."""
@@ -53,23 +47,20 @@ def plan_dense_shapes(
 
     Blocks that are not textured count as identity; ``image_size`` is (width, height) in px.
     """
-    metrics = grid.metrics.reshape(-1, 3)
-    textured = grid.textured.ravel()
-    cover = cover_shapes(
-        metrics,
-        textured.astype(np.float64),
-        radius=options.tilt_radius,
-        max_tilt=options.max_tilt,
-        covered_frac=options.covered_frac,
-        max_num_centers=options.max_num_rectifications,
-    )
+    votes = grid.textured.ravel().astype(np.float64)
+    cover = options.cover(grid.metrics.reshape(-1, 3), votes)
     labels = cover.labels.reshape(grid.textured.shape)
     items: list[Rectification] = []
     for label, (tilt, angle) in enumerate(cover.centers.tolist()):
         blocks = (labels == label) & grid.textured
         if np.count_nonzero(blocks) < options.min_region_frac * labels.size:
             continue
-        for part in _parts(blocks, options.min_part_frac * labels.size):
+        # The canvas of a warp is the bounding box of its region: for a region in several places one
+        # canvas for each is far smaller than one for all.
+        parts = connected_groups(blocks, GAP_BLOCKS) if options.min_part_frac else [blocks]
+        for part in parts:
+            if np.count_nonzero(part) < options.min_part_frac * labels.size:
+                continue
             region = _region(part, grid, image_size)
             items.append(
                 affine_rectification(
@@ -77,18 +68,6 @@ def plan_dense_shapes(
                 )
             )
     return RectificationPlan(image_size, tuple(items), replaces_original=True)
-
-
-def _parts(blocks: Mask, min_num_blocks: float) -> list[Mask]:
-    """Split a region into its places that are large enough; not at all if any size is.
-
-    The canvas of a warp is the bounding box of its region: for a region in several places one
-    canvas for each is far smaller than one for all.
-    """
-    if not min_num_blocks:
-        return [blocks]
-    groups = connected_groups(blocks, GAP_BLOCKS)
-    return [group for group in groups if np.count_nonzero(group) >= min_num_blocks]
 
 
 def _region(blocks: Mask, grid: ShapeGrid, image_size: tuple[int, int]) -> Region:

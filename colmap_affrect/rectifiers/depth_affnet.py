@@ -8,10 +8,9 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from colmap_affrect.data import Photograph, Rectification, RectificationPlan
-from colmap_affrect.rectifiers.base import CoverOptions, RectifierInputs
+from colmap_affrect.rectifiers.base import CoverOptions, WithInputs
 from colmap_affrect.rectifiers.depth_planes import PlaneOptions, planar_segments
 from colmap_affrect.rectifiers.regions import affine_rectification
-from colmap_affrect.rectifiers.whole_image import covering_centers
 
 
 class DepthAffNetOptions(CoverOptions):
@@ -22,16 +21,10 @@ class DepthAffNetOptions(CoverOptions):
     uses_depth: ClassVar[bool] = True
 
 
-class DepthAffNet:
+class DepthAffNet(WithInputs):
     """Planar segments, each warped by the affine maps that cover its shapes."""
 
     Options = DepthAffNetOptions
-
-    def __init__(self, options: DepthAffNetOptions, sources: RectifierInputs) -> None:
-        """See :mod:`colmap_affrect.rectifiers.base`."""
-        self.options = options
-        self.shapes = sources.required_shapes()
-        self.source = sources.required_depth()
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan the warps of each segment; one without tilted shapes has none.
@@ -40,12 +33,12 @@ class DepthAffNet:
             DepthError: when there is no usable depth map.
         """
         options = self.options
-        segments = planar_segments(photograph, self.source.depth(photograph), options.planes)
+        segments = planar_segments(photograph, self.depth.depth(photograph), options.planes)
         samples = self.shapes.samples(photograph.gray)
         items: list[Rectification] = []
         for number, segment in enumerate(segments):
             inside = segment.region.contains(samples.points)
-            centers = covering_centers(samples.metrics[inside], options)
+            centers = options.cover(samples.metrics[inside]).centers
             items += [
                 affine_rectification(
                     segment.region, tilt, angle, number, area_preserving=options.area_preserving

@@ -23,7 +23,7 @@ from colmap_affrect.geometry.planes import (
 )
 from colmap_affrect.images.masks import connected_regions
 from colmap_affrect.options import Options, within
-from colmap_affrect.rectifiers.base import RectifierInputs, RectifierOptions
+from colmap_affrect.rectifiers.base import RectifierOptions, WithInputs
 from colmap_affrect.rectifiers.regions import Region, homography_rectification
 
 MAX_DEPTH_SIZE_PX = 640
@@ -76,19 +76,14 @@ class DepthPlanesOptions(RectifierOptions):
     uses_depth: ClassVar[bool] = True
 
 
-class DepthPlanes:
+class DepthPlanes(WithInputs):
     """Planar segments as if seen from the front."""
 
     Options = DepthPlanesOptions
 
-    def __init__(self, options: DepthPlanesOptions, sources: RectifierInputs) -> None:
-        """See :mod:`colmap_affrect.rectifiers.base`."""
-        self.options = options
-        self.source = sources.required_depth()
-
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan one warp for each segment; DepthError when there is no usable depth map."""
-        segments = planar_segments(photograph, self.source.depth(photograph), self.options.planes)
+        segments = planar_segments(photograph, self.depth.depth(photograph), self.options.planes)
         items = tuple(
             homography_rectification(
                 segment.region,

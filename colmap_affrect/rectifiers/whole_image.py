@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import Photograph, Rectification, RectificationPlan
 from colmap_affrect.geometry.canvas import fit_canvas, image_corners, rectifying_affine
-from colmap_affrect.geometry.tilts import asift_covering, cover_shapes, near_optimal_covering
+from colmap_affrect.geometry.tilts import asift_covering, near_optimal_covering
 from colmap_affrect.rectifiers.base import (
     AffineWarpOptions,
     CoverOptions,
-    RectifierInputs,
     RectifierOptions,
+    WithInputs,
 )
 
 COVERINGS = {"near-optimal": near_optimal_covering, "asift": asift_covering}
@@ -26,14 +26,10 @@ class IdentityOptions(RectifierOptions):
     name: Literal["identity"] = "identity"
 
 
-class Identity:
+class Identity(WithInputs):
     """The photograph as it is."""
 
     Options = IdentityOptions
-
-    def __init__(self, options: IdentityOptions, sources: RectifierInputs) -> None:
-        """See :mod:`colmap_affrect.rectifiers.base`."""
-        del options, sources
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Plan no warps."""
@@ -49,15 +45,10 @@ class AsiftOptions(AffineWarpOptions):
     2018); ``asift``: the 60 of ASIFT with tilts to 8 (Morel & Yu 2009, the paper)."""
 
 
-class Asift:
+class Asift(WithInputs):
     """The same maps for every photograph (Morel & Yu 2009)."""
 
     Options = AsiftOptions
-
-    def __init__(self, options: AsiftOptions, sources: RectifierInputs) -> None:
-        """See :mod:`colmap_affrect.rectifiers.base`."""
-        del sources
-        self.options = options
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Warp the whole photograph by every map of the covering."""
@@ -71,32 +62,15 @@ class AffNetShapesOptions(CoverOptions):
     name: Literal["affnet-shapes"] = "affnet-shapes"
 
 
-class AffNetShapes:
+class AffNetShapes(WithInputs):
     """A greedy cover of the photograph's own affine shapes (Rodriguez et al. 2018; Sec. 2.4)."""
 
     Options = AffNetShapesOptions
 
-    def __init__(self, options: AffNetShapesOptions, sources: RectifierInputs) -> None:
-        """See :mod:`colmap_affrect.rectifiers.base`."""
-        self.options = options
-        self.shapes = sources.required_shapes()
-
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Warp the whole photograph by every covering map of its shapes."""
-        centers = covering_centers(self.shapes.samples(photograph.gray).metrics, self.options)
+        centers = self.options.cover(self.shapes.samples(photograph.gray).metrics).centers
         return plan_whole_image(photograph.size, centers, self.options)
-
-
-def covering_centers(metrics: NDArray[np.floating], options: CoverOptions) -> NDArray[np.float64]:
-    """Return the (K, 2) rows (tilt, angle_rad) that cover (N, 3) metrics, each with one vote."""
-    return cover_shapes(
-        metrics,
-        np.ones(len(metrics)),
-        radius=options.tilt_radius,
-        max_tilt=options.max_tilt,
-        covered_frac=options.covered_frac,
-        max_num_centers=options.max_num_rectifications,
-    ).centers
 
 
 def plan_whole_image(

@@ -14,13 +14,11 @@ from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace, database_files
+from colmap_affrect.shown import such_as
 from colmap_affrect.stages.context import Context
 
 if TYPE_CHECKING:
     from colmap_affrect.stages.extract import Inputs
-
-MAX_NAMES = 3
-"""Photographs that are named of those that have changed."""
 
 
 def source_files(path: Path) -> list[Path]:
@@ -98,10 +96,7 @@ def forget_changed(
 
 
 def _told(names: Sequence[str], what: str) -> list[str]:
-    if not names:
-        return []
-    more = ", ..." if len(names) > MAX_NAMES else ""
-    return [f"{len(names)} {what} ({', '.join(names[:MAX_NAMES])}{more})"]
+    return [f"{len(names)} {what} ({such_as(names)})"] if names else []
 
 
 def refuse_changed(context: Context, digests: Mapping[str, str]) -> None:

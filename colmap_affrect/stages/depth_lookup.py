@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.colmap.database import camera_matrix as intrinsics
 from colmap_affrect.colmap.database import read_cameras
 from colmap_affrect.conventions import camera_matrix, pixel_from_colmap, resized_from_original
 from colmap_affrect.data import Photograph
@@ -48,7 +49,8 @@ def depth_lookup(context: Context) -> DepthLookup | None:
         try:
             gray = read_gray(folder / name)
             size = (gray.shape[1], gray.shape[0])
-            matrix = cameras[name].matrix if name in cameras else camera_matrix(size)
+            known = cameras.get(name)
+            matrix = intrinsics(known) if known else camera_matrix(size)
             return size, source.depth(Photograph(gray, name, folder / name, matrix))
         except (DepthError, ImageError) as error:
             logger.debug("%s: no depth: %s", name, error)

@@ -34,7 +34,6 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import (
     PairVerifier,
-    inlier_matches,
     verified_pairs,
     verify,
 )
@@ -59,10 +58,15 @@ from colmap_affrect.stages.extract import (
 from colmap_affrect.stages.guide import restore_exact
 from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, recorded_matching
 from colmap_affrect.stages.one_image import ImageExtractor
-from colmap_affrect.stages.one_pair import iterate_matches
+from colmap_affrect.stages.one_pair import Matching, iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.stationary import StationaryFilter
-from colmap_affrect.stages.verify import extracted_px, recorded_verification, verify_new
+from colmap_affrect.stages.verify import (
+    extracted_px,
+    recorded_verification,
+    verified_inliers,
+    verify_new,
+)
 
 
 def recorded_escalation(workspace: Workspace) -> EscalateOptions:
@@ -179,7 +183,7 @@ def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | No
         yield None
         return
     escalation = Escalation(context, EscalateOptions())
-    inliers = escalation.inlier_matches()
+    inliers = verified_inliers(context)
     doubted = [
         pair for pair, indices in inliers.items() if not escalation.measured(pair, indices).any()
     ]
@@ -252,7 +256,7 @@ class Escalation:
         weakly_connected: set[str] = set()
         if len({name for pair in num_inliers for name in pair}) > 2:
             weakly_connected = weakly_connected_images(
-                self.inlier_matches(), self.options.min_num_tracks
+                verified_inliers(self.context), self.options.min_num_tracks
             )
         insecure = insecure_images(num_inliers, self.options.strong_num_inliers, weakly_connected)
         failed = [pair for pair, count in num_inliers.items() if not count]
@@ -301,13 +305,6 @@ class Escalation:
             steps += len(self._images_to_extend(todo, level)) + len(todo)
         return steps
 
-    def inlier_matches(self) -> dict[Pair, NDArray[np.int64]]:
-        """Return the (M, 2) features of each verified pair that are inliers."""
-        ids = colmap_database.image_ids(self.path)
-        names = {image_id: name for name, image_id in ids.items()}
-        verified = inlier_matches(self.path, self.verification.min_num_inliers)
-        return {(names[one], names[two]): indices for (one, two), indices in verified.items()}
-
     def climb(self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]) -> None:
         """Match pairs with the features of a level and keep what has more inliers."""
         self._extend(self._images_to_extend(pairs, level), level, advance)
@@ -346,18 +343,11 @@ class Escalation:
         self, pairs: Sequence[Pair], level: int
     ) -> Generator[PairMatches, None, None]:
         chosen = self.extraction.levels[level]
-        found_pairs = iterate_matches(
-            pairs,
-            self.features,
-            chosen.matching or self.matching,
-            level,
-            self.context.resources,
-            self.context.executor,
-            chosen.features.name,
-            chosen.base,
-        )
+        options, extractor = chosen.matching or self.matching, chosen.features.name
+        resources, executor = self.context.resources, self.context.executor
+        matching = Matching(self.features, options, level, chosen.base, extractor, resources)
         stationary = StationaryFilter(self.features, self.matches)
-        with closing(found_pairs):
+        with closing(iterate_matches(pairs, matching, executor)) as found_pairs:
             for found in found_pairs:
                 yield stationary.filtered(found)
 
@@ -458,7 +448,7 @@ class Escalation:
         """Return the (M, 2) inliers, of frames measured or not, that a level does not look for."""
         is_measured, todo = self.extraction.levels[level].features.has_shapes, set(pairs)
         found = {}
-        for (one, two), inliers in self.inlier_matches().items():
+        for (one, two), inliers in verified_inliers(self.context).items():
             pair, indices = (
                 ((one, two), inliers) if (one, two) in todo else ((two, one), inliers[:, ::-1])
             )

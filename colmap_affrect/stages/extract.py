@@ -381,8 +381,10 @@ def image_tasks(
         camera = known.get(name)
         intrinsics = None
         if options.uses_depth:
-            intrinsics = camera.matrix if camera else initial.matrix(name, names)
-        size = camera.size if camera else None
+            intrinsics = (
+                colmap_database.camera_matrix(camera) if camera else initial.matrix(name, names)
+            )
+        size = (camera.width, camera.height) if camera else None
         yield ImageTask(inputs.photographs, name, level, intrinsics, size)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.verification import PairVerifier, inlier_matches, verified_pairs
+from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.connectivity import weakly_connected_images
@@ -33,9 +33,14 @@ from colmap_affrect.stages.match import PAIRS_PER_WRITE
 from colmap_affrect.stages.one_guided_pair import (
     GuidedMatcher,
     GuidedTask,
-    PairView,
+    guided_task,
 )
-from colmap_affrect.stages.verify import extracted_px, recorded_verification, verify_new
+from colmap_affrect.stages.verify import (
+    extracted_px,
+    recorded_verification,
+    verified_inliers,
+    verify_new,
+)
 
 Matches = NDArray[np.int64]
 
@@ -106,15 +111,6 @@ def restore_exact(context: Context, pairs: Collection[Pair] | None = None) -> No
             database.delete_two_view_geometry(*(ids[name] for name in pair.names))
     verify_new(context)
     context.guided.write([replace(pair, num_inliers=0) for pair in guided])
-
-
-def verified_inliers(context: Context) -> dict[Pair, Matches]:
-    """Return the inliers of each verified pair."""
-    workspace = context.workspace
-    names = {number: name for name, number in colmap_database.image_ids(workspace.database).items()}
-    min_num_inliers = recorded_verification(workspace).min_num_inliers
-    found = inlier_matches(workspace.database, min_num_inliers)
-    return {(names[one], names[two]): indices for (one, two), indices in found.items()}
 
 
 def exact_inliers(context: Context) -> dict[Pair, Matches]:
@@ -241,7 +237,7 @@ class Guiding:
             images = {image.name: image for image in database.read_all_images()}
             for names in pairs:
                 first, second = (images[name] for name in names)
-                view = PairView(
+                task = guided_task(
                     names,
                     (cameras[first.camera_id], cameras[second.camera_id]),
                     (
@@ -249,9 +245,10 @@ class Guiding:
                         database.read_keypoints(second.image_id),
                     ),
                     (self.scales[names[0]], self.scales[names[1]]),
+                    database.read_two_view_geometry(first.image_id, second.image_id),
+                    self.options.band_px,
                 )
-                geometry = database.read_two_view_geometry(first.image_id, second.image_id)
-                tasks.append(view.task(geometry, self.options.band_px))
+                tasks.append(task)
         return [task for task in tasks if task]
 
     def _keep(self, found: Sequence[GuidedPair]) -> None:

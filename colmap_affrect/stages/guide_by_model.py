@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import undistorted
 from colmap_affrect.conventions import colmap_from_pixel
+from colmap_affrect.geometry.two_views import essential_matrix
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.guide import Guiding, current, recorded_guiding, verified_inliers
+from colmap_affrect.stages.guide import Guiding, current, recorded_guiding
 from colmap_affrect.stages.one_guided_pair import GuidedTask
+from colmap_affrect.stages.verify import verified_inliers
 
 Array = NDArray[np.float64]
 
@@ -62,12 +64,11 @@ class View:
 def fundamental_matrix(first: View, second: View) -> Array:
     """Return F of two views with ``x2^T F x1 = 0``, for pixels without distortion."""
     rotation = second.pose[:, :3] @ first.pose[:, :3].T
-    x, y, z = second.pose[:, 3] - rotation @ first.pose[:, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    translation = second.pose[:, 3] - rotation @ first.pose[:, 3]
     inverse1, inverse2 = (
         np.linalg.inv(view.camera.calibration_matrix()) for view in (first, second)
     )
-    return np.asarray(inverse2.T @ cross @ rotation @ inverse1)
+    return np.asarray(inverse2.T @ essential_matrix(rotation, translation) @ inverse1)
 
 
 def guide_by_model(context: Context, model: pycolmap.Reconstruction) -> StageReport:
@@ -99,7 +100,11 @@ def guide_by_model(context: Context, model: pycolmap.Reconstruction) -> StageRep
         (first, second)
         for first, second in combinations(sorted(views, key=guiding.ids.__getitem__), 2)
         if (first, second) not in known
-        and _overlap(views[first], views[second]) >= max(1, options.min_num_tracks)
+        and min(
+            views[first].num_visible(views[second].points),
+            views[second].num_visible(views[first].points),
+        )
+        >= max(1, options.min_num_tracks)
     ]
 
     def task(pair: Pair) -> GuidedTask:
@@ -118,7 +123,3 @@ def guide_by_model(context: Context, model: pycolmap.Reconstruction) -> StageRep
     with context.progress.stage("guide by model", len(todo), "pairs") as advance:
         guiding.guide(todo, advance, lambda batch: [task(pair) for pair in batch])
     return StageReport("guide", time.perf_counter() - start, len(todo))
-
-
-def _overlap(first: View, second: View) -> int:
-    return min(first.num_visible(second.points), second.num_visible(first.points))

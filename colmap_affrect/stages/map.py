@@ -83,13 +83,14 @@ def map_images(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
             "--overwrite to map from the beginning"
         )
+    copied = is_copy(workspace)
     task = MappingTask(
         workspace.database,
-        _image_path(workspace),
+        copied_image_path(workspace) if copied else Path(Inputs.recorded(workspace).image_path),
         existing,
-        guided={} if is_copy(workspace) else guided_matches(context),
+        guided={} if copied else guided_matches(context),
         cameras=read_camera_records(workspace.cameras),
-        depth_at=None if is_copy(workspace) else depth_lookup(context),
+        depth_at=None if copied else depth_lookup(context),
     )
     if known == inputs:
         models = read_models(workspace.sparse, task)
@@ -97,7 +98,7 @@ def map_images(
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models, num_rejected = _map(context, mapper, task, advance)
-    if not is_copy(workspace) and _num_registered(models) < min(num_images, LARGE_MODEL):
+    if not copied and _num_registered(models) < min(num_images, LARGE_MODEL):
         models = _or_first_level(context, mapper, task, models)
     warnings = {}
     if num_rejected:
@@ -123,12 +124,6 @@ def _inputs(workspace: Workspace, extend: Extension | None) -> str:
         return geometry
     own = extend.model_path.resolve().is_relative_to(workspace.sparse.resolve())
     return f"{geometry} {'own' if own else extend.digest()}"
-
-
-def _image_path(workspace: Workspace) -> Path | None:
-    if is_copy(workspace):
-        return copied_image_path(workspace)
-    return Path(Inputs.recorded(workspace).image_path)
 
 
 def image_names(workspace: Workspace) -> list[str]:
@@ -354,5 +349,7 @@ def images_in_need(context: Context, sparse_path: Path, min_num_tracks: int) -> 
     path = sparse_path / "0"
     if not path.exists() or len(names) < 3:
         return names if len(names) > 2 else set()
-    counts = num_long_tracks(path)
+    model = pycolmap.Reconstruction(path)
+    by_id = num_long_tracks(model)
+    counts = {image.name: by_id[image_id] for image_id, image in model.images.items()}
     return {name for name in names if counts.get(name, 0) < min_num_tracks}

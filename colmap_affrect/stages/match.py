@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from typing import Any
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.features.weights import digests_by_name, resolve
@@ -17,7 +16,7 @@ from colmap_affrect.project.stores import PairMatches, pair_key
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import recorded_extraction, write_images_and_keypoints
-from colmap_affrect.stages.one_pair import iterate_matches
+from colmap_affrect.stages.one_pair import Matching, iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.stationary import StationaryFilter
 
@@ -40,12 +39,6 @@ def recorded_matching(workspace: Workspace) -> MatcherOptions:
     return options
 
 
-def _with_weights(context: Context, options: MatcherOptions) -> dict[str, Any]:
-    """Return options for the record, with the digests of the files of weights, if any."""
-    digests = digests_by_name(resolve(options.weights, context.resources.weights_path))
-    return options.to_mapping() | ({WEIGHTS: digests} if digests else {})
-
-
 def match(
     context: Context, options: MatcherOptions | None = None, *, overwrite: bool = False
 ) -> StageReport:
@@ -58,7 +51,9 @@ def match(
     context.resources.require_device()
     pairs = listed_pairs(context)
     options = options or recorded_matching(context.workspace)
-    context.workspace.record_options("match", _with_weights(context, options), overwrite=overwrite)
+    digests = digests_by_name(resolve(options.weights, context.resources.weights_path))
+    record = options.to_mapping() | ({WEIGHTS: digests} if digests else {})
+    context.workspace.record_options("match", record, overwrite=overwrite)
     done = context.matches.complete(pair_key(*pair) for pair in pairs)
     missing = [pair for pair in pairs if pair_key(*pair) not in done]
     with context.progress.stage("match", len(missing), "pairs") as advance:
@@ -80,22 +75,14 @@ def match_pairs(
     advance: Callable[[int], None],
 ) -> None:
     """Match pairs by the features that every image has, and store them batch by batch."""
+    extractor = recorded_extraction(context.workspace).features.name
+    matching = Matching(context.features, options, extractor=extractor, resources=context.resources)
     matches = context.matches
     stationary = StationaryFilter(context.features, matches)
     batch: list[PairMatches] = []
     written = time.monotonic()
     try:
-        with closing(
-            iterate_matches(
-                pairs,
-                context.features,
-                options,
-                0,
-                context.resources,
-                context.executor,
-                recorded_extraction(context.workspace).features.name,
-            )
-        ) as found_pairs:
+        with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
             for found in found_pairs:
                 batch.append(stationary.filtered(found))
                 advance(1)

@@ -63,38 +63,33 @@ class GuidedTask:
         return make(self.matrix, *self.points, band_px)
 
 
-@dataclass(frozen=True)
-class PairView:
-    """One pair in a database.
+def guided_task(
+    names: Pair,
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
+    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+    scales: tuple[float, float],
+    geometry: pycolmap.TwoViewGeometry,
+    band_px: float,
+) -> GuidedTask | None:
+    """Return what is to be done for a pair of a database where its geometry can guide, else None.
 
-    Attributes:
-        names: of the image with the lower id and the other one.
-        cameras: of both.
-        keypoints: (N, 2 or more) of both, as in the database.
-        scales: the longer side of each image over that at which features were extracted: bands
-            are as wide as features are exact.
+    The image of the lower id comes first. Keypoints are as in the database; scales the longer side
+    of each image over that at which features were extracted: bands are as wide as features are
+    exact.
     """
-
-    names: Pair
-    cameras: tuple[pycolmap.Camera, pycolmap.Camera]
-    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]]
-    scales: tuple[float, float]
-
-    def task(self, geometry: pycolmap.TwoViewGeometry, band_px: float) -> GuidedTask | None:
-        """Return what is to be done where a geometry can guide, else None."""
-        inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
-        tolerance_px = BANDS_OF_HOMOGRAPHY * band_px * max(self.scales)
-        homography = homography_of(geometry, self.keypoints, tolerance_px, MIN_OFF_PLANE)
-        if homography is not None:
-            first, second = (np.asarray(p[:, :2], np.float64) for p in self.keypoints)
-            task = GuidedTask(self.names, homography, True, (first, second), inliers)
-        else:
-            pair = epipolar_pair(geometry, self.cameras, self.keypoints)
-            if pair is None:
-                return None
-            points = (pair.points1, pair.points2)
-            task = GuidedTask(self.names, pair.fundamental, False, points, inliers)
-        return task.scaled(self.scales)
+    inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+    tolerance_px = BANDS_OF_HOMOGRAPHY * band_px * max(scales)
+    homography = homography_of(geometry, keypoints, tolerance_px, MIN_OFF_PLANE)
+    if homography is not None:
+        first, second = (np.asarray(p[:, :2], np.float64) for p in keypoints)
+        task = GuidedTask(names, homography, True, (first, second), inliers)
+    else:
+        pair = epipolar_pair(geometry, cameras, keypoints)
+        if pair is None:
+            return None
+        points = (pair.points1, pair.points2)
+        task = GuidedTask(names, pair.fundamental, False, points, inliers)
+    return task.scaled(scales)
 
 
 @dataclass(frozen=True)

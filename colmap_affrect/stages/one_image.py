@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
@@ -347,17 +347,13 @@ def prepare(
         depth = DEPTH_SOURCES.make(options.depth, depth_context)
         if image_names is not None:
             depth.require_some(image_names)
-    shapes = {
-        (item.shape_source, level.features): SHAPES.make(item.shape_source, network, level.features)
-        for level in levels
-        if isinstance(item := level.rectifier, CoverOptions)
-    }
+    shapes = cache(lambda source, features: SHAPES.make(source, network, features))
     rectifiers = []
     for level in levels:
         item = level.rectifier
-        source = (
-            shapes[item.shape_source, level.features] if isinstance(item, CoverOptions) else None
-        )
+        source = None
+        if isinstance(item, CoverOptions):
+            source = shapes(item.shape_source, level.features)
         inputs = RectifierInputs(source, depth if item.uses_depth else None)
         rectifiers.append(RECTIFIERS.make(item, inputs))
     of_levels = tuple(extractors[level.features] for level in levels)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -37,38 +37,47 @@ BYTES_PER_FEATURE = 870
 """Of a feature ready for matching, with descriptors of 128 and coarse ones."""
 
 
-def iterate_matches(
-    pairs: Sequence[Pair],
-    features: FeatureStore,
-    options: MatcherOptions,
-    level: int = 0,
-    resources: Resources | None = None,
-    executor: Executor | None = None,
-    extractor: str = "",
-    base: int = 0,
-) -> Generator[PairMatches, None, None]:
-    """Match pairs by the features of one level and those of the images themselves, in its base.
+@dataclass(frozen=True)
+class Matching:
+    """What is matched, how, and with what.
 
-    Pairs come in an order in which an image, once read, stays in memory for most of its pairs.
-    Workers that do not see the file of features get those of each pair; ``extractor`` is the name
-    of the feature extractor. By default there is a thread for each core.
+    Attributes:
+        store: of the features.
+        options: of the matcher.
+        level: of escalation: its features, together with those of its base.
+        base: level that has the features of the images themselves.
+        extractor: name of the feature extractor; empty for another program's.
+        resources: weights and device.
+        max_num_features: of each image, those of the largest responses; None for all.
+        num_similarities: about how many pairs of features there will be to compare.
+    """
+
+    store: FeatureStore
+    options: MatcherOptions
+    level: int = 0
+    base: int = 0
+    extractor: str = ""
+    resources: Resources = field(default_factory=Resources)
+    max_num_features: int | None = None
+    num_similarities: float = 0
+
+
+def iterate_matches(
+    pairs: Sequence[Pair], matching: Matching, executor: Executor | None = None
+) -> Generator[PairMatches, None, None]:
+    """Match pairs, in an order in which an image, once read, stays in memory for most of its pairs.
+
+    Workers that do not see the file of features get those of each pair. By default there is a
+    thread for each core.
     """
     if not pairs:
         return
     executor = executor or Threads(available_cores())
-    store = FeatureStore(features.path.absolute(), features.options_digest)
+    store = FeatureStore(matching.store.path.absolute(), matching.store.options_digest)
     counts = store.num_keypoints()
     num_similarities = sum(counts[first] * counts[second] for first, second in pairs)
     num_kept = CACHE_BYTES * len(counts) // (BYTES_PER_FEATURE * sum(counts.values()) + 1)
-    images = CachedMatcher(
-        store,
-        options,
-        level=level,
-        num_similarities=num_similarities,
-        resources=resources or Resources(),
-        extractor=extractor,
-        base=base,
-    )
+    images = CachedMatcher(replace(matching, store=store, num_similarities=num_similarities))
     files = [store.path]
     is_shared = executor.sees(files)
     tasks = (
@@ -174,12 +183,10 @@ class ImageCache(Generic[Content]):
             if name not in self._images:
                 self._images[name] = self._make(name)
             self._images.move_to_end(name)
-            while self._nbytes() > CACHE_BYTES and len(self._images) > 1:
-                self._images.popitem(last=False)
+            nbytes = sum(image.nbytes for image in self._images.values())
+            while nbytes > CACHE_BYTES and len(self._images) > 1:
+                nbytes -= self._images.popitem(last=False)[1].nbytes
             return self._images[name]
-
-    def _nbytes(self) -> int:
-        return sum(image.nbytes for image in self._images.values())
 
 
 class CachedMatcher:
@@ -188,46 +195,19 @@ class CachedMatcher:
     A copy in another process starts with none.
     """
 
-    def __init__(
-        self,
-        store: FeatureStore,
-        options: MatcherOptions,
-        *,
-        level: int = 0,
-        max_num_features: int | None = None,
-        num_similarities: float = 0,
-        resources: Resources | None = None,
-        extractor: str = "",
-        base: int = 0,
-    ) -> None:
-        """Name the features and build the matcher.
-
-        The features of a level come together with those of its base; ``max_num_features`` are those
-        of the largest responses, None takes all. ``num_similarities`` is about how many pairs of
-        features there will be to compare.
-        """
-        resources = resources or Resources()
-        options.require_extractor(extractor)
-        self._store, self._options, self._level = store, options, level
-        self._max_num_features, self._num_similarities = max_num_features, num_similarities
-        self._resources, self._extractor, self._base = resources, extractor, base
-        weights = resolve(options.weights, resources.weights_path)
-        context = MatcherContext(weights, resources.device, num_similarities)
-        self._weights = weights
+    def __init__(self, matching: Matching) -> None:
+        """Build the matcher."""
+        options, resources = matching.options, matching.resources
+        options.require_extractor(matching.extractor)
+        self._matching = matching
+        self._weights = resolve(options.weights, resources.weights_path)
+        context = MatcherContext(self._weights, resources.device, matching.num_similarities)
         self._matcher = MATCHERS.make(options, context)
         self._images = ImageCache(lambda name: self._prepare(self.read(name)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        given = {
-            "level": self._level,
-            "max_num_features": self._max_num_features,
-            "num_similarities": self._num_similarities,
-            "resources": self._resources,
-            "extractor": self._extractor,
-            "base": self._base,
-        }
         digests = {key: file_sha256(path) for key, path in self._weights.items()}
-        return _rebuilt, (self._store, self._options, given, digests)
+        return _rebuilt, (self._matching, digests)
 
     def __call__(self, task: PairTask) -> PairMatches:
         """Match by the features that came with the task, or by those in the store."""
@@ -240,7 +220,7 @@ class CachedMatcher:
         rows, columns = found.indices.T
         indices = np.stack([first.indices[rows], second.indices[columns]], axis=1)
         count = int(first.indices.max(initial=-1)) + 1
-        return PairMatches(task.names, indices, found.scores, count, self._level)
+        return PairMatches(task.names, indices, found.scores, count, self._matching.level)
 
     def match(self, first: PreparedImage, second: PreparedImage) -> Matches:
         """Match two images; indices are those among the features that were prepared."""
@@ -248,14 +228,15 @@ class CachedMatcher:
 
     def read(self, name: str) -> StoredFeatures:
         """Read the features of an image."""
-        indices = self._store.level_indices(name, self._level, self._base)
-        features = self._store.read(name).select(indices)
-        if self._max_num_features is not None:
+        matching, store = self._matching, self._matching.store
+        indices = store.level_indices(name, matching.level, matching.base)
+        features = store.read(name).select(indices)
+        if matching.max_num_features is not None:
             order = np.argsort(-features.responses, kind="stable")
-            strongest = np.sort(order[: self._max_num_features])
+            strongest = np.sort(order[: matching.max_num_features])
             indices, features = indices[strongest], features.select(strongest)
-        size = self._store.image_size(name)
-        return StoredFeatures(ImageFeatures(features, size, self._extractor), indices)
+        size = store.image_size(name)
+        return StoredFeatures(ImageFeatures(features, size, matching.extractor), indices)
 
     def _prepare(self, stored: StoredFeatures) -> PreparedImage:
         content = self._matcher.prepare(stored.image)
@@ -266,9 +247,7 @@ class CachedMatcher:
         return self._images.get(name)
 
 
-def _rebuilt(
-    store: FeatureStore, options: MatcherOptions, given: dict[str, Any], digests: Mapping[str, str]
-) -> CachedMatcher:
-    matcher = CachedMatcher(store, options, **given)
+def _rebuilt(matching: Matching, digests: Mapping[str, str]) -> CachedMatcher:
+    matcher = CachedMatcher(matching)
     require_same_files(matcher._weights, digests)
     return matcher

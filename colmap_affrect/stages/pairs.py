@@ -19,7 +19,7 @@ from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, write_images_and_keypoints
-from colmap_affrect.stages.one_pair import CachedMatcher
+from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +89,8 @@ def _similar_pairs(context: Context, options: PairOptions, there: Collection[Pai
     if "retrieval" in options.methods:
         pairs += retrieved_pairs(names, features.read, options.num_neighbors, progress)
     if "low-resolution" in options.methods:
-        strongest = CachedMatcher(features, NearestOptions(), max_num_features=NUM_STRONGEST)
+        matching = Matching(features, NearestOptions(), max_num_features=NUM_STRONGEST)
+        strongest = CachedMatcher(matching)
 
         def match(pair: Pair) -> Matches:
             return strongest.match(strongest.prepared(pair[0]), strongest.prepared(pair[1]))

@@ -5,8 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap.verification import ExtractedPx, VerificationOptions, verify
+from colmap_affrect.colmap.verification import (
+    ExtractedPx,
+    VerificationOptions,
+    inlier_matches,
+    verify,
+)
+from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
@@ -43,6 +52,14 @@ def verify_matches(
     with context.progress.stage("verify", todo, "pairs") as advance:
         verify_new(context, advance)
     return StageReport("verify", time.perf_counter() - start, todo, len(pairs) - todo)
+
+
+def verified_inliers(context: Context) -> dict[Pair, NDArray[np.int64]]:
+    """Return the (M, 2) features of each verified pair that are inliers."""
+    path = context.workspace.database
+    names = {number: name for name, number in colmap_database.image_ids(path).items()}
+    found = inlier_matches(path, recorded_verification(context.workspace).min_num_inliers)
+    return {(names[one], names[two]): indices for (one, two), indices in found.items()}
 
 
 def extracted_px(context: Context) -> ExtractedPx:

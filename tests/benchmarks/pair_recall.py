@@ -31,7 +31,7 @@ from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.progress import SILENT
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.one_pair import CachedMatcher
+from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 from colmap_affrect.stages.verify import recorded_verification
 
 
@@ -71,7 +71,7 @@ def ways_to_choose(folder_of: dict[str, Workspace]) -> dict[str, Callable[[int],
     matcher = NearestNeighbors(options, MatcherContext())
     stores = {folder.path: Context(folder).features for folder in folder_of.values()}
     caches = {
-        path: CachedMatcher(store, options, max_num_features=NUM_STRONGEST)
+        path: CachedMatcher(Matching(store, options, max_num_features=NUM_STRONGEST))
         for path, store in stores.items()
     }
 

@@ -272,40 +272,6 @@ def test_pipeline_options_leave_given_intrinsics_alone_if_asked_to(
     assert passed.mapper.abs_pose_refine_extra_params is refined
 
 
-SPARSE_VERIFICATION = {
-    "ransac.max_error": 3.0,
-    "ransac.min_inlier_ratio": 0.1,
-}
-SPARSE_MAPPING = {
-    "incremental": {
-        "min_model_size": 2,
-        "mapper.init_min_tri_angle": 8.0,
-        "mapper.init_min_num_inliers": 50,
-        "mapper.abs_pose_min_num_inliers": 12,
-        "triangulation.ignore_two_view_tracks": False,
-    },
-    "global": {
-        "min_model_size": 2,
-        "mapper.track_min_num_views_per_track": 2,
-        "mapper.global_positioning.min_num_view_per_track": 2,
-        "mapper.bundle_adjustment.min_track_length": 2,
-        "mapper.retriangulation.ignore_two_view_tracks": False,
-    },
-}
-FIXED_INTRINSICS = {
-    "incremental": {
-        "ba_refine_focal_length": False,
-        "ba_refine_extra_params": False,
-        "mapper.abs_pose_refine_focal_length": False,
-        "mapper.abs_pose_refine_extra_params": False,
-    },
-    "global": {
-        "mapper.bundle_adjustment.refine_focal_length": False,
-        "mapper.bundle_adjustment.refine_extra_params": False,
-    },
-}
-SPARSE_MAPPING["sparse"] = SPARSE_MAPPING["incremental"]
-FIXED_INTRINSICS["sparse"] = FIXED_INTRINSICS["incremental"]
 NATIVE = {
     "sparse": pycolmap.IncrementalPipelineOptions,
     "incremental": pycolmap.IncrementalPipelineOptions,
@@ -318,22 +284,6 @@ def repeatable(mapper: str) -> dict[str, int]:
     names = {"num_threads": 1, "random_seed": SEED}
     keys = flat_values(NATIVE[mapper]())
     return {key: names[key.split(".")[-1]] for key in keys if key.split(".")[-1] in names}
-
-
-@pytest.mark.parametrize("given", [False, True])
-@pytest.mark.parametrize("mapper", MAPPERS.names())
-def test_sparse_preset_is_the_default_and_differs_from_colmap_in_exactly_this(
-    mapper: str, given: bool
-) -> None:
-    assert VerificationOptions.preset("sparse") == VerificationOptions()
-    assert mapper_of(mapper).options == MAPPERS.options({"name": mapper, "random_seed": SEED})
-    assert verification_differences(VerificationOptions(random_seed=SEED)) == {
-        **SPARSE_VERIFICATION,
-        "ransac.random_seed": SEED,
-    }
-    differs = mapper_of(mapper).differences(ALL_GIVEN if given else NOTHING_KNOWN)
-    fixed = FIXED_INTRINSICS[mapper] if given else {}
-    assert differs == {**SPARSE_MAPPING[mapper], **fixed, **repeatable(mapper)}
 
 
 @pytest.mark.parametrize("given", [False, True])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from pathlib import Path
 
@@ -92,7 +91,7 @@ def test_wrong_true_position_is_the_direction_error() -> None:
 def test_distortion_is_respected_unless_switched_off() -> None:
     points = matches(200)
     straight = RelativePoseProtocol(threshold_px=0.2)
-    bent = dataclasses.replace(straight, use_distortion=False)
+    bent = straight.changed(use_distortion=False)
     assert straight.score(make_pair(), *points, 0).num_inliers == 200
     score = bent.score(make_pair(), *points, 0)
     assert score.num_inliers < 150
@@ -118,7 +117,7 @@ def test_hundred_thousand_iterations_find_what_a_thousand_do_not() -> None:
     points2[30:] = np.random.default_rng(5).uniform(0, 600, (90, 2))
     # A quarter of the matches is right: a thousand samples miss a good one four times in ten.
     many = RelativePoseProtocol(confidence=0.99)
-    few = dataclasses.replace(many, max_num_iterations=1_000)
+    few = many.changed(max_num_iterations=1_000)
     assert few.score(make_pair(), points1, points2, 1).error > 5
     score = many.score(make_pair(), points1, points2, 1)
     assert score.error < 0.1

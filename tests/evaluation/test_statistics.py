@@ -62,14 +62,6 @@ def test_equal_methods_do_not_differ() -> None:
     assert paired_test([], [], 0) == 1.0
 
 
-def test_many_differences_are_sampled() -> None:
-    rng = np.random.default_rng(1)
-    base = rng.normal(size=100)
-    noise = rng.normal(size=100)
-    assert paired_test(base.tolist(), (base + noise + 1.0).tolist(), 0) < 0.001
-    assert paired_test(base.tolist(), (base + noise - noise.mean()).tolist(), 0) > 0.2
-
-
 def test_random_signs_agree_with_all_signs(monkeypatch: pytest.MonkeyPatch) -> None:
     a = [3.0, 1.0, 4.0, 1.5, 5.0, 9.0, 2.0, 6.0]
     b = [2.0, 0.5, 1.0, 2.5, 3.0, 4.0, 2.2, 1.0]

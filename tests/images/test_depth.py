@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 import sys
 import threading
 import time
@@ -26,7 +25,6 @@ from colmap_affrect.conventions import pixel_from_colmap
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError, ImageError
 from colmap_affrect.images.depth import (
-    DEPTH_SOURCES,
     NETWORK_IMAGE_SIZE_PX,
     DepthContext,
     DepthFiles,
@@ -410,28 +408,11 @@ def test_megadepth_maps_of_the_paper_are_read(name, kind):
 # --- the factory
 
 
-def test_depth_source_follows_the_options():
-    assert isinstance(
-        DEPTH_SOURCES.make(DepthFilesOptions(path="maps"), DepthContext()), DepthFiles
-    )
-    options = DEPTH_SOURCES.options({"name": "monocular", "model": "some/model"})
-    assert isinstance(DEPTH_SOURCES.make(options, DepthContext()), MonocularDepth)
-    assert not DepthFilesOptions().is_given
-
-
 def monocular(model, cache, kind="z"):
     return MonocularDepth(MonocularOptions(model=model, kind=kind), DepthContext(cache))
 
 
 # --- networks: tiny ones of random weights, through the real loading code
-
-
-def with_orientation(jpeg, orientation):
-    """Put an EXIF segment that holds nothing but the orientation tag into a JPEG."""
-    entry = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
-    tiff = b"II*\x00" + struct.pack("<I", 8) + struct.pack("<H", 1) + entry + bytes(4)
-    segment = b"Exif\x00\x00" + tiff
-    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
 
 
 @pytest.fixture(scope="module")
@@ -524,15 +505,6 @@ def test_network_stored_in_half_precision_computes_in_float32(transformers, mode
     depth = monocular(half, None).depth(COURT_1)
     assert len(np.unique(depth)) > 10_000  # float16 has 1024 steps from 1 to 2
     assert_allclose(depth, monocular(model, None).depth(COURT_1), rtol=0.05)
-
-
-@pytest.mark.long
-def test_exif_orientation_is_not_applied(model, tmp_path):
-    turned = tmp_path / "court_1.jpg"
-    turned.write_bytes(with_orientation(COURT_1.path.read_bytes(), 6))
-    assert cv2.imread(str(turned)).shape == (720, 540, 3), "the EXIF bytes are not understood"
-    network = monocular(model, None)
-    assert_array_equal(network.depth(replace(COURT_1, path=turned)), network.depth(COURT_1))
 
 
 @pytest.mark.long

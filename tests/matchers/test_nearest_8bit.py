@@ -85,7 +85,7 @@ def test_matches_are_those_of_exact_similarities(
     assert 30 < len(exact.indices) < 260
     found = match_features(*(matchable(*view, options, kind) for view in views), options)
     np.testing.assert_array_equal(found.indices, exact.indices)
-    np.testing.assert_allclose(found.ratios, exact.ratios, atol=1e-4)
+    np.testing.assert_allclose(found.scores, exact.scores, atol=1e-4)
 
 
 def test_short_list_has_few_rows_and_few_entries(kind: MakeCoarse) -> None:
@@ -150,7 +150,7 @@ def test_ambiguous_copies_do_not_hide_a_match(kind: MakeCoarse) -> None:
         found = match_features(*(matchable(*view, options, kind) for view in views), options)
         assert len(exact.indices) == 1
         np.testing.assert_array_equal(found.indices, exact.indices)
-        np.testing.assert_allclose(found.ratios, exact.ratios, rtol=1e-4)
+        np.testing.assert_allclose(found.scores, exact.scores, atol=1e-4)
 
 
 @pytest.mark.parametrize("counts", [(0, 5), (5, 0), (1, 1), (1, 7), (300, 1)])

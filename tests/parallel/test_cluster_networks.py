@@ -23,7 +23,7 @@ from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.extract import Inputs, extract
 from colmap_affrect.stages.match import match, recorded_matching
-from colmap_affrect.stages.one_pair import CachedMatcher, iterate_matches
+from colmap_affrect.stages.one_pair import CachedMatcher, Matching, iterate_matches
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
 
 RECIPE = load_recipe("sift-lightglue", ["matching.max_num_features=120"])
@@ -86,8 +86,10 @@ def test_threads_one_pair_alone_and_a_resumed_run_find_the_same(
     context = Context(Workspace(tmp_path / "one"), Resources(weights, "cpu"))
     pairs = listed_pairs(context)
     assert sum(len(found.scores) for found in context.matches.read(pairs)) > 50
-    given = (context.features, RECIPE.matching, 0, context.resources, Threads(1), "rootsift")
-    (alone,) = iterate_matches(pairs[3:4], *given)
+    matching = Matching(
+        context.features, RECIPE.matching, extractor="rootsift", resources=context.resources
+    )
+    (alone,) = iterate_matches(pairs[3:4], matching, Threads(1))
     (stored,) = context.matches.read(pairs[3:4])
     np.testing.assert_array_equal(alone.indices, stored.indices)
     assert len(np.unique(stored.scores)) > 3
@@ -113,7 +115,8 @@ def test_workers_with_other_weights_are_refused(
     shutil.copytree(weights, folder)
     store = Context(Workspace(extracted)).features
     resources = Resources(folder, "cpu")
-    rebuild, given = CachedMatcher(store, RECIPE.matching, resources=resources).__reduce__()
+    matching = Matching(store, RECIPE.matching, resources=resources)
+    rebuild, given = CachedMatcher(matching).__reduce__()
     rebuild(*given)
     state = torch.load(folder / "sift_lightglue.pth", weights_only=True)
     torch.save(
@@ -128,4 +131,4 @@ def test_matcher_that_was_trained_for_other_features_is_refused() -> None:
         load_recipe("default", ["matching.name=lightglue"])
     context = Context(Workspace(Path("nowhere")))
     with pytest.raises(OptionError, match="takes features of rootsift, not of disk"):
-        CachedMatcher(context.features, RECIPE.matching, extractor="disk")
+        CachedMatcher(Matching(context.features, RECIPE.matching, extractor="disk"))

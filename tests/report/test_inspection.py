@@ -273,7 +273,7 @@ def test_rectifiers_show_what_they_read(name: str) -> None:
     options = RECTIFIERS.options(name)
     rectifier = RECTIFIERS.make(options, replace(SHAPES, depth=SlantedDepth()))
     assert hasattr(rectifier, "shapes") == isinstance(options, CoverOptions)
-    assert hasattr(rectifier, "source") == options.uses_depth
+    assert hasattr(rectifier, "depth") == options.uses_depth
 
 
 # --- Sheets

@@ -272,9 +272,9 @@ def test_strong_pairs_without_a_track_of_three_climb(
     matches = {pair: np.arange(80).reshape(40, 2) for pair in chain}
     apart = {**matches, (NAMES[1], NAMES[2]): np.arange(1, 81).reshape(40, 2)}
     monkeypatch.setattr(climb, "num_inliers", lambda: chain)
-    monkeypatch.setattr(climb, "inlier_matches", lambda: apart)
+    monkeypatch.setattr(escalation, "verified_inliers", lambda _: apart)
     assert climb.next_work() is None
-    monkeypatch.setattr(climb, "inlier_matches", lambda: matches)
+    monkeypatch.setattr(escalation, "verified_inliers", lambda _: matches)
     assert climb.next_work() == (1, list(chain))
 
 

@@ -33,13 +33,12 @@ from colmap_affrect.stages.guide import (
     guided_counts,
     guided_matches,
     restore_exact,
-    verified_inliers,
 )
 from colmap_affrect.stages.guide_by_model import guide_by_model
 from colmap_affrect.stages.map import agreement, map_images
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
-from colmap_affrect.stages.verify import verify_matches
+from colmap_affrect.stages.verify import verified_inliers, verify_matches
 
 ALWAYS = GuidedOptions(enabled="always")
 

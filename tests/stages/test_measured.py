@@ -28,7 +28,7 @@ from colmap_affrect.stages.escalate import Escalation, escalate, measured_databa
 from colmap_affrect.stages.extract import Inputs, extract
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
-from colmap_affrect.stages.verify import verify_matches
+from colmap_affrect.stages.verify import verified_inliers, verify_matches
 
 PAIR = NAMES[0], NAMES[1]
 Counts = dict[tuple[int, int], int]
@@ -95,7 +95,7 @@ def test_matches_of_both_kinds_of_frames_are_united(
     assert set(escalation.matches.levels(escalation.pairs).values()) == {1}
     after = verified_pairs(context.workspace.database, 1)
     assert len(after) == len(before) == 6
-    for pair, inliers in escalation.inlier_matches().items():
+    for pair, inliers in verified_inliers(escalation.context).items():
         num_measured = np.count_nonzero(escalation.measured(pair, inliers))
         assert 0.5 * len(inliers) < 2 * num_measured < 1.5 * len(inliers)
     assert all(after[ids] > 1.5 * before[ids] for ids in before)

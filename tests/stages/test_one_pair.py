@@ -20,7 +20,7 @@ from colmap_affrect.matchers.nearest_8bit import MakeCoarse, ShortList
 from colmap_affrect.pairs.lists import exhaustive_pairs
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.stages import one_pair
-from colmap_affrect.stages.one_pair import CachedMatcher, iterate_matches
+from colmap_affrect.stages.one_pair import CachedMatcher, Matching, iterate_matches
 
 NAMES = [f"{index}.png" for index in range(6)]
 NUM_FEATURES = 50
@@ -44,7 +44,7 @@ def store(tmp_path: Path) -> FeatureStore:
 
 def matches(store: FeatureStore) -> dict[tuple[str, str], list[list[int]]]:
     pairs = exhaustive_pairs(NAMES)
-    found = list(iterate_matches(pairs, store, NearestOptions(), 0))
+    found = list(iterate_matches(pairs, Matching(store, NearestOptions())))
     assert sorted(item.names for item in found) == pairs
     return {item.names: item.indices.tolist() for item in found}
 
