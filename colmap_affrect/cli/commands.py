@@ -40,6 +40,7 @@ def run(options: argparse.Namespace) -> int:
             run_options,
             executor=executor,
             overwrite=options.overwrite,
+            page=options.page,
             progress=given.progress(options),
         )
     return _print_reconstruction(report, options)
@@ -150,6 +151,7 @@ def map(options: argparse.Namespace) -> int:
             extend=extend,
             check_cameras=options.focal_vote == "always",
             overwrite=options.overwrite,
+            page=options.page,
             progress=given.progress(options),
         )
         return _print_reconstruction(report, options)
@@ -167,6 +169,7 @@ def map(options: argparse.Namespace) -> int:
             extend,
             earlier=[choose_cameras(context, may_share=not extend)] if votes else [],
             overwrite=options.overwrite,
+            page=options.page,
         )
     return _print_reconstruction(report, options)
 
@@ -292,6 +295,8 @@ def _printed(report: StageReport | InterchangeReport) -> int:
 
 def _print_reconstruction(report: ReconstructionReport, options: argparse.Namespace) -> int:
     show(report.to_json() if options.json else report.summary())
+    if options.page and not options.json:
+        show(f"page        {options.output_path / 'report.html'}")
     why = ""
     if not report.models:
         why = "one image cannot make a model" if report.images_total == 1 else "no model was found"

@@ -25,6 +25,7 @@ from colmap_affrect.mappers.attempts import (
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
+from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import INPUTS, Workspace
@@ -88,7 +89,7 @@ def map_images(
         )
     task = MappingTask(
         workspace.database,
-        _image_path(workspace),
+        image_path_of(workspace),
         existing,
         guided={} if is_copy(workspace) else guided_matches(context),
         cameras=read_camera_records(workspace.cameras),
@@ -128,7 +129,8 @@ def _inputs(workspace: Workspace, extend: Extension | None) -> str:
     return f"{geometry} {'own' if own else extend.digest()}"
 
 
-def _image_path(workspace: Workspace) -> Path | None:
+def image_path_of(workspace: Workspace) -> Path | None:
+    """Return the folder of the photographs, None where another program's database names none."""
     if is_copy(workspace):
         return copied_image_path(workspace)
     return Path(Inputs.recorded(workspace).image_path)
@@ -230,9 +232,12 @@ def _ignore(_: int) -> None:
     pass
 
 
-def num_verified_pairs(workspace: Workspace) -> int:
-    """Return the number of pairs with a two-view geometry."""
-    return len(verified_pairs(workspace.database, _min_num_inliers(workspace)))
+def verified_inliers(workspace: Workspace) -> dict[Pair, int]:
+    """Return the number of inliers of each verified pair, by the names of its images."""
+    ids = colmap_database.image_ids(workspace.database)
+    names = {image_id: name for name, image_id in ids.items()}
+    pairs = verified_pairs(workspace.database, _min_num_inliers(workspace))
+    return {(names[first], names[second]): count for (first, second), count in pairs.items()}
 
 
 def _min_num_inliers(workspace: Workspace) -> int:
@@ -247,7 +252,7 @@ def unregistered(
     workspace = context.workspace
     num_keypoints = colmap_database.keypoint_counts(workspace.database)
     ids = colmap_database.image_ids(workspace.database)
-    verified = _verified_by_name(workspace.database, _min_num_inliers(workspace))
+    verified = _verified_by_name(workspace)
     elsewhere = {
         name: f"in another model, sparse/{index}"
         for index, model in reversed(list(enumerate(models)))
@@ -275,12 +280,10 @@ def unregistered(
     return reasons
 
 
-def _verified_by_name(database_path: Path, min_num_inliers: int) -> dict[str, dict[str, int]]:
+def _verified_by_name(workspace: Workspace) -> dict[str, dict[str, int]]:
     """Return for each image of a verified pair its partners, and how many inliers they share."""
-    names = {image_id: name for name, image_id in colmap_database.image_ids(database_path).items()}
     found: defaultdict[str, dict[str, int]] = defaultdict(dict)
-    for pair, count in verified_pairs(database_path, min_num_inliers).items():
-        first, second = (names[image_id] for image_id in pair)
+    for (first, second), count in verified_inliers(workspace).items():
         found[first][second] = found[second][first] = count
     return dict(found)
 
@@ -298,8 +301,7 @@ def advice(
     if not missing:
         return ()
     workspace = context.workspace
-    min_num_inliers = recorded_verification(workspace).min_num_inliers
-    verified = _verified_by_name(workspace.database, min_num_inliers)
+    verified = _verified_by_name(workspace)
     texts = []
     cameras, inputs = colmap_database.all_cameras(workspace.database), Inputs.recorded(workspace)
     same_size = len({(camera.width, camera.height) for camera in cameras}) == 1
