@@ -28,10 +28,10 @@ MAX_NUM_THUMBNAILS = 60
 MAX_NUM_LAID_OUT, MAX_NUM_IN_MATRIX = 300, 1000
 """With more photographs the nodes are on a circle; and there is no matrix."""
 
-MAX_NODE, MIN_NODE, DOT = 84.0, 24.0, 9.0
+MAX_NODE, MIN_NODE, DOT = 64.0, 22.0, 9.0
 """Sides of nodes in units of the graph."""
 
-MIDDLE, GRAVITY = "", 0.05
+MIDDLE, GRAVITY = "", 0.1
 """A node and the weight of its edges to all others: they hold parts of the graph
 together that have no edge between them."""
 
@@ -97,13 +97,14 @@ def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layou
         places = np.stack([np.sin(turn), -np.cos(turn)], axis=1)
         return Layout((places + 1) / 2 * (np.array(GRAPH_SIZE) - size) + size / 2, size)
     if count <= MAX_NUM_THUMBNAILS:
-        size = min(MAX_NODE, max(MIN_NODE, 0.45 * sqrt(GRAPH_SIZE[0] * GRAPH_SIZE[1] / count)))
+        size = min(MAX_NODE, max(MIN_NODE, 0.3 * sqrt(GRAPH_SIZE[0] * GRAPH_SIZE[1] / count)))
     graph = networkx.Graph()
     graph.add_nodes_from(names)
+    strongest = log(1 + max((count for pairs in graphs for count in pairs.values()), default=1))
     for pairs in graphs:
         for pair, inliers in pairs.items():
             known = graph.get_edge_data(*pair, default={"weight": 0.0})["weight"]
-            graph.add_edge(*pair, weight=max(known, log(1 + inliers)))
+            graph.add_edge(*pair, weight=max(known, log(1 + inliers) / strongest))
     graph.add_weighted_edges_from((name, MIDDLE, GRAVITY) for name in names)
     places = networkx.spring_layout(graph, seed=0, iterations=200 if count < 100 else 60)
     centers = np.array([places[name] for name in names])

@@ -44,7 +44,7 @@
   for (const caption of all("figure.panel > figcaption")) {
     const button = document.createElement("button");
     Object.assign(button, { type: "button", className: "enlarge script-only", textContent: "Enlarge" });
-    caption.append(button);
+    caption.prepend(button);
   }
   document.addEventListener("click", (event) => {
     const photograph = event.target.closest("[data-open]");
@@ -237,6 +237,10 @@
           context.lineTo(next[0], next[1]);
         }
         context.stroke();
+        context.fillStyle = context.strokeStyle;
+        context.globalAlpha = isPointedAt ? 0.5 : 0.2;
+        context.fill(new Path2D(`M${places.slice(1).map(([x, y]) => `${x} ${y}`).join("L")}Z`));
+        context.globalAlpha = 1;
         labels.push([isPointedAt, camera.index + 1, ...camera.place]);
       }
       if (labels.length <= MAX_LABELLED) this.drawLabels(labels, density, style);
