@@ -101,9 +101,7 @@ def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
     return cards
 
 
-def _mark(
-    column: Column, number: int, name: str, *, has_ground_truth: bool, is_only: bool
-) -> Mark:
+def _mark(column: Column, number: int, name: str, *, has_ground_truth: bool, is_only: bool) -> Mark:
     method, seeds = column.method, column.method.seeds
     registering = [seed for seed in seeds if name in seed.registered_names]
     correct = [s for s in registering if s.scores is not None and name in s.scores.correct_names]

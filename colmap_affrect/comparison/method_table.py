@@ -91,14 +91,15 @@ def _row(
     known = [span for span in spans if span]
     means = {round(span.mean, digits) for span in known}
     best = better(means) if better and len(means) > 1 else None
-    digits_of_mean = _digits((span.mean for span in known), digits)
-    digits_of_ends = _digits((end for span in known for end in (span.min, span.max)), digits)
+    digits_of_mean = digits_of((span.mean for span in known), digits)
+    digits_of_ends = digits_of((end for span in known for end in (span.min, span.max)), digits)
     cells = [span_text(span, digits_of_mean, digits_of_ends) for span in spans]
     is_best = [span is not None and round(span.mean, digits) == best for span in spans]
     return Row(key, title, cells, tuple(is_best))
 
 
-def _digits(values: Iterable[float], digits: int) -> int:
+def digits_of(values: Iterable[float], digits: int) -> int:
+    """Return so many digits after the point, none where all values are whole."""
     return 0 if all(value == round(value) for value in values) else digits
 
 
@@ -117,7 +118,7 @@ def _model_rows(methods: Sequence[MethodResult], comparison: Comparison) -> list
         Row("models", "Images in each model", splits, tuple(False for _ in splits)),
         measured("verified_pairs", f"Verified pairs, of {comparison.num_pairs:,}"),
         measured("points3D", "3D points", 0, max),
-        measured("mean_track_length", "Images per 3D point", 2, max),
+        measured("mean_track_length", "Images per 3D point", 2),
         _row("num_keypoints", "Keypoints per image", means, 0),
         measured("inliers", "Inliers in all pairs", 0),
         measured("mean_observations", "3D points seen by an image", 0),

@@ -9,7 +9,13 @@ from typing import Any
 from colmap_affrect.colmap.poses import AUC_THRESHOLDS_DEG, MAX_CORRECT_ERROR_DEG
 from colmap_affrect.comparison.contact_sheet import FILTERS, KINDS, cards_of
 from colmap_affrect.comparison.differing_pairs import choose_pairs, pair_rows, plot_pairs
-from colmap_affrect.comparison.method_table import Column, columns_of, span_text, summary_rows
+from colmap_affrect.comparison.method_table import (
+    Column,
+    columns_of,
+    digits_of,
+    span_text,
+    summary_rows,
+)
 from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.comparison.verdict import cautions, changes, headline
 from colmap_affrect.errors import AffrectError
@@ -89,12 +95,13 @@ def _bars(columns: Sequence[Column], comparison: Comparison) -> list[dict[str, A
     bars = []
     for column in columns:
         spans = [column.method.registered, column.method.correct]
-        texts = [span_text(span, 0 if span.mean == round(span.mean) else 1) for span in spans if span]
+        known = [span for span in spans if span]
+        texts = [span_text(span, digits_of([span.mean], 1)) for span in known]
         bars.append(
             {
                 "column": column,
-                "shares": [span.mean / total for span in spans if span],
-                "text": f"{texts[0]} of {total}" + "".join(f", {text} correct" for text in texts[1:]),
+                "shares": [span.mean / total for span in known],
+                "text": ", ".join([f"{texts[0]} of {total}", *(f"{t} correct" for t in texts[1:])]),
             }
         )
     return bars
@@ -122,8 +129,7 @@ def _graphs_and_models(
         "script_data": {
             "matrices": [view_graph.matrix(names, graph) for graph in graphs],
             "views": [
-                view.script_data(index, of_view)
-                for view, of_view in zip(views, kinds, strict=True)
+                view.script_data(index, of_view) for view, of_view in zip(views, kinds, strict=True)
             ],
         },
     }

@@ -33,7 +33,8 @@ def write_page(
     machine is in the page, ``folders`` in particular, since pages are sent to others. Raises
     WorkspaceError when it cannot be written.
     """
-    hidden = sorted((f"{folder.parent}{os.sep}" for folder in folders), key=len, reverse=True)
+    known = [f"{place}{os.sep}" for folder in folders for place in (folder, folder.parent)]
+    hidden = sorted(known, key=len, reverse=True)
 
     def finalized(value: Any) -> Any:
         return shown(without_folders(value, hidden)) if type(value) is str else value
@@ -67,7 +68,7 @@ def write_page(
 def without_folders(text: str, known: Iterable[str] = ()) -> str:
     r"""Leave of paths of this machine their last part, and of those in known folders what is below.
 
-    >>> without_folders("/home/me/a.jpg: damaged, see C:\x\b.txt and c/d.jpg or 1/2")
+    >>> without_folders(r"/home/me/a.jpg: damaged, see C:\x\b.txt and c/d.jpg or 1/2")
     'a.jpg: damaged, see b.txt and c/d.jpg or 1/2'
     """
     for folder in known:

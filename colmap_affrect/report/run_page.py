@@ -205,9 +205,11 @@ def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str
     counts = Counter(camera["source"] for camera in report.cameras)
     sources = ", ".join(f"{count} by {SOURCES[key]}" for key, count in counts.most_common())
     more = len(report.cameras) - len(rows)
-    note = f"{len(report.cameras)} cameras, focal lengths: {sources}."
+    total = len(report.cameras)
+    note = f"{total} camera{'s' if total != 1 else ''}, focal lengths: {sources}."
     note += f" The first {len(rows)} are listed, report.json has all." if more else ""
-    return {"cameras": rows, "camera_note": note, "has_range": scale > 0}
+    has_range = any(row["spread"] != "-" for row in rows)
+    return {"cameras": rows, "camera_note": note, "has_range": has_range}
 
 
 def _focals(camera: Mapping[str, Any]) -> list[float]:

@@ -359,7 +359,7 @@
     mark(index) {
       if (index === pointedAt) return;
       pointedAt = index;
-      const fate = cards[index]?.querySelector(".fate")?.textContent;
+      const fate = cards[index]?.querySelector(".fate")?.textContent.trim();
       for (const model of models) {
         const isHere = model.cameras.some((camera) => camera.index === index);
         const text = isHere ? fate : "not registered";
