@@ -28,6 +28,7 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
+from colmap_affrect.report.run_page import write_run_page
 from colmap_affrect.stages.cameras import choose_cameras
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.copy import copy_verified, is_copy
@@ -45,10 +46,11 @@ from colmap_affrect.stages.map import (
     agreement,
     contradicting_pairs,
     image_names,
+    image_path_of,
     images_in_need,
     map_images,
-    num_verified_pairs,
     unregistered,
+    verified_inliers,
 )
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
@@ -143,6 +145,7 @@ def run(
     *,
     executor: Executor | None = None,
     overwrite: bool = False,
+    page: bool = True,
     progress: Progress = SILENT,
 ) -> ReconstructionReport:
     """Extract, match, verify and map; go on where an earlier run stopped.
@@ -155,6 +158,7 @@ def run(
             (:func:`colmap_affrect.parallel.cluster.connected`); by default in threads of this
             process.
         overwrite: discard results that are there.
+        page: also write ``report.html``.
         progress: where to show progress.
 
     Returns:
@@ -190,7 +194,7 @@ def run(
         reports.append(guide(context, options.recipe.guided))
         if options.database_descriptors:
             write_descriptors(context)
-        return map_and_report(context, mapper, options.extend, earlier=reports)
+        return map_and_report(context, mapper, options.extend, earlier=reports, page=page)
 
 
 def map_from_database(
@@ -203,6 +207,7 @@ def map_from_database(
     extend: Extension | None = None,
     check_cameras: bool = False,
     overwrite: bool = False,
+    page: bool = True,
     progress: Progress = SILENT,
 ) -> ReconstructionReport:
     """Map a database of any program; it is copied and stays as it is.
@@ -216,6 +221,7 @@ def map_from_database(
         extend: register the images into this model instead of beginning one.
         check_cameras: let the pairs vote on cameras whose focal length is no prior.
         overwrite: discard results that are there.
+        page: also write ``report.html``.
         progress: where to show progress.
 
     Returns:
@@ -238,7 +244,7 @@ def map_from_database(
             overwrite=overwrite,
         )
         reports = [report, choose_cameras(context)] if check_cameras else [report]
-        return map_and_report(context, mapper, extend, earlier=reports)
+        return map_and_report(context, mapper, extend, earlier=reports, page=page)
 
 
 def map_and_report(
@@ -248,8 +254,9 @@ def map_and_report(
     *,
     earlier: Sequence[StageReport] = (),
     overwrite: bool = False,
+    page: bool = True,
 ) -> ReconstructionReport:
-    """Map a verified workspace and write ``report.json``."""
+    """Map a verified workspace and write ``report.json`` and, if wanted, ``report.html``."""
     workspace, options = context.workspace, mapper.options
     _require_photographs(context)
     if extend and overwrite:
@@ -258,14 +265,14 @@ def map_and_report(
     reports, models = map_guided(context, mapper, extend, overwrite=overwrite)
     names, copied = image_names(workspace), is_copy(workspace)
     verification = recorded_verification(workspace)
-    missing = unregistered(context, names, models)
+    missing, pair_inliers = unregistered(context, names, models), verified_inliers(workspace)
     cameras = read_camera_records(workspace.cameras)
     result = ReconstructionReport(
         images_total=len(names),
         unregistered=missing,
         models=tuple(models),
         num_pairs=num_matched_pairs(workspace.database) if copied else len(listed_pairs(context)),
-        num_verified_pairs=num_verified_pairs(workspace),
+        num_verified_pairs=len(pair_inliers),
         stages=(*earlier, *reports),
         recipe="" if copied else workspace.recipe(),
         versions=installed_versions(),
@@ -287,6 +294,17 @@ def map_and_report(
         advice=advice(context, missing, models),
     )
     replace_text(workspace.report, result.to_json())
+    if page:
+        write_run_page(
+            workspace,
+            result,
+            names,
+            pair_inliers,
+            image_path_of(workspace),
+            context.progress,
+        )
+    else:
+        workspace.page.unlink(missing_ok=True)  # of an earlier run
     return result
 
 

@@ -41,7 +41,7 @@ def make_comparison(folder: Path) -> Comparison:
         upright = texture((3 * IMAGE_SIZE[0], IMAGE_SIZE[1]), number)
         slanted = cv2.resize(upright, IMAGE_SIZE, interpolation=cv2.INTER_AREA)
         write_image(photographs / name, slanted)
-    truth, pair_inliers = _write_scene(folder / "all.db")
+    truth, pair_inliers = write_scene(folder / "all.db")
     sift = _write_method(folder, "sift", truth, NAMES[:4])
     default = _write_method(folder, "default", truth, NAMES[:5], SIMILARITY)
     _write_features(folder / "methods" / "default")
@@ -67,17 +67,19 @@ def make_comparison(folder: Path) -> Comparison:
     )
 
 
-def _write_scene(database_path: Path) -> tuple[pycolmap.Reconstruction, dict[Pair, int]]:
+def write_scene(
+    database_path: Path, names: Sequence[str] = NAMES
+) -> tuple[pycolmap.Reconstruction, dict[Pair, int]]:
     """Write a database of all images; return their model and the inliers of all pairs."""
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, len(NAMES), 90
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, len(names), 90
     options.camera_width, options.camera_height = IMAGE_SIZE
     options.camera_model_id = pycolmap.CameraModelId.PINHOLE
     options.camera_params = [200.0, 200.0, 80.0, 60.0]
     pycolmap.set_random_seed(0)
     with open_database(database_path) as database:
         model = pycolmap.synthesize_dataset(options, database)
-        for image, name in zip(database.read_all_images(), NAMES, strict=True):
+        for image, name in zip(database.read_all_images(), names, strict=True):
             image.name = name
             database.update_image(image)
             model.images[image.image_id].name = name

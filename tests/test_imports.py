@@ -73,7 +73,6 @@ except colmap_affrect.AffrectError as error:
 @pytest.mark.parametrize(
     "call",
     [
-        "colmap_affrect.compare(Path('photos'), Path('out'))",
         "colmap_affrect.evaluate('evd', Path('EVD'), Path('out'))",
     ],
 )
@@ -86,11 +85,10 @@ def test_what_ends_with_pictures_is_refused_after_pycolmap(call: str) -> None:
 def test_pictures_are_not_refused_where_numpy_came_before_pycolmap() -> None:
     done = run_python(
         "import numpy, pycolmap\n"
-        "from colmap_affrect.images.reading import encode_png, require_png\n"
-        "require_png()\n"
-        "print(len(encode_png(numpy.eye(300, dtype=numpy.uint8))) > 100)"
+        "from colmap_affrect.images.reading import require_png\n"
+        "print(require_png())"
     )
-    assert (done.returncode, done.stdout) == (0, "True\n"), done.stderr
+    assert (done.returncode, done.stdout) == (0, "None\n"), done.stderr
 
 
 def test_zlib_works_after_the_import_of_pycolmap() -> None:

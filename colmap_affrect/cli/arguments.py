@@ -213,6 +213,10 @@ EXTEND = (
 )  # fmt: skip
 
 
+NO_PAGE = Option("--no-page", dest="page", action="store_false",
+    help="leave out report.html, the page to look at")  # fmt: skip
+
+
 def seed(what: str = "of verification and mapping", default: int | None = None) -> Option:
     text = f"seed {what} (default: 0)"
     return _value("--random-seed", "N", text, type=int, default=default)

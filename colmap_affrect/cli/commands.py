@@ -44,6 +44,7 @@ def run(options: argparse.Namespace) -> int:
             run_options,
             executor=executor,
             overwrite=options.overwrite,
+            page=options.page,
             progress=given.progress(options),
         )
     return _print_reconstruction(report, options)
@@ -154,6 +155,7 @@ def map(options: argparse.Namespace) -> int:
             extend=extend,
             check_cameras=options.focal_vote == "always",
             overwrite=options.overwrite,
+            page=options.page,
             progress=given.progress(options),
         )
         return _print_reconstruction(report, options)
@@ -171,6 +173,7 @@ def map(options: argparse.Namespace) -> int:
             extend,
             earlier=[choose_cameras(context, may_share=not extend)] if votes else [],
             overwrite=options.overwrite,
+            page=options.page,
         )
     return _print_reconstruction(report, options)
 

@@ -35,7 +35,6 @@ from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResu
 from colmap_affrect.comparison.tables import to_csv, to_json
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
 from colmap_affrect.features.weights import install_hint
-from colmap_affrect.images.reading import require_png
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import Options
 from colmap_affrect.pairs.base import Pair, PairOptions
@@ -85,7 +84,6 @@ def compare(
     folder, which is made if missing. Raises AffrectError for anything that the caller can mend,
     before any method is run.
     """
-    require_png()
     options = options or CompareOptions()
     plan = _Plan.checked(image_path, Layout(output_path), options)
     with Workspace(output_path).locked():

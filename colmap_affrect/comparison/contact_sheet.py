@@ -19,16 +19,34 @@ FILTERS = {
 }
 
 
+KINDS = {
+    "shared": "registered by other methods, too",
+    "only": "registered by this method only",
+    "doubtful": "contradicts other seeds or methods",
+    "wrong": "at a wrong place",
+}
+"""How cameras are drawn; each has a colour of this name."""
+
+
 @dataclass(frozen=True)
 class Mark(Node):
     """What one method does with one photograph.
 
     Attributes:
         is_doubtful: registered in poses that contradict those of other seeds or methods.
+        is_only: usually registered by no other method.
     """
 
     column: Column
     is_doubtful: bool
+    is_only: bool
+
+    @property
+    def kind(self) -> str:
+        """One of ``KINDS``."""
+        if self.is_wrong:
+            return "wrong"
+        return "doubtful" if self.is_doubtful else "only" if self.is_only else "shared"
 
 
 @dataclass(frozen=True)
@@ -56,10 +74,20 @@ def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
         for name in pair
     }
     usually_registered = [column.method.usually_registered for column in columns]
+    only = comparison.only_registered_by
     registered_by_none = set(comparison.registered_by_none)
     cards = []
     for number, name in enumerate(comparison.image_names, 1):
-        marks = tuple(_mark(column, number, name, name in with_truth) for column in columns)
+        marks = tuple(
+            _mark(
+                column,
+                number,
+                name,
+                has_ground_truth=name in with_truth,
+                is_only=only.get(name) == column.name and len(columns) > 1,
+            )
+            for column in columns
+        )
         tests = {
             "all": True,
             "differ": len({name in names for names in usually_registered}) > 1,
@@ -73,7 +101,7 @@ def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
     return cards
 
 
-def _mark(column: Column, number: int, name: str, has_ground_truth: bool) -> Mark:
+def _mark(column: Column, number: int, name: str, *, has_ground_truth: bool, is_only: bool) -> Mark:
     method, seeds = column.method, column.method.seeds
     registering = [seed for seed in seeds if name in seed.registered_names]
     correct = [s for s in registering if s.scores is not None and name in s.scores.correct_names]
@@ -102,4 +130,5 @@ def _mark(column: Column, number: int, name: str, has_ground_truth: bool) -> Mar
         f"{column.name}: {text}",
         column=column,
         is_doubtful=is_unstable or bool(others),
+        is_only=is_only,
     )

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from typing import Any
 
 from colmap_affrect.colmap.poses import AUC_THRESHOLDS_DEG, PoseScores
 from colmap_affrect.comparison.results import Comparison, MethodResult, Span
+from colmap_affrect.comparison.verdict import ranked
 from colmap_affrect.project.workspace import STAGES
-from colmap_affrect.report.page import number_text
 
 METHOD_COLORS = (
     "#0b62a8", "#a34700", "#00714f", "#9b2d79", "#5d4bb0", "#7a5c00", "#a3213b", "#46606e",
 )  # fmt: skip
 """Of the marks of methods; white text on them is readable."""
 
-MAIN_ROWS = {"registered", "correct", "verified_pairs", "points3D", "total_s"}
-"""Rows that decide."""
+MAIN_ROWS = {
+    "registered", "correct", "models", "verified_pairs", "points3D", "mean_track_length", "total_s",
+}  # fmt: skip
+"""Rows that decide; the others are folded away."""
 
 BYTES_PER_MB = 1_000_000
 NOTHING = "-"
@@ -39,14 +42,14 @@ class Column:
 
 
 def columns_of(comparison: Comparison) -> list[Column]:
-    """Give each method that finished a letter and a colour."""
+    """Give each method that finished a letter and a colour, the best first."""
     return [
         Column(
             chr(ord("A") + index) if index < 26 else str(index + 1),
             METHOD_COLORS[index % len(METHOD_COLORS)],
             method,
         )
-        for index, method in enumerate(comparison.finished)
+        for index, method in enumerate(ranked(comparison.finished))
     ]
 
 
@@ -56,11 +59,13 @@ class Row:
 
     Attributes:
         key: for programs, as in ``comparison.json``.
+        best: which cells have the best value, where methods differ.
     """
 
     key: str
     title: str
     cells: list[str]
+    best: tuple[bool, ...]
 
     @property
     def is_main(self) -> bool:
@@ -68,57 +73,78 @@ class Row:
         return self.key in MAIN_ROWS
 
 
-Line = tuple[str, str, Callable[[MethodResult], str]]
-"""Key, title and how the cell of a method is written."""
+Better = Callable[[Iterable[float]], float] | None
+"""``max`` or ``min`` of the means is best; None where neither is."""
 
 
 def summary_rows(columns: Sequence[Column], comparison: Comparison) -> list[Row]:
     """Return the table of methods, without the lines that say nothing of any of them."""
     methods = [column.method for column in columns]
-    lines = [*_model_lines(comparison), *_score_lines(), *_cost_lines(methods)]
-    rows = [Row(key, title, [text(method) for method in methods]) for key, title, text in lines]
+    rows = [*_model_rows(methods, comparison), *_score_rows(methods), *_cost_rows(methods)]
     return [row for row in rows if any(cell != NOTHING for cell in row.cells)]
 
 
-def _model_lines(comparison: Comparison) -> list[Line]:
+def _row(
+    key: str, title: str, spans: Sequence[Span | None], digits: int = 1, better: Better = None
+) -> Row:
+    """Write means and, in brackets, ranges with as many decimals in all cells as any needs."""
+    known = [span for span in spans if span]
+    means = {round(span.mean, digits) for span in known}
+    best = better(means) if better and len(means) > 1 else None
+    digits_of_mean = digits_of((span.mean for span in known), digits)
+    digits_of_ends = digits_of((end for span in known for end in (span.min, span.max)), digits)
+    cells = [span_text(span, digits_of_mean, digits_of_ends) for span in spans]
+    is_best = [span is not None and round(span.mean, digits) == best for span in spans]
+    return Row(key, title, cells, tuple(is_best))
+
+
+def digits_of(values: Iterable[float], digits: int) -> int:
+    """Return so many digits after the point, none where all values are whole."""
+    return 0 if all(value == round(value) for value in values) else digits
+
+
+def _model_rows(methods: Sequence[MethodResult], comparison: Comparison) -> list[Row]:
     given = len(comparison.image_names)
 
-    def measured(key: str, title: str, digits: int = 1) -> Line:
-        return key, title, lambda method: span_text(method.span(key), digits)
+    def measured(key: str, title: str, digits: int = 1, better: Better = None) -> Row:
+        return _row(key, title, [method.span(key) for method in methods], digits, better)
 
+    correct, splits = [method.correct for method in methods], [_splits(m) for m in methods]
+    keypoints = [list(method.num_keypoints.values()) for method in methods]
+    means = [Span.of([fmean(counts)]) if counts else None for counts in keypoints]
     return [
-        measured("registered", f"Registered, of {given}"),
-        ("correct", f"Registered correctly, of {given}", lambda m: span_text(m.correct)),
-        ("models", "Images in each model", _splits),
-        ("num_keypoints", "Keypoints per image", _mean_num_keypoints),
+        measured("registered", f"Registered, of {given}", better=max),
+        _row("correct", f"Registered correctly, of {given}", correct, better=max),
+        Row("models", "Images in each model", splits, tuple(False for _ in splits)),
         measured("verified_pairs", f"Verified pairs, of {comparison.num_pairs:,}"),
-        measured("inliers", "Inliers in all pairs", 0),
-        measured("points3D", "3D points", 0),
+        measured("points3D", "3D points", 0, max),
         measured("mean_track_length", "Images per 3D point", 2),
+        _row("num_keypoints", "Keypoints per image", means, 0),
+        measured("inliers", "Inliers in all pairs", 0),
         measured("mean_observations", "3D points seen by an image", 0),
         measured("mean_reprojection_error_px", "Reprojection error, px", 2),
     ]
 
 
-def _score_lines() -> list[Line]:
-    """Return the lines that only ground truth fills."""
+def _score_rows(methods: Sequence[MethodResult]) -> list[Row]:
+    """Return the rows that only ground truth fills."""
 
     def scored(
-        key: str, title: str, digits: int, value: Callable[[PoseScores], float | None]
-    ) -> Line:
-        def text(method: MethodResult) -> str:
+        key: str, title: str, digits: int, better: Better, value: Callable[[PoseScores], Any]
+    ) -> Row:
+        spans = []
+        for method in methods:
             values = [value(seed.scores) for seed in method.seeds if seed.scores is not None]
             known = [number for number in values if number is not None]
-            return span_text(Span.of(known) if known else None, digits)
+            spans.append(Span.of(known) if known else None)
+        return _row(key, title, spans, digits, better)
 
-        return key, title, text
-
-    def area(limit: float) -> Line:
+    def area(limit: float) -> Row:
         title = f"AUC of relative poses at {limit:g}°"
-        return scored(f"auc_{limit:g}", title, 3, lambda scores: scores.auc[limit])
+        return scored(f"auc_{limit:g}", title, 3, max, lambda scores: scores.auc[limit])
 
-    def median(key: str, title: str, digits: int) -> Line:
-        return scored(key, f"Median {title}", digits, lambda scores: getattr(scores, key))
+    def median(key: str, title: str, digits: int) -> Row:
+        return scored(key, f"Median {title}", digits, min, lambda scores: getattr(scores, key))
 
     return [
         *map(area, AUC_THRESHOLDS_DEG),
@@ -128,39 +154,36 @@ def _score_lines() -> list[Line]:
     ]
 
 
-def _cost_lines(methods: Sequence[MethodResult]) -> list[Line]:
-    def seconds(stage: str) -> Line:
-        def text(method: MethodResult) -> str:
-            known = method.stage_seconds
-            return number_text(known[stage]) if stage in known else NOTHING
+def _cost_rows(methods: Sequence[MethodResult]) -> list[Row]:
+    def costs(key: str, title: str, digits: int, values: Iterable[float | None]) -> Row:
+        spans = [Span.of([value]) if value is not None else None for value in values]
+        return _row(key, title, spans, digits, min)
 
-        return f"{stage}_s", f"Seconds to {stage}", text
-
-    def memory(method: MethodResult) -> str:
-        return number_text(method.peak_memory_bytes / BYTES_PER_MB, 0)
-
-    stages = {stage for method in methods for stage in method.stage_seconds}
+    seconds = [method.stage_seconds for method in methods]
+    stages = {stage for known in seconds for stage in known}
+    memory = [method.peak_memory_bytes / BYTES_PER_MB for method in methods]
     return [
-        *map(seconds, sorted(stages, key=STAGES.index)),
-        ("total_s", "Seconds in all", lambda method: number_text(method.total_s)),
-        ("peak_memory_bytes", "Peak memory, MB", memory),
+        *(
+            costs(f"{stage}_s", f"Seconds to {stage}", 1, [known.get(stage) for known in seconds])
+            for stage in sorted(stages, key=STAGES.index)
+        ),
+        costs("total_s", "Seconds in all", 1, [method.total_s for method in methods]),
+        costs("peak_memory_bytes", "Peak memory, MB", 0, memory),
     ]
 
 
-def span_text(span: Span | None, digits: int = 1) -> str:
+def span_text(span: Span | None, digits: int = 1, digits_of_ends: int = 0) -> str:
     """Write a mean, and the range where it is one.
 
     >>> span_text(Span.of([7, 8])), span_text(Span.of([8, 8])), span_text(None)
-    ('7.5 (7-8)', '8', '-')
+    ('7.5 (7-8)', '8.0', '-')
     """
     if span is None:
         return NOTHING
-    low, mean, high = (number_text(value, digits) for value in (span.min, span.mean, span.max))
-    return mean if low == high else f"{mean} ({low}-{high})"
-
-
-def _mean_num_keypoints(method: MethodResult) -> str:
-    return number_text(fmean(method.num_keypoints.values()), 0) if method.num_keypoints else NOTHING
+    mean = f"{span.mean:,.{digits}f}"
+    if span.min == span.max:
+        return mean
+    return f"{mean} ({span.min:,.{digits_of_ends}f}-{span.max:,.{digits_of_ends}f})"
 
 
 def _splits(method: MethodResult) -> str:

@@ -7,17 +7,23 @@ from pathlib import Path
 from typing import Any
 
 from colmap_affrect.colmap.poses import AUC_THRESHOLDS_DEG, MAX_CORRECT_ERROR_DEG
-from colmap_affrect.comparison.contact_sheet import FILTERS, cards_of
+from colmap_affrect.comparison.contact_sheet import FILTERS, KINDS, cards_of
 from colmap_affrect.comparison.differing_pairs import choose_pairs, pair_rows, plot_pairs
-from colmap_affrect.comparison.method_table import columns_of, summary_rows
+from colmap_affrect.comparison.method_table import (
+    Column,
+    columns_of,
+    digits_of,
+    span_text,
+    summary_rows,
+)
 from colmap_affrect.comparison.results import Comparison
-from colmap_affrect.comparison.verdict import verdict
+from colmap_affrect.comparison.verdict import cautions, changes, headline
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.options import flat
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import page, view_graph
-from colmap_affrect.report.pictures import photograph_pictures
+from colmap_affrect.report.pictures import photograph_pictures, thumbnails
 from colmap_affrect.report.scene import read_scene
 from colmap_affrect.report.warp_views import rectifies, warped_photographs
 from colmap_affrect.stages.context import Resources
@@ -25,7 +31,6 @@ from colmap_affrect.stages.context import Resources
 TEMPLATE = Path(__file__).parent / "templates" / "comparison.html"
 FILE_NAME = "report.html"
 
-THUMBNAIL_PX = 160
 MATCH_PICTURE_PX = 560
 MAX_NUM_WARPED_PHOTOGRAPHS = 3
 MAX_NUM_TABLE_PAIRS = 200
@@ -44,27 +49,29 @@ def write_page(
     networks, to draw their warps. Raises WorkspaceError when it cannot be written.
     """
     columns = columns_of(comparison)
+    methods = [column.method for column in columns]
     folder = Path(comparison.image_path)
     rectifying = [
-        column.name
-        for column in columns
-        if column.method.folder and rectifies(Workspace(output_path / column.method.folder))
+        method.name
+        for method in methods
+        if method.folder and rectifies(Workspace(output_path / method.folder))
     ]
-    thumbnails = photograph_pictures(folder, comparison.image_names, THUMBNAIL_PX, progress)
-    chosen = choose_pairs(comparison.finished, rectifying)
+    chosen = choose_pairs(methods, rectifying)
     of_pairs = list(dict.fromkeys(name for item in chosen for name in item.names))
     pair_pictures = photograph_pictures(folder, sorted(of_pairs), MATCH_PICTURE_PX)
-    rows = pair_rows(comparison.finished)
+    rows = pair_rows(methods)
     content = {
         "comparison": comparison,
-        "verdict": verdict(comparison),
+        "headline": headline(comparison),
+        "changes": changes(comparison),
+        "cautions": cautions(comparison),
+        "bars": _bars(columns, comparison),
         "columns": columns,
         "column_of": {column.name: column for column in columns},
         "failed": [method for method in comparison.methods if method.failed],
         "rows": summary_rows(columns, comparison),
         "filters": FILTERS,
-        "cards": cards_of(columns, comparison),
-        "thumbnails": thumbnails,
+        "thumbnails": thumbnails(folder, comparison.image_names, progress),
         "image_index": {name: index for index, name in enumerate(comparison.image_names)},
         "pair_rows": rows[:MAX_NUM_TABLE_PAIRS],
         "num_verified_pairs": len(rows),
@@ -74,27 +81,57 @@ def write_page(
         "max_correct_error_deg": MAX_CORRECT_ERROR_DEG,
         "auc_thresholds_deg": AUC_THRESHOLDS_DEG,
         "settings": flat(comparison.settings),
-        "method_options": {column.name: flat(column.method.options) for column in columns},
+        "method_options": {method.name: flat(method.options) for method in methods},
         **_warps(comparison, rectifying, of_pairs, output_path, resources),
-        **_graphs_and_models(comparison, output_path),
+        **_graphs_and_models(columns, comparison, output_path),
     }
-    return page.write_page(output_path / FILE_NAME, TEMPLATE, content)
+    folders = [folder, output_path.resolve()]
+    return page.write_page(output_path / FILE_NAME, TEMPLATE, content, folders)
 
 
-def _graphs_and_models(comparison: Comparison, output_path: Path) -> dict[str, Any]:
+def _bars(columns: Sequence[Column], comparison: Comparison) -> list[dict[str, Any]]:
+    """Return a bar for each method: photographs registered and, in front, those correctly."""
+    total = max(1, len(comparison.image_names))
+    bars = []
+    for column in columns:
+        spans = [column.method.registered, column.method.correct]
+        known = [span for span in spans if span]
+        texts = [span_text(span, digits_of([span.mean], 1)) for span in known]
+        bars.append(
+            {
+                "column": column,
+                "shares": [span.mean / total for span in known],
+                "text": ", ".join([f"{texts[0]} of {total}", *(f"{t} correct" for t in texts[1:])]),
+            }
+        )
+    return bars
+
+
+def _graphs_and_models(
+    columns: Sequence[Column], comparison: Comparison, output_path: Path
+) -> dict[str, Any]:
     """Return the content of the sections that the script of the page works on."""
     names = comparison.image_names
-    graphs = [method.pair_inliers for method in comparison.finished]
+    graphs = [column.method.pair_inliers for column in columns]
     layout = view_graph.lay_out(names, graphs)
-    matrices = [view_graph.matrix(names, graph) for graph in graphs]
-    scene = read_scene(comparison.model_paths(output_path))
-    counts = [matrix.counts for matrix in matrices]
+    cards = cards_of(columns, comparison)
+    paths = comparison.model_paths(output_path)
+    views = read_scene({column.name: paths[column.name] for column in columns})
+    index = {name: number for number, name in enumerate(names)}
+    kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
+    used = {kind for of_view in kinds for kind in of_view.values()}
     return {
+        "cards": cards,
         "layout": layout,
         "edges": [view_graph.edge_paths(names, layout, graph) for graph in graphs],
-        "matrices": matrices,
-        "views": scene.views,
-        "script_data": {"names": names, "matrices": counts, **scene.script_data()},
+        "views": views,
+        "kinds": {kind: text for kind, text in KINDS.items() if kind in used},
+        "script_data": {
+            "matrices": [view_graph.matrix(names, graph) for graph in graphs],
+            "views": [
+                view.script_data(index, of_view) for view, of_view in zip(views, kinds, strict=True)
+            ],
+        },
     }
 
 

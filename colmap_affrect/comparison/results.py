@@ -119,6 +119,11 @@ MEASURES: dict[str, Callable[[SeedResult], float]] = {
 }
 """Numbers of every seed, by their names in JSON and CSV."""
 
+MEASURES_OF_MODEL = {
+    "points3D", "mean_track_length", "mean_observations", "mean_reprojection_error_px",
+}  # fmt: skip
+"""Of these, what a seed without a model has none of."""
+
 
 @dataclass(frozen=True)
 class MethodResult:
@@ -196,9 +201,10 @@ class MethodResult:
         """Seconds from photographs to one model."""
         return sum(self.stage_seconds.values())
 
-    def span(self, measure: str) -> Span:
-        """Return one of ``MEASURES`` over the seeds."""
-        return Span.of(MEASURES[measure](seed) for seed in self.seeds)
+    def span(self, measure: str) -> Span | None:
+        """Return one of ``MEASURES`` over the seeds; those of models None without any."""
+        seeds = [s for s in self.seeds if s.model_names or measure not in MEASURES_OF_MODEL]
+        return Span.of(MEASURES[measure](seed) for seed in seeds) if seeds else None
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON, spans first; without seeds where the method failed."""
@@ -208,7 +214,7 @@ class MethodResult:
             return {key: values[key] for key in ("failed", *KEPT_OF_FAILED)}
         del values["failed"]
         return {
-            **{key: asdict(self.span(key)) for key in MEASURES},
+            **{key: asdict(span) if (span := self.span(key)) else None for key in MEASURES},
             "correct": asdict(self.correct) if self.correct else None,
             "registered_names": {str(s.seed): list(s.registered_names) for s in self.seeds},
             "wall_s": self.stage_seconds,

@@ -53,19 +53,25 @@ def _row(method: MethodResult, comparison: Comparison) -> list[str]:
         method.name,
         f"{_span(method.registered)} of {len(comparison.image_names)}",
         _span(method.span("verified_pairs")),
-        f"{method.span('points3D').mean:.0f}",
-        f"{method.span('mean_track_length').mean:.2f}",
-        f"{method.span('mean_reprojection_error_px').mean:.2f}",
+        _mean(method.span("points3D"), 0),
+        _mean(method.span("mean_track_length"), 2),
+        _mean(method.span("mean_reprojection_error_px"), 2),
         f"{method.total_s:.1f}",
         f"{method.peak_memory_bytes / 1e6:.0f}",
     ]
     if comparison.has_ground_truth:
-        row.insert(2, _span(method.correct) if method.correct else "-")
+        row.insert(2, _span(method.correct))
     return row
 
 
-def _span(span: Span) -> str:
+def _mean(span: Span | None, digits: int) -> str:
+    return f"{span.mean:.{digits}f}" if span else "-"
+
+
+def _span(span: Span | None) -> str:
     """Return the mean and, if it varies, the range."""
+    if span is None:
+        return "-"
     if span.min == span.max:
         return f"{span.mean:g}"
     return f"{span.mean:.1f} [{span.min:g}-{span.max:g}]"

@@ -26,11 +26,21 @@ MIN_WHOLE_SECONDS = 10
 
 def verdict(comparison: Comparison) -> tuple[str, ...]:
     """Return the paragraphs, the most important one first."""
+    return (*headline(comparison), *changes(comparison), *cautions(comparison))
+
+
+def cautions(comparison: Comparison) -> tuple[str, ...]:
+    """Return what follows on gains and losses: what is missing, wrong or doubtful."""
     rules = (
-        headline, changes, seeds_disagree, wrong_poses, registered_by_none, failures,
-        doubts, unstable_poses, contradictions, not_compared,
+        seeds_disagree, wrong_poses, registered_by_none, failures, doubts, unstable_poses,
+        contradictions, not_compared,
     )  # fmt: skip
     return tuple(text for rule in rules for text in rule(comparison))
+
+
+def ranked(methods: Iterable[MethodResult]) -> list[MethodResult]:
+    """Put the method with most photographs first, of equals the fastest."""
+    return sorted(methods, key=lambda method: (-_count(method).mean, method.total_s))
 
 
 def not_compared(comparison: Comparison) -> list[str]:
@@ -92,7 +102,7 @@ def headline(comparison: Comparison) -> list[str]:
     finished, total = comparison.finished, len(comparison.image_names)
     if not finished:
         return ["No method finished."]
-    best = max(finished, key=lambda method: (_count(method).mean, -method.total_s))
+    best = ranked(finished)[0]
     most = max(method.registered.max for method in finished)
     if most < MIN_IMAGES <= total:
         return [
@@ -197,7 +207,8 @@ def registered_by_none(comparison: Comparison) -> list[str]:
     missing = comparison.registered_by_none
     if not missing or not comparison.finished:
         return []
-    return [f"Registered by no method: {_listed(missing)}."]
+    often = " in most seeds" if len(comparison.seeds) > 1 else ""
+    return [f"Registered by no method{often}: {_listed(missing)}."]
 
 
 def failures(comparison: Comparison) -> list[str]:

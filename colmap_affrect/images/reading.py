@@ -114,7 +114,8 @@ def in_eight_bits(
 
 def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
     """Return an (H, W) or (H, W, 3) uint8 image as JPEG; quality is 0 to 100."""
-    return _encode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    ordered = image[:, :, ::-1] if image.ndim == 3 else image
+    return cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def require_png() -> None:
@@ -127,18 +128,6 @@ def require_png() -> None:
             "pictures cannot be written in a script that imports pycolmap first; put "
             '"import colmap_affrect" before "import pycolmap"'
         )
-
-
-def encode_png(image: NDArray[np.uint8]) -> bytes:
-    """Return an (H, W), (H, W, 3) or, with opacity, (H, W, 4) uint8 image as PNG."""
-    return _encode(".png", image, [])
-
-
-def _encode(suffix: str, image: NDArray[np.uint8], settings: list[int]) -> bytes:
-    if image.ndim == 3:
-        image = image[:, :, [2, 1, 0, 3][: image.shape[2]]]
-    _, data = cv2.imencode(suffix, image, settings)
-    return data.tobytes()
 
 
 GRAY_AS_STORED = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION

@@ -76,6 +76,7 @@ class Workspace:
         aside: models that wait to be compared with those of guided matches.
         snapshots: folder of what a mapping that was interrupted goes on from.
         report: of the last run (JSON).
+        page: the same to look at (HTML).
         cameras: what is known of the cameras of the database, and from where (JSON).
         contents: digests of the files that were read (JSON).
         depth: folder of the depth maps that a network made.
@@ -92,7 +93,7 @@ class Workspace:
         self.snapshots, self.depth = path / "sparse.snapshots", path / "depth"
         self.config, self.log = path / "config.toml", path / "run.log"
         self.report, self.cameras = path / "report.json", path / "cameras.json"
-        self.contents = path / "contents.json"
+        self.contents, self.page = path / "contents.json", path / "report.html"
 
     @classmethod
     def beside(cls, database_path: Path) -> Self:

@@ -15,7 +15,7 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.report.pictures import Picture
 
-MAX_NUM_LINES = 150
+MAX_NUM_LINES = 100
 
 PLOT_HEIGHT, GAP = 300.0, 8.0
 """Of two photographs side by side, in units of the plot."""

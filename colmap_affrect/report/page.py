@@ -4,33 +4,48 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Mapping
+import os
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.report import match_plots, scene, view_graph
+from colmap_affrect.report import match_plots, view_graph
 from colmap_affrect.shown import shown
 
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-def write_page(path: Path, template: Path, content: Mapping[str, Any]) -> Path:
+FOLDERS = re.compile(r"(?<![^\s'\"(=\[])(?:[A-Za-z]:[\\/]|~?/)(?:[^/\\\s'\"]+[/\\])*(?=[^\s/])")
+"""The folders at the beginning of a path of this machine."""
+
+
+def write_page(
+    path: Path, template: Path, content: Mapping[str, Any], folders: Iterable[Path] = ()
+) -> Path:
     """Fill a template and write it as one file that loads nothing; return its path.
 
     The template extends ``base.html`` and may use the macros of ``parts.html``, which say what they
-    look for in the content; ``script_data`` of the content is for ``page.js``. Raises
-    WorkspaceError when the page cannot be written.
+    look for in the content; ``script_data`` of the content is for ``page.js``. No folder of this
+    machine is in the page, ``folders`` in particular, since pages are sent to others. Raises
+    WorkspaceError when it cannot be written.
     """
+    known = [f"{place}{os.sep}" for folder in folders for place in (folder, folder.parent)]
+    hidden = sorted(known, key=len, reverse=True)
+
+    def finalized(value: Any) -> Any:
+        return shown(without_folders(value, hidden)) if type(value) is str else value
+
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([template.parent, TEMPLATES], encoding="utf-8"),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
-        finalize=lambda value: shown(value) if type(value) is str else value,
+        finalize=finalized,
     )
     environment.tests["contains"] = lambda values, value: value in values
     script = (TEMPLATES / "page.js").read_text(encoding="utf-8")
@@ -38,13 +53,27 @@ def write_page(path: Path, template: Path, content: Mapping[str, Any]) -> Path:
     environment.globals |= {
         "graph_constants": view_graph,
         "match_constants": match_plots,
-        "scene_constants": scene,
         "script": script,
         "script_digest": base64.b64encode(digest).decode("ascii"),
         "style": (TEMPLATES / "page.css").read_text(encoding="utf-8"),
     }
-    replace_text(path, environment.get_template(template.name).render(content))
+    classes = {"starts": view_graph.CLASS_STARTS, "colors": view_graph.CLASS_COLORS}
+    names = list(map(shown, content["image_index"]))
+    data = {"names": names, "classes": classes, **content["script_data"]}
+    page = environment.get_template(template.name)
+    replace_text(path, page.render({**content, "script_data": data}))
     return path
+
+
+def without_folders(text: str, known: Iterable[str] = ()) -> str:
+    r"""Leave of paths of this machine their last part, and of those in known folders what is below.
+
+    >>> without_folders(r"/home/me/a.jpg: damaged, see C:\x\b.txt and c/d.jpg or 1/2")
+    'a.jpg: damaged, see b.txt and c/d.jpg or 1/2'
+    """
+    for folder in known:
+        text = text.replace(folder, "")
+    return FOLDERS.sub("", text)
 
 
 def number_text(value: float, digits: int = 1) -> str:

@@ -8,16 +8,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 from colmap_affrect.data import ColorImage, GrayImage
 from colmap_affrect.errors import ImageError
-from colmap_affrect.images.reading import encode_jpeg, encode_png, read_color
+from colmap_affrect.images.reading import encode_jpeg, read_color
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Progress
 
 JPEG_QUALITY = 70
+MAX_TOTAL_PX, MAX_SIDE_PX = 12_000_000, 640
+"""Of all thumbnails of a page, and of each."""
+MAX_NUM_THUMBNAILS = 1000
+
+
+def thumbnail_size_px(count: int) -> int:
+    """Return the longer side of so many thumbnails, with which a page stays below some MB.
+
+    >>> thumbnail_size_px(9), thumbnail_size_px(300), thumbnail_size_px(1000)
+    (640, 230, 126)
+    """
+    return int(min(MAX_SIDE_PX, (4 / 3 * MAX_TOTAL_PX / max(1, count)) ** 0.5))
 
 
 @dataclass(frozen=True)
@@ -36,22 +45,22 @@ class Picture:
     @classmethod
     def jpeg(cls, image: GrayImage | ColorImage) -> Self:
         """Make one of an (H, W) or (H, W, 3) uint8 image, with loss."""
-        return cls._of("image/jpeg", encode_jpeg(image, JPEG_QUALITY), image)
-
-    @classmethod
-    def png(cls, image: NDArray[np.uint8]) -> Self:
-        """Make one of an (H, W, 3) or, with opacity, (H, W, 4) uint8 image, without loss."""
-        return cls._of("image/png", encode_png(image), image)
-
-    @classmethod
-    def _of(cls, media_type: str, data: bytes, image: NDArray[np.uint8]) -> Self:
+        data = encode_jpeg(image, JPEG_QUALITY)
         height, width = image.shape[:2]
-        return cls(f"data:{media_type};base64,{base64_text(data)}", width, height)
+        return cls(f"data:image/jpeg;base64,{base64_text(data)}", width, height)
 
 
 def base64_text(data: bytes) -> str:
     """Return bytes as base64."""
     return base64.b64encode(data).decode("ascii")
+
+
+def thumbnails(
+    folder: Path, names: Sequence[str], progress: Progress = SILENT
+) -> dict[str, Picture]:
+    """Read photographs for a page, of which some or hundreds are as large as one."""
+    size_px = thumbnail_size_px(len(names))
+    return photograph_pictures(folder, names[:MAX_NUM_THUMBNAILS], size_px, progress)
 
 
 def photograph_pictures(

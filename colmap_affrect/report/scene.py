@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import registered_names
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.report.pictures import Picture, base64_text
+from colmap_affrect.report.pictures import base64_text
 
 Array = NDArray[np.float64]
 
-MAX_NUM_POINTS = 8000
+MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE = 20_000, 40_000
+"""Of a model, and of all that are on a page."""
 POINT_PERCENTILE = 90.0
 """Share of the points, from the middle outwards, that the view is made to hold."""
 RADIUS_MARGIN = 1.15
+MIN_COMMON_DIRECTION = 0.3
+"""Length of the mean of horizontal viewing directions from which a model has a front."""
 
 CAMERA_DEPTH = 0.07
 """Depth of the pyramids that stand for cameras, as a share of the view's radius."""
@@ -29,9 +32,6 @@ MAX_HALF_WIDTH = 0.8
 
 DARKEST, COLOR_RANGE = 60, 140
 """Colours of points are squeezed so that they show on light and on dark ground."""
-
-STILL_SIZE_PX = (800, 600)
-"""Size of the picture of the points from above."""
 
 
 @dataclass(frozen=True)
@@ -42,44 +42,31 @@ class View3D:
         num_points: points in ``points``.
         points: (N, 3) uint16 positions from -1 to 1 and then (N, 3) uint8 colours, as base64.
         cameras: name and (5, 3) centre and corners of the pyramid of each camera.
-        still: the points from above; None without a model.
-        pyramids: SVG path of each camera by name, in px of the still picture.
         note: what is special about it; empty if nothing is.
     """
 
     num_points: int = 0
     points: str = ""
     cameras: tuple[tuple[str, Array], ...] = ()
-    still: Picture | None = None
-    pyramids: tuple[tuple[str, str], ...] = ()
     note: str = ""
 
+    def script_data(self, index: Mapping[str, int], kinds: Mapping[str, str]) -> dict[str, Any]:
+        """Return what the script of the page reads.
 
-@dataclass(frozen=True)
-class Scene:
-    """Models to be shown side by side.
-
-    Attributes:
-        zoom: with which they fill the view from above.
-    """
-
-    views: tuple[View3D, ...]
-    zoom: float
-
-    def script_data(self) -> dict[str, Any]:
-        """Return what the script of the page reads."""
-        views = [
+        Args:
+            index: of the photographs on the page, by name.
+            kinds: name of the colour that the style has for each camera.
+        """
+        cameras = [
             {
-                "points": view.points,
-                "count": view.num_points,
-                "cameras": [
-                    {"name": name, "corners": corners.round(4).ravel().tolist()}
-                    for name, corners in view.cameras
-                ],
+                "index": index[name],
+                "kind": kinds[name],
+                "corners": corners.round(4).ravel().tolist(),
             }
-            for view in self.views
+            for name, corners in self.cameras
+            if name in index
         ]
-        return {"zoom": self.zoom, "views": views}
+        return {"points": self.points, "count": self.num_points, "cameras": cameras}
 
 
 @dataclass(frozen=True)
@@ -90,7 +77,7 @@ class Model:
         centers: (M, 3) of the cameras.
         axes: (M, 3, 3) rotations world_from_camera.
         half_sizes: (M, 2) half width and height of the view at depth 1.
-        points, colors: (N, 3) and (N, 3) uint8; at most ``MAX_NUM_POINTS``.
+        points, colors: (N, 3) and (N, 3) uint8.
     """
 
     names: tuple[str, ...]
@@ -110,15 +97,14 @@ class Model:
         )
 
 
-def read_scene(paths: Mapping[str, Path | None]) -> Scene:
+def read_scene(paths: Mapping[str, Path | None]) -> list[View3D]:
     """Read models, bring them into the frame of the largest, and prepare them for the page.
 
     ``paths`` are the folders by the names that the page has for the models; None for no model.
     """
     models, notes = read_models(paths)
-    zoom = _zoom_from_above(list(models.values()))
-    views = {name: _view(model, notes.get(name, ""), zoom) for name, model in models.items()}
-    return Scene(tuple(views.get(name) or View3D(note=notes[name]) for name in paths), zoom)
+    views = {name: _view(model, notes.get(name, "")) for name, model in models.items()}
+    return [views.get(name) or View3D(note=notes[name]) for name in paths]
 
 
 def read_models(paths: Mapping[str, Path | None]) -> tuple[dict[str, Model], dict[str, str]]:
@@ -128,36 +114,19 @@ def read_models(paths: Mapping[str, Path | None]) -> tuple[dict[str, Model], dic
     """
     models: dict[str, Model] = {}
     notes: dict[str, str] = {}
+    max_num_points = min(MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE // max(1, len(paths)))
     for name, path in paths.items():
         if path is None:
             notes[name] = "There is no model."
             continue
         try:
-            models[name] = _read(path)
+            models[name] = _read(path, max_num_points)
         except AffrectError as error:
             notes[name] = f"The model cannot be shown: {error}"
     return (_in_one_frame(models, notes) if models else {}), notes
 
 
-def _zoom_from_above(models: Sequence[Model]) -> float:
-    """Return the zoom, 1 to 3, with which cameras and nearly all points fill the still picture."""
-    if not models:
-        return 1.0
-    reach = np.max(
-        [
-            np.percentile(np.abs(places), share, axis=0)
-            for model in models
-            for places, share in ((model.points, POINT_PERCENTILE), (model.centers, 100.0))
-            if len(places)
-        ],
-        axis=0,
-    )
-    width, height = STILL_SIZE_PX
-    zoom = min(width / height / max(reach[0], 1e-9), 1.0 / max(reach[1], 1e-9)) / RADIUS_MARGIN
-    return float(np.clip(zoom, 1.0, 3.0))
-
-
-def _read(path: Path) -> Model:
+def _read(path: Path, max_num_points: int) -> Model:
     registered_names(path)
     model = pycolmap.Reconstruction(path)
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
@@ -167,8 +136,8 @@ def _read(path: Path) -> Model:
         focal_px = camera.mean_focal_length()
         sizes.append([camera.width / focal_px / 2, camera.height / focal_px / 2])
     ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
-    if len(ids) > MAX_NUM_POINTS:
-        ids = np.random.default_rng(0).choice(ids, MAX_NUM_POINTS, replace=False)
+    if len(ids) > max_num_points:
+        ids = np.random.default_rng(0).choice(ids, max_num_points, replace=False)
     points = [model.points3D[point_id] for point_id in ids.tolist()]
     return Model(
         tuple(image.name for image in images),
@@ -227,9 +196,10 @@ def similarity_of(source: Model, target: Model) -> tuple[float, Array, Array] | 
 
 
 def _upright(model: Model) -> Model:
-    """Turn a model so that z is up, as cameras are held on average, and x is its long side.
+    """Turn a model so that z is up, as cameras are held on average, and y is where they look.
 
-    The middle of cameras and points goes to the origin, and the scale is that of the view.
+    Where they look in all directions, x is the long side. The middle of cameras and points goes to
+    the origin, and the scale is that of the view.
     """
     up = -model.axes[:, :, 1].mean(axis=0)
     if np.linalg.norm(up) < 1e-6:
@@ -242,6 +212,10 @@ def _upright(model: Model) -> Model:
     distances = np.linalg.norm(flat, axis=1)
     near = flat[distances <= np.percentile(distances, POINT_PERCENTILE)]
     along = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][0] @ level
+    ahead = model.axes[:, :, 2] @ level.T
+    common = (ahead / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]).mean(axis=0)
+    if np.linalg.norm(common) > MIN_COMMON_DIRECTION:
+        along = np.cross(common / np.linalg.norm(common) @ level, up)
     rotation = np.stack([along, np.cross(up, along), up])
     centers, points = model.centers @ rotation.T, model.points @ rotation.T
     spread = np.linalg.norm(points - np.median(points, axis=0), axis=1) if len(points) else []
@@ -252,20 +226,17 @@ def _upright(model: Model) -> Model:
     return model.transformed(1 / radius, rotation, -middle / radius)
 
 
-def _view(model: Model, note: str, zoom: float) -> View3D:
+def _view(model: Model, note: str) -> View3D:
     inside = np.abs(model.points).max(axis=1, initial=0.0) <= 1.0
     points, colors = model.points[inside], model.colors[inside]
     if not colors.any():
         colors = np.full_like(colors, 128)
     colors = (DARKEST + colors.astype(np.float64) / 255 * COLOR_RANGE).astype(np.uint8)
     quantised = np.rint((points + 1.0) / 2.0 * np.iinfo(np.uint16).max).astype("<u2")
-    cameras = tuple(zip(model.names, _pyramids(model), strict=True))
     return View3D(
         len(points),
         base64_text(quantised.tobytes() + colors.tobytes()),
-        cameras,
-        _still(points, colors, zoom),
-        tuple((name, _still_path(corners, zoom)) for name, corners in cameras),
+        tuple(zip(model.names, _pyramids(model), strict=True)),
         note,
     )
 
@@ -278,29 +249,3 @@ def _pyramids(model: Model) -> Array:
     corners[:, :, :2] = signs * half[:, None]
     turned = np.einsum("mab,mcb->mca", model.axes, corners * CAMERA_DEPTH)
     return np.concatenate([model.centers[:, None], model.centers[:, None] + turned], axis=1)
-
-
-def _on_still(points: Array, zoom: float) -> Array:
-    """Return the (N, 2) px on the still picture of (N, 3) points, seen from above."""
-    width, height = STILL_SIZE_PX
-    scale = zoom * height / 2
-    return points[:, :2] * [scale, -scale] + [width / 2, height / 2]
-
-
-def _still(points: Array, colors: NDArray[np.uint8], zoom: float) -> Picture:
-    width, height = STILL_SIZE_PX
-    image = np.zeros((height, width, 4), np.uint8)
-    order = np.argsort(points[:, 2], kind="stable")
-    places = np.floor(_on_still(points[order], zoom)).astype(int)
-    inside = (places >= 0).all(axis=1) & (places < STILL_SIZE_PX).all(axis=1)
-    (columns, rows), shown = places[inside].T, colors[order][inside]
-    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        x, y = np.clip(columns + right, 0, width - 1), np.clip(rows + down, 0, height - 1)
-        image[y, x, :3], image[y, x, 3] = shown, 255
-    return Picture.png(image)
-
-
-def _still_path(corners: Array, zoom: float) -> str:
-    places = [f"{x:.0f} {y:.0f}" for x, y in _on_still(corners, zoom)]
-    base = "L".join(places[1:])
-    return f"M{base}Z" + "".join(f"M{places[0]}L{place}" for place in places[1:])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.report.pictures import Picture, base64_text
+from colmap_affrect.report.pictures import base64_text
 
 CLASS_STARTS = (1, 30, 60, 120, 240, 480)
 """Smallest number of inliers of each class."""
@@ -24,12 +24,14 @@ CLASS_WIDTHS = (1.2, 2.0, 3.0, 4.2, 5.6, 7.2)
 
 GRAPH_SIZE = (640.0, 460.0)
 MAX_NUM_THUMBNAILS = 60
-"""With more photographs the nodes are dots, and the matrix is an image."""
+"""With more photographs the nodes are dots."""
+MAX_NUM_LAID_OUT, MAX_NUM_IN_MATRIX = 300, 1000
+"""With more photographs the nodes are on a circle; and there is no matrix."""
 
-MAX_NODE, MIN_NODE, DOT = 84.0, 24.0, 9.0
+MAX_NODE, MIN_NODE, DOT = 64.0, 22.0, 9.0
 """Sides of nodes in units of the graph."""
 
-MIDDLE, GRAVITY = "", 0.05
+MIDDLE, GRAVITY = "", 0.1
 """A node and the weight of its edges to all others: they hold parts of the graph
 together that have no edge between them."""
 
@@ -90,14 +92,19 @@ def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layou
     """Place photographs so that those which share many inliers in any graph are close."""
     count = len(names)
     size = DOT
+    if count > MAX_NUM_LAID_OUT:
+        turn = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+        places = np.stack([np.sin(turn), -np.cos(turn)], axis=1)
+        return Layout((places + 1) / 2 * (np.array(GRAPH_SIZE) - size) + size / 2, size)
     if count <= MAX_NUM_THUMBNAILS:
-        size = min(MAX_NODE, max(MIN_NODE, 0.45 * sqrt(GRAPH_SIZE[0] * GRAPH_SIZE[1] / count)))
+        size = min(MAX_NODE, max(MIN_NODE, 0.3 * sqrt(GRAPH_SIZE[0] * GRAPH_SIZE[1] / count)))
     graph = networkx.Graph()
     graph.add_nodes_from(names)
+    strongest = log(1 + max((count for pairs in graphs for count in pairs.values()), default=1))
     for pairs in graphs:
         for pair, inliers in pairs.items():
             known = graph.get_edge_data(*pair, default={"weight": 0.0})["weight"]
-            graph.add_edge(*pair, weight=max(known, log(1 + inliers)))
+            graph.add_edge(*pair, weight=max(known, log(1 + inliers) / strongest))
     graph.add_weighted_edges_from((name, MIDDLE, GRAVITY) for name in names)
     places = networkx.spring_layout(graph, seed=0, iterations=200 if count < 100 else 60)
     centers = np.array([places[name] for name in names])
@@ -140,49 +147,13 @@ def edge_paths(
     return [(number, "".join(parts[number])) for number in sorted(parts)]
 
 
-@dataclass(frozen=True)
-class Matrix:
-    """Verified inliers of all pairs of one graph.
-
-    Attributes:
-        counts: (N * N) uint16, row by row, little-endian, as base64.
-        cells: (class, SVG path of its cells of side 1); empty where there is an image.
-        image: the matrix as an image of N x N px, for many photographs.
-        labels: (row, column, count, class) to write into cells, for few photographs.
-    """
-
-    counts: str
-    cells: list[tuple[int, str]]
-    image: Picture | None
-    labels: list[tuple[int, int, int, int]]
-
-
-MAX_NUM_LABELLED = 14
-"""Photographs up to which the numbers are written into the cells."""
-
-
-def matrix(names: Sequence[str], pair_inliers: Mapping[Pair, int]) -> Matrix:
-    """Make the symmetric matrix of inliers of pairs."""
+def matrix(names: Sequence[str], pair_inliers: Mapping[Pair, int]) -> str:
+    """Return the symmetric (N, N) uint16 inliers of pairs, row by row, as base64."""
+    if len(names) > MAX_NUM_IN_MATRIX:
+        return ""
     index = {name: number for number, name in enumerate(names)}
     counts = np.zeros((len(names), len(names)), dtype="<u2")
     for (name1, name2), inliers in pair_inliers.items():
         row, column = index[name1], index[name2]
         counts[row, column] = counts[column, row] = min(inliers, np.iinfo(np.uint16).max)
-    text = base64_text(counts.tobytes())
-    classes = np.searchsorted(CLASS_STARTS, counts, side="right") - 1
-    if len(names) > MAX_NUM_THUMBNAILS:
-        palette = [[*bytes.fromhex(color[1:]), 255] for color in CLASS_COLORS]
-        colors = np.array([*palette, [0, 0, 0, 0]], np.uint8)
-        return Matrix(text, [], Picture.png(colors[classes]), [])
-    cells = [
-        (
-            number,
-            "".join(f"M{column} {row}h1v1h-1z" for row, column in np.argwhere(classes == number)),
-        )
-        for number in np.unique(classes[classes >= 0]).tolist()
-    ]
-    labels = [
-        (row, column, int(counts[row, column]), int(classes[row, column]))
-        for row, column in np.argwhere(counts).tolist()
-    ]
-    return Matrix(text, cells, None, labels if len(names) <= MAX_NUM_LABELLED else [])
+    return base64_text(counts.tobytes())

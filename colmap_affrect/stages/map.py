@@ -25,6 +25,7 @@ from colmap_affrect.mappers.attempts import (
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
+from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import INPUTS, Workspace
@@ -86,7 +87,7 @@ def map_images(
     copied = is_copy(workspace)
     task = MappingTask(
         workspace.database,
-        copied_image_path(workspace) if copied else Path(Inputs.recorded(workspace).image_path),
+        image_path_of(workspace),
         existing,
         guided={} if copied else guided_matches(context),
         cameras=read_camera_records(workspace.cameras),
@@ -124,6 +125,13 @@ def _inputs(workspace: Workspace, extend: Extension | None) -> str:
         return geometry
     own = extend.model_path.resolve().is_relative_to(workspace.sparse.resolve())
     return f"{geometry} {'own' if own else extend.digest()}"
+
+
+def image_path_of(workspace: Workspace) -> Path | None:
+    """Return the folder of the photographs, None where another program's database names none."""
+    if is_copy(workspace):
+        return copied_image_path(workspace)
+    return Path(Inputs.recorded(workspace).image_path)
 
 
 def image_names(workspace: Workspace) -> list[str]:
@@ -222,9 +230,12 @@ def _ignore(_: int) -> None:
     pass
 
 
-def num_verified_pairs(workspace: Workspace) -> int:
-    """Return the number of pairs with a two-view geometry."""
-    return len(verified_pairs(workspace.database, _min_num_inliers(workspace)))
+def verified_inliers(workspace: Workspace) -> dict[Pair, int]:
+    """Return the number of inliers of each verified pair, by the names of its images."""
+    ids = colmap_database.image_ids(workspace.database)
+    names = {image_id: name for name, image_id in ids.items()}
+    pairs = verified_pairs(workspace.database, _min_num_inliers(workspace))
+    return {(names[first], names[second]): count for (first, second), count in pairs.items()}
 
 
 def _min_num_inliers(workspace: Workspace) -> int:
@@ -239,7 +250,7 @@ def unregistered(
     workspace = context.workspace
     num_keypoints = colmap_database.keypoint_counts(workspace.database)
     ids = colmap_database.image_ids(workspace.database)
-    verified = _verified_by_name(workspace.database, _min_num_inliers(workspace))
+    verified = _verified_by_name(workspace)
     elsewhere = {
         name: f"in another model, sparse/{index}"
         for index, model in reversed(list(enumerate(models)))
@@ -267,12 +278,10 @@ def unregistered(
     return reasons
 
 
-def _verified_by_name(database_path: Path, min_num_inliers: int) -> dict[str, dict[str, int]]:
+def _verified_by_name(workspace: Workspace) -> dict[str, dict[str, int]]:
     """Return for each image of a verified pair its partners, and how many inliers they share."""
-    names = {image_id: name for name, image_id in colmap_database.image_ids(database_path).items()}
     found: defaultdict[str, dict[str, int]] = defaultdict(dict)
-    for pair, count in verified_pairs(database_path, min_num_inliers).items():
-        first, second = (names[image_id] for image_id in pair)
+    for (first, second), count in verified_inliers(workspace).items():
         found[first][second] = found[second][first] = count
     return dict(found)
 
@@ -290,8 +299,7 @@ def advice(
     if not missing:
         return ()
     workspace = context.workspace
-    min_num_inliers = recorded_verification(workspace).min_num_inliers
-    verified = _verified_by_name(workspace.database, min_num_inliers)
+    verified = _verified_by_name(workspace)
     recipe, again = workspace.recipe(), "run again with"
     texts = []
     cameras, inputs = colmap_database.all_cameras(workspace.database), Inputs.recorded(workspace)

@@ -1,0 +1,241 @@
+"""A run as one page, ``report.html`` beside ``report.json``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from colmap_affrect.options import flat
+from colmap_affrect.pairs.base import Pair
+from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.report import ModelSummary, ReconstructionReport
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report import view_graph
+from colmap_affrect.report.page import TEMPLATES, number_text, write_page
+from colmap_affrect.report.pictures import thumbnails
+from colmap_affrect.report.scene import read_scene
+
+KINDS = {
+    "tracks": "registered by common points",
+    "guided": "by guided matches",
+    "bridged": "bridged by one pair",
+    "existing": "was in the model",
+    "doubtful": "doubtful",
+}
+"""How cameras came in; each has a colour of this name."""
+
+FILTERS = {
+    "all": "All", "missing": "Missing", "doubtful": "Doubtful", "added": "New",
+    "guided": "Guided", "bridged": "Bridged",
+}  # fmt: skip
+
+SOURCES = {
+    "given": "given",
+    "exif": "EXIF",
+    "exif-rescaled": "EXIF, scaled to a photograph that was shrunk",
+    "pairs": "verified pairs",
+    "guess": "guess",
+}
+
+MAX_NUM_CAMERAS = 200
+"""In the table; report.json has all."""
+
+MAX_NAMES = 3
+
+
+@dataclass(frozen=True)
+class Fate(view_graph.Node):
+    """What became of a photograph.
+
+    Attributes:
+        kind: one of ``KINDS``, or ``missing``.
+        groups: of ``FILTERS``.
+    """
+
+    kind: str
+    groups: tuple[str, ...]
+
+
+def write_run_page(
+    workspace: Workspace,
+    report: ReconstructionReport,
+    names: Sequence[str],
+    pair_inliers: Mapping[Pair, int],
+    image_path: Path | None,
+    progress: Progress = SILENT,
+) -> Path:
+    """Write ``report.html`` into the folder of a run, one file that loads nothing.
+
+    Args:
+        workspace: with models.
+        report: of the run.
+        names: of all photographs.
+        pair_inliers: of the verified pairs, by names.
+        image_path: folder of the photographs; None where it is not known.
+        progress: where to show progress.
+
+    Raises:
+        WorkspaceError: when it cannot be written.
+    """
+    model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
+    cards = [_fate(number, name, report, model) for number, name in enumerate(names, 1)]
+    index = {name: number for number, name in enumerate(names)}
+    pair_inliers = {pair: n for pair, n in pair_inliers.items() if index.keys() >= set(pair)}
+    (view,) = read_scene({"this run": workspace.sparse / "0" if report.models else None})
+    kinds = Counter(card.kind for card in cards)
+    layout = view_graph.lay_out(names, [pair_inliers])
+    matrix = view_graph.matrix(names, pair_inliers)
+    content = {
+        "headline": f"{len(model.registered_names)} of {len(names)} photographs registered",
+        "about": _about(report),
+        "doubts": _doubts(report, model),
+        "advice": report.advice,
+        "tiles": _tiles(report, model),
+        "view": view,
+        "kinds": {kind: f"{text} ({kinds[kind]})" for kind, text in KINDS.items() if kinds[kind]},
+        "cards": cards,
+        "filters": FILTERS,
+        "thumbnails": thumbnails(image_path, names, progress) if image_path else {},
+        "image_index": index,
+        "num_pairs": len(pair_inliers),
+        "layout": layout,
+        "edges": view_graph.edge_paths(names, layout, pair_inliers),
+        "matrix": matrix,
+        "guided": _guided(report),
+        **_cameras(report, index),
+        "stages": _stages(report),
+        "settings": _settings(report),
+        "script_data": {
+            "matrices": [matrix],
+            "views": [view.script_data(index, {card.name: card.kind for card in cards})],
+        },
+    }
+    folders = [workspace.path.resolve(), *([image_path.resolve()] if image_path else [])]
+    return write_page(workspace.page, TEMPLATES / "run.html", content, folders)
+
+
+def _about(report: ReconstructionReport) -> str:
+    by = f"recipe {report.recipe}" if report.recipe else "the database of another program"
+    return (
+        f"colmap-affrect {report.versions['colmap-affrect']}, {by}, {report.mapping['name']} "
+        f"mapper, preset {report.preset}."
+    )
+
+
+def _fate(number: int, name: str, report: ReconstructionReport, model: ModelSummary) -> Fate:
+    if name not in set(model.registered_names):
+        text = report.unregistered.get(name, "not registered")
+        text += f": {report.failures[name]}" if name in report.failures else ""
+        return Fate(number, name, "never", False, text, kind="missing", groups=("all", "missing"))
+    arrival = model.arrivals.get(name)
+    kind = arrival.how if arrival else "tracks"
+    text = "registered" if not arrival or kind == "tracks" else arrival.text()
+    if name in report.extended:
+        kind, text = "existing", KINDS["existing"]
+    groups = ["all", kind, *(["added"] if name in report.added else [])]
+    is_doubtful = name in model.doubtful
+    if is_doubtful:
+        kind, text = "doubtful", f"{text}; doubtful: {model.doubtful[name]}"
+        groups.append("doubtful")
+    return Fate(number, name, "always", is_doubtful, text, kind=kind, groups=tuple(groups))
+
+
+def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
+    """Return what cannot be trusted, the model as a whole first."""
+    texts = [] if report.models else ["No model was found."]
+    texts += [f"The whole model: {why}." for why in model.doubts]
+    texts += [f"{name}: {why}" for name, why in model.doubtful.items()]
+    texts += [
+        f"{name}: focal lengths from {low:.0f} to {high:.0f} px fit as well"
+        for name, (low, high) in model.rival_focals_px.items()
+    ]
+    if report.contradicting_pairs:
+        total = sum(report.contradicting_pairs.values())
+        texts.append(f"The model contradicts {total} of the verified pairs.")
+    return [*texts, *(f"{name}: {why}" for name, why in report.warnings.items())]
+
+
+def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
+    """Return the numbers that are read first."""
+    return {
+        "photographs in the model": f"{len(model.registered_names)} of {report.images_total}",
+        "verified pairs": f"{report.num_verified_pairs:,} of {report.num_pairs:,}",
+        "points": f"{model.num_points3D:,}",
+        "photographs per point": f"{model.mean_track_length:.2f}",
+        "reprojection error": f"{model.mean_reprojection_error_px:.2f} px",
+        "seconds": number_text(sum(stage.wall_s for stage in report.stages)),
+        **({"models": str(len(report.models))} if len(report.models) > 1 else {}),
+    }
+
+
+def _guided(report: ReconstructionReport) -> str:
+    if not report.guided:
+        return ""
+    return (
+        "Guided matching took {pairs} pairs from {matches_before:,} to {matches_after:,} inliers."
+    ).format(**report.guided)
+
+
+def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str, Any]:
+    """Return the table of cameras, each with its place on the scale of all focal lengths."""
+    shown = report.cameras[:MAX_NUM_CAMERAS]
+    values = [value for camera in shown for value in _focals(camera)]
+    low, high = (min(values), max(values)) if values else (0.0, 0.0)
+    scale = 100 / (high - low) if high > low else 0.0
+    rows = []
+    for camera in shown:
+        spread = camera["rival_px"] or camera["spread_px"]
+        ends = spread or [camera["focal_px"]] * 2
+        refined = camera["refined_px"]
+        rows.append(
+            {
+                "photographs": _photographs(camera["names"], index),
+                "focal": f"{camera['focal_px']:,.0f}",
+                "refined": f"{refined:,.0f}" if refined else "-",
+                "spread": "{:,.0f} to {:,.0f}".format(*spread) if spread else "-",
+                "source": f"{SOURCES[camera['source']]}{camera['why'] and ': '}{camera['why']}",
+                "low": round((ends[0] - low) * scale, 1),
+                "high": round((ends[1] - low) * scale, 1),
+                "at": round(((refined or camera["focal_px"]) - low) * scale, 1),
+            }
+        )
+    counts = Counter(camera["source"] for camera in report.cameras)
+    sources = ", ".join(f"{count} by {SOURCES[key]}" for key, count in counts.most_common())
+    more = len(report.cameras) - len(rows)
+    total = len(report.cameras)
+    note = f"{total} camera{'s' if total != 1 else ''}, focal lengths: {sources}."
+    note += f" The first {len(rows)} are listed, report.json has all." if more else ""
+    has_range = any(row["spread"] != "-" for row in rows)
+    return {"cameras": rows, "camera_note": note, "has_range": has_range}
+
+
+def _focals(camera: Mapping[str, Any]) -> list[float]:
+    spread = camera["rival_px"] or camera["spread_px"] or []
+    return [value for value in (camera["focal_px"], camera["refined_px"], *spread) if value]
+
+
+def _photographs(names: Sequence[str], index: Mapping[str, int]) -> str:
+    shown = ", ".join(f"{index[name] + 1} {name}" for name in names[:MAX_NAMES] if name in index)
+    return shown + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")
+
+
+def _stages(report: ReconstructionReport) -> list[dict[str, Any]]:
+    longest = max((stage.wall_s for stage in report.stages), default=0.0) or 1.0
+    return [
+        {"label": stage.name, "shares": [stage.wall_s / longest], "text": f"{stage.wall_s:.1f}"}
+        for stage in report.stages
+    ]
+
+
+def _settings(report: ReconstructionReport) -> dict[str, Mapping[str, Any]]:
+    settings = {
+        "Two-view geometry": flat(report.verification),
+        "Mapping": flat(report.mapping),
+        "What differs from COLMAP's defaults": flat(report.differs_from_colmap),
+        "Verified pairs by level of the recipe": report.pair_levels,
+        "Versions": report.versions,
+    }
+    return {title: values for title, values in settings.items() if values}

@@ -1,0 +1,90 @@
+"""What the page of a run says, and what it must not have."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_run import NAMES, make_run_page, small_report
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report import view_graph
+from colmap_affrect.report.run_page import write_run_page
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("run")
+
+
+@pytest.fixture(scope="module")
+def html(folder: Path) -> str:
+    return make_run_page(folder).read_text(encoding="utf-8")
+
+
+def test_everything_of_the_report_is_told(html: str) -> None:
+    for text in (
+        "<title>4 of 6 photographs registered</title>", "The whole model: hardly any parallax.",
+        "d.png: hangs on few &lt;points&gt;", "c.png: focal lengths from 150 to 260 px fit as well",
+        "--camera-mode single", "no verified pair", "unreadable: f.png: not a readable image",
+        "12 of 15 depths agree, scale +-3.1%", "took 2 pairs from 20 to 1,050 inliers",
+        "1 camera, focal lengths: 1 by verified pairs.", "180 to 230", "they vote",
+        "15 verified pairs", "model: an &lt;old&gt; one",
+    ):  # fmt: skip
+        assert text in html
+    assert html.index("What to doubt") < html.index("What to try next") < html.index("<main>")
+
+
+def test_page_loads_nothing_and_names_are_never_markup(html: str) -> None:
+    assert re.findall(r"https?://[^\s\"'<]*", html) == []
+    assert "default-src 'none'" in html
+    assert "<img src=x" not in html
+    assert "\u202e" not in html
+    assert r"b\u202egnp.c" in html
+
+
+def test_no_folder_of_this_machine_is_in_the_page(html: str, folder: Path) -> None:
+    assert str(folder) not in html
+    assert "/home/" not in html
+
+
+def test_cameras_are_where_the_model_has_them_seen_from_the_front(html: str, folder: Path) -> None:
+    data = json.loads(html.split('id="data">')[1].split("</script>")[0])
+    assert data["names"][0] == NAMES[0]
+    (view,) = data["views"]
+    kinds = {camera["index"]: camera["kind"] for camera in view["cameras"]}
+    assert kinds == {0: "tracks", 1: "guided", 2: "bridged", 3: "doubtful"}
+    model = pycolmap.Reconstruction(folder / "out" / "sparse" / "0")
+    centers = {image.name: image.projection_center() for image in model.images.values()}
+    shown = np.array([camera["corners"][:3] for camera in view["cameras"]])
+    true = np.array([centers[NAMES[camera["index"]]] for camera in view["cameras"]])
+
+    def lengths(points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points[:, None] - points[None], axis=2)[np.triu_indices(4, 1)]
+
+    ratios = lengths(shown) / lengths(true)
+    np.testing.assert_allclose(ratios, ratios[0], rtol=2e-3)
+
+
+def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
+    report = small_report(tmp_path)
+    values = {"models": (), "unregistered": dict.fromkeys(NAMES, "no features"), "cameras": ()}
+    nothing = type(report)(**{**vars(report), **values})
+    path = write_run_page(Workspace(tmp_path), nothing, NAMES, {}, None)
+    html = path.read_text(encoding="utf-8")
+    for text in ("No model was found.", "There is no model.", "No pair of photographs is verified"):
+        assert text in html
+    assert html.count("no picture</span>") == 6
+
+
+def test_hundreds_of_photographs_are_on_a_circle_without_a_large_matrix() -> None:
+    names = [f"{number}.jpg" for number in range(1200)]
+    layout = view_graph.lay_out(names, [{(names[0], names[1]): 50}])
+    middle = np.array(view_graph.GRAPH_SIZE) / 2
+    from_middle = (layout.centers - middle) / (middle - layout.node_size / 2)
+    np.testing.assert_allclose(np.linalg.norm(from_middle, axis=1), 1.0, atol=1e-6)
+    assert view_graph.matrix(names, {(names[0], names[1]): 50}) == ""

@@ -1,0 +1,83 @@
+"""A finished run whose photographs, database and model are on disk, made without running it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from small_comparison import IMAGE_SIZE, write_scene
+from synthetic import texture, write_image
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.project.report import (
+    Arrival,
+    ModelSummary,
+    ReconstructionReport,
+    StageReport,
+)
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.report.run_page import write_run_page
+
+NAMES = ("<img src=x onerror=alert(1)>.png", "b\u202egnp.c", "c.png", "d.png", "e.png", "f.png")
+"""The second one is shown turned round where nobody takes care."""
+
+
+def small_report(folder: Path) -> ReconstructionReport:
+    """Four of six photographs, each of which came in in another way; paths in what is said."""
+    model = ModelSummary(
+        NAMES[:4],
+        90,
+        3.5,
+        0.25,
+        doubtful={NAMES[3]: "hangs on few <points>"},
+        doubts=("hardly any parallax",),
+        arrivals={
+            NAMES[0]: Arrival("tracks"),
+            NAMES[1]: Arrival("guided"),
+            NAMES[2]: Arrival("bridged", NAMES[0], 12, 15, 0.031),
+            NAMES[3]: Arrival("tracks"),
+        },
+        rival_focals_px={NAMES[2]: (150.0, 260.0)},
+    )
+    camera = {
+        "id": 1, "num_images": 6, "names": list(NAMES), "source": "pairs", "focal_px": 200.0,
+        "refined_px": 204.4, "rival_px": None, "spread_px": [180.0, 230.0], "why": "they vote",
+    }  # fmt: skip
+    failure = f"{folder / 'photographs' / 'f.png'}: not a readable image"
+    return ReconstructionReport(
+        images_total=6,
+        unregistered={NAMES[4]: "no verified pair", NAMES[5]: "unreadable"},
+        models=(model,),
+        num_verified_pairs=15,
+        num_pairs=15,
+        stages=(
+            StageReport("extract", 6.5, 5, failures={NAMES[5]: failure}),
+            StageReport("map", 3.25, 1, warnings={"/home/someone/model": "an <old> one"}),
+        ),
+        recipe="default",
+        versions={"colmap-affrect": "1.2.3"},
+        presets=("sparse", "sparse"),
+        verification={"max_error_px": 3.0},
+        mapping={"name": "sparse", "mapper_options": {}},
+        differs_from_colmap={},
+        advice=("--camera-mode single", "more photographs"),
+        guided={"pairs": 2, "matches_before": 20, "matches_after": 1050},
+        cameras=(camera,),
+    )
+
+
+def make_run_page(folder: Path) -> Path:
+    """Write the page of the small run."""
+    photographs = folder / "photographs"
+    photographs.mkdir()
+    for number, name in enumerate(NAMES[:5]):
+        write_image(folder / "texture.png", texture(IMAGE_SIZE, number))
+        (folder / "texture.png").rename(photographs / name)
+    (photographs / NAMES[5]).write_bytes(b"no image")
+    workspace = Workspace(folder / "out")
+    (workspace.sparse / "0").mkdir(parents=True)
+    model, pairs = write_scene(workspace.database, NAMES)
+    for image in list(model.images.values()):
+        if image.name not in NAMES[:4]:
+            model.deregister_frame(image.frame_id)
+    pycolmap.Reconstruction(model).write(workspace.sparse / "0")
+    return write_run_page(workspace, small_report(folder), NAMES, pairs, photographs)
