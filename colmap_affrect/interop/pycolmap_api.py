@@ -275,6 +275,7 @@ def verify(
     verification = translate.verification_options(options, random_seed)
     refuse_unusable(path, path)
     advance = _advance_unless_cancelled(cancellation_token)
+    advance(0)
     if pairs_path is None:
         verify_database(path, verification, advance=advance)
     else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import itertools
+import shutil
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -42,11 +43,17 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def once_extracted(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("extracted")
+    colmap_affrect.extract_features(folder / "a.db", photos, extraction_options=COARSE)
+    return folder
+
+
 @pytest.fixture
-def extracted(photos: Path, tmp_path: Path) -> Path:
-    path = tmp_path / "a.db"
-    colmap_affrect.extract_features(path, photos, extraction_options=COARSE)
-    return path
+def extracted(once_extracted: Path, tmp_path: Path) -> Path:
+    shutil.copytree(once_extracted, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "a.db"
 
 
 def changed_import(source: str) -> ModuleType:
@@ -249,6 +256,7 @@ def test_cancelled_token_stops_and_what_is_done_is_kept(photos: Path, tmp_path: 
         replaced.match_exhaustive(path, cancellation_token=token)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "device", "message"),
     [
