@@ -326,6 +326,8 @@ class _Given:
 def _match(given: _Given, choose: Callable[[Context], Iterable[Pair]], token: Token) -> Reports:
     """Match pairs and do what pycolmap's options ask for besides."""
     ours = given.ours
+    if unknown := ours.keys() - Ours.__annotations__.keys():
+        raise TypeError(f"unexpected keyword argument {min(unknown)!r}")
     verification = translate.verification_options(given.verification, ours.get("random_seed"))
     matching, asked = translate.matching_options(given.matching)
     shown = _Cancellable(ours.get("progress", SILENT), token)

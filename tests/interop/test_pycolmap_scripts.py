@@ -180,6 +180,8 @@ def test_what_matching_options_ask_for_is_done(extracted: Path) -> None:
 
 def test_pairs_are_those_of_pycolmaps_generators(extracted: Path) -> None:
     in_order = pycolmap.SequentialPairingOptions(overlap=1, quadratic_overlap=False)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'pairs_options'"):
+        replaced.match_sequential(extracted, pairs_options=in_order)
     match, _ = replaced.match_sequential(extracted, pairing_options=in_order)
     assert match.num_done == len(NAMES) - 1
     with pytest.raises(AffrectError, match="0 images have a position"):
