@@ -6,7 +6,7 @@ public names are loaded when first used, so that importing the package stays lig
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import logging
 import sys
 import zlib
@@ -48,12 +48,15 @@ _PUBLIC = {
     "extract_features": "colmap_affrect.interop.pycolmap_api",
     "extract_image": "colmap_affrect.stages.one_image",
     "load_recipe": "colmap_affrect.recipes",
-    "incremental_mapping": "colmap_affrect.interop.pycolmap_api",
+    "incremental_mapping": "colmap_affrect.interop.pycolmap_mapping",
     "map_from_database": "colmap_affrect.pipeline",
     "match_exhaustive": "colmap_affrect.interop.pycolmap_api",
     "match_image_pairs": "colmap_affrect.interop.pycolmap_api",
+    "match_sequential": "colmap_affrect.interop.pycolmap_api",
+    "match_spatial": "colmap_affrect.interop.pycolmap_api",
     "run": "colmap_affrect.pipeline",
     "verify": "colmap_affrect.interop.pycolmap_api",
+    "verify_matches": "colmap_affrect.interop.pycolmap_api",
 }
 
 __all__ = ["__version__"]
@@ -62,5 +65,12 @@ __all__ += list(_PUBLIC)
 
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{_hint(name)}")
     return getattr(importlib.import_module(_PUBLIC[name]), name)
+
+
+def _hint(name: str) -> str:
+    """Return what replaces a name of pycolmap; modules of ours are looked for before they load."""
+    if name.startswith("_") or importlib.util.find_spec(f"{__name__}.{name}"):
+        return ""
+    return str(importlib.import_module(f"{__name__}.pycolmap").hint(name))

@@ -280,11 +280,12 @@ def export_h5(options: argparse.Namespace) -> int:
 
 
 def export_database(options: argparse.Namespace) -> int:
-    from colmap_affrect.colmap.old_databases import export_database
+    from colmap_affrect.colmap.old_databases import MAPPER_OPTIONS, export_database
     from colmap_affrect.project.workspace import Workspace
 
     path = Workspace(options.path).database if options.path.is_dir() else options.path
     notes = export_database(path, options.database_path)
+    notes.append(f"of few photographs: colmap mapper {MAPPER_OPTIONS}")
     show("\n".join([f"{options.database_path}: for COLMAP {options.colmap} to 3.13", *notes]))
     return EXIT_OK
 

@@ -7,9 +7,10 @@ index out of range would later end the Python process.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,28 +72,38 @@ def nearest_positions(
 ) -> list[tuple[str, str]]:
     """Return the pairs of images that were taken near to each other, by COLMAP's pose priors.
 
-    Heights are ignored, as in COLMAP's spatial matcher: those of GPS are rough.
-
-    Args:
-        path: of the database.
-        num_neighbors: how many neighbours of each image at most, the nearest ones.
-        max_distance_m: largest distance; in the unit of the priors if they are Cartesian.
-
-    Raises:
-        DatabaseError: when fewer than two images have a position.
+    Heights are ignored, as in COLMAP's spatial matcher: those of GPS are rough. Distances are in
+    the unit of the priors if they are Cartesian. Raises DatabaseError, see :func:`spatial_pairs`.
     """
     options = pycolmap.SpatialPairingOptions(
         max_num_neighbors=num_neighbors, max_distance=max_distance_m, ignore_z=True
     )
+    return spatial_pairs(path, options)
+
+
+def spatial_pairs(path: Path, options: pycolmap.SpatialPairingOptions) -> list[tuple[str, str]]:
+    """Return the pairs of COLMAP's spatial matcher.
+
+    Raises:
+        DatabaseError: when fewer than two images have a position.
+    """
     with open_database(path) as database:
-        positions = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
-        if len(positions) < 2:
-            raise DatabaseError(
-                f"{path}: {len(positions)} images have a position (GPS in EXIF, or pose priors); "
-                "choose pairs in another way"
-            )
+        count = sum(prior.has_position() for prior in database.read_all_pose_priors())
+    if count < 2:
+        raise DatabaseError(
+            f"{path}: {count} images have a position (GPS in EXIF, or pose priors); "
+            "choose pairs in another way"
+        )
+    return generated_pairs(path, pycolmap.SpatialPairGenerator, options)
+
+
+def generated_pairs(
+    path: Path, kind: Callable[[Any, pycolmap.Database], pycolmap.PairGenerator], options: object
+) -> list[tuple[str, str]]:
+    """Return the pairs of image names that a generator of pycolmap makes, sorted."""
+    with open_database(path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
-        found = pycolmap.SpatialPairGenerator(options, database).all_pairs()
+        found = kind(options, database).all_pairs()
     return sorted({(min(names[i], names[j]), max(names[i], names[j])) for i, j in found})
 
 

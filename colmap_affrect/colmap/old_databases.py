@@ -23,6 +23,12 @@ from colmap_affrect.project.atomic_files import cannot_write, require_space
 VERSION = 3800
 """What COLMAP 3.8 writes into ``user_version``; newer ones take the tables over by it."""
 
+MAPPER_OPTIONS = (
+    "--Mapper.tri_ignore_two_view_tracks 0 --Mapper.init_min_num_inliers 50 "
+    "--Mapper.init_min_tri_angle 8 --Mapper.abs_pose_min_num_inliers 12 --Mapper.min_model_size 2"
+)
+"""Our preset for few photographs: by its defaults ``colmap mapper`` finds less, or nothing."""
+
 LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
 """Camera models of COLMAP 3.8 have numbers up to this one."""
 

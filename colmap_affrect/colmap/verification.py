@@ -250,9 +250,10 @@ def _write(
     with pycolmap.DatabaseTransaction(database):
         for ids, geometry in done:
             database.write_two_view_geometry(*ids, geometry)
+    count = len(done)
+    done.clear()  # before advance, which may raise
     if advance:
-        advance(len(done))
-    done.clear()
+        advance(count)
 
 
 def read_image_cameras(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:

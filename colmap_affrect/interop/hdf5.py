@@ -39,6 +39,7 @@ from colmap_affrect.interop.hdf5_layouts import (
     check_names,
     created,
     feature_key,
+    keypoints_key,
     listed,
     match_datasets,
     one_match_per_keypoint,
@@ -46,7 +47,7 @@ from colmap_affrect.interop.hdf5_layouts import (
 )
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.stores import PairMatches
+from colmap_affrect.project.stores import PairMatches, frame_datasets
 from colmap_affrect.project.workspace import Workspace, temporary_folder
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.pairs import listed_pairs
@@ -132,13 +133,13 @@ def import_h5(
                 f"mode {cameras.mode} allows): {listed(lost)}"
             )
         counts, num_matches = _fill_database(new, files, pixel_origin, progress)
+        notes = [*files.notes, *_rounded(files)]
         num_verified = None
         if not skip_verification:
             with progress.stage("verify", len(files.pairs), "pairs") as advance:
                 verify(new, verification, advance=advance)
             num_verified = len(verified_pairs(new, verification.min_num_inliers))
         new.replace(database_path)
-    notes = list(files.notes)
     imported = set(names) - set(rejected)
     if without := sorted(imported - counts.keys()):
         notes.append(f"images without features are there without keypoints: {listed(without)}")
@@ -148,6 +149,17 @@ def import_h5(
         "imported", files.layout, len(imported), sum(counts.values()), len(files.pairs),
         num_matches, num_verified, tuple(notes),
     )  # fmt: skip
+
+
+def _rounded(files: ForeignFiles) -> list[str]:
+    """Say how far apart coordinates in float16 are, as deep-image-matching may write them."""
+    keys = [keypoints_key(files.features, key) for key in files.keys.values()]
+    half = [key for key in keys if files.features.file[key].dtype == np.float16]
+    if not half:
+        return []
+    largest = max(files.features.read(key, (None, 2)).max(initial=0) for key in half)
+    return [f"keypoints of {len(half)} images are float16, rounded to steps of "
+            f"{np.spacing(np.float16(largest)):g} px"]  # fmt: skip
 
 
 def _fill_database(
@@ -240,10 +252,10 @@ def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
 
 
 def _refuse_existing(path: Path, error: type[StoreError | DatabaseError]) -> None:
+    """Refuse a file that is there, and make the folder of one that is not."""
     if path.exists():
         raise error(f"{path}: exists already and is not overwritten; give another name")
-    if not path.parent.is_dir():
-        raise error(f"{path.parent}: no such folder; make it first")
+    path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def _check_range(
@@ -260,7 +272,7 @@ def _check_range(
 
 def _read_keypoints(source: Source, key: str, pixel_origin: str) -> NDArray[np.float32]:
     """Return the (N, 2), (N, 4) or (N, 6) keypoints of an image as COLMAP stores them."""
-    path = f"{key}/keypoints" if f"{key}/keypoints" in source.shapes else key
+    path = keypoints_key(source, key)
     lafs, scales, oris = (f"{key}/{name}" for name in ("lafs", "scales", "oris"))
     with np.errstate(over="ignore"):  # what float32 cannot hold is refused at the end
         points = source.read(path, (None, 2)).astype(np.float32)
@@ -305,7 +317,7 @@ class _WorkspaceContent:
             "descriptors": found.descriptors.T,
             "scores": found.responses,
         }
-        return self._sizes[name], data | _frame_datasets(found.lafs)
+        return self._sizes[name], data | frame_datasets(found.lafs)
 
     def matches(self) -> Iterator[PairMatches]:
         """Yield the raw matches of all pairs."""
@@ -335,7 +347,7 @@ class _DatabaseContent:
         columns = keypoints.shape[1]
         if columns == 6:
             shapes = keypoints[:, 2:].reshape(-1, 2, 2) * np.float32(MEASUREMENT_SIGMAS)
-            data |= _frame_datasets(np.concatenate([shapes, points[:, :, None]], axis=2))
+            data |= frame_datasets(np.concatenate([shapes, points[:, :, None]], axis=2))
         elif columns == 4:
             data |= {"scales": keypoints[:, 2], "oris": np.rad2deg(keypoints[:, 3])}
         if self._database.exists_descriptors(image.image_id):
@@ -373,19 +385,10 @@ def _content(
     if output_path is not None and database_path is None:
         workspace = Workspace(output_path)
         workspace.require("match")
-        with workspace.locked():
+        with workspace.locked_or_read_only():
             yield _WorkspaceContent(workspace)
     elif database_path is not None and output_path is None:
         with open_copy(database_path) as database:
             yield _DatabaseContent(database, str(database_path))
     else:
         raise OptionError("give either an output folder or a database")
-
-
-def _frame_datasets(lafs: NDArray[np.floating]) -> Datasets:
-    """Return (N, 2, 3) frames, and their scales in sigmas and orientations in degrees."""
-    shapes = lafs[:, :, :2].astype(np.float64)
-    scales = np.sqrt(np.abs(np.linalg.det(shapes))) / MEASUREMENT_SIGMAS
-    angles = np.rad2deg(np.arctan2(shapes[:, 1, 0], shapes[:, 0, 0]))
-    datasets = {"lafs": lafs, "scales": scales, "oris": angles}
-    return {name: values.astype(np.float32) for name, values in datasets.items()}

@@ -369,6 +369,11 @@ def feature_key(name: str, layout: str) -> str:
     return name if layout == "hloc" else PurePosixPath(name).name
 
 
+def keypoints_key(source: Source, key: str) -> str:
+    """Return the dataset of the keypoints of a group, or of one without groups."""
+    return f"{key}{KEYPOINTS}" if f"{key}{KEYPOINTS}" in source.shapes else key
+
+
 def match_datasets(pair: PairMatches, layout: str) -> tuple[str, Datasets]:
     """Return the group of a pair and its datasets."""
     if layout == "hloc":

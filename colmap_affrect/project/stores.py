@@ -2,7 +2,8 @@
 
 ``features.h5``: a group per image name with ``keypoints`` (N, 2) float32, ``descriptors``
 (D, N) float16, ``scores`` (N,), ``image_size`` (width, height) and, of our own, ``lafs``
-(N, 2, 3) float32, ``rectification_ids`` (N,), and ``level_ends``: the features of level k of
+(N, 2, 3) float32 and, for hloc's matchers, their ``scales`` (sigmas in px) and ``oris`` (degrees
+from x towards y), ``rectification_ids`` (N,), and ``level_ends``: the features of level k of
 escalation follow those of level k - 1 and end at ``level_ends[k]``. Descriptors of several sizes
 are filled up with zeros, which change no distance. ``matches.h5``: a group
 per pair with ``matches0`` (N0,), -1 where unmatched, ``matching_scores0`` (N0,) and the
@@ -28,6 +29,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import LocalFeatures, union
 from colmap_affrect.errors import StaleStoreError, StoreError
 from colmap_affrect.project.atomic_files import (
@@ -182,6 +184,16 @@ DATASETS = {
 """What complete groups hold; groups too, where a file has become a folder."""
 
 
+def frame_datasets(lafs: NDArray[np.floating]) -> dict[str, NDArray[np.float32]]:
+    """Return (N, 2, 3) frames, and their scales in sigmas and orientations in degrees."""
+    stored = lafs.astype(np.float32)
+    shapes = stored[:, :, :2].astype(np.float64)
+    scales = np.sqrt(np.abs(np.linalg.det(shapes))) / MEASUREMENT_SIGMAS
+    angles = np.rad2deg(np.arctan2(shapes[:, 1, 0], shapes[:, 0, 0]))
+    oris = angles.astype(np.float32)
+    return {"lafs": stored, "scales": scales.astype(np.float32), "oris": oris}
+
+
 class FeatureStore(_Store):
     """Local features by image name."""
 
@@ -245,7 +257,7 @@ class FeatureStore(_Store):
                 "descriptors": features.descriptors.T.astype(np.float16),
                 "scores": features.responses,
                 "image_size": np.asarray(image_size),
-                "lafs": features.lafs.astype(np.float32),
+                **frame_datasets(features.lafs),
                 "rectification_ids": features.rectification_ids,
                 "level_ends": np.asarray(level_ends),
             },

@@ -9,7 +9,7 @@ import os
 import shutil
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from copy import deepcopy
 from functools import lru_cache
 from pathlib import Path
@@ -139,6 +139,17 @@ class Workspace:
             yield self
         finally:
             lock.release()
+
+    @contextmanager
+    def locked_or_read_only(self) -> Iterator[Workspace]:
+        """Keep other runs out as :meth:`locked`; a folder that cannot be written needs no lock."""
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(self.locked())
+            except WorkspaceError as error:
+                if not self.config.exists() or isinstance(error.__cause__, Timeout):
+                    raise
+            yield self
 
     def recorded(self) -> dict[str, Any]:
         """Return the options on record by stage; empty where there are none.

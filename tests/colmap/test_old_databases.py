@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import Call
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_with_frames, copy_without_features, is_stamped
-from colmap_affrect.colmap.old_databases import export_database
+from colmap_affrect.colmap.old_databases import MAPPER_OPTIONS, export_database
 from colmap_affrect.doctor.database import examine_database
 from colmap_affrect.doctor.findings import Findings
 from colmap_affrect.errors import DatabaseError
@@ -78,6 +79,18 @@ def test_content_and_ids_are_those_of_the_source(source: Path, tmp_path: Path) -
     assert rows(old, "SELECT prior_tx, prior_ty, prior_tz FROM images")[:3] == [
         (None, None, None), (47.5, 8.25, 400.0), (None, None, None),
     ]  # fmt: skip
+
+
+def test_command_takes_an_output_folder(source: Path, tmp_path: Path, call: Call) -> None:
+    (tmp_path / "out").mkdir()
+    shutil.copy(source, tmp_path / "out" / "database.db")
+    done = call("export-database", tmp_path / "out", tmp_path / "old.db", "--colmap", "3.8")
+    assert done.code == 0
+    assert done.stdout.startswith(f"{tmp_path / 'old.db'}: for COLMAP 3.8 to 3.13\n1 rigs are left")
+    assert MAPPER_OPTIONS in done.stdout
+    again = call("export-database", tmp_path / "out", tmp_path / "old.db")
+    assert (again.code, len(again.errors)) == (1, 1)
+    assert "exists already" in again.errors[0]
 
 
 def test_what_is_exported_comes_back(source: Path, tmp_path: Path) -> None:
@@ -209,7 +222,7 @@ def test_the_program_colmap_works_on_what_is_exported(source: Path, tmp_path: Pa
     colmap(
         "mapper", *given, "--image_path", tmp_path / "photos",
         "--output_path", tmp_path / "sparse", "--Mapper.extract_colors", "0",
-        "--Mapper.min_model_size", "3",
+        *MAPPER_OPTIONS.split(),
     )  # fmt: skip
     text = colmap("model_analyzer", "--path", tmp_path / "sparse" / "0")
     assert f"Registered images: {NUM_IMAGES}" in text

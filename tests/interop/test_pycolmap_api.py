@@ -230,9 +230,22 @@ def test_masks_of_the_reader_options_are_used(photos: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"extraction_options": {"sift": {}}}, "unknown option 'sift'"),
+        ({"extraction_options": {"sifft": {}}}, "unknown option 'sifft'"),
+        (
+            {"extraction_options": {"sift": {"upright": True}}},
+            "sift.upright=True cannot be carried",
+        ),
+        ({"extraction_options": {"sift": {"uprigt": 1}}}, "did you mean 'sift.upright'"),
         ({"extraction_options": {"max_image_size_px": "big"}}, "expected int"),
-        ({"extraction_options": pycolmap.FeatureExtractionOptions()}, "does not apply here"),
+        (
+            {
+                "extraction_options": pycolmap.FeatureExtractionOptions(
+                    type=pycolmap.FeatureExtractorType.ALIKED_N32
+                )
+            },
+            "extraction_options: type=ALIKED_N32 cannot be carried over",
+        ),
+        ({"extraction_options": pycolmap.Camera()}, "Camera does not apply here"),
         ({"extraction_options": "defualt"}, "did you mean 'default'"),
         ({"reader_options": {"camera_modell": "PINHOLE"}}, "did you mean 'camera_model'"),
         ({"camera_mode": "two"}, "mode='two' is not one of"),
@@ -241,7 +254,10 @@ def test_masks_of_the_reader_options_are_used(photos: Path, tmp_path: Path) -> N
         ({"from_database": "missing.db"}, "no such file"),
         ({"from_database": "missing.db", "image_names": ["a.png"]}, "missing.db: no such file"),
         ({"image_path": "nowhere", "image_names": ["a.png"]}, "nowhere: no such folder"),
-        ({"reader_options": {"default_focal_length_factor": "big"}}, "expected float, got str"),
+        (
+            {"reader_options": {"default_focal_length_factor": "big"}},
+            "Could not assign default_focal_length_factor",
+        ),
     ],
 )
 def test_wrong_arguments_are_one_clear_line(

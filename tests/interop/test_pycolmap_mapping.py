@@ -13,7 +13,7 @@ import colmap_affrect
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import DatabaseError, OptionError, PairListError
-from colmap_affrect.interop import pycolmap_api
+from colmap_affrect.interop import pycolmap_options
 
 NUM_IMAGES = 6
 
@@ -93,10 +93,10 @@ def test_options_that_differ_from_the_defaults_of_pycolmap_are_carried_over() ->
     native = pycolmap.IncrementalPipelineOptions(
         random_seed=7, min_model_size=4, mapper=dict(init_min_num_inliers=44)
     )
-    ours = pycolmap_api._mapper_options(native)
+    ours = pycolmap_options.mapper_options(native)
     assert ours.random_seed == 7
     assert ours.mapper_options == {"min_model_size": 4, "mapper.init_min_num_inliers": 44}
-    usual = pycolmap_api._mapper_options(pycolmap.IncrementalPipelineOptions())
+    usual = pycolmap_options.mapper_options(pycolmap.IncrementalPipelineOptions())
     assert (usual.mapper_options, usual.random_seed) == ({}, 0)
     assert usual.preset_name == "sparse"
 

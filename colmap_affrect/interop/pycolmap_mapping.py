@@ -1,0 +1,94 @@
+"""``incremental_mapping`` with pycolmap's signature, by our mapper; on any verified database."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.checks import refuse_unusable
+from colmap_affrect.interop import pycolmap_options as translate
+from colmap_affrect.interop.pycolmap_api import CANCELLED, Native, PathLike, Token
+from colmap_affrect.mappers.attempts import map_database
+from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.mappers.existing import Extension, read_existing
+from colmap_affrect.project.workspace import temporary_folder
+
+
+def incremental_mapping(
+    database_path: PathLike,
+    image_path: PathLike,
+    output_path: PathLike,
+    options: pycolmap.IncrementalPipelineOptions | Native = None,
+    input_path: PathLike = "",
+    initial_image_pair_callback: Callable[[], None] | None = None,
+    next_image_callback: Callable[[], None] | None = None,
+    cancellation_token: Token = None,
+) -> dict[int, pycolmap.Reconstruction]:
+    """Map any verified database by our mapper and write the models as pycolmap does.
+
+    Args:
+        database_path: COLMAP database with two-view geometries.
+        image_path: folder of the photographs, for the colours of the points; empty for none.
+        output_path: models are written to 0, 1, ... in it, or, with ``input_path``, into it.
+        options: what differs from pycolmap's defaults wins over our preset for sparse sets.
+        input_path: a model to be extended. Its poses and cameras stay with ``fix_existing_frames``.
+        initial_image_pair_callback: called when a first pair is registered.
+        next_image_callback: called for every further image.
+        cancellation_token: stops mapping when it is cancelled, by InterruptedError as in pycolmap.
+
+    Returns:
+        The models by the number of their folder, largest first.
+    """
+    native = translate.native(options, pycolmap.IncrementalPipelineOptions, "options")
+    mapper = MAPPERS.make(translate.mapper_options(native))
+    database, output = Path(database_path), Path(output_path)
+    refuse_unusable(database)
+    existing = None
+    if translate.given_path(input_path):
+        extension = Extension(Path(input_path), refine_existing=not native.fix_existing_frames)
+        existing = read_existing(extension, database)
+    task = MappingTask(
+        database,
+        Path(image_path) if str(image_path) else None,
+        extend=existing,
+        cancellation=cancellation_token,
+    )
+    callbacks = _Callbacks(initial_image_pair_callback, next_image_callback, existing is not None)
+    output.mkdir(parents=True, exist_ok=True)
+    with temporary_folder(output) as folder:
+        found = folder / "sparse"
+        try:
+            map_database(mapper, task, found, callbacks.show)
+        except KeyboardInterrupt as error:
+            if cancellation_token and cancellation_token.is_cancelled:
+                raise InterruptedError(CANCELLED) from error
+            raise
+        models = {int(path.name): pycolmap.Reconstruction(path) for path in found.iterdir()}
+        for index in models:
+            target = output if existing else output / str(index)
+            shutil.copytree(found / str(index), target, dirs_exist_ok=True)
+    return dict(sorted(models.items()))
+
+
+@dataclass
+class _Callbacks:
+    """pycolmap's callbacks, told of numbers of registered images."""
+
+    begun: Callable[[], None] | None
+    following: Callable[[], None] | None
+    extends: bool
+    count: int = 0
+
+    def show(self, number: int) -> None:
+        first = 0
+        if not self.count:
+            first = number if self.extends else min(number, 2)
+            if self.begun:
+                self.begun()
+        self.count += number
+        for _ in range(number - first):
+            if self.following:
+                self.following()

@@ -1,0 +1,199 @@
+"""What pycolmap's option objects, or nested dictionaries of their fields, ask of us.
+
+A field that keeps pycolmap's default asks for nothing: ours stays. One that differs is honoured
+where :data:`HONOURED` has it, and refused by its name elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.native_options import differences, flat_values
+from colmap_affrect.colmap.verification import VerificationOptions
+from colmap_affrect.errors import OptionError
+from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+from colmap_affrect.mappers.base import MAPPERS, MapperOptions
+from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
+from colmap_affrect.options import CUSTOM, Options, flat, suggestion
+from colmap_affrect.recipes import ExtractionOptions, Recipe, RecipeOptions, load_recipe
+
+Native = TypeVar("Native")
+
+VERIFICATION_NAMES = {
+    "min_num_inliers": "min_num_inliers",
+    "min_inlier_ratio": "min_inlier_ratio",
+    "ransac.max_error": "max_error_px",
+    "ransac.max_num_trials": "max_num_trials",
+    "ransac.min_inlier_ratio": "ransac_min_inlier_ratio",
+    "ransac.random_seed": "random_seed",
+}
+"""Names in pycolmap's TwoViewGeometryOptions and in ours."""
+
+WHERE = ("num_threads", "use_gpu", "gpu_index")
+"""Where the work is done; of ``use_gpu`` the argument ``device`` decides, as in pycolmap."""
+
+HONOURED: dict[type, tuple[str, ...]] = {
+    pycolmap.FeatureExtractionOptions: ("max_image_size", *WHERE),
+    pycolmap.FeatureMatchingOptions: (
+        "skip_geometric_verification", "skip_image_pairs_in_same_frame", "guided_matching",
+        "rig_verification", *WHERE,
+    ),
+    pycolmap.TwoViewGeometryOptions: tuple(VERIFICATION_NAMES),
+    pycolmap.ExhaustivePairingOptions: ("block_size",),
+    pycolmap.ImportedPairingOptions: ("block_size", "match_list_path"),
+    pycolmap.SequentialPairingOptions: (
+        "overlap", "quadratic_overlap", "expand_rig_images", "loop_detection",
+        "loop_detection_period", "loop_detection_num_images", "num_threads",
+    ),
+    pycolmap.SpatialPairingOptions: tuple(flat_values(pycolmap.SpatialPairingOptions())),
+    pycolmap.ImageReaderOptions: tuple(flat_values(pycolmap.ImageReaderOptions())),
+}  # fmt: skip
+"""Fields that may differ from their defaults."""
+
+SET_OTHERWISE = ("random_seed", "image_path", "fix_existing_frames")
+"""Options of pycolmap's mapper, in any section, that reach ours by other ways."""
+
+
+def native(given: object, kind: type[Native], argument: str) -> Native:
+    """Return pycolmap's options: as they are, or from a nested dictionary; None for the defaults.
+
+    Raises:
+        OptionError: naming the argument and the field.
+    """
+    if isinstance(given, kind):
+        return given
+    if given is not None and not isinstance(given, Mapping):
+        raise _not_ours(given, argument, f"pycolmap.{kind.__name__}")
+    known = flat_values(kind())
+    sections = {key.rpartition(".")[0] for key in known}
+    for key in flat(given or {}):
+        if key not in known and key not in sections:
+            raise OptionError(f"{argument}: unknown option '{key}'{suggestion(key, known)}")
+    try:
+        return kind(dict(given or {}))  # type: ignore[call-arg]
+    except (AttributeError, TypeError, ValueError, RuntimeError) as error:
+        raise OptionError(f"{argument}: {' '.join(str(error).split())}") from error
+
+
+def changes(given: object, kind: type, argument: str) -> dict[str, Any]:
+    """Return the fields that differ from pycolmap's defaults, by dotted key.
+
+    Raises:
+        OptionError: naming one that has no counterpart here.
+    """
+    usual, honoured = flat_values(kind()), HONOURED[kind]
+    found = {
+        key: value
+        for key, value in flat_values(native(given, kind, argument)).items()
+        if value != usual[key]
+    }
+    for key, value in found.items():
+        if key not in honoured:
+            shown = getattr(value, "name", value)
+            raise OptionError(f"{argument}: {key}={shown} cannot be carried over")
+    return found
+
+
+def is_native(given: object, kind: type, own: type[Options]) -> bool:
+    """Tell pycolmap's options from ours: a dictionary is whose alone has one of its keys."""
+    if not isinstance(given, Mapping):
+        return isinstance(given, kind)
+    names = {key.partition(".")[0] for key in flat_values(kind())}
+    return not names.isdisjoint(given.keys() - own.model_fields.keys())
+
+
+def extraction_recipe(given: object) -> tuple[Recipe, dict[str, Any]]:
+    """Return the recipe that is named or given in any form, and what pycolmap's options ask for."""
+    if isinstance(given, str):
+        return load_recipe(given), {}
+    if is_native(given, pycolmap.FeatureExtractionOptions, RecipeOptions):
+        asked = changes(given, pycolmap.FeatureExtractionOptions, "extraction_options")
+        recipe = load_recipe("default")
+        if "max_image_size" in asked:
+            size = {"max_image_size_px": asked["max_image_size"]}
+            recipe = replace(recipe, name=CUSTOM, extraction=recipe.extraction.changed(**size))
+        return recipe, asked
+    if isinstance(given, Mapping):
+        return Recipe.from_mapping(CUSTOM, given, "extraction_options"), {}
+    if isinstance(given, ExtractionOptions):
+        return Recipe(CUSTOM, extraction=given), {}
+    raise _not_ours(given, "extraction_options", "colmap_affrect.ExtractionOptions")
+
+
+def matching_options(given: object) -> tuple[MatcherOptions | None, dict[str, Any]]:
+    """Return our options, None for those of the recipe, and what pycolmap's options ask for."""
+    if given is None or isinstance(given, MatcherOptions):
+        return given, {}
+    if is_native(given, pycolmap.FeatureMatchingOptions, MATCHERS.part(MATCHERS.default).Options):
+        return None, changes(given, pycolmap.FeatureMatchingOptions, "matching_options")
+    if isinstance(given, Mapping):
+        return MATCHERS.options(given, where="matching_options"), {}
+    raise _not_ours(given, "matching_options", "colmap_affrect.NearestOptions")
+
+
+def verification_options(given: object, random_seed: int | None) -> VerificationOptions:
+    """Return ours, with what pycolmap's options change; a seed that is given wins."""
+    argument, seed = "verification_options", {} if random_seed is None else {"seed": random_seed}
+    if isinstance(given, VerificationOptions):
+        options = given
+    elif is_native(given, pycolmap.TwoViewGeometryOptions, VerificationOptions):
+        asked = changes(given, pycolmap.TwoViewGeometryOptions, argument)
+        values = {VERIFICATION_NAMES[key]: value for key, value in asked.items()}
+        if "max_error_px" in values:  # in pixels of the files
+            values["scale_max_error"] = False
+        options = VerificationOptions.from_mapping(values, argument)
+    elif given is None or isinstance(given, Mapping):
+        options = VerificationOptions.from_mapping(given or {}, argument)
+    else:
+        raise _not_ours(given, argument, "colmap_affrect.VerificationOptions")
+    return options.changed(random_seed=seed.get("seed", options.random_seed))
+
+
+def reader_options(given: object, camera_mode: object) -> tuple[CameraOptions, MaskOptions]:
+    """Return what pycolmap's options say of cameras and masks."""
+    known = native(given, pycolmap.ImageReaderOptions, "reader_options")
+    cameras = CameraOptions.from_mapping(
+        {
+            "mode": str(getattr(camera_mode, "name", camera_mode)).lower().replace("_", "-"),
+            "model": known.camera_model,
+            "params": known.camera_params,
+            "default_focal_length_factor": known.default_focal_length_factor,
+            "existing_camera_id": known.existing_camera_id,
+        },
+        "camera_mode, reader_options",
+    )
+    masks = MaskOptions(
+        path=given_path(known.mask_path), camera_path=given_path(known.camera_mask_path)
+    )
+    return cameras, masks
+
+
+def given_path(path: Path | str) -> str:
+    """Return an absolute path, or nothing for pycolmap's '.', which stands for none."""
+    return "" if Path(path) == Path() else str(Path(path).resolve())
+
+
+def mapper_options(given: pycolmap.IncrementalPipelineOptions) -> MapperOptions:
+    """Translate what differs from pycolmap's defaults into options of our mapper."""
+    usual = pycolmap.IncrementalPipelineOptions()
+    known = flat_values(usual)
+    for key, value in flat_values(given).items():
+        if isinstance(value, list | set) and value != known[key]:
+            raise OptionError(f"options: {key}={value} cannot be carried over")
+    values = differences(given, usual)
+    seed = {"random_seed": given.random_seed} if "random_seed" in values else {}
+    kept = {k: v for k, v in values.items() if k.rpartition(".")[2] not in SET_OTHERWISE}
+    options: MapperOptions = MAPPERS.options(
+        {"name": MAPPERS.default, **seed, "mapper_options": kept}, where="options"
+    )
+    return options
+
+
+def _not_ours(given: object, argument: str, name: str) -> OptionError:
+    return OptionError(
+        f"{argument}: {type(given).__name__} does not apply here; give {name} or a dictionary"
+    )

@@ -1,0 +1,292 @@
+"""Scripts of pycolmap run on when only the import of it is changed, options and all."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import itertools
+import shutil
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from room_panoramas import write_panoramas
+from small_scene import NAMES, write_photographs
+
+import colmap_affrect
+from colmap_affrect import pycolmap as replaced
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.errors import AffrectError, DeviceError, OptionError
+from colmap_affrect.interop import pycolmap_api
+from colmap_affrect.interop.pycolmap_options import (
+    HONOURED,
+    changes,
+    extraction_recipe,
+    matching_options,
+    verification_options,
+)
+from colmap_affrect.matchers.nearest import NearestOptions
+from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import load_recipe
+
+COARSE = {"rectifier": "identity", "max_image_size_px": 320}
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos")
+    write_photographs(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def once_extracted(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("extracted")
+    colmap_affrect.extract_features(folder / "a.db", photos, extraction_options=COARSE)
+    return folder
+
+
+@pytest.fixture
+def extracted(once_extracted: Path, tmp_path: Path) -> Path:
+    shutil.copytree(once_extracted, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "a.db"
+
+
+def changed_import(source: str) -> ModuleType:
+    """Load a module of pycolmap's package that takes ours for pycolmap."""
+    origin = Path(str(importlib.util.find_spec(source).origin))
+    text = origin.read_text(encoding="utf-8")
+    line = "from . import _core as pycolmap"
+    assert text.count(line) == 1
+    module = ModuleType(f"changed_{origin.stem}")
+    sys.modules[module.__name__] = module  # its dataclasses look there
+    code = text.replace(line, "from colmap_affrect import pycolmap")
+    exec(compile(code, str(origin), "exec"), module.__dict__)
+    return module
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("matcher", ["sequential", "exhaustive"])
+def test_panorama_script_of_pycolmap_registers_all_images(tmp_path: Path, matcher: str) -> None:
+    (tmp_path / "panoramas").mkdir()
+    write_panoramas(tmp_path / "panoramas", 3)
+    script = changed_import("pycolmap.panorama")
+    options = script.PanoramaReconstructionOptions(matcher=script.Matcher(matcher))
+    models = script.reconstruct(tmp_path / "panoramas", tmp_path / "out", options)
+    assert models[0].num_reg_images() == 3 * 12
+    assert models[0].num_reg_frames() == 3
+    equirectangular = pycolmap.Reconstruction(tmp_path / "out/sparse_equirectangular/0")
+    assert equirectangular.num_reg_images() == 3
+
+
+@pytest.mark.long
+def test_script_with_callbacks_runs_on(photos: Path, tmp_path: Path) -> None:
+    database_path, sfm_path = tmp_path / "database.db", tmp_path / "sfm"
+    from colmap_affrect.pycolmap import logging
+
+    assert logging is pycolmap.logging
+    replaced.set_random_seed(0)
+    replaced.extract_features(str(database_path), str(photos))
+    replaced.match_exhaustive(str(database_path))
+    with replaced.Database.open(str(database_path)) as database:
+        assert database.num_images() == len(NAMES)
+    sfm_path.mkdir()
+    steps: list[int] = []
+    models = replaced.incremental_mapping(
+        str(database_path), str(photos), str(sfm_path),
+        initial_image_pair_callback=lambda: steps.append(2),
+        next_image_callback=lambda: steps.append(1),
+    )  # fmt: skip
+    assert sum(steps) == len(NAMES)
+    assert models[0].num_reg_images() == len(NAMES)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["extract_features", "match_exhaustive", "match_sequential", "match_spatial",
+     "match_image_pairs", "verify_matches", "incremental_mapping"],
+)  # fmt: skip
+def test_arguments_are_those_of_pycolmap_in_order(name: str) -> None:
+    text = getattr(pycolmap, name).__doc__.partition("->")[0]
+    ours = inspect.signature(getattr(replaced, name)).parameters.values()
+    named = [p.name for p in ours if p.kind is p.POSITIONAL_OR_KEYWORD]
+    positions = [text.index(f"{argument}: ") for argument in named]
+    assert positions == sorted(positions)
+    assert text.count(": ") == len(named)
+    assert getattr(replaced, name) is getattr(colmap_affrect, name)
+
+
+@pytest.mark.parametrize("kind", HONOURED)
+def test_default_options_ask_for_nothing_and_every_field_is_honoured_or_named(kind: type) -> None:
+    assert changes(kind(), kind, "x") == changes({}, kind, "x") == changes(None, kind, "x") == {}
+    for key, value in kind().todict().items():
+        other = {**value, next(iter(value)): 77} if isinstance(value, dict) else _other(value)
+        given = kind()
+        given.mergedict({key: other})
+        if key in HONOURED[kind]:
+            assert changes({key: other}, kind, "x") == changes(given, kind, "x")
+            assert list(changes(given, kind, "x")) == [key]
+        elif not isinstance(value, dict):
+            with pytest.raises(OptionError, match=rf"^x: {key}=\S+ cannot be carried over$"):
+                changes(given, kind, "x")
+    with pytest.raises(OptionError, match=r"^x: unknown option 'no_such'"):
+        changes({"no_such": 1}, kind, "x")
+
+
+def _other(value: Any) -> Any:
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, int | float):
+        return type(value)(value + 1)
+    if isinstance(value, str | Path):
+        return "77"
+    return next(item for item in type(value).__members__.values() if item != value)
+
+
+def test_options_are_translated() -> None:
+    recipe, asked = extraction_recipe({"max_image_size": 1000, "use_gpu": True})
+    default = load_recipe("default")
+    assert recipe.extraction == default.extraction.changed(max_image_size_px=1000)
+    assert asked == {"max_image_size": 1000, "use_gpu": True}
+    assert extraction_recipe(pycolmap.FeatureExtractionOptions()) == (default, {})
+    assert matching_options({"sift": {"max_ratio": 0.8}, "num_threads": 3}) == (
+        None, {"num_threads": 3},
+    )  # fmt: skip
+    assert matching_options({"max_ratio": 0.7}) == (NearestOptions(max_ratio=0.7), {})
+    with pytest.raises(OptionError, match=r"sift\.max_ratio=0\.7 cannot be carried over"):
+        matching_options({"sift": {"max_ratio": 0.7}})
+    usual = colmap_affrect.VerificationOptions()
+    assert verification_options(pycolmap.TwoViewGeometryOptions(), None) == usual
+    nested = verification_options({"ransac": {"random_seed": 7, "max_error": 2.5}}, None)
+    assert nested == usual.changed(random_seed=7, max_error_px=2.5, scale_max_error=False)
+    with pytest.raises(OptionError, match=r"ransac\.max_eror'.*did you mean 'ransac\.max_error'"):
+        verification_options({"ransac": {"max_eror": 2}}, None)
+
+
+def test_what_matching_options_ask_for_is_done(extracted: Path) -> None:
+    asked = pycolmap.FeatureMatchingOptions(skip_geometric_verification=True, num_threads=1)
+    (match,) = replaced.match_exhaustive(extracted, asked)
+    assert match.num_done == 6
+    with open_database(extracted) as database:
+        assert database.num_verified_image_pairs() == 0
+    reports = replaced.match_exhaustive(extracted, {"guided_matching": True})
+    assert [report.name for report in reports] == ["match", "verify", "guide"]
+    assert (reports[0].num_kept, reports[2].num_done) == (6, 6)
+
+
+def test_pairs_are_those_of_pycolmaps_generators(extracted: Path) -> None:
+    in_order = pycolmap.SequentialPairingOptions(overlap=1, quadratic_overlap=False)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'pairs_options'"):
+        replaced.match_sequential(extracted, pairs_options=in_order)
+    match, _ = replaced.match_sequential(extracted, pairing_options=in_order)
+    assert match.num_done == len(NAMES) - 1
+    with pytest.raises(AffrectError, match="0 images have a position"):
+        replaced.match_spatial(extracted)
+    with open_database(extracted) as database:
+        for image_id, x in ((1, 0.0), (2, 5.0), (3, 500.0), (4, 506.0)):
+            prior = pycolmap.PosePrior(
+                position=np.array([x, 0.0, 0.0]),
+                coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+            )
+            prior.corr_data_id = database.read_image(image_id).data_id
+            database.write_pose_prior(prior)
+    match, _ = replaced.match_spatial(extracted, pairing_options={"max_distance": 20.0})
+    assert match.num_done + match.num_kept == len(NAMES) - 1
+    match, _ = replaced.match_sequential(
+        extracted, pairing_options={"overlap": 1, "loop_detection": True}
+    )
+    assert match.num_done + match.num_kept == 6
+
+
+def test_pairs_of_a_list_are_verified(extracted: Path, tmp_path: Path) -> None:
+    replaced.match_exhaustive(extracted, {"skip_geometric_verification": True})
+    listed = tmp_path / "pairs.txt"
+    listed.write_text(f"{NAMES[2]} {NAMES[3]}\n")
+    token = pycolmap.CancellationToken()
+    replaced.verify_matches(extracted, listed, {"ransac": {"random_seed": 3}}, token)
+    ids = image_ids(extracted)
+    with open_database(extracted) as database:
+        (pair_id,), _ = database.read_two_view_geometries()
+    assert set(pycolmap.pair_id_to_image_pair(pair_id)) == {ids[NAMES[2]], ids[NAMES[3]]}
+    token.cancel()
+    with pytest.raises(InterruptedError):
+        replaced.verify_matches(extracted, listed, None, token)
+
+
+def test_frames_of_a_rig_are_verified_together_and_not_matched_within(tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    pycolmap.set_random_seed(5)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=2, num_points3D=100,
+        camera_has_prior_focal_length=True,
+    )  # fmt: skip
+    with open_database(path) as database:
+        pycolmap.synthesize_dataset(options, database)
+        frames = {image.name: image.frame_id for image in database.read_all_images()}
+    pairs = list(itertools.combinations(frames, 2))
+    kept = pycolmap_api._of_different_frames(path, pairs)
+    assert len(pairs) == 6
+    assert kept == [pair for pair in pairs if frames[pair[0]] != frames[pair[1]]]
+    pycolmap_api._verify_rigs(path, colmap_affrect.VerificationOptions(), None)
+    of_rig = int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED_RIG)
+    with open_database(path) as database:
+        found = [int(geometry.config) for geometry in database.read_two_view_geometries()[1]]
+    assert found.count(of_rig) == len(kept) == 4
+
+
+def test_cancelled_token_stops_and_what_is_done_is_kept(photos: Path, tmp_path: Path) -> None:
+    class Cancelling(colmap_affrect.progress.Progress):  # type: ignore[misc]
+        """Cancels after the first image."""
+
+        def stage(self, name: str, total: int, unit: str) -> Any:
+            token.cancel()
+            return super().stage(name, total, unit)
+
+    path, token = tmp_path / "a.db", pycolmap.CancellationToken()
+    with pytest.raises(InterruptedError, match="Operation cancelled"):
+        replaced.extract_features(
+            path, photos, extraction_options=COARSE, cancellation_token=token,
+            progress=Cancelling(),
+        )  # fmt: skip
+    report = replaced.extract_features(path, photos, extraction_options=COARSE)
+    assert (report.num_done, report.num_kept) == (len(NAMES) - 1, 1)
+    with pytest.raises(InterruptedError):
+        replaced.match_exhaustive(path, cancellation_token=token)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("options", "device", "message"),
+    [
+        ({}, "cuda", "finds no CUDA device"),
+        ({"gpu_index": "0"}, pycolmap.Device.cuda, "--device cuda:0: torch finds no CUDA device"),
+        ({"gpu_index": "0,1"}, "cuda", "gpu_index=0,1: give the number of one GPU"),
+    ],
+)
+def test_gpu_that_is_not_there_is_refused(
+    extracted: Path, options: dict[str, Any], device: Any, message: str
+) -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises((DeviceError, OptionError), match=message):
+        replaced.match_exhaustive(extracted, options, device=device)
+
+
+def test_names_of_pycolmap_say_what_replaces_them() -> None:
+    assert replaced.Reconstruction is pycolmap.Reconstruction
+    with pytest.raises(AttributeError, match="no vocabulary tree"):
+        replaced.match_vocabtree  # noqa: B018
+    for name, text in (
+        ("match_vocabtree", "retrieval"),
+        ("geometric_verification", "use colmap_affrect.verify"),
+        ("Reconstruction", "pycolmap.Reconstruction works with it, as does 'from colmap_affrect"),
+    ):
+        with pytest.raises(AttributeError, match=f"no attribute '{name}'; .*{text}"):
+            getattr(colmap_affrect, name)
+    assert not Workspace.beside(Path("a.db")).config.exists()
