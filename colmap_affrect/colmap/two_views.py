@@ -21,7 +21,6 @@ PLANAR = (
 )
 """Pairs that a homography explains: their epipolar geometry is arbitrary."""
 
-
 CALIBRATED = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
 
 MIN_TRANSLATION = 1e-9
