@@ -39,7 +39,6 @@ from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.images.exif import (
     MAX_CONTRADICTION,
     PLAUSIBLE_FOCALS,
-    CameraTags,
     ExifFocal,
     exif_focal,
     read_camera_tags,
@@ -66,7 +65,7 @@ class InitialCameras:
         self.image_path = image_path
         self.options = options
         self._given = read_given_cameras(options)
-        self._tags: dict[str, CameraTags | None] = {}
+        self._tags = cache(lambda name: read_camera_tags(image_path / name))
 
     def given(self, name: str) -> GivenCamera:
         """Return what the user says of the camera of an image."""
@@ -74,13 +73,8 @@ class InitialCameras:
 
     def size(self, name: str) -> Size | None:
         """Return the (width, height) that the header of an image tells; None if it is damaged."""
-        tags = self._read(name)
+        tags = self._tags(name)
         return tags.size if tags else None
-
-    def _read(self, name: str) -> CameraTags | None:
-        if name not in self._tags:
-            self._tags[name] = read_camera_tags(self.image_path / name)
-        return self._tags[name]
 
     def group(self, name: str) -> Group:
         """Return what is the same for images that share a camera."""
@@ -94,7 +88,7 @@ class InitialCameras:
         label = self.given(name).label
         if label:
             return ("given", label)
-        tags = None if self.options.ignore_exif else self._read(name)
+        tags = None if self.options.ignore_exif else self._tags(name)
         if tags and tags.identity:
             return ("exif", *tags.identity, self.given(name))
         return ("image", name)
@@ -196,7 +190,7 @@ class InitialCameras:
         if self.options.ignore_exif:
             return ExifFocal(None, why="EXIF is ignored")
         found = []
-        for tags in filter(None, map(self._read, names)):
+        for tags in filter(None, map(self._tags, names)):
             make, model, _ = tags.body
             width_mm = sensor_width_mm(make, model) if tags.focal_mm else None
             found.append(exif_focal(tags, width_mm))

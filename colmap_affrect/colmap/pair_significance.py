@@ -8,16 +8,14 @@ there the map must turn as the homography does.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import PLANAR, epipolar_pair, keypoint_shapes
-from colmap_affrect.geometry.affine import determinants, homography_errors, transform_frames
-from colmap_affrect.geometry.epipolar import common_sign, direction_cosines, sampson_errors
+from colmap_affrect.geometry.epipolar import common_sign
+from colmap_affrect.geometry.pair_models import HomographyModel, PairModel, Points, Rows
 from colmap_affrect.geometry.shapes import of_unit_area, vary_singly
 from colmap_affrect.geometry.significance import (
     log10_bayes_factor,
@@ -33,58 +31,6 @@ MAX_CHANCE = 0.99
 """Frames that agree by chance nearly always, upright ones for one, say nothing."""
 MIN_VARIETY = 0.05
 """Elements of shapes of area one that differ by less are all alike: they have no direction."""
-
-Points = NDArray[np.float64]
-Rows = NDArray[np.integer]
-
-
-@dataclass(frozen=True)
-class _Epipolar:
-    """What an epipolar geometry says of matches of features ``rows1`` with features ``rows2``."""
-
-    has_sign: ClassVar[bool] = True
-    """All cosines may have the other sign."""
-    fundamental: Points
-    points: tuple[Points, Points]
-    sample_size: int
-
-    def errors(self, rows1: Rows, rows2: Rows) -> Points:
-        """Return (M,) px."""
-        return sampson_errors(self.fundamental, self.points[0][rows1], self.points[1][rows2])
-
-    def cosines(self, rows1: Rows, rows2: Rows, shapes: tuple[Points, Points]) -> Points:
-        """Return (M,) cosines between what frames carry over and what the geometry does."""
-        points = self.points[0][rows1], self.points[1][rows2]
-        return direction_cosines(self.fundamental, *points, shapes[0][rows1], shapes[1][rows2])
-
-
-@dataclass(frozen=True)
-class _Homography:
-    """As :class:`_Epipolar`, of a homography."""
-
-    has_sign: ClassVar[bool] = False
-    sample_size: ClassVar[int] = 4
-    matrix: Points
-    points: tuple[Points, Points]
-
-    def errors(self, rows1: Rows, rows2: Rows) -> Points:
-        """Return (M,) px."""
-        return homography_errors(self.matrix, self.points[0][rows1], self.points[1][rows2])
-
-    def cosines(self, rows1: Rows, rows2: Rows, shapes: tuple[Points, Points]) -> Points:
-        """Return (M,) cosines between what frames carry over and what the geometry does."""
-        frames = np.concatenate([shapes[0][rows1], self.points[0][rows1, :, None]], axis=2)
-        return turn_cosines(transform_frames(self.matrix, frames)[:, :, :2], shapes[1][rows2])
-
-
-def turn_cosines(shapes1: Points, shapes2: Points) -> Points:
-    """Return (N,) cosines of the angles by which frames are turned against others; -1 mirrored."""
-    a, b, c, d = (shapes1[:, i, j] for i in (0, 1) for j in (0, 1))
-    inverses = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)  # up to the determinants
-    turns = shapes2 @ inverses * np.sign(determinants(shapes1))[:, None, None]
-    along, across = turns[:, 0, 0] + turns[:, 1, 1], turns[:, 1, 0] - turns[:, 0, 1]
-    cosines = along / np.maximum(np.hypot(along, across), np.finfo(float).tiny)
-    return np.where(determinants(turns) > 0.0, cosines, -1.0)
 
 
 def significance(
@@ -136,21 +82,16 @@ def _model(
     geometry: pycolmap.TwoViewGeometry,
     cameras: tuple[pycolmap.Camera, pycolmap.Camera],
     keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
-) -> _Epipolar | _Homography | None:
-    configs = pycolmap.TwoViewGeometryConfiguration
+) -> PairModel | None:
     if geometry.config in PLANAR and geometry.H is not None:
         points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
-        return _Homography(np.asarray(geometry.H, np.float64), (points1, points2))
-    pair = epipolar_pair(geometry, cameras, keypoints)
-    if pair is None or geometry.config == configs.WATERMARK:
+        return HomographyModel(np.asarray(geometry.H, np.float64), (points1, points2))
+    if geometry.config == pycolmap.TwoViewGeometryConfiguration.WATERMARK:
         return None
-    sample_size = 5 if geometry.config == configs.CALIBRATED else 7
-    return _Epipolar(pair.fundamental, (pair.points1, pair.points2), sample_size)
+    return epipolar_pair(geometry, cameras, keypoints)
 
 
-def _frame_evidence(
-    model: _Epipolar | _Homography, inliers: Rows, shapes: tuple[Points, Points]
-) -> float:
+def _frame_evidence(model: PairModel, inliers: Rows, shapes: tuple[Points, Points]) -> float:
     """Return the Bayes factor of the agreement of frames, as a decimal logarithm."""
     cosines = model.cosines(inliers, inliers, shapes)
     first, second = shuffled(len(inliers))

@@ -5,8 +5,6 @@ All points here are in COLMAP's pixels, the corner of the image being (0, 0).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose
 from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.pair_models import EpipolarModel
 
 PLANAR = (
     pycolmap.TwoViewGeometryConfiguration.PLANAR,
@@ -22,33 +21,20 @@ PLANAR = (
 )
 """Pairs that a homography explains: their epipolar geometry is arbitrary."""
 
+CALIBRATED = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
 
 MIN_TRANSLATION = 1e-9
 """Of a decomposed homography, in units of the distance of its plane."""
-
-
-@dataclass(frozen=True)
-class EpipolarPair:
-    """The epipolar geometry of a pair and all keypoints in the pixels it holds in.
-
-    Attributes:
-        fundamental: (3, 3), ``x2^T F x1 = 0``.
-        points1: (N1, 2) keypoints of image 1, px; without distortion where both cameras are
-            known.
-        points2: (N2, 2) keypoints of image 2.
-    """
-
-    fundamental: NDArray[np.float64]
-    points1: NDArray[np.float64]
-    points2: NDArray[np.float64]
 
 
 def epipolar_pair(
     geometry: pycolmap.TwoViewGeometry,
     cameras: tuple[pycolmap.Camera, pycolmap.Camera],
     keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
-) -> EpipolarPair | None:
-    """Return the epipolar geometry of a pair; None where it has none.
+) -> EpipolarModel | None:
+    """Return the epipolar geometry of a pair and all keypoints; None where it has none.
+
+    Where both cameras are known it holds in pixels without distortion.
 
     Args:
         geometry: as COLMAP estimated it.
@@ -65,7 +51,8 @@ def epipolar_pair(
         points2 = undistorted(cameras[1], points2)
     if fundamental is None or not np.any(fundamental):
         return None
-    return EpipolarPair(np.asarray(fundamental, np.float64), points1, points2)
+    sample_size = 5 if geometry.config == CALIBRATED else 7
+    return EpipolarModel(np.asarray(fundamental, np.float64), (points1, points2), sample_size)
 
 
 def undistorted(camera: pycolmap.Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,6 +13,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.geometry.two_views import homogeneous
+
 Array = NDArray[np.float64]
 
 
@@ -20,10 +22,7 @@ def epipolar_lines(
     fundamental: NDArray[np.floating], points1: NDArray[np.floating], points2: NDArray[np.floating]
 ) -> tuple[Array, Array]:
     """Return (N, 3) lines in image 1 of ``points2``, and in image 2 of ``points1``."""
-    ones1, ones2 = np.ones((len(points1), 1)), np.ones((len(points2), 1))
-    lines1 = np.hstack([points2, ones2]) @ fundamental
-    lines2 = np.hstack([points1, ones1]) @ fundamental.T
-    return lines1, lines2
+    return homogeneous(points2) @ fundamental, homogeneous(points1) @ fundamental.T
 
 
 def sampson_errors(

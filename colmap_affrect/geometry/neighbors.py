@@ -49,6 +49,23 @@ def neighbors_within(points: NDArray[np.floating], radius: float) -> NeighborLis
     return NeighborLists(starts, candidate[np.argsort(row, kind="stable")])
 
 
+def without_duplicates(
+    points1: NDArray[np.floating], points2: NDArray[np.floating], radius_px: float
+) -> NDArray[np.bool_]:
+    """Tell which of (M, 2) matching points, the best first, to keep.
+
+    Those within ``radius_px`` of a better one that is kept, at both ends, go.
+    """
+    rows, others = neighbors_within(points1, radius_px).of(np.arange(len(points1)))
+    near = ((points2[rows] - points2[others]) ** 2).sum(axis=1) <= radius_px**2
+    near &= others < rows
+    keep = np.ones(len(points1), dtype=bool)
+    for row, other in zip(rows[near], others[near], strict=True):
+        if keep[other]:
+            keep[row] = False
+    return keep
+
+
 def _expand(
     begin: NDArray[np.integer], end: NDArray[np.integer]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -19,8 +19,9 @@ from typing import Annotated, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.geometry.affine import project, transform_frames
-from colmap_affrect.geometry.epipolar import common_sign, direction_cosines, epipolar_lines
+from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.epipolar import common_sign, epipolar_lines
+from colmap_affrect.geometry.pair_models import EpipolarModel, HomographyModel, PairModel
 from colmap_affrect.geometry.shapes import vary_singly
 from colmap_affrect.matchers.base import distance_ratios
 from colmap_affrect.options import Options, within
@@ -96,17 +97,13 @@ class GuidableImage:
 class Guide(Protocol):
     """What the geometry of a pair says about matches of its features."""
 
+    model: PairModel
+
     def groups(self) -> Iterator[tuple[Indices, Indices]]:
         """Yield features of image 1, each once, and all of image 2 that any of these may match."""
 
     def allowed(self, rows: Indices, columns: Indices) -> NDArray[np.bool_]:
         """Tell which of (R,) and (C,) features may match, (R, C)."""
-
-    def angles_deg(self, shapes1: Array, shapes2: Array, indices: Indices, of: Indices) -> Array:
-        """Return (M,) angles between the frames of (M, 2) matches and the geometry.
-
-        Directions that the geometry leaves open are taken from the matches ``of``, mostly right.
-        """
 
 
 class EpipolarGuide:
@@ -114,7 +111,7 @@ class EpipolarGuide:
 
     def __init__(self, fundamental: Array, points1: Array, points2: Array, band_px: float) -> None:
         """Bring both images to unit size, which keeps angles around far epipoles apart."""
-        self._fundamental, self._points = fundamental, (points1, points2)
+        self.model: PairModel = EpipolarModel(fundamental, (points1, points2))
         finite = [points[np.isfinite(points).all(axis=1)] for points in (points1, points2)]
         size = max([1.0, *(float(np.ptp(p, axis=0).max()) for p in finite if len(p))])
         to_pixels, unit = [], []
@@ -170,35 +167,21 @@ class EpipolarGuide:
         squares = self._squares2[rows, None] + self._squares1[columns]
         return np.asarray(residuals**2 <= self._band**2 * squares)
 
-    def angles_deg(self, shapes1: Array, shapes2: Array, indices: Indices, of: Indices) -> Array:
-        """See :class:`Guide`; the open sign of all directions is that of most matches."""
-        cosines, known = (
-            direction_cosines(
-                self._fundamental,
-                self._points[0][pairs[:, 0]],
-                self._points[1][pairs[:, 1]],
-                shapes1[pairs[:, 0]],
-                shapes2[pairs[:, 1]],
-            )
-            for pairs in (indices, of)
-        )
-        angles = np.arccos(np.clip(cosines * common_sign(known), -1.0, 1.0))
-        return np.asarray(np.degrees(angles))
-
 
 class HomographyGuide:
     """Matches lie near the places that a homography gives: of planes, and without a baseline."""
 
     def __init__(self, homography: Array, points1: Array, points2: Array, band_px: float) -> None:
         """Carry the points of image 1 over."""
-        self._homography, self._points = homography, (points1, points2)
+        self._points2 = points2
+        self.model: PairModel = HomographyModel(homography, (points1, points2))
         with np.errstate(divide="ignore", invalid="ignore"):
             self._places = project(homography, points1)
         self._radius = BANDS_OF_HOMOGRAPHY * band_px
 
     def groups(self) -> Iterator[tuple[Indices, Indices]]:
         """See :class:`Guide`; a group is a part of a strip of image 2."""
-        points2, radius = self._points[1], self._radius
+        points2, radius = self._points2, self._radius
         order2 = np.argsort(points2[:, 1])[: np.isfinite(points2).all(axis=1).sum()]
         if not len(order2):
             return
@@ -215,19 +198,7 @@ class HomographyGuide:
 
     def allowed(self, rows: Indices, columns: Indices) -> NDArray[np.bool_]:
         """See :class:`Guide`."""
-        return _within(self._places[rows], self._points[1][columns], self._radius)
-
-    def angles_deg(self, shapes1: Array, shapes2: Array, indices: Indices, of: Indices) -> Array:
-        """See :class:`Guide`: by how much frames turn otherwise than the homography does."""
-        del of
-        points = self._points[0][indices[:, 0], :, None]
-        frames = np.concatenate([shapes1[indices[:, 0]], points], axis=2)
-        carried = transform_frames(self._homography, frames)[:, :, :2]
-        relative = shapes2[indices[:, 1]] @ np.linalg.inv(carried)
-        turned = np.arctan2(
-            relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1]
-        )
-        return np.asarray(np.abs(np.degrees(turned)))
+        return _within(self._places[rows], self._points2[columns], self._radius)
 
 
 @dataclass(frozen=True)
@@ -289,6 +260,20 @@ def _within(points1: Array, points2: Array, radius: float) -> NDArray[np.bool_]:
     return np.asarray(x**2 + y**2 <= radius**2)
 
 
+def frame_angles_deg(
+    guide: Guide, shapes: tuple[Array, Array], indices: Indices, of: Indices
+) -> Array:
+    """Return (M,) angles between the frames of (M, 2) matches and the geometry.
+
+    The sign of all directions that the geometry leaves open is that of most of the matches ``of``.
+    """
+    cosines, known = (
+        guide.model.cosines(pairs[:, 0], pairs[:, 1], shapes) for pairs in (indices, of)
+    )
+    sign = common_sign(known) if guide.model.has_sign else 1.0
+    return np.asarray(np.degrees(np.arccos(np.clip(cosines * sign, -1.0, 1.0))))
+
+
 def guided_matches(
     first: GuidableImage,
     second: GuidableImage,
@@ -316,12 +301,12 @@ def guided_matches(
     if not (first.has_directions and second.has_directions):
         found = found[: len(found) if len(inliers) else 0]
     else:
-        shapes1, shapes2 = np.asarray(first.shapes), np.asarray(second.shapes)
+        shapes = np.asarray(first.shapes), np.asarray(second.shapes)
         trusted = inliers if len(inliers) else found
-        agreeing = guide.angles_deg(shapes1, shapes2, trusted, trusted) <= options.max_angle_deg
+        agreeing = frame_angles_deg(guide, shapes, trusted, trusted) <= options.max_angle_deg
         if len(trusted) and agreeing.mean() < MIN_AGREEING:
             return inliers
-        found = found[guide.angles_deg(shapes1, shapes2, found, trusted) <= options.max_angle_deg]
+        found = found[frame_angles_deg(guide, shapes, found, trusted) <= options.max_angle_deg]
     free = ~(np.isin(found[:, 0], inliers[:, 0]) | np.isin(found[:, 1], inliers[:, 1]))
     both = np.concatenate([inliers, found[free]])
     return np.asarray(both[np.argsort(both[:, 0], kind="stable")])

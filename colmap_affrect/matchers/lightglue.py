@@ -25,6 +25,7 @@ from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import OptionError, WeightsError
 from colmap_affrect.features.weights import load_state_dict
 from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.geometry.neighbors import without_duplicates
 from colmap_affrect.matchers.base import (
     ImageFeatures,
     MatcherContext,
@@ -32,7 +33,6 @@ from colmap_affrect.matchers.base import (
     Matches,
     unless_gpu_is_full_or_say,
 )
-from colmap_affrect.matchers.duplicates import without_duplicates
 from colmap_affrect.options import within
 from colmap_affrect.parallel.executor import one_openmp_thread
 

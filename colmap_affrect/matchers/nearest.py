@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.geometry.neighbors import NeighborLists, neighbors_within
+from colmap_affrect.geometry.neighbors import NeighborLists, neighbors_within, without_duplicates
 from colmap_affrect.matchers.base import (
     ImageFeatures,
     MatcherContext,
@@ -25,7 +25,6 @@ from colmap_affrect.matchers.base import (
     distance_ratios,
     unless_gpu_is_full_or_say,
 )
-from colmap_affrect.matchers.duplicates import without_duplicates
 from colmap_affrect.matchers.nearest_8bit import (
     CoarseDescriptors,
     MakeCoarse,

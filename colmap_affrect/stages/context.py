@@ -28,15 +28,16 @@ class Resources:
     device: str = "auto"
     depth_cache_path: Path | None = None
 
-    def require_device(self) -> None:
-        """Refuse a device that is not there; torch is loaded only when one is named.
+    def require_device(self, *, uses_network: bool = False) -> str:
+        """Return the device that is there, else raise DeviceError.
 
-        Raises DeviceError.
+        torch is loaded only where networks are used, or when a device is named.
         """
-        if self.device not in ("auto", "cpu"):
-            from colmap_affrect.features.networks import resolve_device
+        if self.device in ("auto", "cpu") and not uses_network:
+            return "cpu"
+        from colmap_affrect.features.networks import resolve_device
 
-            resolve_device(self.device)
+        return str(resolve_device(self.device))
 
 
 def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) -> None:

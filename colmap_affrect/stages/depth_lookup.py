@@ -36,11 +36,7 @@ def depth_lookup(context: Context) -> DepthLookup | None:
     options = recorded_extraction(workspace)
     if not options.depth.is_given:
         return None
-    device = context.resources.device
-    if options.depth.uses_network:
-        from colmap_affrect.features.networks import resolve_device
-
-        device = str(resolve_device(device))
+    device = context.resources.require_device(uses_network=options.depth.uses_network)
     source = DEPTH_SOURCES.make(options.depth, DepthContext(workspace.depth, device))
     folder, cameras = Path(Inputs.recorded(workspace).image_path), read_cameras(workspace.database)
 

@@ -87,8 +87,7 @@ def guided_task(
         pair = epipolar_pair(geometry, cameras, keypoints)
         if pair is None:
             return None
-        points = (pair.points1, pair.points2)
-        task = GuidedTask(names, pair.fundamental, False, points, inliers)
+        task = GuidedTask(names, pair.fundamental, False, pair.points, inliers)
     return task.scaled(scales)
 
 

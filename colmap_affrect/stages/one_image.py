@@ -336,7 +336,8 @@ def prepare(
     resources = resources or Resources()
     options.check_depth()
     weights = resolve(options.weights, resources.weights_path, progress=progress)
-    network = NetworkContext(weights, _device(options, resources))
+    device = resources.require_device(uses_network=options.uses_networks)
+    network = NetworkContext(weights, device)
     levels = options.levels
     extractors = {
         features: EXTRACTORS.make(features, network) for features in {x.features for x in levels}
@@ -367,12 +368,3 @@ def _prepared_elsewhere(
     extractor = prepare(options, replace(resources, depth_cache_path=None))
     require_same_files(extractor.weights, digests)
     return extractor
-
-
-def _device(options: ExtractionOptions, resources: Resources) -> str:
-    """Return the device that is there; torch is asked only when it is needed."""
-    if resources.device in ("auto", "cpu") and not options.uses_networks:
-        return "cpu"
-    from colmap_affrect.features.networks import resolve_device
-
-    return str(resolve_device(resources.device))

@@ -297,16 +297,6 @@ def test_colmap_preset_is_what_pycolmap_has_by_default(mapper: str, given: bool)
     assert made.options.max_num_attempts == 1
 
 
-def test_differences_are_those_of_the_options_that_pycolmap_is_given() -> None:
-    for mapper in MAPPERS.names():
-        made = mapper_of(mapper)
-        native = flat_values(made.native(ALL_GIVEN, SEED))
-        default = flat_values(NATIVE[mapper]())
-        differs = made.differences(ALL_GIVEN)
-        for key in native.keys() - {"constant_cameras"}:  # a set; the flags say it as well
-            assert np.array_equal(native[key], differs.get(key, default[key])), key
-
-
 @pytest.mark.parametrize("name", PRESETS)
 def test_preset_knows_its_name(name: str) -> None:
     assert VerificationOptions.preset(name).preset_name == name

@@ -15,6 +15,7 @@ from colmap_affrect.matchers.guided import (
     Guide,
     GuidedOptions,
     HomographyGuide,
+    frame_angles_deg,
     guided_matches,
     nearest_allowed,
 )
@@ -180,10 +181,10 @@ def test_directions_may_all_be_turned() -> None:
     first, second, _ = plane_pair()
     guide = EpipolarGuide(-fundamental((1, 0.2, 0.1)), first.points, second.points, 1e4)
     every = np.stack([np.arange(200)] * 2, axis=1)
-    angles = guide.angles_deg(first.shapes, second.shapes, every, every)
+    angles = frame_angles_deg(guide, (first.shapes, second.shapes), every, every)
     opposite = EpipolarGuide(fundamental((1, 0.2, 0.1)), first.points, second.points, 1e4)
     np.testing.assert_allclose(
-        angles, opposite.angles_deg(first.shapes, second.shapes, every, every), atol=1e-6
+        angles, frame_angles_deg(opposite, (first.shapes, second.shapes), every, every), atol=1e-6
     )
 
 
