@@ -103,7 +103,7 @@ def test_options_commands_and_names_in_the_text_exist(name: str) -> None:
             assert script or flag in {*ALL_FLAGS, *FOREIGN, *PENDING}, code
         if re.fullmatch(r"colmap_affrect(\.\w+)+", code):
             pkgutil.resolve_name(code)
-        if words[0] == "--recipe" and not words[1].isupper() and ".toml" not in code:
+        if words[0] == "--recipe" and words[1:] and not words[1].isupper() and ".toml" not in code:
             load_recipe(words[1])
         if words[0] == "--set" and "=" in code:
             load_recipe("default", [words[1]])
