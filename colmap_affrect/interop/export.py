@@ -157,7 +157,8 @@ def _nvm(source: Source, folder: Path) -> Path:
         lines.append(f"{image.name} {_numbers(values)}")
     lines += ["", str(source.model.num_points3D())]
     for point, views in source.tracks():
-        seen = {view[0]: view for view in reversed(views)}.values()  # one keypoint of each image
+        unique = {view[0]: view for view in reversed(views)}  # one keypoint of each image
+        seen = [unique[place] for place in sorted(unique)]
         keypoints = [
             f"{place} {index} {_numbers(xy - centers[place])}" for place, index, xy in seen
         ]
