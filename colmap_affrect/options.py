@@ -221,15 +221,15 @@ def _descriptions(cls: type) -> dict[str, str]:
     for base in reversed(cls.__mro__):
         if not issubclass(base, Options):
             continue
-        (body,) = (node.body for node in ast.parse(_source(base)).body)  # type: ignore[attr-defined]
+        try:
+            source = textwrap.dedent(inspect.getsource(base))
+        except (OSError, TypeError):  # made at run time, or installed without its source
+            continue
+        (body,) = (node.body for node in ast.parse(source).body if isinstance(node, ast.ClassDef))
         for field, text in itertools.pairwise(body):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
                 found[ast.unparse(field.target)] = " ".join(ast.literal_eval(text.value).split())
     return found
-
-
-def _source(cls: type) -> str:
-    return textwrap.dedent(inspect.getsource(cls))
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

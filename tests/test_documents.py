@@ -61,13 +61,9 @@ def shell_commands(name: str) -> Iterator[list[str]]:
             yield words
 
 
-def flags_of(command: str) -> set[str]:
-    parser = build_parser()
-    (choices,) = (action.choices for action in parser._actions if action.dest == "command")
-    return set(choices[command]._option_string_actions)
-
-
-ALL_FLAGS = {flag for command in COMMANDS for flag in flags_of(command)}
+PARSER = build_parser()
+(CHOICES,) = (action.choices for action in PARSER._actions if action.dest == "command")
+ALL_FLAGS = {flag for command in CHOICES.values() for flag in command._option_string_actions}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -75,7 +71,7 @@ def test_commands_are_understood(name: str) -> None:
     for words in shell_commands(name):
         if not words or Path(words[0]).name != "colmap-affrect" or words[1] in PENDING:
             continue
-        options = build_parser().parse_args(words[1:])
+        options = PARSER.parse_args(words[1:])
         recipe = getattr(options, "recipe", None) or "default"
         if not recipe.endswith(".toml") and "recipe" in options:
             load_recipe(recipe, options.set)
@@ -103,7 +99,7 @@ def test_options_commands_and_names_in_the_text_exist(name: str) -> None:
             assert script or flag in {*ALL_FLAGS, *FOREIGN, *PENDING}, code
         if re.fullmatch(r"colmap_affrect(\.\w+)+", code):
             pkgutil.resolve_name(code)
-        if words[0] == "--recipe" and not words[1].isupper() and ".toml" not in code:
+        if words[0] == "--recipe" and words[1:] and not words[1].isupper() and ".toml" not in code:
             load_recipe(words[1])
         if words[0] == "--set" and "=" in code:
             load_recipe("default", [words[1]])

@@ -156,7 +156,9 @@ def _nvm(source: Source, folder: Path) -> Path:
         values = [camera.mean_focal_length(), w, x, y, z, *image.projection_center(), -terms[0], 0]
         lines.append(f"{image.name} {_numbers(values)}")
     lines += ["", str(source.model.num_points3D())]
-    for point, seen in source.tracks():
+    for point, views in source.tracks():
+        unique = {view[0]: view for view in reversed(views)}  # one keypoint of each image
+        seen = [unique[place] for place in sorted(unique)]
         keypoints = [
             f"{place} {index} {_numbers(xy - centers[place])}" for place, index, xy in seen
         ]

@@ -334,7 +334,7 @@ class ReconstructionReport:
         if self.cameras:
             sources = Counter(str(camera["source"]) for camera in self.cameras).most_common()
             texts = [f"{count} {SOURCES.get(source, source)}" for source, count in sources]
-            lines += [f"focal       {', '.join(texts)}"]
+            lines += [f"cameras     focal lengths: {', '.join(texts)}"]
         if self.models:
             lines += self.models[0].summary_lines()
         if len(self.models) > 1:

@@ -289,40 +289,58 @@ def _verified_by_name(workspace: Workspace) -> dict[str, dict[str, int]]:
 def advice(
     context: Context, missing: Collection[str], models: Sequence[ModelSummary]
 ) -> tuple[str, ...]:
-    """Say what may help when images are missing, best first.
+    """Say what may help when images are missing or the model is doubtful, best first.
 
     Args:
         context: of a run that has been mapped.
         missing: images that are not in the largest model.
         models: all models, largest first.
     """
-    if not missing:
+    is_doubtful = bool(models and (models[0].doubtful or models[0].doubts))
+    if not missing and not is_doubtful:
         return ()
     workspace = context.workspace
-    verified = _verified_by_name(workspace)
-    recipe, again = workspace.recipe(), "run again with"
     texts = []
-    cameras, inputs = colmap_database.all_cameras(workspace.database), Inputs.recorded(workspace)
-    same_size = len({(camera.width, camera.height) for camera in cameras}) == 1
-    if len(cameras) > 1 and same_size and not any(c.has_prior_focal_length for c in cameras):
-        texts.append(f"{again} --camera-mode single, if one camera took all: they have one size")
+    if is_copy(workspace):
+        texts.append("run --from-database, with --image-path, makes new features for its images")
+    else:
+        cameras = colmap_database.all_cameras(workspace.database)
+        same_size = len({(camera.width, camera.height) for camera in cameras}) == 1
+        if len(cameras) > 1 and same_size and not any(c.has_prior_focal_length for c in cameras):
+            texts.append("run again with --camera-mode single, if one camera took all: their size "
+                         "is the same")  # fmt: skip
+        masks = Inputs.recorded(workspace).masks
+        if is_doubtful and not (masks.path or masks.camera_path):
+            texts.append(
+                "run again with --mask-path, if things move, repeat or are written on them"
+            )
+    if missing:
+        texts += [] if is_copy(workspace) else _other_recipes(context)
+        texts.append(f"more photographs {_missing_places(workspace, missing)}")
+    return tuple(texts)
+
+
+def _other_recipes(context: Context) -> list[str]:
+    recipe, texts = context.workspace.recipe(), []
     if recipe not in (STRONGER_RECIPE, LEARNED_RECIPE):
-        texts.append(f"{again} --recipe {STRONGER_RECIPE}, which tries more warps for those")
+        texts.append(f"run again with --recipe {STRONGER_RECIPE}, which tries more warps for those")
     if recipe != LEARNED_RECIPE:
         weights = load_recipe(LEARNED_RECIPE).weights
         gone = missing_weights(weights, context.resources.weights_path)
         fetch = f" (first: colmap-affrect weights fetch {' '.join(weights)})" if gone else ""
-        texts.append(f"{again} --recipe {LEARNED_RECIPE}, if light or age differ{fetch}")
+        texts.append(f"run again with --recipe {LEARNED_RECIPE}, if light or age differ{fetch}")
+    return texts
+
+
+def _missing_places(workspace: Workspace, missing: Collection[str]) -> str:
+    """Name what lies beside missing images: the best partners that they have in the model."""
+    verified = _verified_by_name(workspace)
     between = [
-        f"{name} and {max(inside, key=lambda other: partners[other])}"
+        f"between {name} and {max(inside, key=lambda other: partners[other])}"
         for name, partners in verified.items()
         if name in missing and (inside := partners.keys() - set(missing))
     ][:NUM_BEST_PAIRS]
-    places = f"between {', between '.join(between)}" if between else "that show the missing places"
-    texts.append(f"more photographs {places}")
-    if models and models[0].doubtful and not (inputs.masks.path or inputs.masks.camera_path):
-        texts.append(f"{again} --mask-path, where something moves, repeats or is written over them")
-    return tuple(texts)
+    return ", ".join(between) or "that show the missing places"
 
 
 def agreement(context: Context, sparse_path: Path) -> float:

@@ -19,7 +19,7 @@ def main() -> int:
     """Return the exit code of colmap-affrect."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--image", required=True, help="container image with colmap-affrect, see README.md"
+        "--image", required=True, help="container image with colmap-affrect, see docs/cluster.md"
     )
     parser.add_argument("--workers", type=int, default=4)
     parser.add_argument("--cores", type=int, default=8, help="of each worker")

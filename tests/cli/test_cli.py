@@ -17,9 +17,10 @@ import pytest
 from command import Call
 from small_scene import INTRINSICS, write_photographs
 
-from colmap_affrect import __version__
+from colmap_affrect import __version__, pipeline
 from colmap_affrect.cli import main
 from colmap_affrect.cli.parser import EXAMPLES, build_parser, epilog
+from colmap_affrect.errors import OptionError
 from colmap_affrect.features import weights
 from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers.doubts import Doubts
@@ -117,6 +118,7 @@ def test_one_recipe_is_printed_with_all_options_and_can_be_used_as_a_file(
     path.write_text(done.stdout)
     copy, original = load_recipe(str(path)), load_recipe("on-demand")
     assert (copy.extraction, copy.matching) == (original.extraction, original.matching)
+    assert "# Radius r of a covering ball as a tilt ratio. Paper: 1.7.\ntilt_radius" in done.stdout
 
 
 def test_weights_are_listed_with_where_they_are(tmp_path: Path, call: Call) -> None:
@@ -383,25 +385,67 @@ def test_inspect_draws_a_sheet_and_writes_the_plan(tmp_path: Path, call: Call) -
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "code", "message"),
     [
-        (["--device", "gpu"], "--device gpu: not one of auto, cpu, cuda"),
-        (["--recipe", "depth-planes-recommended"], "give --depth-path FOLDER, or --depth-model"),
-        (["--recipe", "depth-planes-recommended", "--depth-path", "nowhere"], "nowhere"),
-        (["--recipe", "dense-affnet", "--weights", "nowhere"], "nowhere: not a folder"),
+        (["--device", "gpu"], 1, "--device gpu: not one of auto, cpu, cuda"),
+        (["--recipe", "depth-planes-recommended"], 2, "give --depth-path FOLDER, or --depth-mod"),
+        (["--recipe", "depth-planes"], 2, "give --depth-path FOLDER, or --depth-model"),
+        (["--recipe", "depth-planes-recommended", "--depth-path", "nowhere"], 1, "nowhere"),
+        (["--recipe", "dense-affnet", "--weights", "nowhere"], 1, "nowhere: not a folder"),
+        (["--recipe", "defalt"], 2, "did you mean 'default'"),
+        (["--pairs", "vocab"], 2, "vocab"),
+        (["--camera-params", "1,2"], 2, "SIMPLE_RADIAL needs 4 values"),
+        (["--config", "none.toml"], 2, "none.toml: has no options of a run"),
     ],
 )
 def test_what_is_missing_is_said_before_any_image_is_read(
-    tmp_path: Path, arguments: list[str], message: str, call: Call
+    tmp_path: Path, arguments: list[str], code: int, message: str, call: Call
 ) -> None:
     write_photographs(tmp_path / "photos", 2)
     out = tmp_path / "out"
     done = call("run", "--image-path", tmp_path / "photos", "--output-path", out, *arguments)
-    assert (done.code, done.stdout) == (1, "")
+    assert (done.code, done.stdout) == (code, "")
     (line,) = done.stderr
     assert line.startswith("error: ")
     assert message in line
-    assert not (out / "features.h5").exists()
+    assert not out.exists()
+
+
+def test_what_is_printed_may_end_early() -> None:
+    command = f"{sys.executable} -m colmap_affrect recipes on-demand | head -n 1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
+    assert (len(done.stdout.splitlines()), done.stderr) == (1, "")
+
+
+def test_run_repeats_what_is_on_record_and_options_win(
+    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[tuple[Path, pipeline.RunOptions]] = []
+
+    def keep(images: Path, _: Path, options: pipeline.RunOptions, **__: object) -> None:
+        taken.append((images, options))
+        raise OptionError("enough")
+
+    write_photographs(tmp_path / "photos", 2)
+    (tmp_path / "list.txt").write_text("a.png\n")
+    done = call(
+        "extract", "--image-path", tmp_path / "photos", "--output-path", tmp_path / "out",
+        "--recipe", "unrectified-rootsift", "--set", "matching.max_ratio=0.7",
+        "--camera-mode", "single", "--image-list-path", tmp_path / "list.txt",
+    )  # fmt: skip
+    assert done.code == 0
+    monkeypatch.setattr(pipeline, "run", keep)
+    again = ["run", "--config", tmp_path / "out" / "config.toml", "--output-path", tmp_path / "b"]
+    call(*again)
+    call(*again, "--image-path", tmp_path, "--camera-mode", "per-image", "--recipe", "default")
+    (images, options), (others, changed) = taken
+    assert images == tmp_path / "photos"
+    assert options.recipe.name == "unrectified-rootsift"
+    assert (options.recipe.matching.max_ratio, options.cameras.mode) == (0.7, "single")
+    assert options.recipe.extraction == load_recipe("unrectified-rootsift").extraction
+    assert options.image_list_path == tmp_path / "list.txt"
+    assert (others, changed.image_list_path) == (tmp_path, None)
+    assert (changed.recipe, changed.cameras.mode) == (load_recipe("default"), "per-image")
 
 
 def test_missing_weights_are_one_error_with_the_way_out(

@@ -13,6 +13,7 @@ import numpy as np
 import PIL.ExifTags
 import PIL.Image
 import pytest
+from command import Call
 from small_scene import IMAGE_SIZE, photograph
 from synthetic import texture, write_image
 
@@ -161,7 +162,6 @@ HUGE_PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(
 @pytest.mark.parametrize(
     ("prepare_mask", "message"),
     [
-        (Path.exists, "has no mask .*a b.png.png; make one"),
         (lambda path: path.write_bytes(b""), "not a readable image"),
         (lambda path: write_mask(path, diagonal_mask((300, 240))), "320 x 240 px and its mask 300"),
         (lambda path: path.write_bytes(HUGE_PNG), "320 x 240 px and its mask 32000 x 31000 px"),
@@ -185,6 +185,25 @@ def test_image_with_a_wrong_mask_is_reported_and_the_others_go_on(
     assert store.names() == ["good.png"]
     log = (tmp_path / "out" / "run.log").read_text()
     assert re.search(message, log)
+
+
+def test_photographs_without_a_mask_are_used_whole_and_named(
+    photo_path: Path, tmp_path: Path, call: Call
+) -> None:
+    write_image(photo_path.with_name("good.png"), texture((90, 70), 1))
+    arguments = ["extract", "--image-path", photo_path.parent, "--output-path", tmp_path / "out"]
+    arguments += ["--mask-path", tmp_path / "masks"]
+    write_mask(tmp_path / "masks" / "other.png", np.zeros((70, 90), bool))
+    done = call(*arguments)
+    assert done.code == 2
+    assert "has no mask of any image, such as " in done.errors[0]
+    write_mask(tmp_path / "masks" / "good.png", np.zeros((70, 90), bool))
+    done = call(*arguments)
+    assert done.code == 0
+    assert "WARNING: masks: 1 images have none and are used whole, as a b.png is" in done.stderr
+    store = FeatureStore(tmp_path / "out" / "features.h5")
+    assert len(store.read("a b.png")) > 100
+    assert len(store.read("good.png")) == 0
 
 
 def test_missing_folder_of_masks_is_one_clear_line(tmp_path: Path) -> None:

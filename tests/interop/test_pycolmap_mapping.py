@@ -183,6 +183,19 @@ def test_database_of_any_program_is_mapped_in_a_copy(
     assert again.stages[0].num_done == 15
 
 
+def test_images_that_a_database_leaves_out_are_named_with_advice(tmp_path: Path) -> None:
+    synthesize(tmp_path / "any.db")
+    with open_database(tmp_path / "any.db") as database:
+        first = database.read_all_images()[0]
+        for other in database.read_all_images()[1:]:
+            database.delete_matches(first.image_id, other.image_id)
+            database.delete_inlier_matches(first.image_id, other.image_id)
+    report = colmap_affrect.map_from_database(tmp_path / "any.db", tmp_path / "out")
+    assert report.unregistered == {first.name: "no verified pair"}
+    assert report.advice[0].startswith("run --from-database, with --image-path")
+    assert report.advice[-1] == "more photographs that show the missing places"
+
+
 def test_map_from_database_extends(tmp_path: Path) -> None:
     names = synthesize(tmp_path / "any.db")
     report = colmap_affrect.map_from_database(tmp_path / "any.db", tmp_path / "out")

@@ -124,7 +124,7 @@ def test_other_options_than_before_are_refused(rooms: Workspace, call: Call) -> 
 
 def test_wrong_way_to_choose_pairs_is_one_clear_line(rooms: Workspace, call: Call) -> None:
     ended = call("pairs", "--output-path", rooms.path, "--pairs", "sequense")
-    assert ended.code == 1
+    assert ended.code == 2
     assert ended.errors[0].startswith("error: pairs: methods.0='sequense' is not one of 'exh")
 
 

@@ -346,7 +346,7 @@ def test_seed_that_colmap_cannot_take_is_one_clear_line(
 ) -> None:
     for stage in ("verify", "map"):
         ended = call(stage, "--output-path", copy.path, "--random-seed", seed, "--overwrite")
-        assert ended.code == 1
+        assert ended.code == 2
         assert ended.errors[0].startswith(f"error: random_seed={seed} is outside [-1, ")
     assert copy.sparse.exists()
 
