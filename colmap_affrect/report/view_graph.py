@@ -31,6 +31,9 @@ MAX_NUM_LAID_OUT, MAX_NUM_IN_MATRIX = 300, 1000
 MAX_NODE, MIN_NODE, DOT = 64.0, 22.0, 9.0
 """Sides of nodes in units of the graph."""
 
+SPACING = 1.6
+"""Of nodes that are joined, in their sides."""
+
 MIDDLE, GRAVITY = "", 0.1
 """A node and the weight of its edges to all others: they hold parts of the graph
 together that have no edge between them."""
@@ -115,12 +118,12 @@ def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layou
 
 
 def _apart(centers: NDArray[np.float64], size: float) -> NDArray[np.float64]:
-    """Push squares of a side apart until none overlap, or nearly."""
+    """Push squares of a side apart until edges show between them, or nearly."""
     low, high = size / 2, np.array(GRAPH_SIZE) - size / 2
     rows, columns = np.triu_indices(len(centers), 1)
     for _ in range(200):
         offsets = centers[columns] - centers[rows]
-        gaps = 1.08 * size - np.abs(offsets).max(axis=1)
+        gaps = SPACING * size - np.abs(offsets).max(axis=1)
         close = gaps > 0
         if not close.any():
             break
