@@ -54,7 +54,11 @@ def read_color(path: Path, max_size_px: int) -> ColorImage:
 
     EXIF orientation is not applied. Raises ImageError as :func:`read_gray`.
     """
-    image = decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image: NDArray[np.generic] = np.zeros((0, 0))
+    if path.suffix.lower() in (".jpg", ".jpeg"):  # an eighth is decoded several times faster
+        image = decode(path, cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION)
+    if max(image.shape) < max_size_px:
+        image = decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return shrink_to(np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8), max_size_px)
 
 

@@ -103,7 +103,7 @@ def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layou
         size = min(MAX_NODE, max(MIN_NODE, 0.3 * sqrt(GRAPH_SIZE[0] * GRAPH_SIZE[1] / count)))
     graph = networkx.Graph()
     graph.add_nodes_from(names)
-    strongest = log(1 + max((count for pairs in graphs for count in pairs.values()), default=1))
+    strongest = log(1 + max((n for pairs in graphs for n in pairs.values()), default=1))
     for pairs in graphs:
         for pair, inliers in pairs.items():
             known = graph.get_edge_data(*pair, default={"weight": 0.0})["weight"]
