@@ -32,7 +32,7 @@ MAX_NODE, MIN_NODE, DOT = 64.0, 22.0, 9.0
 """Sides of nodes in units of the graph."""
 
 SPACING = 1.6
-"""Of nodes that are joined, in their sides."""
+"""Of nodes that are thumbnails, in their sides: edges show between them."""
 
 MIDDLE, GRAVITY = "", 0.1
 """A node and the weight of its edges to all others: they hold parts of the graph
@@ -121,9 +121,10 @@ def _apart(centers: NDArray[np.float64], size: float) -> NDArray[np.float64]:
     """Push squares of a side apart until edges show between them, or nearly."""
     low, high = size / 2, np.array(GRAPH_SIZE) - size / 2
     rows, columns = np.triu_indices(len(centers), 1)
+    spacing = SPACING if len(centers) <= MAX_NUM_THUMBNAILS else 1.0
     for _ in range(200):
         offsets = centers[columns] - centers[rows]
-        gaps = SPACING * size - np.abs(offsets).max(axis=1)
+        gaps = spacing * size - np.abs(offsets).max(axis=1)
         close = gaps > 0
         if not close.any():
             break
