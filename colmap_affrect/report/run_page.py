@@ -11,7 +11,7 @@ from typing import Any
 from colmap_affrect.options import flat
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.report import ModelSummary, ReconstructionReport
+from colmap_affrect.project.report import MAX_LINES, ModelSummary, ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import view_graph
 from colmap_affrect.report.page import TEMPLATES, number_text, write_page
@@ -92,6 +92,7 @@ def write_run_page(
         "headline": f"{len(model.registered_names)} of {len(names)} photographs registered",
         "about": _about(report),
         "doubts": _doubts(report, model),
+        "max_num_doubts": MAX_LINES,
         "advice": report.advice,
         "tiles": _tiles(report, model),
         "view": view,
