@@ -49,8 +49,8 @@ from colmap_affrect.stages.map import (
     image_path_of,
     images_in_need,
     map_images,
+    num_verified_inliers,
     unregistered,
-    verified_inliers,
 )
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
@@ -265,7 +265,7 @@ def map_and_report(
     reports, models = map_guided(context, mapper, extend, overwrite=overwrite)
     names, copied = image_names(workspace), is_copy(workspace)
     verification = recorded_verification(workspace)
-    missing, pair_inliers = unregistered(context, names, models), verified_inliers(workspace)
+    missing, pair_inliers = unregistered(context, names, models), num_verified_inliers(workspace)
     cameras = read_camera_records(workspace.cameras)
     result = ReconstructionReport(
         images_total=len(names),

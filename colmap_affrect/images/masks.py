@@ -42,6 +42,12 @@ def connected_regions(mask: Mask, min_area_px: float) -> list[tuple[Mask, tuple[
     return regions
 
 
+def grown(mask: Mask, num_px: int) -> Mask:
+    """Add the pixels of an (H, W) mask's surroundings, so many in each direction."""
+    kernel = np.ones((2 * num_px + 1, 2 * num_px + 1), np.uint8)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+
+
 def connected_groups(mask: Mask, gap: int) -> list[Mask]:
     """Split an (H, W) mask into groups of pixels that are at most ``gap`` - 1 px apart."""
     joined = cv2.dilate(mask.astype(np.uint8), np.ones((gap, gap), np.uint8))

@@ -17,7 +17,7 @@ from PIL import ExifTags
 from colmap_affrect import PYCOLMAP_CAME_FIRST
 from colmap_affrect.data import ColorImage, GrayImage
 from colmap_affrect.errors import ImageError
-from colmap_affrect.images.headers import require_possible
+from colmap_affrect.images.headers import header_size, require_possible
 
 IMAGE_SUFFIXES = (
     ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".tif", ".tiff", ".bmp", ".pbm", ".pgm", ".pnm",
@@ -58,6 +58,11 @@ BIG_TIFF = 43
 """What files of more than 4 GiB have in the place of 42, with offsets of 64 bits."""
 
 
+COLOR_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+EIGHTH_OF_COLOR = cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
+"""Several times faster, of JPEG files."""
+
+
 def read_gray(path: Path, *, stretch: bool = False) -> GrayImage:
     """Read an image as gray, as stored: EXIF orientation is not applied, 16 bit becomes 8.
 
@@ -73,8 +78,9 @@ def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorIm
 
     EXIF orientation is not applied; for ``stretch`` and errors see :func:`read_gray`.
     """
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = decode(path, flags)[:, :, ::-1]
+    size = header_size(path) if path.suffix.lower() in (".jpg", ".jpeg") else None
+    is_far_larger = size is not None and max(size) >= 8 * max_size_px
+    image = decode(path, EIGHTH_OF_COLOR if is_far_larger else COLOR_AS_STORED)[:, :, ::-1]
     return shrink_to(in_eight_bits(image, tones(image) if stretch else None), max_size_px)
 
 

@@ -290,7 +290,7 @@ class Workspace:
     def _results(self, stage: str) -> list[Path]:
         """Return what a stage and those after it make."""
         first = STAGES.index(stage)
-        outdated = [self.sparse, self.aside, self.snapshots, self.report]
+        outdated = [self.sparse, self.aside, self.snapshots, self.report, self.page]
         if first <= STAGES.index("guide"):
             outdated.append(self.guided)
         if first <= STAGES.index("verify"):

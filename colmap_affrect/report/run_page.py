@@ -11,7 +11,7 @@ from typing import Any
 from colmap_affrect.options import flat
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.report import ModelSummary, ReconstructionReport
+from colmap_affrect.project.report import MAX_LINES, ModelSummary, ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import view_graph
 from colmap_affrect.report.page import TEMPLATES, number_text, write_page
@@ -92,6 +92,7 @@ def write_run_page(
         "headline": f"{len(model.registered_names)} of {len(names)} photographs registered",
         "about": _about(report),
         "doubts": _doubts(report, model),
+        "max_num_doubts": MAX_LINES,
         "advice": report.advice,
         "tiles": _tiles(report, model),
         "view": view,
@@ -160,23 +161,27 @@ def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
 
 def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
     """Return the numbers that are read first."""
-    return {
+    tiles = {
         "photographs in the model": f"{len(model.registered_names)} of {report.images_total}",
         "verified pairs": f"{report.num_verified_pairs:,} of {report.num_pairs:,}",
-        "points": f"{model.num_points3D:,}",
-        "photographs per point": f"{model.mean_track_length:.2f}",
-        "reprojection error": f"{model.mean_reprojection_error_px:.2f} px",
-        "seconds": number_text(sum(stage.wall_s for stage in report.stages)),
-        **({"models": str(len(report.models))} if len(report.models) > 1 else {}),
     }
+    if report.models:
+        tiles |= {
+            "points": f"{model.num_points3D:,}",
+            "photographs per point": f"{model.mean_track_length:.2f}",
+            "reprojection error": f"{model.mean_reprojection_error_px:.2f} px",
+        }
+    if len(report.models) > 1:
+        tiles["models"] = str(len(report.models))
+    return tiles | {"seconds": number_text(sum(stage.wall_s for stage in report.stages))}
 
 
 def _guided(report: ReconstructionReport) -> str:
     if not report.guided:
         return ""
-    return (
-        "Guided matching took {pairs} pairs from {matches_before:,} to {matches_after:,} inliers."
-    ).format(**report.guided)
+    pairs, before, after = (report.guided[k] for k in ("pairs", "matches_before", "matches_after"))
+    plural = "s" if pairs != 1 else ""
+    return f"Guided matching took {pairs} pair{plural} from {before:,} to {after:,} inliers."
 
 
 def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str, Any]:

@@ -31,6 +31,9 @@ MAX_NUM_LAID_OUT, MAX_NUM_IN_MATRIX = 300, 1000
 MAX_NODE, MIN_NODE, DOT = 64.0, 22.0, 9.0
 """Sides of nodes in units of the graph."""
 
+SPACING = 1.6
+"""Of nodes that are thumbnails, in their sides: edges show between them."""
+
 MIDDLE, GRAVITY = "", 0.1
 """A node and the weight of its edges to all others: they hold parts of the graph
 together that have no edge between them."""
@@ -100,7 +103,7 @@ def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layou
         size = min(MAX_NODE, max(MIN_NODE, 0.3 * sqrt(GRAPH_SIZE[0] * GRAPH_SIZE[1] / count)))
     graph = networkx.Graph()
     graph.add_nodes_from(names)
-    strongest = log(1 + max((count for pairs in graphs for count in pairs.values()), default=1))
+    strongest = log(1 + max((n for pairs in graphs for n in pairs.values()), default=1))
     for pairs in graphs:
         for pair, inliers in pairs.items():
             known = graph.get_edge_data(*pair, default={"weight": 0.0})["weight"]
@@ -115,12 +118,13 @@ def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layou
 
 
 def _apart(centers: NDArray[np.float64], size: float) -> NDArray[np.float64]:
-    """Push squares of a side apart until none overlap, or nearly."""
+    """Push squares of a side apart until edges show between them, or nearly."""
     low, high = size / 2, np.array(GRAPH_SIZE) - size / 2
     rows, columns = np.triu_indices(len(centers), 1)
+    spacing = SPACING if len(centers) <= MAX_NUM_THUMBNAILS else 1.0
     for _ in range(200):
         offsets = centers[columns] - centers[rows]
-        gaps = 1.08 * size - np.abs(offsets).max(axis=1)
+        gaps = spacing * size - np.abs(offsets).max(axis=1)
         close = gaps > 0
         if not close.any():
             break

@@ -230,7 +230,7 @@ def _ignore(_: int) -> None:
     pass
 
 
-def verified_inliers(workspace: Workspace) -> dict[Pair, int]:
+def num_verified_inliers(workspace: Workspace) -> dict[Pair, int]:
     """Return the number of inliers of each verified pair, by the names of its images."""
     ids = colmap_database.image_ids(workspace.database)
     names = {image_id: name for name, image_id in ids.items()}
@@ -281,7 +281,7 @@ def unregistered(
 def _verified_by_name(workspace: Workspace) -> dict[str, dict[str, int]]:
     """Return for each image of a verified pair its partners, and how many inliers they share."""
     found: defaultdict[str, dict[str, int]] = defaultdict(dict)
-    for (first, second), count in verified_inliers(workspace).items():
+    for (first, second), count in num_verified_inliers(workspace).items():
         found[first][second] = found[second][first] = count
     return dict(found)
 

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.data import Mask
+from colmap_affrect.images.masks import grown
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
@@ -147,6 +147,6 @@ def _cells(points: NDArray[np.floating], size: Size) -> NDArray[np.int64]:
 
 def _enlarged(cells: NDArray[np.int64]) -> Mask:
     """Return a mask of cells and those beside them: what is faint there matches less often."""
-    mask = np.zeros((NUM_CELLS, NUM_CELLS), np.uint8)
-    mask[cells[:, 1], cells[:, 0]] = 1
-    return np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0)
+    mask = np.zeros((NUM_CELLS, NUM_CELLS), bool)
+    mask[cells[:, 1], cells[:, 0]] = True
+    return grown(mask, 1)

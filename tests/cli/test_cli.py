@@ -267,6 +267,16 @@ def verified(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+def test_page_is_written_unless_it_is_left_out(verified: Path, call: Call) -> None:
+    page = verified / "report.html"
+    assert "3 of 3 photographs registered" in page.read_text(encoding="utf-8")
+    done = call("map", "--output-path", verified, "-q", "--no-page")
+    assert (done.code, page.exists(), "report.html" in done.stdout) == (0, False, False)
+    done = call("map", "--output-path", verified, "-q")
+    assert page.exists()
+    assert done.stdout.endswith(f"page        {page}\n")
+
+
 def test_preset_mapper_and_its_options_are_in_the_report_and_on_record(
     verified: Path, call: Call
 ) -> None:

@@ -120,6 +120,18 @@ def test_numbers_are_those_of_the_comparison(page: Page, comparison: Comparison)
     assert page.cells["registered", "sift"] == "4.0"
 
 
+def test_seeds_without_a_model_are_not_averaged_as_0(comparison: Comparison) -> None:
+    with_model, other = comparison.methods[2].seeds
+    without = replace(other, model_names=(), num_points3D=0, mean_track_length=0.0)
+    method = MethodResult("default", seeds=(with_model, without))
+    points, registered = method.span("points3D"), method.span("registered")
+    assert points is not None
+    assert (points.min, points.mean) == (with_model.num_points3D,) * 2
+    assert registered is not None
+    assert (registered.min, registered.mean) == (0.0, 2.5)
+    assert MethodResult("none", seeds=(without,)).to_mapping()["mean_track_length"] is None
+
+
 def test_verdict_failures_and_settings_are_told(page: Page, comparison: Comparison) -> None:
     assert all(paragraph in page.text for paragraph in verdict(comparison))
     assert "broken failed: weights <affnet> & more are missing" in page.text

@@ -94,7 +94,7 @@ def test_run_leaves_all_results(finished: tuple[Workspace, ReconstructionReport]
     workspace, report = finished
     assert {
         "config.toml", "database.db", "features.h5", "matches.h5", "pairs.txt", "report.json",
-        "sparse",
+        "report.html", "sparse",
     } <= {path.name for path in workspace.path.iterdir()}  # fmt: skip
     model = pycolmap.Reconstruction(workspace.sparse / "0")
     names = sorted(model.images[image_id].name for image_id in model.reg_image_ids())

@@ -197,7 +197,8 @@
         return Math.max(Math.abs((2 * x) / width - 1), Math.abs((2 * y) / height - 1));
       };
       const points = [];
-      for (let index = 0; index < 3 * this.count; index += 3) {
+      const step = 3 * Math.ceil(this.count / 1000);
+      for (let index = 0; index < 3 * this.count; index += step) {
         points.push(reach(this.places.subarray(index, index + 3)));
       }
       points.sort((one, two) => one - two);
