@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,11 +23,14 @@ from colmap_affrect.shown import one_line
 
 logger = logging.getLogger("colmap_affrect")
 
+REPEAT_S = 0.01
+"""After which a Ctrl-C is repeated."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
-    options = build_parser().parse_args(arguments)
     try:
+        options = build_parser().parse_args(arguments)
         if not hasattr(options, "verbose"):  # a command that only prints
             return int(options.function(options))
         with _no_empty_folder(options.output_path), _logging(options):
@@ -52,6 +56,7 @@ def main_of_process() -> NoReturn:
 
     Python takes a moment to end; a Ctrl-C within it is too late to change anything.
     """
+    sys.unraisablehook = _interrupt_again
     try:
         code: int | str | None = main()
     except SystemExit as end:  # argparse: help, or wrong usage
@@ -62,6 +67,17 @@ def main_of_process() -> NoReturn:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
+
+
+def _interrupt_again(passed_over: sys.UnraisableHookArgs) -> None:
+    """Repeat a Ctrl-C that came where Python cannot raise it, as while objects are deleted.
+
+    Else its traceback would be printed, and the command would go on to its end.
+    """
+    if passed_over.exc_type is not KeyboardInterrupt:
+        sys.__unraisablehook__(passed_over)
+        return
+    threading.Timer(REPEAT_S, signal.raise_signal, [signal.SIGINT]).start()
 
 
 def _fail(message: str, code: int = EXIT_FAILED) -> int:

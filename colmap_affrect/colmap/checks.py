@@ -7,6 +7,7 @@ itself, of databases of all versions of COLMAP.
 from __future__ import annotations
 
 import sqlite3
+import struct
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import closing
@@ -51,8 +52,9 @@ CHECKS: dict[str, Check] = {
         "'colmap-affrect run --database-path {path}', which adds frames to its copy"),
     "frame-links": ("error", "rows of rigs and frames that belong to nothing",
         "import the images again into a new database"),
-    "matrix-data": ("error", "rows whose matrices have more or less data than they should, or no "
-        "finite numbers", "delete these rows; two-view geometries are made anew by 'colmap "
+    "matrix-data": ("error",
+        "rows whose matrices or cameras have more or less data than they should, or no finite "
+        "numbers", "delete these rows; two-view geometries are made anew by 'colmap "
         "geometric_verifier'"),
     "unsafe-name": ("warning", "image names that lead out of the image folder",
         "rename these images; programs that write a file per image would write elsewhere"),
@@ -126,6 +128,10 @@ MATRICES = {
 }
 """Columns that hold so many float64 or nothing, by table and its key; that of priors is another
 before COLMAP 4."""
+
+CAMERA_OF_PAIR = struct.Struct("<IiQQBQ")
+"""What a camera of a two-view geometry begins with: id, model, width, height, whether its focal
+length is a prior, and the number of parameters that follow, float64."""
 
 MAX_NUM_IMAGES = 2**31 - 1
 """COLMAP's id of a pair is the smaller image id times this, plus the larger one."""
@@ -254,6 +260,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> tuple[Tables, Problems
         _check_cameras(tables, found)
         _check_links(connection, found)
         _check_matrices(connection, found)
+        _check_cameras_of_pairs(connection, found)
         if tables.names:
             _check_images(tables, found)
             _check_keypoints(connection, tables, found)
@@ -387,6 +394,19 @@ def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
                 is_odd = values is None or (name in "FEH" and not np.isfinite(values).all())
                 if is_odd:
                     found["matrix-data"].append(f"{name} of {key} {row}")
+
+
+def _check_cameras_of_pairs(connection: sqlite3.Connection, found: Problems) -> None:
+    for name in sorted({"camera1", "camera2"} & _columns(connection, "two_view_geometries")):
+        query = f"SELECT pair_id, {name} FROM two_view_geometries WHERE {name} IS NOT NULL"  # noqa: S608
+        for pair_id, blob in connection.execute(query):
+            header = blob[: CAMERA_OF_PAIR.size] if isinstance(blob, bytes) else b""
+            if len(header) == CAMERA_OF_PAIR.size:
+                _, model, *_, count = CAMERA_OF_PAIR.unpack(header)
+                like = _camera_like(model)
+                if like and count == len(like.params) == (len(blob) - len(header)) / 8:
+                    continue
+            found["matrix-data"].append(f"{name} of pair_id {pair_id}")
 
 
 def _check_images(tables: Tables, found: Problems) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import posixpath
 import unicodedata
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
@@ -197,18 +198,20 @@ def _visible_files(folder: Path) -> list[str]:
     """
     found: list[str] = []
     for path, inner, files in os.walk(folder):
-        below = Path(path)
-        inner[:] = [n for n in inner if n[0] != "." and not is_output_folder(below / n)]
-        found += ((below / n).relative_to(folder).as_posix() for n in files if n[0] != ".")
+        inner[:] = [n for n in inner if n[0] != "." and not is_output_folder(Path(path, n))]
+        below = "" if path == str(folder) else f"{Path(path).relative_to(folder).as_posix()}/"
+        found += (below + name for name in files if name[0] != ".")
     return sorted(found)
 
 
 def _suffix(name: str) -> str:
-    return PurePosixPath(name).suffix.lower()
+    return posixpath.splitext(name)[1].lower()
 
 
 def _odd(name: str) -> str:
     """Say why lists of images, one a line, cannot hold a name; empty if they can."""
+    if name.isascii() and name.isprintable():
+        return ""
     if name != name.encode("utf-8", "replace").decode("utf-8"):
         return "the name is not UTF-8"
     if any(unicodedata.category(character) in ("Cc", "Zl", "Zp") for character in name):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.errors import PairListError
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.atomic_files import replace_lines
 
 MAX_NAMES_IN_MESSAGE = 5
 CANDIDATES_PER_NEIGHBOR = 5
@@ -157,11 +157,16 @@ def read_pairs(path: Path, names: Sequence[str]) -> list[Pair]:
     return sorted(pairs)
 
 
-def write_pairs(path: Path, pairs: Sequence[Pair]) -> None:
-    """Write 'name1 name2' lines; with a tab where a name contains white space."""
-    blank = any(re.search(r"\s", name) for pair in pairs for name in pair)
-    separator = "\t" if blank else " "
-    replace_text(path, "".join(f"{a}{separator}{b}\n" for a, b in pairs))
+def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) -> None:
+    """Write 'name1 name2' lines; with a tab where a name contains white space.
+
+    With the names of the images the pairs may be an iterator, of which none is kept.
+    """
+    if not names:
+        pairs = list(pairs)
+        names = {name for pair in pairs for name in pair}
+    separator = "\t" if any(re.search(r"\s", name) for name in names) else " "
+    replace_lines(path, (f"{first}{separator}{second}\n" for first, second in pairs))
 
 
 def _split(line: str, known: set[str]) -> Pair | None:

@@ -14,6 +14,7 @@ import struct
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import islice
 from math import ceil
 from pathlib import Path
 from typing import BinaryIO
@@ -23,6 +24,7 @@ from colmap_affrect.errors import WorkspaceError
 logger = logging.getLogger(__name__)
 
 PAGE_BYTES = 4096
+LINES_AT_ONCE = 10_000
 NEW_SUFFIX = ".affrect-new"
 """Of files that are being written; a killed program leaves them."""
 JOURNAL_MARK = b"AFFRECT1"
@@ -47,6 +49,16 @@ def replace_bytes(path: Path, content: bytes) -> None:
     """Write or replace a file; WorkspaceError when that fails, and an old one stays as it is."""
     try:
         _replace(path, [content])
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def replace_lines(path: Path, lines: Iterable[str]) -> None:
+    """Write or replace a text file that need not fit into memory, as :func:`replace_bytes`."""
+    remaining = iter(lines)
+    batches = iter(lambda: "".join(islice(remaining, LINES_AT_ONCE)), "")
+    try:
+        _replace(path, (batch.encode("utf-8") for batch in batches))
     except OSError as error:
         raise cannot_write(path, error) from error
 

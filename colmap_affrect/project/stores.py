@@ -40,6 +40,7 @@ from colmap_affrect.project.atomic_files import (
     replace_bytes,
     uninterrupted,
 )
+from colmap_affrect.project.feature_index import Entries, entries, forget
 
 FORMAT_VERSION = 2
 MAX_INT16 = 32767
@@ -149,7 +150,7 @@ class _Store:
         if not self.path.exists():
             return []
         with self._open("r") as file:
-            return sorted(_complete_groups(file))
+            return sorted(name for name, _ in _complete_groups(file))
 
     @staticmethod
     def _write(file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:
@@ -162,19 +163,24 @@ class _Store:
         group.attrs["complete"] = True
 
 
-def _complete_groups(group: h5py.Group, path: str = "") -> Iterator[str]:
-    """Yield the paths of all complete groups.
+def _complete_groups(group: h5py.Group, path: str = "") -> Iterator[tuple[str, h5py.Group]]:
+    """Yield the paths of all complete groups, and these.
 
     Their datasets are not opened, which takes long, and links are not followed.
     """
     is_complete = group.attrs.get("complete", False)
     if is_complete:
-        yield path
+        yield path, group
     for key in group.keys() - (DATASETS if is_complete else set()):
         is_link = not isinstance(group.get(key, getlink=True), h5py.HardLink)
         inner = None if is_link else group[key]
         if isinstance(inner, h5py.Group):
             yield from _complete_groups(inner, f"{path}/{key}" if path else key)
+
+
+def _digests_and_counts(file: h5py.File) -> Iterator[tuple[str, tuple[str, int]]]:
+    for name, group in _complete_groups(file):
+        yield name, (str(group.attrs.get("content", "")), len(group["keypoints"]))
 
 
 DATASETS = {
@@ -199,6 +205,28 @@ class FeatureStore(_Store):
 
     kind = "features"
 
+    def _entries(self) -> Entries:
+        """Return the complete groups."""
+        if not self.path.exists():
+            return {}
+        with self._open("r") as file:
+            return entries(self.path, lambda: dict(_digests_and_counts(file)))
+
+    @contextmanager
+    def _open(self, mode: str) -> Iterator[h5py.File]:
+        if mode != "r":
+            forget(self.path)
+        with super()._open(mode) as file:
+            yield file
+
+    def names(self) -> list[str]:
+        """Return the sorted names of the images."""
+        return sorted(self._entries())
+
+    def complete(self, keys: Iterable[str]) -> set[str]:
+        """Return those of the images that are there and complete."""
+        return self._entries().keys() & set(keys)
+
     def write(
         self, name: str, features: LocalFeatures, image_size: tuple[int, int], content: str = ""
     ) -> None:
@@ -208,11 +236,7 @@ class FeatureStore(_Store):
 
     def contents(self) -> dict[str, str]:
         """Return for each image the digest of the files that it was extracted from, if known."""
-        names = self.names()
-        if not names:
-            return {}
-        with self._open("r") as file:
-            return {name: str(file[name].attrs.get("content", "")) for name in names}
+        return {name: content for name, (content, _) in self._entries().items()}
 
     def record_contents(self, contents: Mapping[str, str]) -> None:
         """Put on record what images were extracted from."""
@@ -297,11 +321,7 @@ class FeatureStore(_Store):
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of features of each image."""
-        names = self.names()
-        if not names:
-            return {}
-        with self._open("r") as file:
-            return {name: len(file[name]["keypoints"]) for name in names}
+        return {name: count for name, (_, count) in self._entries().items()}
 
     def image_size(self, name: str) -> tuple[int, int]:
         """Return the (width, height) of one image in px."""
@@ -383,11 +403,11 @@ class MatchStore(_Store):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            for key in list(_complete_groups(file)):
+            for key, group in list(_complete_groups(file)):
                 if (
                     key in keys
                     or not names.isdisjoint(key.split("/"))
-                    or file[key].attrs.get("tried_level")
+                    or group.attrs.get("tried_level")
                 ):
                     del file[key]
 

@@ -223,16 +223,14 @@ class Workspace:
         text = tomli_w.dumps({"format_version": FORMAT_VERSION, **ordered})
         replace_text(self.config, text)
 
-    def rewind(self) -> None:
+    def rewind(self, why: str = "what it was made from has changed") -> None:
         """Remove the database and what was made from it, for inputs that have changed.
 
         The options of these stages stay on record, and models until others take their place.
         Raises StaleStoreError for a database of the user.
         """
         if self.users_database:
-            raise StaleStoreError(
-                f"{self.users_database}: what it was made from has changed; {self._remedy}"
-            )
+            raise StaleStoreError(f"{self.users_database}: {why}; {self._remedy}")
         (self.sparse / INPUTS).unlink(missing_ok=True)
         self._remove(path for path in self._results("verify") if path != self.sparse)
         record, first = self.recorded(), STAGES.index("verify")

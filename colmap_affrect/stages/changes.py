@@ -82,7 +82,7 @@ def forget_changed(
     other_cameras = ["cameras are given by other files"] if before not in ("", cameras) else []
     lines = [*_told(changed, "changed"), *_told(gone, "gone"), *other_cameras]
     if lines:
-        workspace.rewind()
+        workspace.rewind(f"since it was made, {', '.join(lines)}")
         workspace.pairs.unlink(missing_ok=True)
         context.matches.remove({*changed, *gone})
         if changed or gone:

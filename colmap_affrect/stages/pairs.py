@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Collection, Sequence
+from itertools import combinations
 from pathlib import Path
 
 from colmap_affrect.errors import PairListError
@@ -45,18 +46,36 @@ def choose_pairs(
     options = options or PairOptions.from_mapping(
         workspace.planned("pairs") or {}, str(workspace.config)
     )
+    if options.methods == ("exhaustive",) and not options.match_list_path:
+        return _all_pairs(context, options, start, overwrite=overwrite)
     pairs = _given_pairs(context, options)
     workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
     there = kept = _pairs_there(context)
     contents, listed = Contents(workspace.contents), options.match_list_path
     digest = contents.digest([Path(listed)]) if listed else ""
-    if set(options.methods) == {"exhaustive"} or contents.recorded("pairs") not in ("", digest):
+    if contents.recorded("pairs") not in ("", digest):
         kept = set()
     pairs |= kept | _similar_pairs(context, options, kept)
     warnings = _forget_lost(context, there - pairs)
     write_pairs(workspace.pairs, sorted(pairs))
     contents.record("pairs", digest)
     return StageReport("pairs", time.perf_counter() - start, len(pairs), warnings=warnings)
+
+
+def _all_pairs(
+    context: Context, options: PairOptions, start: float, *, overwrite: bool
+) -> StageReport:
+    """List every pair of images, of which there may be too many to be kept in memory."""
+    workspace = context.workspace
+    workspace.require("extract")
+    names = context.features.names()
+    count = len(names) * (len(names) - 1) // 2
+    if len(names) > MANY_IMAGES:
+        logger.warning(MANY_PAIRS, len(names), count)
+    workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
+    write_pairs(workspace.pairs, combinations(names, 2), names)
+    Contents(workspace.contents).record("pairs", "")
+    return StageReport("pairs", time.perf_counter() - start, count)
 
 
 def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:

@@ -319,3 +319,14 @@ def test_damaged_file_is_a_database_error_or_problems(tmp_path: Path, database_p
             errors.append(str(error).startswith(f"{path}: damaged ("))
     assert len(errors) > 40
     assert all(errors)
+
+
+def test_cameras_of_pairs_that_colmap_writes_are_no_problem(database_path: Path) -> None:
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.camera2 = pycolmap.Camera.create_from_model_name(3, "FULL_OPENCV", 50.0, 90, 60)
+    with open_database(database_path) as database:
+        database.delete_two_view_geometry(1, 2)
+        database.write_two_view_geometry(1, 2, geometry)
+    assert check_database(database_path)[1] == {}
+    execute(database_path, "UPDATE two_view_geometries SET camera2 = substr(camera2, 1, 60)")
+    assert list(check_database(database_path)[1]) == ["matrix-data"]

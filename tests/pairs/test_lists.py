@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import tracemalloc
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -225,3 +226,14 @@ def test_written_list_reads_back(
     pairs = exhaustive_pairs(names)
     write_pairs(path, pairs)
     assert read_pairs(path, names) == pairs
+
+
+def test_all_pairs_of_thousands_are_written_without_keeping_them(tmp_path: Path) -> None:
+    names = [f"{index:04d}.png" for index in range(300)]
+    tracemalloc.start()
+    try:
+        write_pairs(tmp_path / "pairs.txt", itertools.combinations(names, 2), names)
+        assert tracemalloc.get_traced_memory()[1] < 3_000_000  # as lists of pairs and lines 7 MB
+    finally:
+        tracemalloc.stop()
+    assert read_pairs(tmp_path / "pairs.txt", names) == exhaustive_pairs(names)

@@ -13,8 +13,10 @@ from synthetic import write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.errors import OptionError, StoreError
-from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.images.photographs import CameraOptions, list_images
+from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
@@ -246,7 +248,23 @@ def test_cameras_that_cannot_be_used_are_refused_before_anything_is_recorded(
     assert call(*extract).code == 0
 
 
-def test_recipe_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
-    path = tmp_path / "own.toml"
-    path.write_text('rectifier = "identity"\n', encoding="utf-8-sig")
-    assert load_recipe(str(path)).extraction.rectifier.name == "identity"
+def test_files_of_text_may_begin_with_a_byte_order_mark(trio: Path, tmp_path: Path) -> None:
+    """As editors of Windows write them."""
+
+    def written(name: str, text: str) -> Path:
+        (tmp_path / name).write_text(text, encoding="utf-8-sig")
+        return tmp_path / name
+
+    recipe = written("own.toml", 'rectifier = "identity"\n')
+    assert load_recipe(str(recipe)).extraction.rectifier.name == "identity"
+    names = list_images(trio)
+    assert list_images(trio, written("list.txt", f"{names[0]}\n")) == names[:1]
+    assert read_pairs(written("pairs.txt", f"{names[0]}\t{names[1]}\n"), names) == [
+        (names[0], names[1])
+    ]
+    table = CameraOptions(cameras_path=str(written("table.csv", "name,focal_px\na.png,300\n")))
+    assert read_given_cameras(table)["a.png"].focal_px == 300.0
+    written("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n")
+    model = written("cameras.txt", "1 PINHOLE 320 240 300 300 160 120\n")
+    given = read_given_cameras(CameraOptions(cameras_path=str(model)))
+    assert given["a.png"].model == "PINHOLE"

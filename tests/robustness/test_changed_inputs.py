@@ -21,6 +21,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.images.reading import read_gray
+from colmap_affrect.interop.pycolmap_api import extract_features
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
@@ -312,6 +313,17 @@ def test_photographs_that_a_database_does_not_name_are_told(tmp_path: Path, call
     ended = call("extract", "--image-path", scene.photos, "--output-path", scene.out, *FAST[:2],
                  "--from-database", scene.file("source.db"))  # fmt: skip
     assert "2 photographs are left out, such as side/d.png" in "".join(ended.stderr)
+
+
+def test_changed_photograph_of_a_users_database_is_named(tmp_path: Path) -> None:
+    scene = Scene(tmp_path)
+    write_photographs(scene.photos, 2)
+    extract_features(scene.file("own.db"), scene.photos, extraction_options=FAST[1])
+    content(scene)
+    with pytest.raises(
+        StaleStoreError, match=r"own\.db: since it was made, 1 changed \(a\.png\); use"
+    ):
+        extract_features(scene.file("own.db"), scene.photos, extraction_options=FAST[1])
 
 
 def test_climbing_refuses_photographs_that_have_changed(tmp_path: Path) -> None:

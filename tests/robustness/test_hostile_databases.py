@@ -42,7 +42,8 @@ ROWS = [
     ("UPDATE cameras SET params = x'00'", "are more or fewer than their model has"),
     ("UPDATE cameras SET params = ?", "or not finite numbers (camera 1, camera 2)"),
     ("UPDATE frames SET rig_id = 99", "rows of rigs and frames that belong to nothing"),
-    ("UPDATE two_view_geometries SET F = x'00'", "matrices have more or less data"),
+    ("UPDATE two_view_geometries SET F = x'00'", "matrices or cameras have more or less data"),
+    ("UPDATE two_view_geometries SET camera2 = x'01'", "(camera2 of pair_id "),
     ("UPDATE cameras SET width = 'wide'", "damaged"),
 ]
 """What is done to a database, and what is said of it."""

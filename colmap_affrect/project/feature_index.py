@@ -1,0 +1,45 @@
+"""What is asked of all images of a file of features, kept so that thousands need not be opened."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from colmap_affrect.errors import WorkspaceError
+from colmap_affrect.project.atomic_files import replace_text
+
+Entries = dict[str, tuple[str, int]]
+"""By image: the digest of the files that it was extracted from, and the number of features."""
+
+MIN_NUM_KEPT = 500
+"""Fewer are read as fast."""
+
+MIN_AGE_NS = 1_000_000_000
+"""A file that has just been written may change again without another time."""
+
+_known: dict[Path, tuple[list[int], Entries]] = {}
+
+
+def forget(path: Path) -> None:
+    """Forget what a file holds that is going to change."""
+    _known.pop(path, None)
+
+
+def entries(path: Path, read: Callable[[], Entries]) -> Entries:
+    """Return what a file holds; it is read only when it has changed since it was read before."""
+    there = path.stat()
+    stamp = [there.st_ino, there.st_size, there.st_mtime_ns, there.st_ctime_ns]
+    kept = path.with_name(f".{path.name}.index")
+    if path not in _known:
+        with suppress(OSError, ValueError, TypeError):
+            found = json.loads(kept.read_text(encoding="utf-8"))
+            _known[path] = found[0], {n: (str(c), int(k)) for n, (c, k) in found[1].items()}
+    if path not in _known or _known[path][0] != stamp:
+        _known[path] = stamp, dict(sorted(read().items()))
+        if len(_known[path][1]) >= MIN_NUM_KEPT and time.time_ns() > stamp[3] + MIN_AGE_NS:
+            with suppress(WorkspaceError):
+                replace_text(kept, json.dumps(_known[path]))
+    return _known[path][1]
