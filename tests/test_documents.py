@@ -26,8 +26,6 @@ DOCUMENTS = [
     *sorted((ROOT / "docs").glob("*.md")),
 ]
 NAMES = [str(path.relative_to(ROOT)) for path in DOCUMENTS]
-PENDING = {"export-database", "--colmap", "--no-page"} - COMMANDS.keys()
-"""Of changes that are made at the same time as these pages."""
 FOREIGN = {
     "--import_path", "--database_path", "--image_path", "--output_path", "--no-deps",
     "--Mapper.tri_ignore_two_view_tracks", "--nthreads", "--nworkers", "--claim",
@@ -69,7 +67,7 @@ ALL_FLAGS = {flag for command in CHOICES.values() for flag in command._option_st
 @pytest.mark.parametrize("name", NAMES)
 def test_commands_are_understood(name: str) -> None:
     for words in shell_commands(name):
-        if not words or Path(words[0]).name != "colmap-affrect" or words[1] in PENDING:
+        if not words or Path(words[0]).name != "colmap-affrect":
             continue
         options = PARSER.parse_args(words[1:])
         recipe = getattr(options, "recipe", None) or "default"
@@ -93,10 +91,10 @@ def test_options_commands_and_names_in_the_text_exist(name: str) -> None:
     for code in inline(text_of(name)):
         words = code.split()
         if words[0] == "colmap-affrect" and len(words) > 1 and words[1].islower():
-            assert words[1] in {*COMMANDS, *PENDING}, code
+            assert words[1] in COMMANDS, code
         for flag in (word.partition("=")[0] for word in words if re.match(r"--[a-zA-Z]", word)):
             script = "recipes/" in code or "tests/" in code
-            assert script or flag in {*ALL_FLAGS, *FOREIGN, *PENDING}, code
+            assert script or flag in {*ALL_FLAGS, *FOREIGN}, code
         if re.fullmatch(r"colmap_affrect(\.\w+)+", code):
             pkgutil.resolve_name(code)
         if words[0] == "--recipe" and words[1:] and not words[1].isupper() and ".toml" not in code:

@@ -141,7 +141,7 @@ class StationaryFilter:
 
 def _cells(points: NDArray[np.floating], size: Size) -> NDArray[np.int64]:
     """Return the (N, 2) cells, column and row, of (N, 2) points in pixel-centre px."""
-    inside = np.clip(points + 0.5, 0.0, np.array(size) - 1e-6)
+    inside = np.clip(points, 0.0, np.array(size) - 1.0)
     return np.asarray(inside * (NUM_CELLS / max(size)), np.int64)
 
 

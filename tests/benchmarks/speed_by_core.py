@@ -51,7 +51,7 @@ MANY_FEATURES = (
 )
 
 STAGES = {
-    "colmap_affrect.stages.one_image.read_gray": "reading",
+    "colmap_affrect.stages.one_image.decode": "reading",
     "colmap_affrect.stages.one_image.shrink_to": "reading",
     "colmap_affrect.features.shapes.second_moment.SecondMoment.grid": "shapes",
     "colmap_affrect.stages.one_image.ImageExtractor.plan": "cover",
