@@ -108,7 +108,8 @@ def _draw_header(page: FigurePage, level: InspectedLevel, stored_size: Size) -> 
     about = [
         f"{width} x {height} px{stored * (level.photograph.size != stored_size)};"
         f" {which}: rectifier {level.options.name}{shapes}, features {level.extractor_name}",
-        f"{summary(level)}: {steps}",
+        f"{summary(level)}: {steps}" + "; contrast stretched" * level.photograph.stretched,
+        HOW_TO_READ,
     ]
     for name in wrap(level.photograph.name, NAME_CHARS):
         page.text(MARGIN_PX, page.top, name, fontsize=NAME_PT, weight="bold")
@@ -119,6 +120,14 @@ def _draw_header(page: FigurePage, level: InspectedLevel, stored_size: Size) -> 
         page.text(MARGIN_PX, page.top, line, fontsize=HEADER_PT, color=color)
         page.top += LINE_PX
     page.top += MARGIN_PX
+
+
+MASKED = (0.0, 0.0, 0.0, 0.65)
+"""Colour and opacity over what a mask leaves out."""
+HOW_TO_READ = (
+    "From above: where the photograph is looked at anew and how strongly it is tilted there, the"
+    " warps made of these places, and the features of all of them; one colour is one warp."
+)
 
 
 # --- Regions and the space of tilts
@@ -142,7 +151,8 @@ def _draw_overview(page: FigurePage, level: InspectedLevel, colors: Sequence[Col
     for warp_id, item in enumerate(level.plan.items, 1):
         groups.setdefault((item.segment_id, item.tilt, item.tilt_angle_rad), []).append(warp_id)
 
-    page.heading(MARGIN_PX, "Regions", _map_caption(level.plan))
+    masked = "; dark: masked" if level.photograph.mask is not None else ""
+    page.heading(MARGIN_PX, "Regions", _map_caption(level.plan) + masked)
     _draw_map(page.axes(MARGIN_PX, page.top + HEAD_PX, map_size), map_size, level, colors)
     caption, more = tilt_space_captions(level)
     page.heading(left, "Space of tilts", caption)
@@ -206,6 +216,8 @@ def _draw_map(axes: Axes, shown_px: Size, level: InspectedLevel, colors: Sequenc
     width, height = size = level.photograph.size
     _show(axes, level.photograph.gray, shown_px, fade=0.25)
     tint = np.zeros((height, width, 4), dtype=np.float32)
+    if level.photograph.mask is not None:
+        tint[~level.photograph.mask] = MASKED
     ids_at: dict[tuple[float, ...], list[int]] = {}
     for warp_id, (item, color) in enumerate(zip(level.plan.items, colors, strict=True), 1):
         if item.region is None:

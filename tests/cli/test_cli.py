@@ -306,9 +306,9 @@ def test_page_is_written_unless_it_is_left_out(verified: Path, call: Call) -> No
     assert "3 of 3 photographs registered" in page.read_text(encoding="utf-8")
     done = call("map", "--output-path", verified, "-q", "--no-page")
     assert (done.code, page.exists(), "report.html" in done.stdout) == (0, False, False)
-    done = call("map", "--output-path", verified, "-q")
+    done = call("map", "--output-path", verified)
     assert page.exists()
-    assert done.stdout.endswith(f"page        {page}\n")
+    assert f"to look at: {page}\n" in done.stdout
 
 
 def test_preset_mapper_and_its_options_are_in_the_report_and_on_record(

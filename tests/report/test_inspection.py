@@ -344,7 +344,7 @@ def test_region_is_tinted_where_it_lies(tmp_path: Path) -> None:
     path = write_image(tmp_path / "photo.png", np.full(SIZE[::-1], 100, np.uint8))
     plan = RectificationPlan(SIZE, (affine_warp(2.0, 0.3, (150, 20, 120, 50)),))
     _, image = inspect(extractor_of(plan, extractor=NO_FEATURES), path, tmp_path)
-    top = MARGIN_PX + NAME_PX + 2 * LINE_PX + MARGIN_PX + HEAD_PX
+    top = MARGIN_PX + NAME_PX + 3 * LINE_PX + MARGIN_PX + HEAD_PX
     scale = fitted(SIZE, sheet.MAP_BOX_PX)[0] / SIZE[0]
 
     def drawn(x: float, y: float) -> NDArray[np.int_]:
