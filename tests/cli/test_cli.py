@@ -269,6 +269,7 @@ cli.main_of_process()
 """
 
 
+@pytest.mark.long
 def test_interrupt_that_python_cannot_raise_is_repeated() -> None:
     """It was printed with its traceback, and the command went on and ended with 0."""
     done = subprocess.run(

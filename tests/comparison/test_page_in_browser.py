@@ -12,7 +12,7 @@ from small_comparison import make_comparison
 
 from colmap_affrect.comparison.page import write_page
 
-pytestmark = needs_chromium
+pytestmark = [needs_chromium, pytest.mark.long]
 
 
 @pytest.fixture(scope="module")

@@ -70,6 +70,7 @@ def test_features_of_the_image_and_of_all_warps_keep_to_the_mask(photo_path: Pat
     assert (inside.rectification_ids > 0).sum() > 0.8 * len(inside)
 
 
+@pytest.mark.long
 def test_mask_is_applied_before_the_strongest_features_are_chosen(photo_path: Path) -> None:
     mask = np.zeros(IMAGE_SIZE[::-1], bool)
     mask[150:, 200:] = True

@@ -196,6 +196,7 @@ def test_images_that_a_database_leaves_out_are_named_with_advice(tmp_path: Path)
     assert report.advice[-1] == "more photographs that show the missing places"
 
 
+@pytest.mark.long
 def test_map_from_database_extends(tmp_path: Path) -> None:
     names = synthesize(tmp_path / "any.db")
     report = colmap_affrect.map_from_database(tmp_path / "any.db", tmp_path / "out")

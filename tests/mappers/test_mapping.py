@@ -187,6 +187,7 @@ def test_mapping_is_tried_again_while_images_are_missing_in_a_small_model(
     assert given == seeds
 
 
+@pytest.mark.long
 def test_global_mapper_that_dies_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "database.db").write_bytes(b"no database" * 100)
     with pytest.raises(MappingError, match=r"^COLMAP's global mapper failed \(exit code -?\d+\)"):

@@ -118,6 +118,7 @@ def test_bad_images_are_reported_and_the_others_registered(mixed: Mixed) -> None
     assert all(name in mixed.ended.errors[0] for name in failures)
 
 
+@pytest.mark.long
 def test_good_images_have_the_features_that_they_have_alone(mixed: Mixed, trio, run_images) -> None:
     assert run_images(trio).code == 0
     alone = database_content(trio.parent / "out" / "database.db")["keypoints"]
@@ -267,6 +268,7 @@ def test_hundred_megapixels_fit_into_little_memory(trio, tmp_path) -> None:
     assert keypoints.max(axis=0)[0] > 10_000  # in px of the stored image
 
 
+@pytest.mark.long
 def test_same_names_in_folders_are_different_images(tmp_path, run_images) -> None:
     photos = tmp_path / "photos"
     for index, folder in enumerate(["left", "right", "left/deep"]):

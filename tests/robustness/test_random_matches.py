@@ -58,6 +58,7 @@ def test_random_matches_are_rejected(
     assert verified_pairs(path, 1) == {}
 
 
+@pytest.mark.long
 def test_random_matches_are_accepted_by_colmaps_default(tmp_path: Path) -> None:
     # The test above could fail: this is why there is a preset of ours.
     path = tmp_path / "database.db"

@@ -38,6 +38,7 @@ def state(folder: Path, *, without: Path) -> dict[str, tuple[bytes, int]]:
     }
 
 
+@pytest.mark.long
 def test_nothing_is_written_outside_the_output_folder(tmp_path: Path, call: Call) -> None:
     photos, elsewhere, out = (tmp_path / name for name in ("photos", "elsewhere", "out"))
     write_photographs(photos, 3)
