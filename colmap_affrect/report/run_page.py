@@ -92,7 +92,8 @@ def write_run_page(
         "headline": f"{len(model.registered_names)} of {len(names)} photographs registered",
         "about": _about(report),
         "doubts": _doubts(report, model),
-        "max_num_doubts": MAX_LINES,
+        "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
+        "max_num_lines": MAX_LINES,
         "advice": report.advice,
         "tiles": _tiles(report, model),
         "view": view,
@@ -156,7 +157,7 @@ def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
     if report.contradicting_pairs:
         total = sum(report.contradicting_pairs.values())
         texts.append(f"The model contradicts {total} of the verified pairs.")
-    return [*texts, *(f"{name}: {why}" for name, why in report.warnings.items())]
+    return texts
 
 
 def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
