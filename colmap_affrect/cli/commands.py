@@ -285,7 +285,11 @@ def export_database(options: argparse.Namespace) -> int:
 
     path = Workspace(options.path).database if options.path.is_dir() else options.path
     notes = export_database(path, options.database_path)
-    notes.append(f"of few photographs: colmap mapper {MAPPER_OPTIONS}")
+    notes.append(
+        "then, for few photographs (the folder of models must be there): colmap mapper "
+        f"--database_path {options.database_path} --image_path PHOTOS --output_path MODELS "
+        f"{MAPPER_OPTIONS}"
+    )
     show("\n".join([f"{options.database_path}: for COLMAP {options.colmap} to 3.13", *notes]))
     return EXIT_OK
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from colmap_affrect.errors import OptionError, WorkspaceError
-from colmap_affrect.options import Options
+from colmap_affrect.options import Options, suggestion
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.workspace import Workspace, placeless
 
@@ -41,10 +41,25 @@ def record(options: argparse.Namespace) -> dict[str, Any]:
         raise OptionError(f"--config {path}: of another version, or no config.toml") from error
     if "extract" not in found:
         raise OptionError(f"--config {path}: has no options of a run; give its config.toml")
+    _refuse_unknown(found, str(path))
     if not options.image_path:
         return found
     return {key: placeless(value) if isinstance(value, dict) else value
             for key, value in found.items()}  # fmt: skip
+
+
+def _refuse_unknown(record: Mapping[str, Any], where: str) -> None:
+    """Refuse sections, and options of extraction, that no run has recorded: typos of an editor."""
+    from colmap_affrect.project.workspace import STAGES
+    from colmap_affrect.recipes import ExtractionOptions
+    from colmap_affrect.stages.extract import Inputs
+
+    sections = {"format_version", "recipe", "begun", *STAGES}
+    of_extract = {*Inputs.model_fields, *ExtractionOptions.model_fields, "weights"}
+    for names, known in ((record, sections), (record["extract"], of_extract)):
+        for name in names:
+            if name not in known:
+                raise OptionError(f"--config {where}: unknown {name!r}{suggestion(name, known)}")
 
 
 def inputs(

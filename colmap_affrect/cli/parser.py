@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from colmap_affrect import __version__
 from colmap_affrect.cli import arguments as args
@@ -55,8 +56,8 @@ EXAMPLES = (
 )
 
 ENDING = """
-Run a command again and it goes on where it stopped. Exit codes: 0 done, 1 failed (one line
-says why; also when images could not be read, see --max-failures), 2 wrong usage, 3 finished
+What computes goes on where it stopped when it is run again. Exit codes: 0 done, 1 failed (one
+line says why; also when images could not be read, see --max-failures), 2 wrong usage, 3 finished
 without a model that can be trusted, 130 interrupted.
 """
 
@@ -67,16 +68,40 @@ def epilog(command: str = "") -> str:
     return "\n  colmap-affrect ".join(["examples:", *examples]) + "\n" + ENDING
 
 
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage of forty options."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with exit code 2."""
+        self.exit(2, f"error: {message}; see {self.prog} --help\n")
+
+
+class CommandParser(Parser):
+    """Names the option that may have been meant."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse, and refuse what is not known here, where the options of the command are."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            name = next((word for word in unknown if word.startswith("-")), unknown[0])
+            close = get_close_matches(name.partition("=")[0], self._option_string_actions, n=1)
+            meant = f" (did you mean {close[0]}?)" if close else ""
+            self.error(f"unknown argument {name}{meant}")
+        return found, unknown
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="colmap-affrect",
         description="Rectified wide-baseline features for COLMAP: photographs in, model out.",
         epilog=epilog(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"colmap-affrect {__version__}")
-    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    subparsers = parser.add_subparsers(
+        dest="command", required=True, metavar="COMMAND", parser_class=CommandParser
+    )
     for name, (function, summary, options) in COMMANDS.items():
         command = subparsers.add_parser(
             name,

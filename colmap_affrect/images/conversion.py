@@ -8,20 +8,17 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from PIL import Image, TiffImagePlugin, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
 from colmap_affrect.errors import ImageError
-from colmap_affrect.images.photographs import photograph_files
+from colmap_affrect.images.headers import pages
+from colmap_affrect.images.photographs import TIFF_SUFFIXES, photograph_files
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_bytes
 
 AS_STORED = ("1", "L", "I;16", "RGB")
 """Pillow's modes that PNG holds and COLMAP reads; others become RGB."""
-
-
-NEW_SUBFILE_TYPE, REDUCED = 254, 1
-"""TIFF's tag, and its bit of a smaller copy of another page."""
 
 
 @dataclass
@@ -53,12 +50,14 @@ def convert_images(
 ) -> ConversionReport:
     """Fill a folder with the photographs of another one, all in formats that COLMAP reads.
 
-    Pages of a file become a file each, ``scan-page2.png``. EXIF, its orientation too, stays. What
-    is there already is not made again.
+    Pages of a file become a file each, ``scan.tif-page2.png``. EXIF, its orientation too, stays.
+    What is there already is not made again.
 
     Raises:
         ImageError: when there are no photographs, or the new folder is inside the old one.
     """
+    if image_path.is_file():
+        raise ImageError(f"{image_path}: is a file; give the folder that it is in")
     if output_path.resolve().is_relative_to(image_path.resolve()):
         raise ImageError(f"{output_path}: is inside {image_path}; give a folder beside it")
     with suppress(ImportError):  # of the extra "heic"
@@ -82,46 +81,33 @@ def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> N
     """Convert or copy one file."""
     suffix = PurePosixPath(name).suffix.lower()
     is_read = suffix in IMAGE_SUFFIXES and not foreign_format(path)
-    pages = _pages(path) if suffix in (".tif", ".tiff") or not is_read else [0]
+    numbers = pages(path) if suffix in TIFF_SUFFIXES else [0]
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    if is_read and pages == [0]:
+    if is_read and numbers == [0]:
         if (folder / name).exists():
             report.kept.append(name)
             return
         shutil.copy2(path, folder / name)
         report.copied.append(name)
         return
-    made = [_page_name(name, number) for number in range(1, len(pages) + 1)]
+    made = [_page_name(name, k, len(numbers)) for k in range(1, len(numbers) + 1)]
     if all((folder / target).exists() for target in made):
         report.kept.append(name)
         return
     with _opened(path) as image:
-        for target, page in zip(made, pages, strict=True):
+        for target, page in zip(made, numbers, strict=True):
             image.seek(page)
             replace_bytes(folder / target, _png(image, path))
     report.written[name] = made
 
 
-def _page_name(name: str, page: int) -> str:
+def _page_name(name: str, page: int, num_pages: int) -> str:
     """Return what a page is called; the suffix stays, since a.jp2 may lie beside a.png.
 
-    >>> _page_name("box/a.jp2", 1), _page_name("b.tif", 2)
+    >>> _page_name("box/a.jp2", 1, 1), _page_name("b.tif", 2, 3)
     ('box/a.jp2.png', 'b.tif-page2.png')
     """
-    return f"{name}-page{page}.png" if page > 1 else f"{name}.png"
-
-
-def _pages(path: Path) -> list[int]:
-    """Return the numbers of the pages of a TIFF without its previews; else of the first image."""
-    with _opened(path) as image:
-        if not isinstance(image, TiffImagePlugin.TiffImageFile):
-            return [0]
-        found = []
-        for page in range(image.n_frames):
-            image.seek(page)
-            if not image.tag_v2.get(NEW_SUBFILE_TYPE, 0) & REDUCED:
-                found.append(page)
-        return found or [0]
+    return f"{name}-page{page}.png" if num_pages > 1 else f"{name}.png"
 
 
 def _opened(path: Path) -> Image.Image:

@@ -32,6 +32,10 @@ READERS = {
 """Pillow's by the first bytes: ``Image.open`` has a limit of pixels that photographs exceed."""
 
 
+NEW_SUBFILE_TYPE, REDUCED = 254, 1
+"""TIFF's tag, and its bit of a smaller copy of another page."""
+
+
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
     """Open an image file by its header; what is damaged raises nearly anything."""
@@ -48,6 +52,22 @@ def stored_size(image: Image.Image) -> tuple[int, int]:
         tags = image.tag_v2
         return int(tags[ExifTags.Base.ImageWidth]), int(tags[ExifTags.Base.ImageLength])
     return image.size
+
+
+def pages(path: Path) -> list[int]:
+    """Return the numbers of the pages of a TIFF without its previews; [0] of other files."""
+    try:
+        with opened(path) as image:
+            if not isinstance(image, TiffImageFile):
+                return [0]
+            found = []
+            for page in range(image.n_frames):
+                image.seek(page)
+                if not image.tag_v2.get(NEW_SUBFILE_TYPE, 0) & REDUCED:
+                    found.append(page)
+            return found or [0]
+    except Exception:  # noqa: BLE001 - a damaged file, which its reader will name
+        return [0]
 
 
 def header_size(path: Path) -> tuple[int, int] | None:

@@ -14,13 +14,15 @@ import numpy as np
 
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import ImageError, OptionError, StoreError
-from colmap_affrect.images.headers import header_size
+from colmap_affrect.images.headers import header_size, pages
 from colmap_affrect.images.masks import read_mask
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.stores import pair_key
 from colmap_affrect.project.workspace import is_output_folder
 from colmap_affrect.shown import one_line
+
+TIFF_SUFFIXES = (".tif", ".tiff")
 
 
 class CameraOptions(Options):
@@ -144,6 +146,8 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     Raises:
         ImageError: when there are none, or a listed one is missing.
     """
+    if image_path.is_file():
+        raise ImageError(f"{image_path}: is a file; give the folder that it is in")
     if not image_path.is_dir():
         raise ImageError(f"{image_path}: no such folder; give the folder of the photographs")
     if image_list_path is not None:
@@ -157,14 +161,20 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
 
 
 def left_out(image_path: Path) -> dict[str, str]:
-    """Tell which photographs in a folder are passed over: for their format, or their names."""
+    """Tell which photographs in a folder are passed over: for their format, names, or as pages."""
     found: dict[str, list[str]] = {}
     for name in _visible_files(image_path):
         if _suffix(name) in OTHER_IMAGE_SUFFIXES:
             found.setdefault(f"*{_suffix(name)}", []).append(name)
         elif _suffix(name) in IMAGE_SUFFIXES and _odd(name):
             found.setdefault("names", []).append(name)
-    return {
+    notes = {
+        name: f"has {count} pages, and only the first is used; colmap-affrect convert makes a file "
+        "of each"
+        for name in _visible_files(image_path)
+        if _suffix(name) in TIFF_SUFFIXES and (count := len(pages(image_path / name))) > 1
+    }
+    return notes | {
         kind: f"{len(names)} left out, such as {one_line(names[0])}: "
         + (
             f"{_odd(names[0])}; rename it"

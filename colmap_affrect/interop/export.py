@@ -98,8 +98,13 @@ def export(
     source = Source(
         model_path, read_given_model(model_path), image_path or _recorded_images(model_path)
     )
+    is_new = not output_path.exists()
     output_path.mkdir(parents=True, exist_ok=True)
-    return {name: FORMATS[name](source, output_path) for name in dict.fromkeys(formats)}
+    try:
+        return {name: FORMATS[name](source, output_path) for name in dict.fromkeys(formats)}
+    finally:
+        if is_new and not any(output_path.iterdir()):
+            output_path.rmdir()
 
 
 def _recorded_images(model_path: Path) -> Path | None:

@@ -22,7 +22,7 @@ MAX_LINES, MAX_ADVICE = 12, 4
 
 SOURCES = {
     "exif": "from EXIF", "exif-rescaled": "from EXIF, for another size", "pairs": "from matches",
-    "guess": "guessed",
+    "guess": "uncertain",
 }  # fmt: skip
 """How a summary calls where focal lengths are from; others are called by their own names."""
 
@@ -320,7 +320,9 @@ class ReconstructionReport:
             lines += [f"            new {name}" for name in self.added]
         lines += _some(f"            not {name}: {why}" for name, why in self.unregistered.items())
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
-        if counts := [by_level(*item) for item in self.pair_levels.items() if item[0] != "none"]:
+        if counts := [
+            by_level(*item) for item in self.pair_levels.items() if item[0] != "none" and item[1]
+        ]:
             lines += [f"            {', '.join(counts)}"]
         if self.contradicting_pairs:
             counts = [by_level(*item) for item in self.contradicting_pairs.items()]

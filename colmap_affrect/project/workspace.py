@@ -208,8 +208,8 @@ class Workspace:
             )
             if difference:
                 raise StaleStoreError(
-                    f"{self.path}: the {stage} stage was run there with {difference}; "
-                    f"{self._remedy}"
+                    f"{self.path}: the {stage} stage was run there with {difference}"
+                    f"{_other_recipe(record.get('recipe'), recipe)}; {self._remedy}"
                 )
         begun = [name for name in STAGES if name in begun or name == stage]
         later = {name: dict(values) for name, values in (plan or {}).items() if name not in begun}
@@ -325,6 +325,11 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
         Workspace(Path(folder)).locked() as workspace,
     ):
         yield workspace.path
+
+
+def _other_recipe(known: str | None, now: str) -> str:
+    """Say it when another recipe is why options differ."""
+    return f" (recipe {known!r} there, {now!r} now)" if known and now and known != now else ""
 
 
 def is_output_folder(path: Path) -> bool:

@@ -310,7 +310,7 @@ def advice(
             texts.append("run again with --camera-mode single, if one camera took all: their size "
                          "is the same")  # fmt: skip
         masks = Inputs.recorded(workspace).masks
-        if is_doubtful and not (masks.path or masks.camera_path):
+        if not (masks.path or masks.camera_path):
             texts.append(
                 "run again with --mask-path, if things move, repeat or are written on them"
             )

@@ -27,8 +27,8 @@ MAX_MOTION_FRAC = 0.005
 NUM_CELLS = 48
 """Cells along the longer side."""
 MIN_NUM_PAIRS = 3
-MIN_NUM_IMAGES = 4
-"""Two views of a camera that did not turn have places that stay where they are; four have none."""
+MIN_NUM_IMAGES = 3
+"""Two views of a camera that did not turn have places that stay where they are; more have none."""
 MIN_SHARE = 0.5
 """Of the pairs that have a match in a cell."""
 MAX_SHARE_OF_PHOTOGRAPH = 0.5

@@ -148,8 +148,9 @@ def test_wrong_usage_ends_with_2_and_does_nothing(
     out = tmp_path / "out"
     done = call(*[argument.format(out=out) for argument in arguments])
     assert (done.code, done.stdout) == (2, "")
-    assert "usage: colmap-affrect" in done.stderr[0]
-    assert "error:" in done.stderr[-1]
+    (line,) = done.stderr
+    assert line.startswith("error: ")
+    assert "; see colmap-affrect" in line
     assert not out.exists()
 
 
@@ -454,6 +455,27 @@ def test_what_is_missing_is_said_before_any_image_is_read(
     assert line.startswith("error: ")
     assert message in line
     assert not out.exists()
+
+
+def test_misspelt_option_names_the_one_that_was_meant(tmp_path: Path, call: Call) -> None:
+    done = call("run", "--output-path", tmp_path / "out", "--recipie", "on-demand")
+    assert (done.code, len(done.stderr)) == (2, 1)
+    assert "unknown argument --recipie (did you mean --recipe?); see" in done.stderr[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("[verify", "[verrify"), ("max_image_size_px", "max_image_size")]
+)
+def test_typo_in_a_config_is_refused(
+    tmp_path: Path, verified: Path, call: Call, old: str, new: str
+) -> None:
+    config = tmp_path / "config.toml"
+    text = (verified / "config.toml").read_text(encoding="utf-8")
+    config.write_text(text.replace(old, new), encoding="utf-8")
+    done = call("run", "--config", config, "--output-path", tmp_path / "out")
+    assert done.code == 2
+    meant = f"unknown '{new.strip('[')}' (did you mean '{old.strip('[')}'?)"
+    assert meant in done.stderr[0]
 
 
 def test_what_is_printed_may_end_early() -> None:

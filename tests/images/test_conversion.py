@@ -51,13 +51,13 @@ def test_every_photograph_arrives_as_colmap_reads_it(scans: Path, tmp_path: Path
     assert report.written == {
         "b.webp": ["b.webp.png"],
         "box/a.jp2": ["box/a.jp2.png"],
-        "d.tif": ["d.tif.png", "d.tif-page2.png"],
+        "d.tif": ["d.tif-page1.png", "d.tif-page2.png"],
         "truly-webp.png": ["truly-webp.png.png"],
     }
     assert report.copied == ["c.jpg"]
     assert (out / "c.jpg").read_bytes() == (scans / "c.jpg").read_bytes()
     np.testing.assert_array_equal(Image.open(out / "box" / "a.jp2.png"), picture(1))
-    deep = decode(out / "d.tif.png")
+    deep = decode(out / "d.tif-page1.png")
     assert (deep.dtype, int(deep[29, 44])) == (np.uint16, 1349 * 40)
     np.testing.assert_array_equal(decode(out / "d.tif-page2.png"), picture(5).convert("L"))
     for path in sorted(out.rglob("*.png")):
