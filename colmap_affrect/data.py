@@ -172,6 +172,16 @@ class LocalFeatures:
         return is_inside(self.keypoints, size)
 
 
+def of_one_size(parts: list[LocalFeatures]) -> list[LocalFeatures]:
+    """Fill up shorter descriptors with zeros, so that features of two kinds can be united."""
+    size = max(part.descriptors.shape[1] for part in parts)
+    return [
+        replace(part, descriptors=np.pad(part.descriptors, ((0, 0), (0, size - width))))
+        for part in parts
+        for width in (part.descriptors.shape[1],)
+    ]
+
+
 def union(parts: list[LocalFeatures]) -> LocalFeatures:
     """Concatenate features in the order given; at least one part."""
     return LocalFeatures(

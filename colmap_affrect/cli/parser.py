@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from colmap_affrect import __version__
 from colmap_affrect.cli import arguments as args
 from colmap_affrect.cli import commands
+from colmap_affrect.errors import OptionError
 
 if TYPE_CHECKING:
     # The type of what takes arguments has no public name.
@@ -72,8 +73,8 @@ class Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, without the usage of forty options."""
 
     def error(self, message: str) -> NoReturn:
-        """End with exit code 2."""
-        self.exit(2, f"error: {message}; see {self.prog} --help\n")
+        """Raise OptionError, which ends with exit code 2."""
+        raise OptionError(f"{message}; see {self.prog} --help")
 
 
 class CommandParser(Parser):

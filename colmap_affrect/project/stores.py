@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.data import LocalFeatures, union
+from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StaleStoreError, StoreError
 from colmap_affrect.project.atomic_files import (
     FileTransaction,
@@ -260,7 +260,7 @@ class FeatureStore(_Store):
             first_id = int(there.rectification_ids.max(initial=0))
             ids = features.rectification_ids
             added = replace(features, rectification_ids=np.where(ids, ids + first_id, 0))
-            both = union(_of_one_size([there, added]))
+            both = union(of_one_size([there, added]))
             content = str(group.attrs.get("content", ""))
             self._write_features(file, name, both, size, [*ends, len(both)], content)
 
@@ -346,16 +346,6 @@ class FeatureStore(_Store):
         """Read the (N,) warps that the features of one image come from."""
         with self._open("r") as file:
             return np.asarray(self._group(file, name)["rectification_ids"][()])
-
-
-def _of_one_size(parts: list[LocalFeatures]) -> list[LocalFeatures]:
-    """Fill up shorter descriptors with zeros."""
-    size = max(part.descriptors.shape[1] for part in parts)
-    return [
-        replace(part, descriptors=np.pad(part.descriptors, ((0, 0), (0, size - width))))
-        for part in parts
-        for width in (part.descriptors.shape[1],)
-    ]
 
 
 def pair_key(name1: str, name2: str) -> str:

@@ -171,6 +171,7 @@ def test_json_goes_to_stdout_alone_and_progress_to_stderr(photos: Path, tmp_path
     assert ".cc:" in log
 
 
+@pytest.mark.long
 def test_quiet_prints_the_result_only_and_verbose_every_image(
     photos: Path, tmp_path: Path, call: Call
 ) -> None:

@@ -181,6 +181,7 @@ def test_positions_of_old_databases_are_pose_priors_of_the_copy(
     assert old.read_bytes() == before
 
 
+@pytest.mark.long
 def test_doctor_tells_an_old_database_from_one_that_an_old_colmap_stamped(
     source: Path, tmp_path: Path
 ) -> None:

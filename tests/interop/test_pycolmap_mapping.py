@@ -161,6 +161,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
 
 
+@pytest.mark.long
 def test_database_of_any_program_is_mapped_in_a_copy(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

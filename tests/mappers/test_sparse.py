@@ -192,6 +192,7 @@ def test_depth_map_gives_the_scale_where_no_neighbours_and_no_plane_do(tmp_path:
     assert ratio == pytest.approx(1.0, abs=MAX_SCALE_ERROR)
 
 
+@pytest.mark.long
 def test_wrong_pair_in_a_loop_of_four_contradicts_it(tmp_path: Path) -> None:
     truth = views(4)
     path = tmp_path / "database.db"
