@@ -165,7 +165,8 @@ def test_json_goes_to_stdout_alone_and_progress_to_stderr(photos: Path, tmp_path
     assert "extract: 3/3 images" in lines
     assert "match: 3/3 pairs" in lines
     # What COLMAP prints is in the log.
-    assert all(line.split(":")[0] in ("extract", "match", "verify", "map") for line in lines)
+    stages = ("extract", "match", "verify", "map", "pictures")
+    assert all(line.split(":")[0] in stages for line in lines)
     log = (tmp_path / "out" / "run.log").read_text(encoding="utf-8")
     assert "colmap-affrect" in log
     assert ".cc:" in log

@@ -208,11 +208,11 @@ CHANGES: list[tuple[str, Callable[[Scene], None], str]] = [
 
 
 def run(call: Call, kind: str, scene: Scene, out: Path) -> str:
-    """Run, and return the warnings in the summary."""
+    """Run, and return the warnings."""
     paths = ["--image-path", scene.photos, "--output-path", out, "--max-failures", 4]
     ended = call("run", *paths, *ARGUMENTS[kind](scene))
     assert ended.code in (0, 3), ended.stderr
-    return "\n".join(line for line in ended.stdout.splitlines() if line.startswith("warning  "))
+    return "\n".join(line for line in ended.stderr if line.startswith("WARNING: "))
 
 
 def by_sorted_names(found: dict[str, Any]) -> dict[str, Any]:
