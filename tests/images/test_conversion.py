@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import ImageError
@@ -37,8 +37,11 @@ def scans(tmp_path: Path) -> Path:
     picture(3).save(folder / "c.jpg")
     deep = Image.fromarray(np.arange(1350, dtype=np.uint16).reshape(30, 45) * 40)
     preview = Image.fromarray(np.zeros((3, 4), np.uint8))
-    preview.encoderinfo = {"tiffinfo": {254: 1}}
-    deep.save(folder / "d.tif", save_all=True, append_images=[preview, picture(5).convert("L")])
+    pages = [(deep, {}), (preview, {254: 1}), (picture(5).convert("L"), {})]
+    with TiffImagePlugin.AppendingTiffWriter(str(folder / "d.tif")) as file:
+        for page, tags in pages:
+            page.save(file, format="TIFF", tiffinfo=tags)
+            file.newFrame()
     picture(6).save(folder / "truly-webp.png", format="webp")
     (folder / "broken.jp2").write_bytes(b"\x00\x00\x00\x0cjP  \r\n\x87\n")
     return folder
