@@ -167,6 +167,7 @@ def test_options_are_translated() -> None:
         verification_options({"ransac": {"max_eror": 2}}, None)
 
 
+@pytest.mark.long
 def test_what_matching_options_ask_for_is_done(extracted: Path) -> None:
     asked = pycolmap.FeatureMatchingOptions(skip_geometric_verification=True, num_threads=1)
     (match,) = replaced.match_exhaustive(extracted, asked)
@@ -178,6 +179,7 @@ def test_what_matching_options_ask_for_is_done(extracted: Path) -> None:
     assert (reports[0].num_kept, reports[2].num_done) == (6, 6)
 
 
+@pytest.mark.long
 def test_pairs_are_those_of_pycolmaps_generators(extracted: Path) -> None:
     in_order = pycolmap.SequentialPairingOptions(overlap=1, quadratic_overlap=False)
     with pytest.raises(TypeError, match="unexpected keyword argument 'pairs_options'"):
@@ -238,6 +240,7 @@ def test_frames_of_a_rig_are_verified_together_and_not_matched_within(tmp_path: 
     assert found.count(of_rig) == len(kept) == 4
 
 
+@pytest.mark.long
 def test_cancelled_token_stops_and_what_is_done_is_kept(photos: Path, tmp_path: Path) -> None:
     class Cancelling(colmap_affrect.progress.Progress):  # type: ignore[misc]
         """Cancels after the first image."""

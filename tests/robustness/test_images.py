@@ -189,6 +189,7 @@ def test_pixels_of_all_kinds_register(trio, run_images, tmp_path) -> None:
     assert ended.report["unregistered"] == {}
 
 
+@pytest.mark.long
 def test_exif_orientation_is_not_applied(tmp_path, call) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()

@@ -120,6 +120,7 @@ def test_escalation_before_its_turn_leaves_nothing_on_record(tmp_path: Path, cal
     assert not Workspace(tmp_path).config.exists()
 
 
+@pytest.mark.long
 def test_other_thresholds_than_before_need_no_new_features(
     climbed: tuple[Workspace, StageReport], tmp_path: Path, call: Call
 ) -> None:
