@@ -260,7 +260,9 @@ class Escalation:
             )
         insecure = insecure_images(num_inliers, self.options.strong_num_inliers, weakly_connected)
         failed = [pair for pair, count in num_inliers.items() if not count]
-        return ClimbingGraph(num_inliers, self._num_consistent(failed), insecure)
+        reached, tried = self.matches.levels(failed), self.matches.tried_levels(failed)
+        stalled = {pair for pair in failed if reached[pair] < tried[pair]}
+        return ClimbingGraph(num_inliers, self._num_consistent(failed), insecure, stalled)
 
     def _num_consistent(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
         ids = colmap_database.image_ids(self.path)
