@@ -30,6 +30,7 @@ from colmap_affrect.interop.pycolmap_options import (
     verification_options,
 )
 from colmap_affrect.matchers.nearest import NearestOptions
+from colmap_affrect.progress import Progress
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 
@@ -242,7 +243,7 @@ def test_frames_of_a_rig_are_verified_together_and_not_matched_within(tmp_path: 
 
 @pytest.mark.long
 def test_cancelled_token_stops_and_what_is_done_is_kept(photos: Path, tmp_path: Path) -> None:
-    class Cancelling(colmap_affrect.progress.Progress):  # type: ignore[misc]
+    class Cancelling(Progress):
         """Cancels after the first image."""
 
         def stage(self, name: str, total: int, unit: str) -> Any:
