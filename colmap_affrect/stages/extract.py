@@ -219,11 +219,7 @@ def extract(
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
     failures = _extract_missing(context, inputs, extractor, missing, digests, warnings)
-    if len(failures) == len(names):
-        raise ImageError(
-            f"{folder}: none of the {len(names)} images can be used; the first: "
-            f"{failures[names[0]]}"
-        )
+    _require_some(folder, names, failures)
     failures |= write_images_and_keypoints(context)
     return StageReport(
         "extract",
@@ -233,6 +229,14 @@ def extract(
         failures,
         warnings,
     )
+
+
+def _require_some(folder: Path, names: Sequence[str], failures: Mapping[str, str]) -> None:
+    if len(failures) == len(names):
+        raise ImageError(
+            f"{folder}: none of the {len(names)} images can be used; the first: "
+            f"{failures[names[0]]}"
+        )
 
 
 def _require_usable_cameras(workspace: Workspace, inputs: Inputs) -> None:
