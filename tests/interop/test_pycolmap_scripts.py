@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from room_panoramas import write_panoramas
-from small_scene import NAMES, write_photographs
+from small_scene import NAMES
 
 import colmap_affrect
 from colmap_affrect import pycolmap as replaced
@@ -35,13 +35,6 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 
 COARSE = {"rectifier": "identity", "max_image_size_px": 320}
-
-
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("photos")
-    write_photographs(folder)
-    return folder
 
 
 @pytest.fixture(scope="module")

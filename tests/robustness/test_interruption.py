@@ -89,22 +89,22 @@ def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
 
 @pytest.mark.long
 def test_run_ended_again_and_again_has_the_results_of_an_undisturbed_one(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed
+    photos: Path, tmp_path: Path, undisturbed: Undisturbed
 ) -> None:
     expected, worked_s = undisturbed.results, undisturbed.worked_s
     signals = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGKILL)
     chance = random.Random(4)
     out = tmp_path / "out"
-    end_again_and_again(small_photos, out, FAST, worked_s, signals, chance)
-    assert finish(small_photos, out, FAST) == expected
+    end_again_and_again(photos, out, FAST, worked_s, signals, chance)
+    assert finish(photos, out, FAST) == expected
 
 
 @pytest.mark.long
 def test_two_runs_at_once_are_one_that_works_and_one_that_is_refused(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed
+    photos: Path, tmp_path: Path, undisturbed: Undisturbed
 ) -> None:
     out = tmp_path / "out"
-    arguments = run_arguments(small_photos, out, FAST)
+    arguments = run_arguments(photos, out, FAST)
     with start(*arguments) as first, start(*arguments) as second:
         printed = [process.communicate(timeout=120)[1] for process in (first, second)]
     assert sorted([first.returncode, second.returncode]) == [0, 1]
