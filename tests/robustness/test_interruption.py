@@ -5,8 +5,6 @@ from __future__ import annotations
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,20 +36,9 @@ def finish(photos: Path, out: Path, options: Sequence[str]) -> dict[str, Any]:
     return results(out)
 
 
-def restore_interrupt() -> None:
-    """Test runners in the background ignore SIGINT, and their children inherit that."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 def end_after(delay_s: float, number: signal.Signals, arguments: Sequence[str], out: Path) -> bool:
     """Start a run and send it a signal; tell whether it was still at work then."""
-    with subprocess.Popen(
-        [sys.executable, "-m", "colmap_affrect", *arguments],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=restore_interrupt,  # noqa: PLW1509  (nothing here uses threads)
-    ) as process:
+    with start(*arguments) as process:
         wait_until_at_work(process, out)
         time.sleep(delay_s)
         process.send_signal(number)
@@ -102,22 +89,22 @@ def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
 
 @pytest.mark.long
 def test_run_ended_again_and_again_has_the_results_of_an_undisturbed_one(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed
+    photos: Path, tmp_path: Path, undisturbed: Undisturbed
 ) -> None:
     expected, worked_s = undisturbed.results, undisturbed.worked_s
     signals = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGKILL)
     chance = random.Random(4)
     out = tmp_path / "out"
-    end_again_and_again(small_photos, out, FAST, worked_s, signals, chance)
-    assert finish(small_photos, out, FAST) == expected
+    end_again_and_again(photos, out, FAST, worked_s, signals, chance)
+    assert finish(photos, out, FAST) == expected
 
 
 @pytest.mark.long
 def test_two_runs_at_once_are_one_that_works_and_one_that_is_refused(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed
+    photos: Path, tmp_path: Path, undisturbed: Undisturbed
 ) -> None:
     out = tmp_path / "out"
-    arguments = run_arguments(small_photos, out, FAST)
+    arguments = run_arguments(photos, out, FAST)
     with start(*arguments) as first, start(*arguments) as second:
         printed = [process.communicate(timeout=120)[1] for process in (first, second)]
     assert sorted([first.returncode, second.returncode]) == [0, 1]
