@@ -31,6 +31,9 @@ MAX_NUM_LAID_OUT, MAX_NUM_IN_MATRIX = 300, 1000
 MAX_NODE, MIN_NODE, DOT = 64.0, 22.0, 9.0
 """Sides of nodes in units of the graph."""
 
+EDGE = 3.0
+"""Free edge of a graph, in which frames of nodes are."""
+
 SPACING = 1.6
 """Of nodes that are thumbnails, in their sides: edges show between them."""
 
@@ -111,15 +114,15 @@ def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layou
     graph.add_weighted_edges_from((name, MIDDLE, GRAVITY) for name in names)
     places = networkx.spring_layout(graph, seed=0, iterations=200 if count < 100 else 60)
     centers = np.array([places[name] for name in names])
-    room = np.array(GRAPH_SIZE) - size
+    room = np.array(GRAPH_SIZE) - size - 2 * EDGE
     extent = np.maximum(np.ptp(centers, axis=0), 1e-9)
-    centers = (centers - centers.min(axis=0)) / extent * room + size / 2
+    centers = (centers - centers.min(axis=0)) / extent * room + size / 2 + EDGE
     return Layout(_apart(centers, size), size)
 
 
 def _apart(centers: NDArray[np.float64], size: float) -> NDArray[np.float64]:
     """Push squares of a side apart until edges show between them, or nearly."""
-    low, high = size / 2, np.array(GRAPH_SIZE) - size / 2
+    low, high = size / 2 + EDGE, np.array(GRAPH_SIZE) - size / 2 - EDGE
     rows, columns = np.triu_indices(len(centers), 1)
     spacing = SPACING if len(centers) <= MAX_NUM_THUMBNAILS else 1.0
     for _ in range(200):
