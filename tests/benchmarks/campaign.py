@@ -26,6 +26,7 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -118,6 +119,9 @@ def forked(*arguments: object, output: Path) -> Ended:
             code = main_of_package([str(argument) for argument in arguments])
         except SystemExit as end:
             code = int(end.code or 0)
+        except BaseException:  # noqa: BLE001 - this process must not go on as its parent
+            traceback.print_exc()
+            code = 1
         sys.stdout.flush()
         os._exit(code)
     _, status = os.waitpid(child, 0)

@@ -34,7 +34,7 @@ STATEMENTS = (
     "UPDATE two_view_geometries SET data = zeroblob(length(data) - 3)",
     "UPDATE two_view_geometries SET data = x'ffffffffffffffff', rows = 1",
     "UPDATE cameras SET model = 12345",
-    "UPDATE cameras SET model = NULL",
+    "UPDATE cameras SET height = 0",
     "UPDATE cameras SET width = 9223372036854775807",
     "UPDATE cameras SET width = 'wide'",
     "UPDATE cameras SET params = x'00'",
