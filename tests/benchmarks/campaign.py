@@ -95,7 +95,7 @@ class Case:
 
     def assert_finishes(self, out: Path) -> None:
         """Run again without disturbance and have the same results."""
-        ended = ended_in(start(*self.arguments(out)))
+        ended = forked(*self.arguments(out), output=self.folder / "output")
         assert ended.code == 0, ended.stderr
         found = content(out)
         different = [key for key in self.content if found.get(key) != self.content[key]]
