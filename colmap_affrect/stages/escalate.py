@@ -198,7 +198,7 @@ def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | No
 def reject(context: Context, pairs: Sequence[Pair]) -> None:
     """Let pairs count as not verified, and none climb again: further levels would be no better."""
     escalation = Escalation(context, EscalateOptions())
-    context.matches.mark_tried(escalation.pairs, escalation.levels[-1])
+    context.matches.write((), escalation.pairs, escalation.levels[-1])
     colmap_database.reject_pairs(context.workspace.database, pairs)
 
 
@@ -327,7 +327,7 @@ class Escalation:
         higher = [pair for pair in self.pairs if levels[pair]]
         with self.context.progress.stage("match", len(higher), "pairs") as advance:
             match_pairs(self.context, higher, self.matching, advance)
-        self.matches.mark_tried(self.pairs, 0)
+        self.matches.write((), self.pairs, 0)
         self.write()
 
     def match_first_level(self, pairs: Sequence[Pair], path: Path) -> None:
@@ -395,8 +395,7 @@ class Escalation:
         better: list[PairMatches] = []
 
         def record() -> None:
-            self.matches.mark_tried(tried, level)
-            self.matches.write(better)
+            self.matches.write(better, tried, level)  # both or neither, if it is killed here
             tried.clear()
             better.clear()
 
