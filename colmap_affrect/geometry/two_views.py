@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from colmap_affrect.geometry.neighbors import neighbors_within
 
 Array = NDArray[np.float64]
 
@@ -265,13 +264,10 @@ def _nearest_known(
     known: Array, places: Array, radius_px: float, count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Return (place, known point, distance) of the ``count`` nearest of each place."""
-    neighbors = neighbors_within(np.concatenate([places, known]), radius_px)
-    rows, columns = neighbors.of(np.arange(len(places)))
-    is_known = columns >= len(places)
-    rows, columns = rows[is_known], columns[is_known] - len(places)
-    distances = np.linalg.norm(places[rows] - known[columns], axis=1)
-    order = np.lexsort((distances, rows))
-    rows = rows[order]
-    rank = np.arange(len(rows)) - np.searchsorted(rows, rows)
-    kept = order[rank < count]
-    return rows[rank < count], columns[kept], distances[kept]
+    if not len(known) or not len(places):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
+    distances, columns = cv2.batchDistance(
+        places.astype(np.float32), known.astype(np.float32), cv2.CV_32F, K=min(count, len(known))
+    )
+    near = distances <= radius_px
+    return np.nonzero(near)[0], columns[near].astype(np.int64), distances[near].astype(np.float64)
