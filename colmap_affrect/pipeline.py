@@ -17,6 +17,7 @@ from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
 from colmap_affrect.errors import ImageError
 from colmap_affrect.features.weights import resolve
+from colmap_affrect.forecast import Forecast
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions, MappingTask
 from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
@@ -53,7 +54,7 @@ from colmap_affrect.stages.map import (
     unregistered,
 )
 from colmap_affrect.stages.match import match
-from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
+from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed_pairs
 from colmap_affrect.stages.verify import recorded_verification, verify_matches
 
 FocalVote = Literal["auto", "always", "never"]
@@ -168,10 +169,17 @@ def run(
         AffrectError: for anything that the caller can mend; what is done stays.
     """
     options = options or RunOptions()
-    context = Context(Workspace(output_path), options.resources, executor, progress)
     mapper = MAPPERS.make(options.mapping)
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
+    forecast = Forecast(
+        len(names),
+        expected_num_pairs(options.pairs, len(names)),
+        by_network=bool(options.recipe.matching.weights),
+        may_climb=bool(options.recipe.extraction.escalation),
+    )
+    shown = progress.with_forecast(forecast)
+    context = Context(Workspace(output_path), options.resources, executor, shown)
     if options.extend:
         if overwrite:
             options.extend.refuse_discarding(output_path)

@@ -341,10 +341,8 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
     show(report.to_json() if options.json else report.summary(with_warnings=options.quiet))
     if not (options.json or options.quiet):
         show("\n".join(_next_steps(report, options.output_path)))
-    why = ""
-    if not report.models:
-        why = "one image cannot make a model" if report.images_total == 1 else "no model was found"
-    elif not report.models[0].is_trustworthy:
+    why = report.why_no_model
+    if report.status == "doubtful":
         why = "nothing in the model can be trusted"
     if why:
         show(f"error: {why}; see {options.output_path / 'report.json'}", file=sys.stderr)
@@ -364,7 +362,7 @@ def _next_steps(report: ReconstructionReport, out: Path) -> list[str]:
             look + (["--image_path", photos] if photos else []),
             ["colmap-affrect", "export", "--model-path", model, "--output-path", out / "export"],
         ]
-    if report.unregistered and photos:
+    if report.unregistered and report.num_pairs and photos:
         where = ["--image-path", photos, "--output-path", out / "compare"]
         commands.append(["colmap-affrect", "compare", *where])
     lines = [f"results     {out}" + (f", to look at: {page}" if page.exists() else "")]

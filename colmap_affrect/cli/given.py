@@ -252,7 +252,9 @@ def distance(text: str) -> tuple[str, str, float]:
         first, second, length = text.split(",")
         return first, second, float(length)
     except ValueError as error:
-        raise OptionError(f"--distance {text}: expected A,B,METRES") from error
+        raise OptionError(
+            f"--distance {text}: expected A,B,METRES with a decimal point, such as a.jpg,b.jpg,2.5"
+        ) from error
 
 
 def progress(options: argparse.Namespace) -> Progress:

@@ -193,6 +193,10 @@ def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
                 is_odd = values is None or (name in "FEH" and not np.isfinite(values).all())
                 if is_odd:
                     found["matrix-data"].append(f"{name} of {key} {row}")
+    if {"qvec", "tvec"} <= columns_of(connection, "two_view_geometries"):
+        query = "SELECT pair_id FROM two_view_geometries WHERE (qvec IS NULL) != (tvec IS NULL)"
+        for (row,) in connection.execute(query):
+            found["matrix-data"].append(f"qvec and tvec of pair_id {row}")
 
 
 def _check_cameras_of_pairs(connection: sqlite3.Connection, found: Problems) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.comparison.verdict import cautions, changes, headline
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.options import flat
+from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import page, view_graph
@@ -123,7 +124,16 @@ def _graphs_and_models(
     return {
         "cards": cards,
         "layout": layout,
-        "edges": [view_graph.edge_paths(names, layout, graph) for graph in graphs],
+        "edges": [
+            view_graph.differing_edge_paths(names, layout, graph, graphs[0])
+            if number
+            else view_graph.edge_paths(names, layout, graph)
+            for number, graph in enumerate(graphs)
+        ],
+        "edge_notes": [
+            f"{len(graph)} verified pairs" + (_difference(graph, graphs[0]) if number else "")
+            for number, graph in enumerate(graphs)
+        ],
         "views": views,
         "kinds": {kind: text for kind, text in KINDS.items() if kind in used},
         "script_data": {
@@ -133,6 +143,10 @@ def _graphs_and_models(
             ],
         },
     }
+
+
+def _difference(graph: Mapping[Pair, int], first: Mapping[Pair, int]) -> str:
+    return f", {len(graph.keys() - first.keys())} new, {len(first.keys() - graph.keys())} lost"
 
 
 def _warps(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+from itertools import groupby
 from pathlib import Path
 
 from colmap_affrect.doctor.database import examine_database
@@ -74,8 +75,12 @@ def _examine_networks(findings: Findings, weights_path: Path | None) -> None:
     if device.type == "cpu":
         findings.add("no-gpu", "networks")
     rows = describe_weights(weights_path)
-    found = ", ".join(str(row.path) for row in rows if row.path)
-    findings.checked.append(f"weights: {found or 'none found'}")
+    files = sorted(row.path for row in rows if row.path)
+    for folder, paths in groupby(files, lambda path: path.parent):
+        names = ", ".join(path.name for path in paths)
+        findings.checked.append(f"weights: in {folder}: {names}")
+    if not files:
+        findings.checked.append("weights: none found")
     for row in rows:
         if row.verified is False:
             findings.add("other-weights", str(row.path))

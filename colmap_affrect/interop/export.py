@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,7 +91,7 @@ def export(
         What was written, by format.
 
     Raises:
-        AffrectError: when a format cannot hold the model, or a file exists.
+        AffrectError: when a format cannot hold the model, or a file exists; nothing is written.
     """
     for name in formats:
         if name not in FORMATS:
@@ -100,11 +101,15 @@ def export(
     )
     is_new = not output_path.exists()
     output_path.mkdir(parents=True, exist_ok=True)
+    known = set(output_path.iterdir())
     try:
         return {name: FORMATS[name](source, output_path) for name in dict.fromkeys(formats)}
-    finally:
-        if is_new and not any(output_path.iterdir()):
+    except BaseException:
+        for path in set(output_path.iterdir()) - known:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        if is_new:
             output_path.rmdir()
+        raise
 
 
 def _recorded_images(model_path: Path) -> Path | None:

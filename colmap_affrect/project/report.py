@@ -237,6 +237,19 @@ class ReconstructionReport:
         return "partial" if self.unregistered else "ok"
 
     @property
+    def why_no_model(self) -> str:
+        """Why there is none, in a few words; empty where there is one."""
+        if self.models:
+            return ""
+        num_usable = self.images_total - len(self.failures)
+        if num_usable == 1:
+            unreadable = f": {len(self.failures)} cannot be read" if self.failures else ""
+            return f"one image cannot make a model{unreadable}"
+        if not self.num_verified_pairs:
+            return "no model was found: no pair of images is verified"
+        return f"no model was found: {self.num_verified_pairs} verified pairs do not make one"
+
+    @property
     def preset(self) -> str:
         """``sparse``, ``colmap`` or ``custom``; both names where verification's is another one."""
         verification, mapping = self.presets

@@ -92,6 +92,7 @@ def write_run_page(
         "headline": f"{len(model.registered_names)} of {len(names)} photographs registered",
         "about": _about(report),
         "doubts": _doubts(report, model),
+        "doubts_title": "What to doubt" if report.models else "Why there is no model",
         "notes": [f"{name}: {why}" for name, why in report.warnings.items()],
         "max_num_lines": MAX_LINES,
         "advice": report.advice,
@@ -147,7 +148,7 @@ def _fate(number: int, name: str, report: ReconstructionReport, model: ModelSumm
 
 def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
     """Return what cannot be trusted, the model as a whole first."""
-    texts = [] if report.models else ["No model was found."]
+    texts = [] if report.models else _why_no_model(report)
     texts += [f"The whole model: {why}." for why in model.doubts]
     texts += [f"{name}: {why}" for name, why in model.doubtful.items()]
     texts += [
@@ -158,6 +159,18 @@ def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
         total = sum(report.contradicting_pairs.values())
         texts.append(f"The model contradicts {total} of the verified pairs.")
     return texts
+
+
+def _why_no_model(report: ReconstructionReport) -> list[str]:
+    """Return the reason, and what became of the photographs, those of one fate together."""
+    names: dict[str, list[str]] = {}
+    for name, why in report.unregistered.items():
+        names.setdefault(why.partition(";")[0], []).append(name)
+    why = report.why_no_model
+    return [
+        f"{why[0].upper()}{why[1:]}.",
+        *(f"{reason}: {_some_of(alike)}" for reason, alike in names.items()),
+    ]
 
 
 def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
@@ -224,8 +237,13 @@ def _focals(camera: Mapping[str, Any]) -> list[float]:
 
 
 def _photographs(names: Sequence[str], index: Mapping[str, int]) -> str:
-    shown = ", ".join(f"{index[name] + 1} {name}" for name in names[:MAX_NAMES] if name in index)
-    return shown + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")
+    return _some_of([f"{index[name] + 1} {name}" for name in names if name in index])
+
+
+def _some_of(texts: Sequence[str]) -> str:
+    """Return the first few, and how many more there are."""
+    more = len(texts) - MAX_NAMES
+    return ", ".join(texts[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _stages(report: ReconstructionReport) -> list[dict[str, Any]]:

@@ -22,7 +22,7 @@ CLASS_COLORS = ("#e3b341", "#f08c3c", "#e2604f", "#cf4080", "#a14bb5", "#6f60dd"
 CLASS_WIDTHS = (1.2, 2.0, 3.0, 4.2, 5.6, 7.2)
 """Of the edges, in units of the graph."""
 
-GRAPH_SIZE = (640.0, 460.0)
+GRAPH_SIZE = (640.0, 620.0)
 MAX_NUM_THUMBNAILS = 60
 """With more photographs the nodes are dots."""
 MAX_NUM_LAID_OUT, MAX_NUM_IN_MATRIX = 300, 1000
@@ -30,6 +30,9 @@ MAX_NUM_LAID_OUT, MAX_NUM_IN_MATRIX = 300, 1000
 
 MAX_NODE, MIN_NODE, DOT = 64.0, 22.0, 9.0
 """Sides of nodes in units of the graph."""
+
+EDGE = 3.0
+"""Free edge of a graph, in which frames of nodes are."""
 
 SPACING = 1.6
 """Of nodes that are thumbnails, in their sides: edges show between them."""
@@ -111,15 +114,15 @@ def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layou
     graph.add_weighted_edges_from((name, MIDDLE, GRAVITY) for name in names)
     places = networkx.spring_layout(graph, seed=0, iterations=200 if count < 100 else 60)
     centers = np.array([places[name] for name in names])
-    room = np.array(GRAPH_SIZE) - size
+    room = np.array(GRAPH_SIZE) - size - 2 * EDGE
     extent = np.maximum(np.ptp(centers, axis=0), 1e-9)
-    centers = (centers - centers.min(axis=0)) / extent * room + size / 2
+    centers = (centers - centers.min(axis=0)) / extent * room + size / 2 + EDGE
     return Layout(_apart(centers, size), size)
 
 
 def _apart(centers: NDArray[np.float64], size: float) -> NDArray[np.float64]:
     """Push squares of a side apart until edges show between them, or nearly."""
-    low, high = size / 2, np.array(GRAPH_SIZE) - size / 2
+    low, high = size / 2 + EDGE, np.array(GRAPH_SIZE) - size / 2 - EDGE
     rows, columns = np.triu_indices(len(centers), 1)
     spacing = SPACING if len(centers) <= MAX_NUM_THUMBNAILS else 1.0
     for _ in range(200):
@@ -138,9 +141,12 @@ def _apart(centers: NDArray[np.float64], size: float) -> NDArray[np.float64]:
 
 
 def edge_paths(
-    names: Sequence[str], layout: Layout, pair_inliers: Mapping[Pair, int]
-) -> list[tuple[int, str]]:
-    """Return (class, SVG path of all its edges), few inliers first; at most ``MAX_NUM_EDGES``."""
+    names: Sequence[str], layout: Layout, pair_inliers: Mapping[Pair, int], style: str = ""
+) -> list[tuple[str, str]]:
+    """Return (class of CSS, SVG path of all its edges), few inliers first.
+
+    Edges are at most ``MAX_NUM_EDGES``; ``style`` is another class that all of them have.
+    """
     index = {name: number for number, name in enumerate(names)}
     parts: dict[int, list[str]] = {}
     strongest = sorted(pair_inliers, key=lambda pair: -pair_inliers[pair])[:MAX_NUM_EDGES]
@@ -148,7 +154,27 @@ def edge_paths(
         (x1, y1), (x2, y2) = layout.centers[[index[name1], index[name2]]]
         line = f"M{x1:.0f} {y1:.0f}L{x2:.0f} {y2:.0f}"
         parts.setdefault(inlier_class(pair_inliers[name1, name2]), []).append(line)
-    return [(number, "".join(parts[number])) for number in sorted(parts)]
+    return [(f"i{number} {style}".strip(), "".join(parts[number])) for number in sorted(parts)]
+
+
+def differing_edge_paths(
+    names: Sequence[str],
+    layout: Layout,
+    pair_inliers: Mapping[Pair, int],
+    other: Mapping[Pair, int],
+) -> list[tuple[str, str]]:
+    """Return the edges of a graph, with how they differ from those of another one.
+
+    Edges of both are ``shared``, those that only the other has are ``lost``.
+    """
+    lost = {pair: count for pair, count in other.items() if pair not in pair_inliers}
+    shared = {pair: count for pair, count in pair_inliers.items() if pair in other}
+    new = {pair: count for pair, count in pair_inliers.items() if pair not in other}
+    return [
+        *edge_paths(names, layout, lost, "lost"),
+        *edge_paths(names, layout, shared, "shared"),
+        *edge_paths(names, layout, new),
+    ]
 
 
 def matrix(names: Sequence[str], pair_inliers: Mapping[Pair, int]) -> str:

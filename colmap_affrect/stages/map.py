@@ -48,6 +48,9 @@ NUM_BEST_PAIRS = 3
 STRONGER_RECIPE, LEARNED_RECIPE = "on-demand", "on-demand-learned"
 """Advised where photographs are missing; the second needs weights."""
 
+TOO_FEW = "more photographs: two that can be read and show the same from two places make a model"
+"""Advised where nothing else would help."""
+
 
 def map_images(
     context: Context,
@@ -306,6 +309,8 @@ def advice(
     if not missing and not is_doubtful:
         return ()
     workspace = context.workspace
+    if sum(map(bool, colmap_database.keypoint_counts(workspace.database).values())) < 2:
+        return (TOO_FEW,)
     texts = []
     if is_copy(workspace):
         texts.append("run --from-database, with --image-path, makes new features for its images")

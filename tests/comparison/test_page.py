@@ -21,7 +21,7 @@ from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResu
 from colmap_affrect.comparison.verdict import verdict
 from colmap_affrect.report.match_plots import PLOT_HEIGHT
 from colmap_affrect.report.pictures import Picture
-from colmap_affrect.report.view_graph import GRAPH_SIZE, lay_out
+from colmap_affrect.report.view_graph import GRAPH_SIZE, differing_edge_paths, lay_out
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 
@@ -118,6 +118,16 @@ def test_numbers_are_those_of_the_comparison(page: Page, comparison: Comparison)
     assert page.cells["correct", "default"] == "4.5 (4-5)"
     assert page.cells["models", "default"] == "seed 0: 5; seed 1: 4 + 2"
     assert page.cells["registered", "sift"] == "4.0"
+
+
+def test_graphs_show_what_differs_from_the_first_method(page: Page) -> None:
+    pairs = {("a", "b"): 20, ("b", "c"): 500}
+    layout = lay_out(["a", "b", "c"], [pairs])
+    found = differing_edge_paths(["a", "b", "c"], layout, pairs, {("a", "b"): 40, ("a", "c"): 3})
+    assert [style for style, _ in found] == ["i0 lost", "i0 shared", "i5"]
+    counts = [text for text in page.values("svg", "aria-label") if text.startswith("View graph")]
+    assert not counts[0].endswith("lost")
+    assert all(text.endswith("lost") for text in counts[1:])
 
 
 def test_seeds_without_a_model_are_not_averaged_as_0(comparison: Comparison) -> None:

@@ -142,6 +142,9 @@ def test_what_a_format_cannot_hold_is_said(tmp_path: Path) -> None:
         export(tmp_path / "model", tmp_path / "out", ["undistorted"])
     with pytest.raises(ImageError, match=r"a\.png: no such photograph"):
         export(tmp_path / "model", tmp_path / "out", ["undistorted"], image_path=tmp_path)
+    with pytest.raises(OptionError, match="no place on earth"):
+        export(tmp_path / "model", tmp_path / "out", ["ply", "text", "geojson"])
+    assert not (tmp_path / "out").exists()  # the same command with what it lacked can be given
     export(tmp_path / "model", tmp_path / "out", ["cameras"])
     with pytest.raises(OptionError, match="exists, and is left as it is"):
         export(tmp_path / "model", tmp_path / "out", ["cameras"])

@@ -72,11 +72,22 @@ def test_cameras_are_where_the_model_has_them_seen_from_the_front(html: str, fol
 
 def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
     report = small_report(tmp_path)
-    values = {"models": (), "unregistered": dict.fromkeys(NAMES, "no features"), "cameras": ()}
+    values = {
+        "models": (),
+        "num_verified_pairs": 0,
+        "unregistered": dict.fromkeys(NAMES, "no features"),
+        "cameras": (),
+    }
     nothing = type(report)(**{**vars(report), **values})
     path = write_run_page(Workspace(tmp_path), nothing, NAMES, {}, None)
     html = path.read_text(encoding="utf-8")
-    for text in ("No model was found.", "There is no model.", "No pair of photographs is verified"):
+    for text in (
+        "Why there is no model",
+        "No model was found: no pair of images is verified.",
+        "c.png and 3 more</li>",
+        "There is no model.",
+        "No pair of photographs is verified",
+    ):
         assert text in html
     assert html.count("no picture</span>") == 6
 

@@ -89,6 +89,8 @@ def test_one_image_ends_without_a_model(tmp_path: Path, call: Call) -> None:
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert (report["status"], report["num_models"], report["num_pairs"]) == ("no_model", 0, 0)
     assert report["unregistered"] == {"a.png": "no verified pair"}
+    assert len(report["advice"]) == 1  # no recipe would help
+    assert "compare" not in stdout
 
 
 def test_images_without_overlap_end_without_a_model(tmp_path: Path, call: Call) -> None:
@@ -97,7 +99,8 @@ def test_images_without_overlap_end_without_a_model(tmp_path: Path, call: Call) 
         write_image(tmp_path / name, rng.integers(0, 256, (120, 160), dtype=np.uint8))
     code, _, stderr = call("run", "--image-path", tmp_path, "--output-path", tmp_path / "o", "-q")
     assert code == 3
-    assert stderr == [f"error: no model was found; see {tmp_path / 'o' / 'report.json'}"]
+    why = "no model was found: no pair of images is verified"
+    assert stderr == [f"error: {why}; see {tmp_path / 'o' / 'report.json'}"]
 
 
 def test_bad_input_is_one_clear_line_and_writes_no_results(

@@ -126,23 +126,30 @@
   // Models: all are seen from the same place, a camera pointed at is marked in all.
   const [FRONT, TOP, DISTANCE, MAX_ZOOM] = [0.35, Math.PI / 2, 4, 20];
   const [NEAR_PX, DRAG_PX, MAX_LABELLED] = [16, 6, 80];
-  const eye = { yaw: 0, pitch: FRONT, zoom: 0 };
+  const eye = { yaw: 0, pitch: FRONT, zoom: 0, isMoved: false };
   let pointedAt = -1;
   let isWaiting = false;
 
   function turn(yaw, pitch) {
     eye.yaw += yaw;
     eye.pitch = limited(eye.pitch + pitch, -TOP, TOP);
+    eye.isMoved = true;
     redraw();
   }
 
   function zoom(factor) {
     eye.zoom = limited(eye.zoom * factor, 0.3, MAX_ZOOM);
+    eye.isMoved = true;
     redraw();
   }
 
   function look(pitch) {
-    Object.assign(eye, { yaw: 0, pitch, zoom: 0 });
+    Object.assign(eye, { yaw: 0, pitch, zoom: 0, isMoved: false });
+    redraw();
+  }
+
+  function refit() {
+    if (!eye.isMoved) eye.zoom = 0;
     redraw();
   }
 
@@ -171,7 +178,7 @@
       this.pointers = new Map();
       this.dragged = 0;
       this.listen();
-      new ResizeObserver(() => redraw()).observe(canvas);
+      new ResizeObserver(refit).observe(canvas);
     }
 
     projection(width, height, zoom) {
@@ -202,9 +209,10 @@
         points.push(reach(this.places.subarray(index, index + 3)));
       }
       points.sort((one, two) => one - two);
-      const cameras = this.cameras.map((camera) => reach(camera.corners.slice(0, 3)));
+      const cameras = this.cameras.flatMap(({ corners }) =>
+        [0, 3, 6, 9, 12].map((at) => reach(corners.slice(at, at + 3))));
       const held = Math.max(...cameras, points[Math.floor(0.9 * points.length)] ?? 0);
-      return limited(0.88 / held || 1, 0.3, 4);
+      return limited(0.9 / held || 1, 0.3, 4);
     }
 
     draw() {

@@ -1,0 +1,128 @@
+"""How long a whole run takes, roughly: from what its first images and pairs have taken."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+COSTS = {"extract": 1.0, "match": 0.2, "match by network": 0.7, "verify": 0.06, "map": 0.7}
+"""What one unit of a stage takes in the time that one image takes in ``extract``, of a stage that
+has not begun. On eight scenes of 10 to 16 photographs forecasts that have seen ``extract`` only are
+within a factor of 2."""
+
+MIN_DONE, MIN_ELAPSED_S = 5, 3.0
+"""Less of a stage says too little of the rest: the first unit waits for what has to be loaded."""
+
+
+@dataclass
+class _Stage:
+    cost: float
+    ahead: int
+    done: int = 0
+    elapsed_s: float = 0.0
+
+    @property
+    def is_measured(self) -> bool:
+        return self.done >= MIN_DONE and self.elapsed_s >= MIN_ELAPSED_S
+
+
+class Forecast:
+    """Adds up what is left of a row of stages.
+
+    A stage that has begun takes as long per unit as until now; one that has not is guessed from
+    those that have.
+    """
+
+    def __init__(
+        self,
+        num_images: int,
+        num_pairs: int,
+        *,
+        by_network: bool = False,
+        may_climb: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Take what is ahead.
+
+        Args:
+            num_images: to extract and map.
+            num_pairs: to match and verify, if all images are new.
+            by_network: a network matches them.
+            may_climb: a stage ``escalate`` follows, of which nothing is known before it begins.
+            clock: gives seconds.
+        """
+        match_cost = COSTS["match by network" if by_network else "match"]
+        self._stages = {
+            "extract": _Stage(COSTS["extract"], num_images),
+            "match": _Stage(match_cost, num_pairs),
+            "verify": _Stage(COSTS["verify"], num_pairs),
+            "map": _Stage(COSTS["map"], num_images),
+        }
+        self._may_climb, self._clock = may_climb, clock
+        self._current, self._start_s = "", 0.0
+
+    def begin(self, name: str, total: int) -> None:
+        """A stage begins with so many units."""
+        known = self._stages.get(name, _Stage(0.0, 0))
+        if name == "extract":
+            share_old = 1 - total / max(known.ahead, total, 1)
+            self._expect_pairs(round(self._stages["match"].ahead * (1 - share_old**2)))
+        if name == "match":
+            self._expect_pairs(total)
+        self._stages[name] = _Stage(known.cost, total)
+        self._may_climb &= name != "escalate"
+        self._current, self._start_s = name, self._clock()
+
+    def _expect_pairs(self, count: int) -> None:
+        for name in ("match", "verify"):
+            self._stages[name].ahead = count
+
+    def advance(self, count: int) -> None:
+        """So many units of the stage that began last are done."""
+        stage = self._stages[self._current]
+        stage.done += count
+        stage.ahead = max(stage.ahead - count, 0)
+        stage.elapsed_s = self._clock() - self._start_s
+
+    def end(self) -> None:
+        """The stage that began last is over, whatever it has done."""
+        self._stages[self._current].ahead = 0
+
+    def left_s(self) -> float | None:
+        """Return the seconds that are left, None while too little is measured."""
+        measured = [stage for stage in self._stages.values() if stage.is_measured and stage.cost]
+        if not measured:
+            return None
+        total_cost = sum(stage.done * stage.cost for stage in measured)
+        image_s = sum(stage.elapsed_s for stage in measured) / total_cost
+        return sum(
+            stage.ahead
+            * (stage.elapsed_s / stage.done if stage.is_measured else stage.cost * image_s)
+            for stage in self._stages.values()
+        )
+
+    def text(self) -> str:
+        """Return the same for people; empty while too little is measured.
+
+        And from mapping on, which is the last stage and may begin anew.
+        """
+        left_s = self.left_s()
+        if left_s is None or not self._stages["map"].ahead or self._current == "map":
+            return ""
+        but = " without further warps" if self._may_climb else ""
+        return f"whole run: {duration_text(left_s)} left{but}"
+
+
+def duration_text(seconds: float) -> str:
+    """Write a duration as roughly as it is known.
+
+    >>> [duration_text(seconds) for seconds in (20, 110, 1500, 9000)]
+    ['less than a minute', 'about 2 min', 'about 25 min', 'about 2.5 h']
+    """
+    minutes = seconds / 60
+    if minutes < 1:
+        return "less than a minute"
+    if minutes < 90:
+        return f"about {minutes:.0f} min"
+    return f"about {minutes / 60:.1f} h"

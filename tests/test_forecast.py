@@ -1,0 +1,100 @@
+"""How long a run takes, from a clock that tests turn."""
+
+from __future__ import annotations
+
+import io
+import logging
+
+import pytest
+
+from colmap_affrect.forecast import COSTS, Forecast
+from colmap_affrect.progress import Progress
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def run_stage(forecast: Forecast, clock: Clock, name: str, total: int, unit_s: float) -> None:
+    forecast.begin(name, total)
+    for _ in range(total):
+        clock.now_s += unit_s
+        forecast.advance(1)
+    forecast.end()
+
+
+def test_what_has_begun_is_measured_and_the_rest_is_guessed_from_it() -> None:
+    clock = Clock()
+    forecast = Forecast(100, 4950, clock=clock)
+    assert forecast.left_s() is None
+    forecast.begin("extract", 100)
+    for _ in range(4):
+        clock.now_s += 2.0
+        forecast.advance(1)
+        assert forecast.text() == ""  # says too little
+    clock.now_s += 2.0
+    forecast.advance(1)
+    guessed = 4950 * (COSTS["match"] + COSTS["verify"]) + 100 * COSTS["map"]
+    assert forecast.left_s() == pytest.approx(2.0 * (95 + guessed))
+    forecast.end()
+    run_stage(forecast, clock, "match", 4950, 0.01)
+    forecast.begin("verify", 4950)
+    clock.now_s += 10.0
+    forecast.advance(2475)
+    left_s = forecast.left_s()
+    assert left_s is not None
+    assert left_s > 10.0  # and as much again as it took until now
+    forecast.end()
+    forecast.begin("map", 100)
+    clock.now_s += 10.0
+    forecast.advance(1)
+    assert forecast.text() == ""
+
+
+def test_images_that_are_known_leave_their_pairs_out() -> None:
+    clock = Clock()
+    forecast = Forecast(100, 4950, clock=clock)
+    run_stage(forecast, clock, "extract", 10, 1.0)
+    pairs_ahead = round(4950 * (1 - 0.9**2))
+    left_s = pairs_ahead * (COSTS["match"] + COSTS["verify"]) + 100 * COSTS["map"]
+    assert forecast.left_s() == pytest.approx(left_s)
+    run_stage(forecast, clock, "match", 0, 0.0)
+    run_stage(forecast, clock, "verify", 0, 0.0)
+    assert forecast.left_s() == pytest.approx(100 * COSTS["map"])
+
+
+def test_stages_that_nothing_was_known_of_count_from_when_they_begin() -> None:
+    clock = Clock()
+    forecast = Forecast(10, 0, may_climb=True, clock=clock)
+    run_stage(forecast, clock, "HardTFeat.pth", 10, 1.0)  # a download says nothing of the rest
+    assert forecast.left_s() is None
+    run_stage(forecast, clock, "extract", 10, 60.0)
+    assert forecast.text() == "whole run: about 7 min left without further warps"
+    forecast.begin("escalate", 90)
+    clock.now_s += 60.0
+    forecast.advance(9)
+    assert forecast.text() == "whole run: about 16 min left"
+
+
+def test_forecast_is_in_lines_and_log_and_not_where_nothing_is_shown(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    clock, lines = Clock(), io.StringIO()
+    for stream in (None, lines):
+        with (
+            caplog.at_level(logging.INFO, "colmap_affrect"),
+            Progress(stream)
+            .with_forecast(Forecast(20, 0, clock=clock))
+            .stage("extract", 20, "images") as advance,
+        ):
+            for _ in range(20):
+                clock.now_s += 60.0
+                advance(1)
+    assert lines.getvalue().splitlines()[4] == (
+        "extract: 10/20 images, whole run: about 24 min left"
+    )
+    assert caplog.messages == ["whole run: about 29 min left"]
