@@ -268,7 +268,7 @@ def checked_names(image_path: Path, names: Sequence[str], where: str) -> list[st
         if why := _odd(name):
             raise ImageError(f"{image_path}: {name!r}: {why}; rename it")
     if missing:
-        raise ImageError(f"{where}: lists {such_as(missing, 1)}, not in {image_path}")
+        raise ImageError(f"{where}: lists {such_as(missing, 1)}, which is not in {image_path}")
     return found
 
 
