@@ -262,10 +262,10 @@ def _images_nearby(model: pycolmap.Reconstruction) -> dict[int, list[str]]:
 
 def _median_distance(model: pycolmap.Reconstruction, image: pycolmap.Image) -> float:
     """Return how far the points of an image are from it; 0 without any."""
-    points = [point.point3D_id for point in image.points2D if point.has_point3D()]
+    points = image.get_observation_points2D()
     if not points:
         return 0.0
-    places = np.array([model.point3D(i).xyz for i in points])
+    places = np.array([model.point3D(point.point3D_id).xyz for point in points])
     return float(np.median(np.linalg.norm(places - image.projection_center(), axis=1)))
 
 
