@@ -35,7 +35,7 @@ def one_line(text: str) -> str:
     return shown(text).replace("\n", _escaped("\n"))
 
 
-def such_as(names: Iterable[str], most: int = MAX_NAMES, separator: str = ", ") -> str:
+def such_as(names: Iterable[str], most: int = MAX_NAMES) -> str:
     """Return the first few names, and how many there are more.
 
     >>> such_as(["a", "b", "c", "d", "e"])
@@ -43,4 +43,4 @@ def such_as(names: Iterable[str], most: int = MAX_NAMES, separator: str = ", ") 
     """
     listed = list(names)
     more = f" and {len(listed) - most} more" if len(listed) > most else ""
-    return separator.join(listed[:most]) + more
+    return ", ".join(listed[:most]) + more

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from colmap_affrect.errors import PairListError
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_lines
-from colmap_affrect.shown import such_as
 
 MAX_NAMES_IN_MESSAGE = 5
 CANDIDATES_PER_NEIGHBOR = 5
@@ -146,10 +145,12 @@ def read_pairs(path: Path, names: Sequence[str]) -> list[Pair]:
         elif pair[0] != pair[1]:
             pairs[min(pair), max(pair)] = None
     if problems:
-        lines = [f"line {number}: {line.strip()!r}" for number, line in problems]
-        for index, (_, line) in enumerate(problems[:MAX_NAMES_IN_MESSAGE]):
-            lines[index] += _suggestion(line, names)  # which takes long
-        listed = such_as(lines, MAX_NAMES_IN_MESSAGE, "; ")
+        more = len(problems) - MAX_NAMES_IN_MESSAGE
+        shown = (
+            f"line {number}: {line.strip()!r}{_suggestion(line, names)}"
+            for number, line in problems[:MAX_NAMES_IN_MESSAGE]
+        )
+        listed = "; ".join(shown) + (f"; and {more} more" * (more > 0))
         raise PairListError(f"{path}: names that are not among the images: {listed}")
     if not pairs:
         raise PairListError(f"{path}: holds no pair of two different images")

@@ -8,7 +8,8 @@ escalation follow those of level k - 1 and end at ``level_ends[k]``. Descriptors
 are filled up with zeros, which change no distance. ``matches.h5``: a group
 per pair with ``matches0`` (N0,), -1 where unmatched, ``matching_scores0`` (N0,) and the
 attributes ``level``, whose features were matched together with those of level 0, and
-``tried_level``, the highest that was tried. Coordinates have their origin at the centre of the
+``tried_level``, the highest that was tried. ``guided.h5``: a group per pair that was matched again
+by its geometry. Coordinates have their origin at the centre of the
 first pixel. Files are opened for one image or one batch of pairs and closed again; what is
 written in between appears as a whole (:mod:`colmap_affrect.project.atomic_files`). A group without
 the attribute ``complete``, of another program, does not count.
@@ -66,7 +67,7 @@ class PairMatches:
     level: int = 0
 
 
-class Store:
+class _Store:
     """A HDF5 file of complete groups that were all made with the same options."""
 
     kind = ""
@@ -200,7 +201,7 @@ def frame_datasets(lafs: NDArray[np.floating]) -> dict[str, NDArray[np.float32]]
     return {"lafs": stored, "scales": scales.astype(np.float32), "oris": oris}
 
 
-class FeatureStore(Store):
+class FeatureStore(_Store):
     """Local features by image name."""
 
     kind = "features"
@@ -366,7 +367,7 @@ def hloc_matches(pair: PairMatches) -> dict[str, NDArray[np.generic]]:
     }
 
 
-class MatchStore(Store):
+class MatchStore(_Store):
     """Raw matches by pair of image names."""
 
     kind = "matches"
@@ -461,3 +462,50 @@ class MatchStore(Store):
                     len(matches0),
                     int(file[key].attrs["level"]),
                 )
+
+
+@dataclass(frozen=True)
+class GuidedPair:
+    """What guided matching found for a pair.
+
+    Attributes:
+        names: of the two images, in the order of the columns.
+        exact: (M, 2) inliers before; what adjusts models most accurately.
+        candidates: (K, 2) the same and guided matches, to verify.
+        num_inliers: of the geometry that was estimated from the candidates and took the place of
+            the one before; 0 where that stayed.
+    """
+
+    names: tuple[str, str]
+    exact: NDArray[np.int64]
+    candidates: NDArray[np.int64]
+    num_inliers: int
+
+
+class GuidedStore(_Store):
+    """Which pairs were matched again by their geometry."""
+
+    kind = "guided matches"
+
+    def write(self, pairs: Iterable[GuidedPair]) -> None:
+        """Write a batch of pairs, in the place of what is there of them."""
+        with self._open("a") as file:
+            for pair in pairs:
+                datasets = {"exact": pair.exact, "candidates": pair.candidates}
+                names = np.asarray(pair.names, dtype=h5py.string_dtype())
+                key = pair_key(*pair.names)
+                self._write(file, key, datasets, names=names, num_inliers=pair.num_inliers)
+
+    def read(self) -> list[GuidedPair]:
+        """Read all pairs."""
+        keys = self.names()
+        if not keys:
+            return []
+        found = []
+        with self._open("r") as file:
+            for group in (file[key] for key in keys):
+                first, second = (str(name) for name in group.attrs["names"])
+                exact, candidates = group["exact"][()], group["candidates"][()]
+                count = int(group.attrs["num_inliers"])
+                found.append(GuidedPair((first, second), exact, candidates, count))
+        return found

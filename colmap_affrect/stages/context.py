@@ -10,8 +10,7 @@ from colmap_affrect.errors import WeightsError
 from colmap_affrect.features.weights import file_sha256
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.guided_store import GuidedStore
-from colmap_affrect.project.stores import FeatureStore, MatchStore
+from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 
 

@@ -24,8 +24,8 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.connectivity import weakly_connected_images
 from colmap_affrect.pairs.lists import ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
-from colmap_affrect.project.guided_store import GuidedPair
 from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stores import GuidedPair
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import recorded_extraction

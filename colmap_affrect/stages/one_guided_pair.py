@@ -20,8 +20,7 @@ from colmap_affrect.matchers.guided import (
     guided_matches,
 )
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.project.guided_store import GuidedPair
-from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.project.stores import FeatureStore, GuidedPair
 from colmap_affrect.stages.one_pair import ImageCache
 
 MIN_OFF_PLANE = 20
