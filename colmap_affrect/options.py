@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import ast
 import difflib
+import hashlib
 import inspect
 import itertools
+import json
 import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -230,6 +232,11 @@ def _descriptions(cls: type) -> dict[str, str]:
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
                 found[ast.unparse(field.target)] = " ".join(ast.literal_eval(text.value).split())
     return found
+
+
+def digest_of(values: Any) -> str:
+    """Return a sha256 of plain values, the same for equal ones."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

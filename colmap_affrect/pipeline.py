@@ -138,6 +138,15 @@ class RunOptions(InputOptions):
     database_descriptors: bool = False
     extend: Extension | None = None
 
+    def forecast(self, num_images: int) -> Forecast:
+        """Return what so many images will take."""
+        return Forecast(
+            num_images,
+            expected_num_pairs(self.pairs, num_images),
+            by_network=bool(self.recipe.matching.weights),
+            may_climb=bool(self.recipe.extraction.escalation),
+        )
+
 
 def run(
     image_path: Path,
@@ -172,13 +181,7 @@ def run(
     mapper = MAPPERS.make(options.mapping)
     inputs = options.inputs(image_path)
     names = inputs.names()  # refuses what cannot be read before anything is made
-    forecast = Forecast(
-        len(names),
-        expected_num_pairs(options.pairs, len(names)),
-        by_network=bool(options.recipe.matching.weights),
-        may_climb=bool(options.recipe.extraction.escalation),
-    )
-    shown = progress.with_forecast(forecast)
+    shown = progress.with_forecast(options.forecast(len(names)))
     context = Context(Workspace(output_path), options.resources, executor, shown)
     if options.extend:
         if overwrite:

@@ -35,12 +35,12 @@ def one_line(text: str) -> str:
     return shown(text).replace("\n", _escaped("\n"))
 
 
-def such_as(names: Iterable[str]) -> str:
-    """Return the first few names.
+def such_as(names: Iterable[str], most: int = MAX_NAMES) -> str:
+    """Return the first few names, and how many there are more.
 
     >>> such_as(["a", "b", "c", "d", "e"])
     'a, b, c and 2 more'
     """
     listed = list(names)
-    more = f" and {len(listed) - MAX_NAMES} more" if len(listed) > MAX_NAMES else ""
-    return ", ".join(listed[:MAX_NAMES]) + more
+    more = f" and {len(listed) - most} more" if len(listed) > most else ""
+    return ", ".join(listed[:most]) + more

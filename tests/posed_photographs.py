@@ -58,13 +58,11 @@ def write_svp(scene: Path, pairs: str = "a.png b.png 0\na.png d.png 2\nb.png d.p
 def write_calibration(scene: Path, index: int, **changes: object) -> None:
     """Write the calibration file of a photograph, some values changed; None leaves one out."""
     rotation, translation = pose(index)
-    x, y, z, w = pycolmap.Rotation3d(rotation).quat
     width, height = IMAGE_SIZE
     values: dict[str, object] = {
         "K": np.array([[FOCAL_PX, 0, width / 2], [0, FOCAL_PX, height / 2], [0, 0, 1]]),
         "R": rotation,
         "T": translation,
-        "q": np.array([w, x, y, z]),
     }
     folder = scene / "set_100" / "calibration"
     folder.mkdir(parents=True, exist_ok=True)

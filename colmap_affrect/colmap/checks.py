@@ -31,12 +31,10 @@ from colmap_affrect.colmap.tables import (
     rows_of,
 )
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.shown import such_as
 
 Problems = dict[str, list[str]]
 """What was found: by kind, the images, pairs or cameras concerned, none if it is the database."""
-
-MAX_SHOWN = 3
-"""Images or pairs that the message of a refusal names."""
 
 MAX_SIDE_PX = 1 << 24
 """Of a photograph; the largest panoramas have a tenth of it."""
@@ -77,9 +75,8 @@ def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
         _, problems = _check(connection, path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         _, what, advice = CHECKS[kind]
-        more = ", ..." if len(problems[kind]) > MAX_SHOWN else ""
-        items = ", ".join(problems[kind][:MAX_SHOWN])
-        raise DatabaseError(f"{path}: {what} ({items}{more}); {advice.format(path=path)}")
+        items = such_as(problems[kind])
+        raise DatabaseError(f"{path}: {what} ({items}); {advice.format(path=path)}")
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sqlite3
 import tempfile
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
@@ -76,14 +76,26 @@ def copy_as_it_is(source: Path, target: Path) -> None:
         raise DatabaseError(f"cannot copy {source} to {target}: {error}") from error
 
 
-def copy_database(source: Path, target: Path, refused: Collection[str] = ()) -> None:
+Change = Callable[[pycolmap.Database], None]
+
+
+def copy_database(
+    source: Path, target: Path, refused: Collection[str] = (), change: Change | None = None
+) -> None:
     """Copy a database as it is now, including its write-ahead log.
 
-    The copy has the schema of the installed pycolmap, which leaves positions (GPS) of COLMAP before
-    3.10 behind: they become pose priors. Raises DatabaseError when the source is
-    missing, not a COLMAP database, or one of a newer COLMAP; when the target exists; and when the
-    database has problems of kinds that are ``refused``: those of anybody are checked before COLMAP
-    sees the copy.
+    The copy, which appears as a whole, has the schema of the installed pycolmap, which leaves
+    positions (GPS) of COLMAP before 3.10 behind: they become pose priors.
+
+    Args:
+        source: the database, which stays as it is.
+        target: the copy.
+        refused: kinds of problems; databases of anybody are checked before COLMAP sees the copy.
+        change: what is done to the copy first.
+
+    Raises:
+        DatabaseError: when the source is missing, not a COLMAP database, one of a newer COLMAP or
+            has refused problems; when the target exists.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
@@ -96,6 +108,8 @@ def copy_database(source: Path, target: Path, refused: Collection[str] = ()) -> 
         positions = _old_positions(new)
         with open_database(new) as database:  # COLMAP migrates it
             _add_positions(database, positions)
+            if change:
+                change(database)
         new.replace(target)
     finally:
         new.unlink(missing_ok=True)
@@ -139,12 +153,7 @@ def _add_positions(
 
 def copy_with_frames(source: Path, target: Path) -> None:
     """Copy a database with all its content, as :func:`copy_database`; every image gets a frame."""
-    partial = target.with_name(target.name + ".partial")
-    partial.unlink(missing_ok=True)
-    copy_database(source, partial, FATAL)
-    with open_database(partial) as database:
-        _add_frames(database)
-    partial.replace(target)
+    copy_database(source, target, FATAL, _add_frames)
 
 
 def copy_without_features(source: Path, target: Path) -> None:
@@ -153,26 +162,25 @@ def copy_without_features(source: Path, target: Path) -> None:
     Ids stay the same. Images without a frame get one: frames came with COLMAP 3.12, and mapping
     refuses a database in which only some images have one.
     """
-    if target.exists():
-        raise DatabaseError(f"{target}: exists already; it is not overwritten")
-    partial = target.with_name(target.name + ".partial")
-    partial.unlink(missing_ok=True)
-    copy_database(source, partial, FATAL_FOR_IMAGES)
-    with open_database(partial) as database:
+
+    def change(database: pycolmap.Database) -> None:
         database.clear_keypoints()
         database.clear_descriptors()
         database.clear_matches()
         database.clear_two_view_geometries()
         _add_frames(database)
-    partial.replace(target)
+
+    copy_database(source, target, FATAL_FOR_IMAGES, change)
 
 
 def copy_without_pairs(source: Path, target: Path, pairs: Iterable[tuple[int, int]]) -> None:
     """Copy a database and leave out the two-view geometries of some pairs of image ids."""
-    copy_database(source, target)
-    with closing(pycolmap.Database.open(target)) as database:
-        for image_id1, image_id2 in pairs:
-            database.delete_two_view_geometry(image_id1, image_id2)
+
+    def change(database: pycolmap.Database) -> None:
+        for pair in pairs:
+            database.delete_two_view_geometry(*pair)
+
+    copy_database(source, target, change=change)
 
 
 def _add_frames(database: pycolmap.Database) -> None:

@@ -323,7 +323,7 @@ def _record(request: Request, *, overwrite: bool) -> None:
     if path.exists() and overwrite:
         shutil.rmtree(folder)
     if path.exists():
-        known = Request.from_json(path.read_text(encoding="utf-8"))
+        known = Request.read(path)
         difference = first_difference(known.decisive(), request.decisive())
         if difference:
             raise StaleStoreError(

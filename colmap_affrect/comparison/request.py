@@ -7,13 +7,15 @@ and ``methods/NAME/seed-K/`` has the two-view geometries and models of one seed.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
+
+from pydantic import BeforeValidator, PlainSerializer, TypeAdapter, ValidationError
 
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison.methods import Method
+from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.project.workspace import Workspace
@@ -49,6 +51,19 @@ class Layout:
         return self.images.read_text(encoding="utf-8").splitlines()
 
 
+def _method(values: Method | dict[str, Any]) -> Method:
+    if isinstance(values, Method):
+        return values
+    name, recipe = values["name"], values["recipe"]
+    return Method(values["label"], recipe and Recipe.from_mapping(name, recipe))
+
+
+def _plain(method: Method) -> dict[str, Any]:
+    recipe = method.recipe
+    values = recipe and {"summary": recipe.summary, **recipe.to_mapping()}
+    return {"label": method.label, "name": recipe.name if recipe else "", "recipe": values}
+
+
 @dataclass(frozen=True)
 class Request:
     """What one process is to do.
@@ -60,12 +75,14 @@ class Request:
         seeds: of verification and mapping; recipes that climb do it with the first.
     """
 
-    method: Method
+    method: Annotated[Method, BeforeValidator(_method), PlainSerializer(_plain)]
     output_path: Path
     image_path: Path
     masks: MaskOptions
     verification: VerificationOptions
-    mapping: MapperOptions
+    mapping: Annotated[
+        MapperOptions, BeforeValidator(MAPPERS.options), PlainSerializer(MapperOptions.to_mapping)
+    ]
     focal_vote: bool
     may_share: bool
     seeds: tuple[int, ...]
@@ -110,45 +127,18 @@ class Request:
 
     def to_json(self) -> str:
         """Return text for another process."""
-        recipe, weights = self.method.recipe, self.resources.weights_path
-        values = {
-            "label": self.method.label,
-            "recipe": recipe
-            and {"name": recipe.name, "summary": recipe.summary, **recipe.to_mapping()},
-            "output_path": str(self.output_path.resolve()),
-            "image_path": str(self.image_path.resolve()),
-            "masks": self.masks.to_mapping(),
-            "verification": self.verification.to_mapping(),
-            "mapping": self.mapping.to_mapping(),
-            "focal_vote": self.focal_vote,
-            "may_share": self.may_share,
-            "seeds": self.seeds,
-            "weights_path": str(weights.resolve()) if weights else "",
-            "device": self.resources.device,
-        }
-        return json.dumps(values, indent=1)
+        return TypeAdapter(Request).dump_json(self, indent=1).decode()
 
     @classmethod
-    def from_json(cls, text: str) -> Self:
-        """Read :meth:`to_json`."""
-        values = json.loads(text)
-        recipe = values["recipe"]
-        return cls(
-            method=Method(
-                values["label"], recipe and Recipe.from_mapping(recipe.pop("name"), recipe)
-            ),
-            output_path=Path(values["output_path"]),
-            image_path=Path(values["image_path"]),
-            masks=MaskOptions(**values["masks"]),
-            verification=VerificationOptions(**values["verification"]),
-            mapping=MAPPERS.options(values["mapping"]),
-            focal_vote=values["focal_vote"],
-            may_share=values["may_share"],
-            seeds=tuple(values["seeds"]),
-            resources=Resources(
-                Path(values["weights_path"]) if values["weights_path"] else None, values["device"]
-            ),
-        )
+    def read(cls, path: Path) -> Self:
+        """Read a file of :meth:`to_json`; StaleStoreError when it is of another version."""
+        try:
+            return TypeAdapter(cls).validate_json(path.read_text(encoding="utf-8"))
+        except ValidationError as error:
+            raise StaleStoreError(
+                f"{path}: is of another version of colmap-affrect; use --overwrite, or another "
+                "--output-path"
+            ) from error
 
 
 def _what_decides(recipe: Recipe) -> dict[str, Any]:

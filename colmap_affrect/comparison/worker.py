@@ -77,7 +77,7 @@ def main() -> None:
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     logger.addHandler(handler)
     try:
-        request = Request.from_json(Path(sys.argv[1]).read_text(encoding="utf-8"))
+        request = Request.read(Path(sys.argv[1]))
         with Workspace(request.folder).locked():
             compute(request, _Reported(parent))
     except AffrectError as error:

@@ -21,6 +21,7 @@ from colmap_affrect.doctor.findings import Findings
 from colmap_affrect.geometry.focal_evidence import log_evidence
 from colmap_affrect.geometry.focal_vote import FOCALS, MAX_VOTE, FocalEstimate, ballot, count
 from colmap_affrect.images.exif import PLAUSIBLE_FOCALS
+from colmap_affrect.shown import such_as
 
 MAX_NUM_PAIRS = 48
 """The strongest pairs that are asked, some seconds' worth."""
@@ -93,7 +94,7 @@ class _Examination:
         for record in self._records.values():
             focal = record.focal_px / max(record.size)
             if not low <= focal <= high:
-                items.append(f"{_who(record)}: {record.focal_px:.0f} px, {focal:.2g}")
+                items.append(f"{such_as(record.names, 1)}: {record.focal_px:.0f} px, {focal:.2g}")
         self._add("implausible-focal", items)
 
     def contradicted(self) -> set[int]:
@@ -114,7 +115,8 @@ class _Examination:
             if _contradicts(estimate, prior):
                 record, longer = self._records[key], max(self._records[key].size)
                 low, high = estimate.low * longer, estimate.high * longer
-                items.append(f"{_who(record)}: {record.focal_px:.0f}, not {low:.0f} to {high:.0f}")
+                focal = f"{record.focal_px:.0f}, not {low:.0f} to {high:.0f}"
+                items.append(f"{such_as(record.names, 1)}: {focal}")
                 found.add(key)
         self._add("contradicted-focal", items)
         return found
@@ -153,8 +155,3 @@ def _doubt(pair: VotingPair, key: int, focals: Mapping[int, float]) -> float:
 def _contradicts(estimate: FocalEstimate, focal: float) -> bool:
     beyond = max(estimate.low / focal, focal / estimate.high)
     return estimate.spread <= MAX_SPREAD and beyond > max(MAX_DIFFERENCE, estimate.spread**0.5)
-
-
-def _who(record: CameraRecord) -> str:
-    more = f" and {len(record.names) - 1} more" if len(record.names) > 1 else ""
-    return f"{record.names[0]}{more}"

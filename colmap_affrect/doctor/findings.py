@@ -11,6 +11,7 @@ from pathlib import Path
 
 from colmap_affrect.colmap.problems import CHECKS, SEVERITIES, Check, Severity
 from colmap_affrect.progress import Progress
+from colmap_affrect.shown import such_as
 
 MAX_ITEMS_SHOWN = 5
 
@@ -213,9 +214,7 @@ class Findings:
         values = {k: shlex.quote(str(v)) if isinstance(v, Path) else v for k, v in values.items()}
         what, advice = what.format(**values), (advice or usual_advice).format(**values)
         if items:
-            more = len(items) - MAX_ITEMS_SHOWN
-            shown = ", ".join(items[:MAX_ITEMS_SHOWN]) + (f" and {more} more" * (more > 0))
-            what = f"{what} ({len(items)}): {shown}"
+            what = f"{what} ({len(items)}): {such_as(items, MAX_ITEMS_SHOWN)}"
         self._found.append(Finding(severity, str(where), what, advice))
 
 

@@ -49,6 +49,7 @@ from colmap_affrect.evaluation.results import (
 )
 from colmap_affrect.evaluation.statistics import bootstrap_intervals, paired_test
 from colmap_affrect.images.reading import require_png
+from colmap_affrect.options import digest_of
 from colmap_affrect.pipeline import installed_versions
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
@@ -206,8 +207,7 @@ class _Run:
             "matching": self.recipe.matching.to_mapping(),
             **settings,
         }
-        digest = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
-        path = output_path / "pairs" / f"{method.folder_name}-{digest[:8]}.jsonl"
+        path = output_path / "pairs" / f"{method.folder_name}-{digest_of(decisive)[:8]}.jsonl"
         if overwrite:
             for old in path.parent.glob(f"{method.folder_name}-????????.jsonl"):
                 old.unlink()

@@ -17,7 +17,7 @@ K is COLMAP's: the origin is the corner of the image. Where it is plainly that o
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -53,9 +53,6 @@ BINS = tuple(range(10))
 
 MAX_OFF_CENTRE = 1.15
 """Twice the principal point and the size of the image may differ by this factor."""
-
-MAX_QUATERNION_ERROR = 1e-3
-"""Largest difference of an element of R from that of the quaternion beside it."""
 
 
 class Imc(PosedScenes):
@@ -94,7 +91,6 @@ class Imc(PosedScenes):
             *list_notes,
             *counted(unclear, "listed pairs are of images that are not there", unclear),
             *missing_notes(list(bins), wanted, files, lacking, "calibration"),
-            *_doubt_notes(wanted, calibrations),
             *size_notes,
             *(pose_contradictions(pairs[::-1]) if self.check_truth else ()),
             *([f"no pairs with a covisibility from {empty}"] if empty else []),
@@ -103,11 +99,10 @@ class Imc(PosedScenes):
 
 
 class Calibration(NamedTuple):
-    """What a calibration file says: (3, 3) K, camera_from_world, and what is odd though usable."""
+    """What a calibration file says: (3, 3) K and camera_from_world."""
 
     matrix: NDArray[np.float64]
     pose: Pose
-    doubt: str
 
 
 def disjoint_bins(lists: Mapping[int, list[str]]) -> dict[str, int]:
@@ -125,7 +120,7 @@ def read_calibration(path: Path) -> Calibration:
         with h5py.File(path) as file:
             values = {
                 key: np.asarray(file[key][()], dtype=np.float64)
-                for key in ("K", "R", "T", "q")
+                for key in ("K", "R", "T")
                 if key in file
             }
     except (OSError, TypeError, ValueError, RuntimeError, AttributeError) as error:
@@ -142,20 +137,7 @@ def read_calibration(path: Path) -> Calibration:
         raise EvaluationError("K is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     if fault := rotation_fault(rotation):
         raise EvaluationError(fault)
-    doubt = _quaternion_doubt(rotation, values.get("q"))
-    return Calibration(matrix, (rotation, values["T"].ravel()), doubt)
-
-
-def _quaternion_doubt(rotation: NDArray[np.float64], q: NDArray[np.float64] | None) -> str:
-    """Compare R with the quaternion (w, x, y, z) that the challenge's files have beside it."""
-    if q is None or q.size != 4 or not np.isfinite(q).all() or not q.any():
-        return ""
-    expected = pycolmap.Rotation3d(q.ravel()[[1, 2, 3, 0]] / np.linalg.norm(q)).matrix()
-    if np.abs(rotation - expected).max() < MAX_QUATERNION_ERROR:
-        return ""
-    if np.abs(rotation.T - expected).max() < MAX_QUATERNION_ERROR:
-        return "R is transposed, by the quaternion beside it"
-    return "R and the quaternion beside it differ"
+    return Calibration(matrix, (rotation, values["T"].ravel()))
 
 
 def _read_lists(folder: Path) -> tuple[dict[int, list[str]], list[str]]:
@@ -238,13 +220,3 @@ def _scale(matrix: NDArray[np.float64], width: int, height: int) -> float | None
     if ratios.max() > MAX_OFF_CENTRE * ratios.min():
         return None
     return float(ratios[0])
-
-
-def _doubt_notes(wanted: Sequence[str], calibrations: Mapping[str, Calibration]) -> list[str]:
-    """Count the calibrations that are odd in one way or another."""
-    doubts = {name: calibrations[name].doubt for name in wanted if name in calibrations}
-    notes = []
-    for doubt in sorted(set(doubts.values()) - {""}):
-        names = [name for name in doubts if doubts[name] == doubt]
-        notes += counted(names, f"of {len(wanted)} calibrations: {doubt}", names)
-    return notes

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +12,7 @@ from colmap_affrect.evaluation.costs import ImageCost, extract_measured
 from colmap_affrect.evaluation.protocol import EvaluationImage
 from colmap_affrect.evaluation.records import RecordFile
 from colmap_affrect.features.weights import digests_by_name
+from colmap_affrect.options import digest_of
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.recipes import ExtractionOptions
@@ -55,7 +54,6 @@ class RecipeFeatures:
         self._extractor = prepare(options, resources, list(images))
         weights = digests_by_name(self._extractor.weights)
         self.settings = {**inputs, **options.to_mapping(), "weights": weights}
-        digest = hashlib.sha256(json.dumps(self.settings, sort_keys=True).encode()).hexdigest()
         features_path, costs_path = (
             path.with_name(f"{path.name}{suffix}") for suffix in (".h5", ".jsonl")
         )
@@ -63,7 +61,7 @@ class RecipeFeatures:
             features_path.unlink(missing_ok=True)
             costs_path.unlink(missing_ok=True)
         self._costs = RecordFile(costs_path, self.settings)
-        self.store = FeatureStore(features_path, digest)
+        self.store = FeatureStore(features_path, digest_of(self.settings))
         self.failures: dict[str, str] = {}
 
     @property

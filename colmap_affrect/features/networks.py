@@ -22,6 +22,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from colmap_affrect.errors import DeviceError, WeightsError
 from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict
+from colmap_affrect.shown import such_as
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -250,8 +251,7 @@ def _require_same(
         if key in given and _kind(given[key]) != _kind(value)
     ]
     if problems:
-        more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
-        raise WeightsError(f"{path}: not the weights of {name} ({problems[0]}{more})")
+        raise WeightsError(f"{path}: not the weights of {name} ({such_as(problems, 1)})")
 
 
 def _kind(value: Any) -> str:

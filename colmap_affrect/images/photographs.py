@@ -20,7 +20,7 @@ from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
 from colmap_affrect.project.stores import pair_key
 from colmap_affrect.project.workspace import is_output_folder
-from colmap_affrect.shown import one_line
+from colmap_affrect.shown import one_line, such_as
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 
@@ -268,8 +268,7 @@ def checked_names(image_path: Path, names: Sequence[str], where: str) -> list[st
         if why := _odd(name):
             raise ImageError(f"{image_path}: {name!r}: {why}; rename it")
     if missing:
-        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
-        raise ImageError(f"{where}: lists {missing[0]}{more}, which is not in {image_path}")
+        raise ImageError(f"{where}: lists {such_as(missing, 1)}, which is not in {image_path}")
     return found
 
 

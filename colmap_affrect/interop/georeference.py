@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import TypeAdapter, ValidationError
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import StoreError
@@ -43,14 +43,14 @@ class Georeference:
         if not path.exists():
             return None
         try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-            return cls(**{name: float(values[name]) for name in cls.__dataclass_fields__})
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            return TypeAdapter(cls).validate_json(path.read_bytes())
+        except (OSError, ValidationError) as error:
             raise StoreError(f"{path}: damaged ({error}); align the model again") from error
 
     def write(self, model_path: Path) -> None:
         """Put it on record beside a model."""
-        replace_text(model_path / FILE_NAME, json.dumps(asdict(self), indent=1) + "\n")
+        text = TypeAdapter(Georeference).dump_json(self, indent=1).decode()
+        replace_text(model_path / FILE_NAME, text + "\n")
 
     def in_metres(self, positions: ArrayLike) -> NDArray[np.float64]:
         """Return metres east, north and up of the origin for latitudes, longitudes, altitudes."""

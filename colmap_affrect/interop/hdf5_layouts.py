@@ -35,6 +35,7 @@ from colmap_affrect.images.photographs import refuse_colliding_keys
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import require_space
 from colmap_affrect.project.stores import PairMatches, hloc_matches, pair_key
+from colmap_affrect.shown import such_as
 
 Datasets = dict[str, NDArray[Any]]
 
@@ -56,10 +57,7 @@ UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, SystemErro
 
 def listed(names: Iterable[str]) -> str:
     """Return names for a message, the first of them if there are many."""
-    names = list(names)
-    more = len(names) - MAX_NAMES_IN_MESSAGE
-    shown = ", ".join(names[:MAX_NAMES_IN_MESSAGE])
-    return f"{shown}, and {more} more" if more > 0 else shown
+    return such_as(names, MAX_NAMES_IN_MESSAGE)
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections import Counter, defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,15 +25,23 @@ MIN_THREE_VIEW_POINTS = 12
 """So many points tie an image to two others, as the sparse preset asks for."""
 
 
+@dataclass(frozen=True)
+class _Kept:
+    """The content of the file, as :class:`MappedModel` has it."""
+
+    bridges: tuple[Bridge, ...]
+    taken_out: Mapping[str, str]
+    rival_focals_px: Mapping[str, tuple[float, float]]
+
+
+_KEPT = TypeAdapter(_Kept)
+
+
 def write_arrivals(model: MappedModel, folder: Path) -> None:
     """Keep what :func:`read_arrivals` needs; nothing where COLMAP's model says it all."""
     if model.bridges or model.taken_out or model.rival_focals_px:
-        values = {
-            "bridges": [dataclasses.asdict(bridge) for bridge in model.bridges],
-            "taken_out": dict(model.taken_out),
-            "rival_focals_px": dict(model.rival_focals_px),
-        }
-        replace_text(folder / FILE_NAME, json.dumps(values, indent=2, ensure_ascii=False) + "\n")
+        kept = _Kept(model.bridges, model.taken_out, model.rival_focals_px)
+        replace_text(folder / FILE_NAME, _KEPT.dump_json(kept, indent=2).decode() + "\n")
 
 
 def read_arrivals(reconstruction: pycolmap.Reconstruction, folder: Path) -> MappedModel:
@@ -46,15 +54,10 @@ def read_arrivals(reconstruction: pycolmap.Reconstruction, folder: Path) -> Mapp
     if not path.exists():
         return MappedModel(reconstruction)
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-        bridges = TypeAdapter(tuple[Bridge, ...]).validate_python(values["bridges"])
-        taken_out = TypeAdapter(dict[str, str]).validate_python(values["taken_out"])
-        rivals = TypeAdapter(dict[str, tuple[float, float]]).validate_python(
-            values["rival_focals_px"]
-        )
-    except (OSError, ValueError, KeyError, TypeError, ValidationError) as error:
+        kept = _KEPT.validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
         raise StoreError(f"{path}: damaged") from error
-    return MappedModel(reconstruction, bridges, taken_out, rivals)
+    return MappedModel(reconstruction, kept.bridges, kept.taken_out, kept.rival_focals_px)
 
 
 def arrivals(model: MappedModel, task: MappingTask) -> dict[str, Arrival]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 import shutil
 from collections.abc import Iterator
@@ -15,6 +13,7 @@ from colmap_affrect.colmap.database import geometry_digest
 from colmap_affrect.colmap.model_files import registered_names
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.base import MapperOptions, MappingTask
+from colmap_affrect.options import digest_of
 from colmap_affrect.project.atomic_files import replace_text
 
 logger = logging.getLogger(__name__)
@@ -48,7 +47,7 @@ def with_snapshots(
         return
     given = {str(key): record.given for key, record in task.cameras.items()}
     made_from = [geometry_digest(task.database_path), options.to_mapping(), given]
-    digest = hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()
+    digest = digest_of(made_from)
     record = folder / INPUTS
     if not (record.exists() and record.read_text() == digest):
         shutil.rmtree(folder, ignore_errors=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 import os
 import shutil
@@ -20,7 +18,7 @@ import tomli_w
 from filelock import FileLock, Timeout
 
 from colmap_affrect.errors import StaleStoreError, WorkspaceError
-from colmap_affrect.options import flat
+from colmap_affrect.options import digest_of, flat
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 
 logger = logging.getLogger(__name__)
@@ -254,7 +252,7 @@ class Workspace:
             for stage in stages
             for values in (placeless(record.get(stage, {}), GIVEN),)
         }
-        return hashlib.sha256(json.dumps(options, sort_keys=True).encode()).hexdigest()
+        return digest_of(options)
 
     def require(self, stage: str) -> dict[str, Any]:
         """Return the recorded options of an earlier stage; WorkspaceError when it was not run."""

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command import Call, on_photographs, run_in_process_of_its_own
+from command import Call, on_photographs
 from small_scene import write_photographs
 
 from colmap_affrect import __version__, pipeline
@@ -68,8 +68,8 @@ def test_help_loads_no_heavy_package() -> None:
     assert done.stdout.splitlines()[-1] == "loaded []"
 
 
-def test_version_is_that_of_the_package() -> None:
-    done = run_in_process_of_its_own("--version")
+def test_version_is_that_of_the_package(call: Call) -> None:
+    done = call("--version")
     assert (done.code, done.stdout) == (0, f"colmap-affrect {__version__}\n")
 
 

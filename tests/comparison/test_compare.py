@@ -323,9 +323,15 @@ def test_folders_that_were_not_made_here_are_left_alone(scene, options, tmp_path
     ]
 
 
+def test_request_of_another_version_is_one_line(tmp_path) -> None:
+    (tmp_path / "request.json").write_text('{"label": "sift", "seeds": [0]}')
+    with pytest.raises(StaleStoreError, match=r"request\.json: is of another version"):
+        Request.read(tmp_path / "request.json")
+
+
 def run_here(request: Request, progress: Progress) -> MethodResult:
     """Run a method in this process, by way of the request that its own would read."""
-    worker.compute(Request.from_json(request.path.read_text(encoding="utf-8")), progress)
+    worker.compute(Request.read(request.path), progress)
     return module._finished(request)
 
 

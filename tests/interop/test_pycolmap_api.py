@@ -192,7 +192,9 @@ def test_images_of_another_size_than_their_camera_are_reported(
 def test_image_of_the_database_that_is_not_there_is_named(sift: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     write_photographs(folder, 2)
-    with pytest.raises(AffrectError, match=r"old\.db: lists side/d\.png \(and 1 more\)"):
+    with pytest.raises(
+        AffrectError, match=r"old\.db: lists side/d\.png and 1 more, which is not in "
+    ):
         colmap_affrect.extract_features(tmp_path / "new.db", folder, from_database=sift)
 
 

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from local_cluster import local_cluster
 from results import hdf5_content
 from small_scene import INTRINSICS, write_photographs
 from synthetic import write_image
@@ -45,13 +44,6 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_photographs(folder)
     (folder / DAMAGED).write_bytes(b"no image")
     return folder
-
-
-@pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A scheduler and two workers of one thread each, in processes of their own."""
-    with local_cluster(tmp_path_factory.mktemp("cluster"), 2) as started:
-        yield started
 
 
 def run_stages(

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import torch
-from local_cluster import local_cluster
 from random_weights import write_comparing_lightglue
 from results import hdf5_content
 
@@ -43,12 +41,6 @@ def extracted(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         extract(Context(workspace), Inputs.of(photos), RECIPE)
         choose_pairs(Context(workspace))
     return out
-
-
-@pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with local_cluster(tmp_path_factory.mktemp("cluster"), 2) as started:
-        yield started
 
 
 def matched(
