@@ -103,12 +103,12 @@ class Forecast:
         )
 
     def text(self) -> str:
-        """Return the same for people; empty while too little is measured.
+        """Return the same for people; empty while too little is measured, and in the last minute.
 
         And from mapping on, which is the last stage and may begin anew.
         """
-        left_s = self.left_s()
-        if left_s is None or not self._stages["map"].ahead or self._current == "map":
+        left_s = self.left_s() or 0.0
+        if left_s < 60 or not self._stages["map"].ahead or self._current == "map":
             return ""
         but = " without further warps" if self._may_climb else ""
         return f"whole run: {duration_text(left_s)} left{but}"
@@ -117,12 +117,10 @@ class Forecast:
 def duration_text(seconds: float) -> str:
     """Write a duration as roughly as it is known.
 
-    >>> [duration_text(seconds) for seconds in (20, 110, 1500, 9000)]
-    ['less than a minute', 'about 2 min', 'about 25 min', 'about 2.5 h']
+    >>> [duration_text(seconds) for seconds in (110, 1500, 9000)]
+    ['about 2 min', 'about 25 min', 'about 2.5 h']
     """
     minutes = seconds / 60
-    if minutes < 1:
-        return "less than a minute"
     if minutes < 90:
         return f"about {minutes:.0f} min"
     return f"about {minutes / 60:.1f} h"
