@@ -138,6 +138,15 @@ LOW_CONTRASTS = """
     return found"""
 
 
+def assert_fits_and_is_readable(browser: Browser, scheme: str, width: int) -> None:
+    """Nothing sticks out of the window, and all texts have contrast, in light or dark."""
+    browser.prefer(scheme)
+    browser.resize(width)
+    overflow = "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
+    assert browser.run(overflow) == 0
+    assert browser.run(LOW_CONTRASTS) == []
+
+
 def until_drawn(browser: Browser) -> str:
     """Wait until the first model is on its canvas and return the picture."""
     for _ in range(50):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,18 +46,29 @@ class Ended(NamedTuple):
 Call = Callable[..., Ended]
 
 
-def start(*arguments: object) -> subprocess.Popen[str]:
-    """Start the command line in a process of its own."""
+def on_photographs(photos: Path, out: Path) -> list[str]:
+    """Return the options of a fast run on photographs of the small scene."""
+    return ["--image-path", str(photos), "--output-path", str(out), *FAST]
+
+
+def start(
+    *arguments: object, python: Sequence[str] = (), stderr: int = subprocess.PIPE
+) -> subprocess.Popen[str]:
+    """Start the command line in a process of its own, which Ctrl-C ends.
+
+    Test runners in the background ignore SIGINT, and their children inherit that.
+    """
     return subprocess.Popen(
-        [sys.executable, "-m", "colmap_affrect", *map(str, arguments)],
+        [sys.executable, *python, "-m", "colmap_affrect", *map(str, arguments)],
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        stderr=stderr,
         text=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509 - no threads
     )
 
 
-def run_in_process_of_its_own(*arguments: object) -> Ended:
+def run_in_process_of_its_own(*arguments: object, python: Sequence[str] = ()) -> Ended:
     """Run the command line in a process of its own."""
-    with start(*arguments) as process:
+    with start(*arguments, python=python) as process:
         stdout, stderr = process.communicate(timeout=120)
     return Ended(process.returncode, stdout, stderr.splitlines())

@@ -17,6 +17,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 sys.path.insert(0, str(Path(__file__).parent))
 
 from command import Call, Ended
+from small_scene import write_photographs
 
 from colmap_affrect.cli import main
 
@@ -30,6 +31,17 @@ settings.register_profile(
 )
 settings.register_profile("nightly", parent=settings.get_profile("ci"), max_examples=1000)
 settings.load_profile("ci")
+
+
+os.fsync = lambda _: None  # no test can tell whether a disk has been waited for
+
+
+@pytest.fixture(scope="session")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The four photographs of the small scene; nothing may be changed there."""
+    folder = tmp_path_factory.mktemp("photos č")
+    write_photographs(folder)
+    return folder
 
 
 @pytest.fixture

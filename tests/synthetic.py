@@ -72,6 +72,12 @@ def write_image(path: Path, image: NDArray[np.generic]) -> Path:
     return path
 
 
+def png_of_size(width: int, height: int) -> bytes:
+    """A PNG that claims to have a size; what follows the header is missing."""
+    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", 0)
+
+
 def jpeg_with_orientation(image: GrayImage, orientation: int) -> bytes:
     """JPEG whose EXIF segment holds nothing but the orientation tag."""
     jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()

@@ -35,7 +35,9 @@ import pycolmap
 import sys
 import colmap_affrect
 database_path, image_path = sys.argv[1:]
-colmap_affrect.extract_features(database_path, image_path)
+colmap_affrect.extract_features(
+    database_path, image_path, extraction_options="unrectified-rootsift"
+)
 colmap_affrect.match_exhaustive(database_path)
 with pycolmap.Database.open(database_path) as database:
     print(database.num_verified_image_pairs())

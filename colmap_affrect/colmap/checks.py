@@ -9,111 +9,31 @@ from __future__ import annotations
 import sqlite3
 import struct
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import closing
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.problems import CHECKS, FATAL
 from colmap_affrect.colmap.reading import DAMAGED, open_read_only
+from colmap_affrect.colmap.tables import (
+    SENSOR_CAMERA,
+    Camera,
+    Tables,
+    columns_of,
+    pair_images,
+    read_tables,
+    rows_of,
+)
 from colmap_affrect.errors import DatabaseError
-
-Severity = Literal["error", "warning", "note"]
-SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-
-Check = tuple[Severity, str, str]
-"""How serious a problem is, what it is, and what to do about it."""
-
-CHECKS: dict[str, Check] = {
-    "no-images": ("warning", "holds no images",
-        "import some, e.g. by 'colmap feature_extractor --database_path {path} --image_path X'"),
-    "no-camera": ("error", "images whose camera does not exist",
-        "import these images again into a new database"),
-    "camera-model": ("error", "cameras of a model that COLMAP does not have",
-        "import their images again into a new database"),
-    "camera-panorama": ("warning", "cameras that look all around, which have no focal length",
-        "cut perspective views out of the panoramas, as COLMAP's example panorama.py does, and "
-        "give these"),
-    "camera-size": ("error", "cameras of a size that no photograph has",
-        "import their images again into a new database"),
-    "camera-params": ("error",
-        "cameras whose parameters are more or fewer than their model has, or not finite numbers",
-        "import their images again into a new database"),
-    "no-prior-focal": ("note", "cameras whose focal length is a guess",
-        "if you know the intrinsics, give them: --cameras-path or --focal-length-px here, "
-        "--ImageReader.camera_params in COLMAP"),
-    "no-frame": ("error", "images without a frame while others have one, at which mapping aborts",
-        "give each of them a frame (pycolmap.Database.write_frame), or begin anew with "
-        "'colmap-affrect run --database-path {path}', which adds frames to its copy"),
-    "frame-links": ("error", "rows of rigs and frames that belong to nothing",
-        "import the images again into a new database"),
-    "matrix-data": ("error",
-        "rows whose matrices or cameras have more or less data than they should, or no finite "
-        "numbers", "delete these rows; two-view geometries are made anew by 'colmap "
-        "geometric_verifier'"),
-    "unsafe-name": ("warning", "image names that lead out of the image folder",
-        "rename these images; programs that write a file per image would write elsewhere"),
-    "no-keypoints": ("warning", "images without keypoints, which cannot be registered",
-        "extract their features, unless they are blank"),
-    "keypoint-columns": ("error", "images whose keypoints do not have 2, 4 or 6 columns",
-        "write them again as x, y; or x, y, scale, orientation; or x, y and an affine shape"),
-    "keypoint-data": ("error",
-        "images whose keypoints have more or less data than rows and columns",
-        "extract these images again into a new database"),
-    "keypoints-not-finite": ("error",
-        "images with keypoints that are not finite numbers, or are where no image reaches",
-        "extract these images again into a new database"),
-    "keypoints-outside": ("warning", "images with keypoints outside of them",
-        "see that they were found in the images as stored: not rotated, not resized"),
-    "descriptor-count": ("error", "images with another number of descriptors than of keypoints",
-        "extract these images again into a new database"),
-    "descriptor-types": ("error", "descriptors of several types, which COLMAP does not match",
-        "extract all images with the same features into a new database"),
-    "no-matches": ("note", "no pairs are matched yet",
-        "match them, e.g. by 'colmap exhaustive_matcher --database_path {path}'"),
-    "self-pair": ("error", "images that are matched with themselves",
-        "delete the matches of these pairs"),
-    "unknown-pair": ("error", "matches of images that do not exist",
-        "delete the matches of these pairs"),
-    "match-data": ("error", "pairs whose matches have more or less data than rows and 2 columns",
-        "delete the matches of these pairs and match them again"),
-    "match-range": ("error",
-        "pairs with matches of keypoints that do not exist, at which COLMAP crashes",
-        "delete the matches of these pairs and match them again"),
-    "no-geometry": ("warning",
-        "matched pairs without a two-view geometry, which mapping does not see",
-        "run 'colmap geometric_verifier --database_path {path}'"),
-    "undefined-geometry": ("warning",
-        "two-view geometries of undefined configuration, which mapping passes over",
-        "verify these pairs again: in a copy, delete their two-view geometries and run 'colmap "
-        "geometric_verifier'"),
-    "file-missing": ("warning", "images whose file is missing",
-        "put the files back, or give another --image-path"),
-    "file-unreadable": ("warning", "images whose file cannot be read",
-        "replace the files"),
-    "file-size": ("error", "images of another size than their camera",
-        "use the photographs that the database was made from: not resized, not rotated"),
-}  # fmt: skip
-"""The problems of a database by kind."""
 
 Problems = dict[str, list[str]]
 """What was found: by kind, the images, pairs or cameras concerned, none if it is the database."""
-
-FATAL_FOR_IMAGES = frozenset(
-    {"no-camera", "camera-model", "camera-panorama", "camera-size", "camera-params", "frame-links"}
-)
-"""Problems of cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
-
-FATAL = FATAL_FOR_IMAGES | {
-    "keypoint-columns", "keypoint-data", "keypoints-not-finite", "self-pair", "unknown-pair",
-    "match-data", "match-range", "matrix-data",
-}  # fmt: skip
-"""The same of keypoints and matches."""
 
 MAX_SHOWN = 3
 """Images or pairs that the message of a refusal names."""
@@ -133,9 +53,6 @@ CAMERA_OF_PAIR = struct.Struct("<IiQQBQ")
 """What a camera of a two-view geometry begins with: id, model, width, height, whether its focal
 length is a prior, and the number of parameters that follow, float64."""
 
-MAX_NUM_IMAGES = 2**31 - 1
-"""COLMAP's id of a pair is the smaller image id times this, plus the larger one."""
-
 KEYPOINT_COLUMNS = (2, 4, 6)
 """x, y; with scale and orientation; with an affine shape."""
 
@@ -144,81 +61,6 @@ OUTSIDE_TOLERANCE_PX = 1.0
 
 UNDEFINED = 0
 """Configuration of a two-view geometry that COLMAP 4.2 passes over."""
-
-SENSOR_CAMERA = 0
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A row of the table of cameras; the size is in px, the model a number of COLMAP's."""
-
-    width: int
-    height: int
-    has_prior_focal: bool
-    model: int
-    params: Any
-
-
-@dataclass(frozen=True)
-class Tables:
-    """What a database holds, without the data of keypoints and matches.
-
-    Attributes:
-        cameras: by id.
-        names: of the images, by id.
-        camera_ids: by image id.
-        frame_images: ids of the images that are in a frame.
-        num_frames: number of frames.
-        keypoints: rows and columns by image id.
-        descriptors: type and rows by image id.
-        matches: number of raw matches by pair id.
-        geometries: number of inliers and configuration by pair id.
-    """
-
-    cameras: dict[int, Camera]
-    names: dict[int, str]
-    camera_ids: dict[int, int]
-    frame_images: set[int]
-    num_frames: int
-    keypoints: dict[int, tuple[int, int]]
-    descriptors: dict[int, tuple[int, int]]
-    matches: dict[int, int]
-    geometries: dict[int, tuple[int, int]]
-
-    def num_keypoints(self) -> dict[str, int]:
-        """Return the number of keypoints of the images that have a row of them, by name."""
-        return {
-            name: self.keypoints[image_id][0]
-            for image_id, name in self.names.items()
-            if image_id in self.keypoints
-        }
-
-    def matched_pairs(self) -> set[tuple[str, str]]:
-        """Return the sorted names of each pair that has a row of raw matches."""
-        pairs = (sorted(map(self._label, pair_images(pair_id))) for pair_id in self.matches)
-        return {(first, second) for first, second in pairs}
-
-    def pair_label(self, pair_id: int) -> str:
-        """Return the names of a pair for a message."""
-        return " - ".join(map(self._label, pair_images(pair_id)))
-
-    def _label(self, image_id: int) -> str:
-        return self.names.get(image_id, f"image {image_id}")
-
-    def summary(self) -> str:
-        """Return the numbers of what there is."""
-        features = sum(rows for rows, _ in self.keypoints.values())
-        raw = sum(count > 0 for count in self.matches.values())
-        verified = sum(count > 0 for count, _ in self.geometries.values())
-        return (
-            f"{len(self.names)} images, {len(self.cameras)} cameras, {features} keypoints, "
-            f"{raw} matched and {verified} verified pairs"
-        )
-
-
-def pair_images(pair_id: int) -> tuple[int, int]:
-    """Return the image ids of a pair, the smaller one first."""
-    return pair_id // MAX_NUM_IMAGES, pair_id % MAX_NUM_IMAGES
 
 
 def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
@@ -256,7 +98,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> tuple[Tables, Problems
         (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
         if verdict != "ok":
             raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
-        tables = _read_tables(connection)
+        tables = read_tables(connection)
         _check_cameras(tables, found)
         _check_links(connection, found)
         _check_matrices(connection, found)
@@ -304,45 +146,6 @@ def is_unsafe(name: str) -> bool:
     return path.is_absolute() or ".." in path.parts
 
 
-def _read_tables(connection: sqlite3.Connection) -> Tables:
-    def rows(columns: str, table: str) -> list[tuple[Any, ...]]:
-        """Read columns of a table; 0 for those that it lacks, in databases of old."""
-        known = _columns(connection, table)
-        present = [name if name in known else "0" for name in columns.split()]
-        query = f"SELECT {', '.join(present)} FROM {table}"  # noqa: S608
-        return list(connection.execute(query)) if known else []
-
-    images = rows("image_id name camera_id", "images")
-    cameras = rows("camera_id width height prior_focal_length model params", "cameras")
-    return Tables(
-        cameras={
-            int(key): Camera(int(width), int(height), bool(prior), int(model), params)
-            for key, width, height, prior, model, params in cameras
-        },
-        names={int(key): str(name) for key, name, _ in images},
-        camera_ids={int(key): int(camera_id) for key, _, camera_id in images},
-        frame_images={
-            int(key)
-            for key, kind in rows("data_id sensor_type", "frame_data")
-            if kind == SENSOR_CAMERA
-        },
-        num_frames=len(rows("frame_id", "frames")),
-        keypoints=_numbers(rows("image_id rows cols", "keypoints")),
-        descriptors=_numbers(rows("image_id type rows", "descriptors")),
-        matches={int(key): int(count) for key, count in rows("pair_id rows", "matches")},
-        geometries=_numbers(rows("pair_id rows config", "two_view_geometries")),
-    )
-
-
-def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
-    """Return the columns of a table, none if there is no such table."""
-    return {str(row[1]) for row in connection.execute(f"PRAGMA table_info({table})")}
-
-
-def _numbers(rows: Iterable[Any]) -> dict[int, tuple[int, int]]:
-    return {int(key): (int(first), int(second)) for key, first, second in rows}
-
-
 def _check_cameras(tables: Tables, found: Problems) -> None:
     for camera_id, camera in tables.cameras.items():
         label = f"camera {camera_id}"
@@ -370,12 +173,12 @@ def _camera_like(model: int) -> pycolmap.Camera | None:
 
 def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
     tables = [
-        name for name in ("rig_sensors", "frames", "frame_data") if _columns(connection, name)
+        name for name in ("rig_sensors", "frames", "frame_data") if columns_of(connection, name)
     ]
     for table in tables:
         for _, row, parent, _ in connection.execute(f"PRAGMA foreign_key_check({table})"):
             found["frame-links"].append(f"row {row} of {table}, {parent}")
-    if _columns(connection, "rigs"):
+    if columns_of(connection, "rigs"):
         query = (
             "SELECT rig_id FROM rigs WHERE ref_sensor_type = ? AND ref_sensor_id NOT IN "
             "(SELECT camera_id FROM cameras)"
@@ -386,20 +189,24 @@ def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
 
 def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
     for (table, key), columns in MATRICES.items():
-        for name in columns.keys() & _columns(connection, table):
-            query = f"SELECT {key}, {name} FROM {table}"  # noqa: S608
-            for row, blob in connection.execute(query):
+        for name in columns.keys() & columns_of(connection, table):
+            for row, blob in rows_of(connection, f"{key} {name}", table):
                 values = _array(blob, 1, columns[name], np.dtype("<f8")) if blob else True
                 # Priors of position that are not known are not a number.
                 is_odd = values is None or (name in "FEH" and not np.isfinite(values).all())
                 if is_odd:
                     found["matrix-data"].append(f"{name} of {key} {row}")
+    if {"qvec", "tvec"} <= columns_of(connection, "two_view_geometries"):
+        query = "SELECT pair_id FROM two_view_geometries WHERE (qvec IS NULL) != (tvec IS NULL)"
+        for (row,) in connection.execute(query):
+            found["matrix-data"].append(f"qvec and tvec of pair_id {row}")
 
 
 def _check_cameras_of_pairs(connection: sqlite3.Connection, found: Problems) -> None:
-    for name in sorted({"camera1", "camera2"} & _columns(connection, "two_view_geometries")):
-        query = f"SELECT pair_id, {name} FROM two_view_geometries WHERE {name} IS NOT NULL"  # noqa: S608
-        for pair_id, blob in connection.execute(query):
+    for name in sorted({"camera1", "camera2"} & columns_of(connection, "two_view_geometries")):
+        for pair_id, blob in rows_of(connection, f"pair_id {name}", "two_view_geometries"):
+            if blob is None:
+                continue
             header = blob[: CAMERA_OF_PAIR.size] if isinstance(blob, bytes) else b""
             if len(header) == CAMERA_OF_PAIR.size:
                 _, model, *_, count = CAMERA_OF_PAIR.unpack(header)
@@ -473,8 +280,7 @@ def _check_descriptors(tables: Tables, found: Problems) -> None:
 
 def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
     for table, what in (("matches", "raw matches"), ("two_view_geometries", "inliers")):
-        query = f"SELECT pair_id, rows, cols, data FROM {table}"  # noqa: S608
-        for pair_id, rows, columns, blob in connection.execute(query):
+        for pair_id, rows, columns, blob in rows_of(connection, "pair_id rows cols data", table):
             label = f"{tables.pair_label(pair_id)} ({what})"
             images = pair_images(pair_id)
             indices = _array(blob, rows, columns, np.dtype("<u4"))

@@ -12,6 +12,9 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
 from colmap_affrect.project.atomic_files import cannot_write
@@ -170,3 +173,11 @@ def num_long_tracks(model: pycolmap.Reconstruction) -> Counter[int]:
         if len(images := {element.image_id for element in point.track.elements}) > 2
         for image_id in images
     )
+
+
+def seen_points(image: pycolmap.Image) -> NDArray[np.int64]:
+    """Return the id of the point that each keypoint sees, -1 for none, (N,)."""
+    seen = np.full(image.num_points2D(), -1, np.int64)
+    for index in image.get_observation_point2D_idxs():
+        seen[index] = image.points2D[index].point3D_id
+    return seen

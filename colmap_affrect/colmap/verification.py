@@ -219,7 +219,9 @@ def verify(
             telling_shapes(side(image_id).keypoints) is None for image_id in todo[0]
         ):
             logger.warning(
-                "%s: keypoints have no shapes; pairs need more inliers to count as verified", path
+                "%s: keypoints have no shapes; pairs need more inliers to count as verified, and "
+                "sides that look alike are not told apart",
+                path,
             )
 
         def estimate(task: _Task) -> tuple[tuple[int, int], pycolmap.TwoViewGeometry]:

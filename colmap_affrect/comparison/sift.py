@@ -10,7 +10,7 @@ from typing import Any
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database, require_database_space
 from colmap_affrect.colmap.native_options import differences
-from colmap_affrect.images.photographs import MaskOptions
+from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
 
@@ -45,25 +45,32 @@ def extract_sift(
 ) -> dict[str, str]:
     """Extract SIFT features of images that the database has; those with features are kept.
 
+    COLMAP takes memory for whatever a header claims, so images that claim more pixels than
+    photographs have, and those with such masks, are passed over as our extraction does.
+
     Returns the images that have no features now, with the reason.
     """
+    photographs = Photographs(image_path, masks)
+    impossible = {name: why for name in image_names if (why := photographs.why_impossible(name))}
+    usable = [name for name in image_names if name not in impossible]
     require_database_space(database_path, len(image_names) * ROWS_PER_IMAGE)
     reader = pycolmap.ImageReaderOptions()
     if masks.path:
         reader.mask_path = Path(masks.path)
     if masks.camera_path:
         reader.camera_mask_path = Path(masks.camera_path)
-    pycolmap.extract_features(
-        database_path,
-        image_path,
-        image_names=list(image_names),
-        reader_options=reader,
-        extraction_options=extraction_options(affine=affine),
-    )
+    if usable:  # pycolmap takes no names for all
+        pycolmap.extract_features(
+            database_path,
+            image_path,
+            image_names=usable,
+            reader_options=reader,
+            extraction_options=extraction_options(affine=affine),
+        )
     ids = image_ids(database_path)
     with open_database(database_path) as database:
-        failed = [name for name in image_names if not database.exists_keypoints(ids[name])]
-    return dict.fromkeys(failed, "COLMAP cannot read it or its mask")
+        failed = [name for name in usable if not database.exists_keypoints(ids[name])]
+    return impossible | dict.fromkeys(failed, "COLMAP cannot read it or its mask")
 
 
 def match_sift(database_path: Path, pairs: Sequence[Pair], list_path: Path) -> None:

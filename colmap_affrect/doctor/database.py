@@ -7,19 +7,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from colmap_affrect.colmap.checks import (
-    CHECKS,
-    Tables,
-    check_database,
-    check_image_files,
-    is_unsafe,
-)
+from colmap_affrect.colmap.checks import check_database, check_image_files, is_unsafe
 from colmap_affrect.colmap.database_copy import (
     copy_as_it_is,
     is_stamped,
     newest_schema_version,
     schema_version,
 )
+from colmap_affrect.colmap.problems import CHECKS
+from colmap_affrect.colmap.tables import Tables
 from colmap_affrect.doctor.cameras import examine_cameras
 from colmap_affrect.doctor.findings import Findings, without_path
 from colmap_affrect.errors import DatabaseError, ImageError

@@ -7,9 +7,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.colmap.checks import Tables
 from colmap_affrect.colmap.database import geometry_digest
 from colmap_affrect.colmap.model_files import registered_names
+from colmap_affrect.colmap.tables import Tables
 from colmap_affrect.doctor.database import examine_database, examined_copy
 from colmap_affrect.doctor.findings import OWN_ADVICE, SAME_RUN, Findings, without_path
 from colmap_affrect.errors import AffrectError, WorkspaceError

@@ -52,7 +52,6 @@ from colmap_affrect.evaluation.protocol import (
     Dataset,
     EvaluationImage,
     EvaluationPair,
-    EvaluationProtocol,
     PairResult,
     PairScore,
     finite_numbers,
@@ -106,12 +105,12 @@ class Pairs(HomographyProtocol, CorrespondenceProtocol, RelativePoseProtocol):
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
     ) -> PairScore:
         """See :class:`EvaluationProtocol`."""
-        kind: type[EvaluationProtocol] = CorrespondenceProtocol
+        given = (pair, points1, points2, random_seed)
         if isinstance(pair.truth, TrueHomography):
-            kind = HomographyProtocol
-        elif isinstance(pair.truth, tuple):
-            kind = RelativePoseProtocol
-        return kind.score(self, pair, points1, points2, random_seed)
+            return HomographyProtocol.score(self, *given)
+        if isinstance(pair.truth, tuple):
+            return RelativePoseProtocol.score(self, *given)
+        return CorrespondenceProtocol.score(self, *given)
 
     def success(self, score: PairScore) -> float:
         """1 if the error is below the limit of its kind; for correspondences the score of WxBS."""

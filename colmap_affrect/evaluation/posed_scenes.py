@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
@@ -43,9 +44,9 @@ class PosedScenes(RelativePoseProtocol):
             raise EvaluationError(f"{dataset_path}: no pair can be evaluated; {notes}")
         return dataset
 
+    @abstractmethod
     def load_scene(self, path: Path) -> Dataset:
         """Read a scene by the path of what makes it one."""
-        raise NotImplementedError
 
 
 def stem(name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -122,7 +123,7 @@ class Dataset:
         )
 
 
-class EvaluationProtocol(Options):
+class EvaluationProtocol(Options, ABC):
     """Loads a dataset, scores matches, and sums up, as one of the paper's tables does.
 
     A class variable ``error_title`` says what the error of a score is, with its unit, and
@@ -148,23 +149,24 @@ class EvaluationProtocol(Options):
         """Return how to look for a model."""
         return Ransac(method, threshold, self.confidence, self.max_num_iterations, random_seed)
 
+    @abstractmethod
     def load(self, dataset_path: Path) -> Dataset:
         """Find the pairs of a dataset; EvaluationError when the layout is another one."""
-        raise NotImplementedError
 
+    @abstractmethod
     def score(
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
     ) -> PairScore:
         """Score (M, 2) and (M, 2) matched points, pixel-centre px of the stored images."""
-        raise NotImplementedError
 
+    @abstractmethod
     def success(self, score: PairScore) -> float:
         """Return how far a pair counts as matched, in [0, 1]: 1 or 0 where there is a threshold.
 
         Plots and intervals are of its mean; the test against the baseline compares it pair by pair.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def summarize(self, results: Sequence[PairResult]) -> dict[str, float]:
         """Return the columns of the protocol's table by name, in order (counts or shares).
 
@@ -173,7 +175,6 @@ class EvaluationProtocol(Options):
         Names are those of ``published.published`` where the paper has the same number. Of an empty
         sequence all columns are 0.
         """
-        raise NotImplementedError
 
     def settings(self) -> dict[str, Any]:
         """Return everything that decides scores, for the record."""

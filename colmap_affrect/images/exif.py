@@ -10,12 +10,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
-from colmap_affrect.images.headers import opened, stored_size
+from colmap_affrect.images.headers import opened, read_header, stored_size
 
 FILM_DIAGONAL_MM = 43.27
 """Of 35 mm film, to which equivalent focal lengths refer (by COLMAP's rounding)."""
@@ -99,23 +99,18 @@ class ExifFocal:
 
 def read_camera_tags(path: Path) -> CameraTags | None:
     """Read the header of a photograph, without its pixels; None if it has no readable one."""
-    if not path.is_file():  # opening a pipe would wait for ever
-        return None
-    try:
-        with opened(path) as image:
-            return _with_exif(image)
-    except Exception:  # noqa: BLE001 - damaged files raise nearly anything in Pillow
-        return None
+    return read_header(path, _tags_of_file)
 
 
-def _with_exif(image: Image.Image) -> CameraTags:
+def _tags_of_file(file: BinaryIO) -> CameraTags:
+    image = opened(file)
     size = stored_size(image)
     if image.format == "PNG" and "exif" not in image.info:  # else Pillow reads the pixels
         return CameraTags(size)
     try:
         exif = image.getexif()
         tags = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-    except Exception:  # noqa: BLE001 - as above
+    except Exception:  # noqa: BLE001 - damaged tags raise nearly anything in Pillow
         return CameraTags(size, absurd=("EXIF",))
     return _camera_tags(size, tags)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import struct
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO, TypeVar
 
 from PIL import ExifTags, Image
 from PIL.BmpImagePlugin import BmpImageFile
@@ -31,19 +31,32 @@ READERS = {
 }
 """Pillow's by the first bytes: ``Image.open`` has a limit of pixels that photographs exceed."""
 
-
 NEW_SUBFILE_TYPE, REDUCED = 254, 1
 """TIFF's tag, and its bit of a smaller copy of another page."""
 
+Found = TypeVar("Found")
 
-@contextmanager
-def opened(path: Path) -> Iterator[Image.Image]:
-    """Open an image file by its header; what is damaged raises nearly anything."""
-    with warnings.catch_warnings(), path.open("rb") as file:
-        warnings.simplefilter("ignore")  # Pillow warns of broken EXIF
-        start = file.read(len(PNG))
-        file.seek(0)
-        yield next(read for magic, read in READERS.items() if start.startswith(magic))(file, "")
+
+def read_header(path: Path, read: Callable[[BinaryIO], Found]) -> Found | None:
+    """Return what a function reads of an image file, None if that fails in any way.
+
+    Nothing is opened that is not a file: a pipe would wait for ever.
+    """
+    if not path.is_file():
+        return None
+    try:
+        with warnings.catch_warnings(), path.open("rb") as file:
+            warnings.simplefilter("ignore")  # Pillow warns of broken EXIF
+            return read(file)
+    except Exception:  # noqa: BLE001 - damaged files raise nearly anything in Pillow
+        return None
+
+
+def opened(file: BinaryIO) -> Image.Image:
+    """Open an image by its header; what is damaged raises nearly anything."""
+    start = file.read(len(PNG))
+    file.seek(0)
+    return next(read for magic, read in READERS.items() if start.startswith(magic))(file, "")
 
 
 def stored_size(image: Image.Image) -> tuple[int, int]:
@@ -56,36 +69,30 @@ def stored_size(image: Image.Image) -> tuple[int, int]:
 
 def pages(path: Path) -> list[int]:
     """Return the numbers of the pages of a TIFF without its previews; [0] of other files."""
-    try:
-        with opened(path) as image:
-            if not isinstance(image, TiffImageFile):
-                return [0]
-            found = []
-            for page in range(image.n_frames):
-                image.seek(page)
-                if not image.tag_v2.get(NEW_SUBFILE_TYPE, 0) & REDUCED:
-                    found.append(page)
-            return found or [0]
-    except Exception:  # noqa: BLE001 - a damaged file, which its reader will name
-        return [0]
+    return read_header(path, _tiff_pages) or [0]
+
+
+def _tiff_pages(file: BinaryIO) -> list[int]:
+    image, found = opened(file), []
+    if isinstance(image, TiffImageFile):
+        for page in range(image.n_frames):
+            image.seek(page)
+            if not image.tag_v2.get(NEW_SUBFILE_TYPE, 0) & REDUCED:
+                found.append(page)
+    return found
 
 
 def header_size(path: Path) -> tuple[int, int] | None:
-    """Return the (width, height) that a file claims to have; None if there is no readable header.
+    """Return the (width, height) that a file claims; None if it has no readable header."""
+    return read_header(path, _claimed_size)
 
-    Nothing is opened that is not a file: a pipe would wait for ever.
-    """
-    if not path.is_file():
-        return None
-    try:
-        with path.open("rb") as file:
-            start = file.read(24)
-        if start.startswith(PNG):
-            return struct.unpack(">II", start[16:])
-        with opened(path) as image:
-            return stored_size(image)
-    except Exception:  # noqa: BLE001 - as Pillow does
-        return None
+
+def _claimed_size(file: BinaryIO) -> tuple[int, int]:
+    start = file.read(24)
+    if start.startswith(PNG):
+        return struct.unpack(">II", start[16:])
+    file.seek(0)
+    return stored_size(opened(file))
 
 
 def is_too_large(size: tuple[int, int] | None) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 
 from colmap_affrect.data import Mask
 from colmap_affrect.errors import ImageError, OptionError, StoreError
-from colmap_affrect.images.headers import header_size, pages
+from colmap_affrect.images.headers import header_size, pages, require_possible
 from colmap_affrect.images.masks import read_mask
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, OTHER_IMAGE_SUFFIXES
 from colmap_affrect.options import Options, within
@@ -127,6 +127,15 @@ class Photographs:
         if self.masks.camera_path:
             paths.append(Path(self.masks.camera_path))
         return [path for path in paths if path.is_file()]
+
+    def why_impossible(self, name: str) -> str:
+        """Say which of these files claims more pixels than photographs have; empty if none does."""
+        try:
+            for path in self.files(name):
+                require_possible(path)
+        except ImageError as error:
+            return str(error)
+        return ""
 
     def moved(self, move: Callable[[Path], Path]) -> Self:
         """Return the same photographs with all files in other places."""

@@ -116,7 +116,6 @@ def import_h5(
     _check_choice("pixel_origin", pixel_origin, PIXEL_ORIGINS)
     _refuse_existing(database_path, DatabaseError)
     cameras = cameras or CameraOptions()
-    verification = VerificationOptions(random_seed=random_seed)
     names = list_images(image_path)
     InitialCameras(image_path, cameras).check(names)
     with (
@@ -126,29 +125,39 @@ def import_h5(
     ):
         new = folder / "new.db"
         rejected = import_images(new, image_path, names, cameras)
-        lost = sorted(files.keys.keys() & set(rejected))
-        if lost:
+        if lost := sorted(files.keys.keys() & set(rejected)):
             raise ImageError(
                 f"{image_path}: COLMAP does not take (damaged, or of another size than camera "
                 f"mode {cameras.mode} allows): {listed(lost)}"
             )
         counts, num_matches = _fill_database(new, files, pixel_origin, progress)
-        notes = [*files.notes, *_rounded(files)]
+        without = sorted(set(names) - set(rejected) - counts.keys())
+        notes = [
+            *files.notes,
+            *_rounded(files),
+            *_note("images without features are there without keypoints", without),
+            *_note("images that COLMAP does not take are left out", rejected),
+        ]
         num_verified = None
         if not skip_verification:
-            with progress.stage("verify", len(files.pairs), "pairs") as advance:
-                verify(new, verification, advance=advance)
-            num_verified = len(verified_pairs(new, verification.min_num_inliers))
+            num_verified = _verify(new, len(files.pairs), random_seed, progress)
         new.replace(database_path)
-    imported = set(names) - set(rejected)
-    if without := sorted(imported - counts.keys()):
-        notes.append(f"images without features are there without keypoints: {listed(without)}")
-    if rejected:
-        notes.append(f"images that COLMAP does not take are left out: {listed(rejected)}")
     return InterchangeReport(
-        "imported", files.layout, len(imported), sum(counts.values()), len(files.pairs),
-        num_matches, num_verified, tuple(notes),
+        "imported", files.layout, len(names) - len(rejected), sum(counts.values()),
+        len(files.pairs), num_matches, num_verified, tuple(notes),
     )  # fmt: skip
+
+
+def _verify(path: Path, num_pairs: int, random_seed: int, progress: Progress) -> int:
+    """Verify all pairs; return how many have a two-view geometry then."""
+    options = VerificationOptions(random_seed=random_seed)
+    with progress.stage("verify", num_pairs, "pairs") as advance:
+        verify(path, options, advance=advance)
+    return len(verified_pairs(path, options.min_num_inliers))
+
+
+def _note(what: str, names: Sequence[str]) -> list[str]:
+    return [f"{what}: {listed(names)}"] if names else []
 
 
 def _rounded(files: ForeignFiles) -> list[str]:
@@ -335,8 +344,9 @@ class _DatabaseContent:
         pair_ids, _ = database.read_num_matches()
         self._pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
         self.names, self.num_pairs = sorted(found), len(self._pairs)
-        without = sorted(set(self._images) - found)
-        self.notes = [f"images without keypoints are left out: {listed(without)}"] * bool(without)
+        self.notes = _note(
+            "images without keypoints are left out", sorted(set(self._images) - found)
+        )
 
     def features(self, name: str) -> tuple[tuple[int, int], Datasets]:
         image = self._images[name]

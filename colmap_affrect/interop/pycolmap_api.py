@@ -110,7 +110,8 @@ def extract_features(
         reader_options: as in pycolmap, with camera model and parameters, and masks.
         extraction_options: name of a recipe, its path, its sections, or options; of pycolmap's,
             the image size and where the work is done.
-        device: where networks run.
+        device: where networks run. As in pycolmap it overrules ``use_gpu``: ``auto`` is the CPU
+            where there is no GPU, and ``cuda`` is refused there.
         cancellation_token: stops by InterruptedError when it is cancelled; what is done is kept.
         from_database: begin ``database_path`` with the images, cameras, rigs, frames and pose
             priors of this one, which stays as it is.
@@ -151,7 +152,8 @@ def match_exhaustive(
             where the work is done.
         pairing_options: as in pycolmap; the size of blocks does not change results.
         verification_options: ours, or those of pycolmap, what differs from its defaults.
-        device: where matching runs, and networks of recipes that escalate.
+        device: where matching runs, and networks of recipes that escalate; overrules ``use_gpu``,
+            see :func:`extract_features`.
         cancellation_token: as in :func:`extract_features`.
         ours: see :class:`Ours`.
     """

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.native_options import differences, flat_values
@@ -21,7 +21,15 @@ from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.options import CUSTOM, Options, flat, suggestion
 from colmap_affrect.recipes import ExtractionOptions, Recipe, RecipeOptions, load_recipe
 
-Native = TypeVar("Native")
+
+class NativeOptions(Protocol):
+    """What all option classes of pycolmap have."""
+
+    def mergedict(self, kwargs: dict[str, Any], /) -> None:
+        """Take the values of a nested dictionary."""
+
+
+Native = TypeVar("Native", bound=NativeOptions)
 
 VERIFICATION_NAMES = {
     "min_num_inliers": "min_num_inliers",
@@ -73,10 +81,12 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
     for key in flat(given or {}):
         if key not in known and key not in sections:
             raise OptionError(f"{argument}: unknown option '{key}'{suggestion(key, known)}")
+    options = kind()
     try:
-        return kind(dict(given or {}))  # type: ignore[call-arg]
+        options.mergedict(dict(given or {}))
     except (AttributeError, TypeError, ValueError, RuntimeError) as error:
         raise OptionError(f"{argument}: {' '.join(str(error).split())}") from error
+    return options
 
 
 def changes(given: object, kind: type, argument: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import num_long_tracks
+from colmap_affrect.colmap.model_files import num_long_tracks, seen_points
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
@@ -81,16 +81,13 @@ def arrivals(model: MappedModel, task: MappingTask) -> dict[str, Arrival]:
 
 def _tied_by_guided_matches(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:
     """Return the images that too few three-view tracks would tie without guided matches."""
-    points = {
-        i: np.array([point.point3D_id for point in model.images[i].points2D], np.uint64)
-        for i in model.reg_image_ids()
-    }
+    points = {i: seen_points(model.images[i]) for i in model.reg_image_ids()}
     links: defaultdict[tuple[int, int], list[tuple[int, int]]] = defaultdict(list)
     for ids, matches in inlier_matches(task.database_path, 1).items():
         if not points.keys() >= set(ids):
             continue
         both = [points[i][matches[:, side]] for side, i in enumerate(ids)]
-        known = (both[0] == both[1]) & (both[0] != pycolmap.INVALID_POINT3D_ID)
+        known = (both[0] == both[1]) & (both[0] >= 0)
         guided = set(map(tuple, np.asarray(task.guided.get(ids, ())).tolist()))
         for first, second in matches[known].tolist():
             if (first, second) not in guided:

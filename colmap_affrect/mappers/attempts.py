@@ -68,6 +68,31 @@ def map_database(
     partial = sparse_path.with_name(sparse_path.name + ".partial")
     for old in (partial,) if task.extend else (partial, sparse_path):
         shutil.rmtree(old, ignore_errors=True)
+    try:
+        best = _best_attempt(mapper, task, sparse_path, partial, next_image)
+        if not task.extend and _adjust_weak(mapper, task, best):
+            best = sorted(_possible(best, task), key=_size, reverse=True)
+        shutil.rmtree(sparse_path, ignore_errors=True)
+        for index, model in enumerate(best):
+            write_model(model.reconstruction, partial / str(index))
+            write_arrivals(model, partial / str(index))
+        partial.rename(sparse_path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return [summarize(model, task) for model in best]
+
+
+def _best_attempt(
+    mapper: Mapper,
+    task: MappingTask,
+    sparse_path: Path,
+    partial: Path,
+    next_image: Callable[[int], None],
+) -> list[MappedModel]:
+    """Return the models of the best of all attempts, largest first; ``partial`` is for their work.
+
+    Snapshots are kept beside ``sparse_path``.
+    """
     num_images = len(image_ids(task.database_path))
     most_shown = 0
     best: list[MappedModel] = []
@@ -79,31 +104,20 @@ def map_database(
             most_shown += news
             next_image(news)
 
-    try:
-        with with_snapshots(task, mapper.options, snapshots_of(sparse_path), num_images) as kept:
-            attempts = _Attempts(mapper, kept, num_images)
-            while attempts.go_on(best):
-                raw = partial / "raw"
-                raw.mkdir(parents=True)
-                found = attempts.next(partial / "started.db", raw, show)
-                shutil.rmtree(raw)
-                if not task.extend:  # whose images stay, whatever they are
-                    found = _possible(found, kept)
-                found = sorted(found, key=_size, reverse=True)
-                attempts.judge(found)
-                best = better(kept, best, found)
-            (partial / "started.db").unlink(missing_ok=True)
-        best = attempts.with_rivals(best)
-        if not task.extend and _adjust_weak(mapper, task, best):
-            best = sorted(_possible(best, task), key=_size, reverse=True)
-        shutil.rmtree(sparse_path, ignore_errors=True)
-        for index, model in enumerate(best):
-            write_model(model.reconstruction, partial / str(index))
-            write_arrivals(model, partial / str(index))
-        partial.rename(sparse_path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    return [summarize(model, task) for model in best]
+    with with_snapshots(task, mapper.options, snapshots_of(sparse_path), num_images) as kept:
+        attempts = _Attempts(mapper, kept, num_images)
+        while attempts.go_on(best):
+            raw = partial / "raw"
+            raw.mkdir(parents=True)
+            found = attempts.next(partial / "started.db", raw, show)
+            shutil.rmtree(raw)
+            if not task.extend:  # whose images stay, whatever they are
+                found = _possible(found, kept)
+            found = sorted(found, key=_size, reverse=True)
+            attempts.judge(found)
+            best = better(kept, best, found)
+        (partial / "started.db").unlink(missing_ok=True)
+    return attempts.with_rivals(best)
 
 
 class _Attempts:

@@ -76,7 +76,7 @@ class Part:
         """Return (K, 2) px and (K,) depths of the points that an image sees."""
         if image_id not in self._known:
             rotation, translation = self.poses[image_id]
-            points = [p for p in self.model.images[image_id].points2D if p.has_point3D()]
+            points = self.model.images[image_id].get_observation_points2D()
             places = np.array([p.xy for p in points]).reshape(-1, 2)
             world = np.array([self.model.points3D[p.point3D_id].xyz for p in points])
             depths = world.reshape(-1, 3) @ rotation[2] + translation[2]

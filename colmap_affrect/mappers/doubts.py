@@ -57,6 +57,10 @@ MAX_ANGLE_DEG = 90.0
 """To the next image. Surfaces are then tilted by 45 degrees in one of both at least: single matches
 survive that, not most of an image; repeated and symmetric structures look so."""
 
+MIN_BASELINE_DEG = 1.0
+"""Between two cameras, as their points see them. Rotations are right within a tenth of a degree at
+best, which moves centres by as much: the direction between nearer ones is off by 5 degrees then."""
+
 MAX_PAIRS_FOR_PARALLAX, MAX_POINTS_FOR_ANGLES = 100, 2000
 """Pairs and points looked at; more change no share."""
 
@@ -138,7 +142,7 @@ def _image_doubts(model: MappedModel, graph: PairGraph, task: MappingTask) -> Do
         for image_id in pair.ids:
             totals[image_id] += count * graph.agreement(pair, poses, cameras), count
     reasons: dict[str, str] = {}
-    angles = _angles_deg(reconstruction)
+    angles, near = _angles_deg(reconstruction), _images_nearby(reconstruction)
     impossible: list[tuple[float, int, str]] = []
     for image_id in registered:
         image = reconstruction.images[image_id]
@@ -146,7 +150,10 @@ def _image_doubts(model: MappedModel, graph: PairGraph, task: MappingTask) -> Do
         agreement = agreeing / total if total else 1.0
         found = [
             *([] if image.camera_id in given else _camera_doubts(_camera(image))),
-            *_support_doubts(image.num_points3D, agreement, [near for near, _ in angles[image_id]]),
+            *_support_doubts(
+                image.num_points3D, agreement, [next_deg for next_deg, _ in angles[image_id]]
+            ),
+            *_place_doubts(near[image_id], len(registered) - 1),
             *_bridge_doubts(bridges.get(image.name)),
         ]
         if found:
@@ -180,6 +187,14 @@ def _support_doubts(
     if len(angles) >= TOO_FEW_OBSERVATIONS and np.median(angles) > MAX_ANGLE_DEG:
         apart = f"{np.median(angles):.0f} degrees apart"
         yield f"most of its points are seen from directions {apart}", False
+
+
+def _place_doubts(nearby: Sequence[str], num_others: int) -> Iterator[tuple[str, bool]]:
+    """Doubt images of which most others are too near to know the direction to them."""
+    if 2 * len(nearby) >= num_others > 1:
+        names = ", ".join(nearby[:2]) + (", ..." if len(nearby) > 2 else "")
+        place = f"taken from nearly the same place as {names}"
+        yield f"{place}: the directions between them are uncertain", False
 
 
 def _bridge_doubts(bridge: Bridge | None) -> Iterator[tuple[str, bool]]:
@@ -229,6 +244,29 @@ def _model_doubts(model: MappedModel, graph: PairGraph) -> Iterator[str]:
         num_ties = sum(p.track.length() > 2 for p in reconstruction.points3D.values())
         if num_ties < MIN_THREE_VIEW_POINTS:
             yield f"only {num_ties} points are seen by three photographs"
+
+
+def _images_nearby(model: pycolmap.Reconstruction) -> dict[int, list[str]]:
+    """Return, of each image, the others whose centres its points hardly tell from its own."""
+    ids = sorted(model.reg_image_ids())
+    centers = np.array([model.images[i].projection_center() for i in ids])
+    distances = np.linalg.norm(centers[:, None] - centers, axis=2)
+    depths = np.array([_median_distance(model, model.images[i]) for i in ids])
+    is_near = distances < np.tan(np.deg2rad(MIN_BASELINE_DEG)) * depths[:, None]
+    np.fill_diagonal(is_near, False)
+    return {
+        image_id: [model.images[ids[k]].name for k in np.flatnonzero(near)]
+        for image_id, near in zip(ids, is_near, strict=True)
+    }
+
+
+def _median_distance(model: pycolmap.Reconstruction, image: pycolmap.Image) -> float:
+    """Return how far the points of an image are from it; 0 without any."""
+    points = image.get_observation_points2D()
+    if not points:
+        return 0.0
+    places = np.array([model.point3D(point.point3D_id).xyz for point in points])
+    return float(np.median(np.linalg.norm(places - image.projection_center(), axis=1)))
 
 
 def _angles_deg(model: pycolmap.Reconstruction) -> dict[int, list[tuple[float, float]]]:

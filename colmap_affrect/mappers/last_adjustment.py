@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import seen_points
 
 Matches = Mapping[tuple[int, int], NDArray[np.int64]]
 Observations = NDArray[np.int64]
@@ -59,7 +60,7 @@ def adjust_last(
     Returns:
         How many observations of guided matches were taken out first.
     """
-    points = {i: _points(model.images[i]) for i in model.reg_image_ids()}
+    points = {i: seen_points(model.images[i]) for i in model.reg_image_ids()}
     all_ties, guided_ties = _ties(points, verified), _ties(points, guided)
     ties = all_ties[~np.isin(_keys(all_ties), _keys(guided_ties))]
     dropped = np.setdiff1d(all_ties, ties)
@@ -79,14 +80,6 @@ def adjust_last(
 def _keys(ties: Observations) -> NDArray[np.complex128]:
     """Return one number for each (E, 2) tie."""
     return ties[:, 0] + 1j * ties[:, 1]
-
-
-def _points(image: pycolmap.Image) -> NDArray[np.int64]:
-    """Return the number of the point that each keypoint sees, -1 for none."""
-    seen = np.full(image.num_points2D(), -1, np.int64)
-    for index in image.get_observation_point2D_idxs():
-        seen[index] = image.points2D[index].point3D_id
-    return seen
 
 
 def _ties(points: Mapping[int, NDArray[np.int64]], matches: Matches) -> Observations:

@@ -45,6 +45,7 @@ from colmap_affrect.project.feature_index import Entries, entries, forget
 FORMAT_VERSION = 2
 MAX_INT16 = 32767
 STATIONARY = "stationary_cells"
+FILTERED = "is_filtered"
 
 
 @dataclass(frozen=True)
@@ -371,8 +372,13 @@ class MatchStore(_Store):
 
     kind = "matches"
 
-    def write(self, pairs: Iterable[PairMatches]) -> None:
-        """Write a batch of pairs."""
+    def write(
+        self,
+        pairs: Iterable[PairMatches],
+        tried: Iterable[tuple[str, str]] = (),
+        tried_level: int = 0,
+    ) -> None:
+        """Write a batch of pairs; record that a level was tried for others, which keep theirs."""
         with self._open("a") as file:
             for pair in pairs:
                 self._write(
@@ -382,6 +388,8 @@ class MatchStore(_Store):
                     level=pair.level,
                     tried_level=pair.level,
                 )
+            for names in tried:
+                file[pair_key(*names)].attrs["tried_level"] = tried_level
 
     def remove(self, images: Iterable[str] = (), pairs: Iterable[tuple[str, str]] = ()) -> None:
         """Remove the matches of pairs, of all pairs of some images, and of those that climbed.
@@ -414,11 +422,17 @@ class MatchStore(_Store):
         with self._open("a") as file:
             file.attrs[STATIONARY] = json.dumps([(s, found.tolist()) for s, found in cells.items()])
 
-    def mark_tried(self, pairs: Iterable[tuple[str, str]], level: int) -> None:
-        """Record that a level was tried for pairs, which keep the matches they have."""
+    def is_filtered(self) -> bool:
+        """Tell whether all matches have been looked at for what never moves."""
+        if not self.path.exists():
+            return True
+        with self._open("r") as file:
+            return bool(file.attrs.get(FILTERED, True))
+
+    def mark_filtered(self, is_filtered: bool) -> None:
+        """Keep whether all matches have been looked at for what never moves."""
         with self._open("a") as file:
-            for pair in pairs:
-                file[pair_key(*pair)].attrs["tried_level"] = level
+            file.attrs[FILTERED] = is_filtered
 
     def levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
         """Return the level of escalation that the matches of each pair are from."""

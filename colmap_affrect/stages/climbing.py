@@ -54,11 +54,13 @@ class ClimbingGraph:
         num_inliers: of each pair, 0 where it is not verified.
         num_consistent: matches that confirm each other, of each pair that is not verified.
         insecure: images that mapping may well lose.
+        stalled: pairs to which the last level that they climbed to brought nothing.
     """
 
     num_inliers: Mapping[Pair, int]
     num_consistent: Mapping[Pair, int]
     insecure: Set[str]
+    stalled: Set[Pair] = frozenset()
 
     @cached_property
     def components(self) -> dict[str, int]:
@@ -72,15 +74,21 @@ class ClimbingGraph:
         return self.num_inliers[pair], self.num_consistent.get(pair, 0)
 
     def joining(self, options: EscalateOptions) -> list[Pair]:
-        """Return the promising pairs between images that no verified pairs connect."""
+        """Return the promising pairs between images that no verified pairs connect.
+
+        And the best of each image outside the largest part, where no level brought nothing to them;
+        the best pair of each part climbs in any case.
+        """
         parts = self.components
         between = [pair for pair in self.num_inliers if parts[pair[0]] != parts[pair[1]]]
         best: set[Pair] = set()
         for name in (name for name, part in parts.items() if part):
-            own = [pair for pair in between if name in pair]
-            best |= set(
-                heapq.nlargest(options.num_best_pairs, own, self.num_consistent.__getitem__)
-            )
+            own = (pair for pair in between if name in pair)
+            ranked = heapq.nlargest(options.num_best_pairs, own, self.num_consistent.__getitem__)
+            best |= set(ranked) - self.stalled
+        for part in set(parts.values()) - {0} if options.num_best_pairs else ():
+            own = (pair for pair in between if part in (parts[pair[0]], parts[pair[1]]))
+            best.update(heapq.nlargest(1, own, self.num_consistent.__getitem__))
         return [pair for pair in between if pair in best or self._is_promising(pair, options)]
 
     def hanging(self, options: EscalateOptions) -> list[Pair]:
@@ -92,7 +100,8 @@ class ClimbingGraph:
         ]
 
     def _is_promising(self, pair: Pair, options: EscalateOptions) -> bool:
-        return self.num_consistent[pair] >= options.min_num_consistent
+        enough = self.num_consistent[pair] >= options.min_num_consistent
+        return enough and pair not in self.stalled
 
     def links(self, levels: Mapping[Pair, int], level: int) -> list[Pair]:
         """Return the verified pairs of images that gained matches at a level and need more."""

@@ -198,7 +198,7 @@ def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | No
 def reject(context: Context, pairs: Sequence[Pair]) -> None:
     """Let pairs count as not verified, and none climb again: further levels would be no better."""
     escalation = Escalation(context, EscalateOptions())
-    context.matches.mark_tried(escalation.pairs, escalation.levels[-1])
+    context.matches.write((), escalation.pairs, escalation.levels[-1])
     colmap_database.reject_pairs(context.workspace.database, pairs)
 
 
@@ -260,7 +260,9 @@ class Escalation:
             )
         insecure = insecure_images(num_inliers, self.options.strong_num_inliers, weakly_connected)
         failed = [pair for pair, count in num_inliers.items() if not count]
-        return ClimbingGraph(num_inliers, self._num_consistent(failed), insecure)
+        reached, tried = self.matches.levels(failed), self.matches.tried_levels(failed)
+        stalled = {pair for pair in failed if reached[pair] < tried[pair]}
+        return ClimbingGraph(num_inliers, self._num_consistent(failed), insecure, stalled)
 
     def _num_consistent(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
         ids = colmap_database.image_ids(self.path)
@@ -325,7 +327,7 @@ class Escalation:
         higher = [pair for pair in self.pairs if levels[pair]]
         with self.context.progress.stage("match", len(higher), "pairs") as advance:
             match_pairs(self.context, higher, self.matching, advance)
-        self.matches.mark_tried(self.pairs, 0)
+        self.matches.write((), self.pairs, 0)
         self.write()
 
     def match_first_level(self, pairs: Sequence[Pair], path: Path) -> None:
@@ -393,8 +395,7 @@ class Escalation:
         better: list[PairMatches] = []
 
         def record() -> None:
-            self.matches.mark_tried(tried, level)
-            self.matches.write(better)
+            self.matches.write(better, tried, level)  # both or neither, if it is killed here
             tried.clear()
             better.clear()
 

@@ -11,10 +11,11 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.camera_records import read_camera_records
-from colmap_affrect.colmap.checks import CHECKS, FATAL_FOR_IMAGES, refuse_unusable
+from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_without_features, read_names
 from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
+from colmap_affrect.colmap.problems import CHECKS, FATAL_FOR_IMAGES
 from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
 from colmap_affrect.features.weights import digests_by_name
 from colmap_affrect.images.photographs import (
@@ -218,11 +219,7 @@ def extract(
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
     failures = _extract_missing(context, inputs, extractor, missing, digests, warnings)
-    if len(failures) == len(names):
-        raise ImageError(
-            f"{folder}: none of the {len(names)} images can be used; the first: "
-            f"{failures[names[0]]}"
-        )
+    _require_some(folder, names, failures)
     failures |= write_images_and_keypoints(context)
     return StageReport(
         "extract",
@@ -232,6 +229,14 @@ def extract(
         failures,
         warnings,
     )
+
+
+def _require_some(folder: Path, names: Sequence[str], failures: Mapping[str, str]) -> None:
+    if len(failures) == len(names):
+        raise ImageError(
+            f"{folder}: none of the {len(names)} images can be used; the first: "
+            f"{failures[names[0]]}"
+        )
 
 
 def _require_usable_cameras(workspace: Workspace, inputs: Inputs) -> None:

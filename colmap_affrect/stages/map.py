@@ -23,7 +23,7 @@ from colmap_affrect.mappers.attempts import (
     read_models,
 )
 from colmap_affrect.mappers.base import Mapper, MappingTask
-from colmap_affrect.mappers.existing import Extension, read_existing, require_extends
+from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
@@ -87,22 +87,14 @@ def map_images(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
             "--overwrite to map from the beginning"
         )
-    copied = is_copy(workspace)
-    task = MappingTask(
-        workspace.database,
-        image_path_of(workspace),
-        existing,
-        guided={} if copied else guided_matches(context),
-        cameras=read_camera_records(workspace.cameras),
-        depth_at=None if copied else depth_lookup(context),
-    )
+    task = _task(context, existing)
     if known == inputs:
         models = read_models(workspace.sparse, task)
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models, num_rejected = _map(context, mapper, task, advance)
-    if not copied and _num_registered(models) < min(num_images, LARGE_MODEL):
+    if not is_copy(workspace) and _num_registered(models) < min(num_images, LARGE_MODEL):
         models = _or_first_level(context, mapper, task, models)
     warnings = {}
     if num_rejected:
@@ -119,6 +111,20 @@ def map_images(
         )
     wall_s = time.perf_counter() - start
     return StageReport("map", wall_s, len(models), warnings=warnings), models
+
+
+def _task(context: Context, existing: ExistingModel | None) -> MappingTask:
+    """Return what there is to map; another program's database has no matches and depths of ours."""
+    workspace = context.workspace
+    copied = is_copy(workspace)
+    return MappingTask(
+        workspace.database,
+        image_path_of(workspace),
+        existing,
+        guided={} if copied else guided_matches(context),
+        cameras=read_camera_records(workspace.cameras),
+        depth_at=None if copied else depth_lookup(context),
+    )
 
 
 def _inputs(workspace: Workspace, extend: Extension | None) -> str:

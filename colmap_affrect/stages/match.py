@@ -56,13 +56,16 @@ def match(
     context.workspace.record_options("match", record, overwrite=overwrite)
     done = context.matches.complete(pair_key(*pair) for pair in pairs)
     missing = [pair for pair in pairs if pair_key(*pair) not in done]
+    if missing:
+        context.matches.mark_filtered(False)
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance)
     warnings = {}
-    stationary = StationaryFilter(context.features, context.matches)
-    if options.filter_stationary_matches and missing and (line := stationary.learn(pairs)):
-        warnings["matches"] = line
-        logger.warning("matches: %s", line)
+    if options.filter_stationary_matches and not context.matches.is_filtered():
+        if line := StationaryFilter(context.features, context.matches).learn(pairs):
+            warnings["matches"] = line
+            logger.warning("matches: %s", line)
+        context.matches.mark_filtered(True)
     write_matches(context, pairs)
     wall_s = time.perf_counter() - start
     return StageReport("match", wall_s, len(missing), len(done), warnings=warnings)

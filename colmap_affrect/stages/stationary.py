@@ -89,10 +89,13 @@ class StationaryFilter:
         return replace(found, indices=found.indices[left], scores=found.scores[left])
 
     def learn(self, pairs: Sequence[Pair]) -> str:
-        """Look for places in all matches, and drop those there; return a line, empty if none."""
+        """Look for places in all matches, and drop those there; return a line, empty if none.
+
+        A call that was killed may have dropped some: what it found is on record and counts too.
+        """
         known = self._matches.stationary_cells()
         found = {size: cells for size, cells in self._find(pairs).items() if len(cells)}
-        if not found:
+        if not (found or known):
             return ""
         for size, cells in found.items():
             known[size] = np.unique(np.concatenate([known.get(size, cells), cells]), axis=0)
@@ -106,6 +109,8 @@ class StationaryFilter:
                 self._matches.write([after])
                 num_pairs += 1
                 num_matches += len(before.indices) - len(after.indices)
+        if not num_pairs:
+            return ""
         return (
             f"{num_matches} matches of {num_pairs} pairs never move (a caption, a frame or a "
             "watermark?) and were left out (--set matching.filter_stationary_matches=false keeps "

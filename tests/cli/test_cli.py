@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import pty
-import shutil
-import signal
 import subprocess
 import sys
-import termios
-import time
 from pathlib import Path
 
 import pytest
-from command import Call
-from small_scene import INTRINSICS, write_photographs
+from command import Call, on_photographs, run_in_process_of_its_own
+from small_scene import write_photographs
 
 from colmap_affrect import __version__, pipeline
 from colmap_affrect.cli import main
@@ -32,25 +26,6 @@ COMMANDS = [
     "compare", "evaluate", "inspect", "recipes", "weights", "doctor",
 ]  # fmt: skip
 TIMEOUT_S = 60
-
-
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("photos")
-    write_photographs(folder, 3)
-    return folder
-
-
-def run_command(*arguments: object, python: tuple[str, ...] = ()) -> subprocess.CompletedProcess:
-    command = [sys.executable, *python, "-m", "colmap_affrect", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
-
-
-def run_arguments(photos: Path, out: Path) -> list[str]:
-    return [
-        "--image-path", str(photos), "--output-path", str(out), "--recipe", "unrectified-rootsift",
-        "--camera-mode", "single", "--camera-model", "PINHOLE", "--camera-params", INTRINSICS,
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
@@ -94,8 +69,8 @@ def test_help_loads_no_heavy_package() -> None:
 
 
 def test_version_is_that_of_the_package() -> None:
-    done = run_command("--version")
-    assert (done.returncode, done.stdout) == (0, f"colmap-affrect {__version__}\n")
+    done = run_in_process_of_its_own("--version")
+    assert (done.code, done.stdout) == (0, f"colmap-affrect {__version__}\n")
 
 
 def test_recipes_are_listed_with_what_they_need(call: Call) -> None:
@@ -154,44 +129,12 @@ def test_wrong_usage_ends_with_2_and_does_nothing(
     assert not out.exists()
 
 
-@pytest.mark.long
-def test_json_goes_to_stdout_alone_and_progress_to_stderr(photos: Path, tmp_path: Path) -> None:
-    done = run_command("run", *run_arguments(photos, tmp_path / "out"), "--json")
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
-    assert report["images_registered"] == 3
-    assert report == json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
-    lines = done.stderr.splitlines()
-    assert "extract: 3/3 images" in lines
-    assert "match: 3/3 pairs" in lines
-    # What COLMAP prints is in the log.
-    stages = ("extract", "match", "verify", "map", "pictures")
-    assert all(line.split(":")[0] in stages for line in lines)
-    log = (tmp_path / "out" / "run.log").read_text(encoding="utf-8")
-    assert "colmap-affrect" in log
-    assert ".cc:" in log
-
-
-@pytest.mark.long
-def test_quiet_prints_the_result_only_and_verbose_every_image(
-    photos: Path, tmp_path: Path, call: Call
-) -> None:
-    arguments = run_arguments(photos, tmp_path / "out")
-    done = run_command("run", *arguments, "-q", python=("-W", "error"))
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("registered  3 of 3 images\n")
-    done = call("extract", *arguments, "--overwrite", "--verbose")
-    assert done.code == 0
-    assert done.stdout.startswith("extract: 3 done in ")
-    assert any(line.startswith("DEBUG: a.png: ") for line in done.stderr)
-
-
 def test_long_options_are_accepted_with_underscores(
     photos: Path, tmp_path: Path, call: Call
 ) -> None:
     underscored = [
         argument.replace("-", "_").replace("__", "--", 1) if argument.startswith("--") else argument
-        for argument in run_arguments(photos, tmp_path / "out")
+        for argument in on_photographs(photos, tmp_path / "out")
     ]
     assert "--image_path" in underscored
     done = call("extract", *underscored, "--max_failures", 0, "--quiet")
@@ -213,96 +156,6 @@ def test_failure_prints_one_line_and_leaves_the_traceback_in_the_log(
     log = (tmp_path / "out" / "run.log").read_text()
     assert "Traceback" in log
     assert "ImageError" in log
-
-
-def _restore_interrupt() -> None:
-    """Test runners in the background ignore SIGINT, and their children inherit that."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("line", ["extract: 1/3 images", "match: 1/3 pairs", "verify: 3/3 pairs"])
-def test_interrupt_ends_with_130_and_a_later_run_completes(
-    photos: Path, tmp_path: Path, line: str
-) -> None:
-    arguments = ["run", *run_arguments(photos, tmp_path / "out")]
-    with subprocess.Popen(
-        [sys.executable, "-m", "colmap_affrect", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=_restore_interrupt,  # noqa: PLW1509  (nothing here uses threads)
-    ) as process:
-        while (printed := process.stderr.readline().strip()) != line:
-            assert printed, process.wait()
-        os.kill(process.pid, signal.SIGINT)
-        stdout, stderr = process.communicate(timeout=TIMEOUT_S)
-    assert (process.returncode, stdout) == (130, "")
-    lines = stderr.splitlines()
-    assert lines[-1] == "interrupted; run the same command again to go on"
-    stages = ("extract: ", "match: ", "verify: ", "map: ")
-    assert all(text.startswith(stages) for text in lines[:-1])
-    assert not Workspace(tmp_path / "out").report.exists()
-    done = run_command(*arguments, "-q")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("registered  3 of 3 images")
-
-
-INTERRUPTED_WHILE_DELETING = """
-import argparse, os, signal, time
-from colmap_affrect import cli
-
-class Deleted:
-    def __del__(self):
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.2)
-
-def command(options):
-    Deleted()
-    time.sleep(20.0)
-    return 0
-
-class Parser:
-    def parse_args(self, arguments):
-        return argparse.Namespace(function=command)
-
-signal.signal(signal.SIGINT, signal.default_int_handler)
-cli.build_parser = Parser
-cli.main_of_process()
-"""
-
-
-@pytest.mark.long
-def test_interrupt_that_python_cannot_raise_is_repeated() -> None:
-    """It was printed with its traceback, and the command went on and ended with 0."""
-    done = subprocess.run(
-        [sys.executable, "-c", INTERRUPTED_WHILE_DELETING],
-        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
-    )  # fmt: skip
-    assert done.returncode == 130
-    assert done.stderr == "interrupted; run the same command again to go on\n"
-
-
-ENDLESS = {
-    "incremental": [
-        "ba_global_max_refinements=1000000000", "ba_global_max_refinement_change=0",
-    ],
-    "global": ["max_num_irls_iterations=1000000000", "irls_step_convergence_threshold=-1"],
-}  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def verified(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run with COLMAP's preset and its global mapper."""
-    out = tmp_path_factory.mktemp("verified") / "out"
-    given = [
-        "run", *run_arguments(photos, out), "-q",
-        "--preset", "colmap", "--mapper", "global",
-        "--mapper-options", "track_min_num_views_per_track=2", "multiple_models=false",
-        "--mapper-options", "mapper.bundle_adjustment.min_track_length=2",
-    ]  # fmt: skip
-    assert main(given) == 0
-    return out
 
 
 def test_page_is_written_unless_it_is_left_out(verified: Path, call: Call) -> None:
@@ -358,64 +211,6 @@ def test_wrong_mapping_options_are_said_before_any_image_is_read(
     assert (done.code, done.stdout) == (code, "")
     assert message in done.stderr[-1]
     assert not (out / "config.toml").exists()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("mapper", ["incremental", "global"])
-def test_interrupted_mapping_ends_with_130_and_leaves_no_half_written_models(
-    verified: Path, tmp_path: Path, mapper: str
-) -> None:
-    out = Path(shutil.copytree(verified, tmp_path / "out"))
-    arguments = ["map", "--output-path", str(out), "--mapper", mapper, "--overwrite"]
-    with subprocess.Popen(
-        [sys.executable, "-m", "colmap_affrect", *arguments, "--mapper-options", *ENDLESS[mapper]],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=_restore_interrupt,  # noqa: PLW1509  (nothing here uses threads)
-    ) as process:
-        if mapper == "incremental":
-            assert process.stderr.readline() == "map: 2/3 images\n"
-        while not (out / "sparse.partial" / "raw").exists():
-            assert process.poll() is None, process.stderr.read()
-            time.sleep(0.01)
-        os.kill(process.pid, signal.SIGINT)
-        stdout, stderr = process.communicate(timeout=TIMEOUT_S)
-    assert (process.returncode, stdout) == (130, "")
-    assert stderr == "interrupted; run the same command again to go on\n"
-    assert not list(out.glob("sparse*"))
-    assert not (out / "report.json").exists()
-    done = run_command(*arguments, "-q")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("registered  3 of 3 images\n")
-    preset = "colmap for verification, sparse for mapping"
-    assert f"preset      {preset}, {mapper} mapper\n" in done.stdout
-
-
-@pytest.mark.long
-def test_terminal_gets_bars(photos: Path, tmp_path: Path) -> None:
-    controller, terminal = pty.openpty()
-    termios.tcsetwinsize(terminal, (24, 80))
-    arguments = run_arguments(photos, tmp_path / "out")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "colmap_affrect", "extract", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=terminal,
-        text=True,
-    )
-    with process:
-        os.close(terminal)
-        shown = b""
-        try:
-            while data := os.read(controller, 4096):
-                shown += data
-        except OSError:  # Linux tells the end of a terminal so.
-            pass
-        finally:
-            os.close(controller)
-    assert process.returncode == 0
-    assert b"extract: 100%" in shown
-    assert b"3/3" in shown
 
 
 FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images" / "view_5_tilt70.jpg"
@@ -547,10 +342,10 @@ def test_finished_model_is_extended_and_another_database_mapped(
     listed = tmp_path / "names.txt"
     names = sorted(str(p.relative_to(photos)) for p in photos.rglob("*.png"))
     listed.write_text("\n".join(names[:2]))
-    small = call("run", *run_arguments(photos, first), "--image-list-path", listed, "-q")
+    small = call("run", *on_photographs(photos, first), "--image-list-path", listed, "-q")
     assert small.code == 0
     model = first / "sparse" / "0"
-    done = call("run", *run_arguments(photos, out), "--extend", model, "--json", "-q")
+    done = call("run", *on_photographs(photos, out), "--extend", model, "--json", "-q")
     assert (done.code, done.stderr) == (0, [])
     report = json.loads(done.stdout)
     assert (report["extended"], report["added"]) == (names[:2], names[2:])
@@ -565,7 +360,7 @@ def test_finished_model_is_extended_and_another_database_mapped(
     assert "the global mapper cannot" in wrong.errors[-1]
     wrong = call("map", "--output-path", out, "--refine-existing", "-q")
     assert "--refine-existing: only with --extend MODEL" in wrong.errors[-1]
-    wrong = call("run", *run_arguments(photos, tmp_path / "no"), "--extend", photos, "-q")
+    wrong = call("run", *on_photographs(photos, tmp_path / "no"), "--extend", photos, "-q")
     assert "not a COLMAP model" in wrong.errors[-1]
     assert not (tmp_path / "no" / "features.h5").exists()
 

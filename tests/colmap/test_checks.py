@@ -11,13 +11,9 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import (
-    check_database,
-    check_image_files,
-    is_unsafe,
-    pair_images,
-)
+from colmap_affrect.colmap.checks import check_database, check_image_files, is_unsafe
 from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.tables import pair_images
 from colmap_affrect.errors import DatabaseError
 
 NAMES = ["a.png", "b c.png", "side/č.png"]

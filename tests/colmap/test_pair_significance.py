@@ -280,7 +280,8 @@ def test_missing_shapes_are_told_once(tmp_path: Path, caplog: pytest.LogCaptureF
     with caplog.at_level(logging.WARNING):
         verify(tmp_path / "2.db", VerificationOptions(max_num_trials=100))
     assert [message.split(": ")[1] for message in caplog.messages] == [
-        "keypoints have no shapes; pairs need more inliers to count as verified"
+        "keypoints have no shapes; pairs need more inliers to count as verified, and sides that "
+        "look alike are not told apart"
     ]
 
 

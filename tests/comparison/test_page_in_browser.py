@@ -7,7 +7,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from browser import LOW_CONTRASTS, Browser, chromium, needs_chromium, until_changed, until_drawn
+from browser import (
+    Browser,
+    assert_fits_and_is_readable,
+    chromium,
+    needs_chromium,
+    until_changed,
+    until_drawn,
+)
 from small_comparison import make_comparison
 
 from colmap_affrect.comparison.page import write_page
@@ -83,11 +90,7 @@ def test_pointing_at_a_cell_reads_it(browser: Browser) -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [360, 1200])
 def test_page_fits_and_is_readable(browser: Browser, scheme: str, width: int) -> None:
-    browser.prefer(scheme)
-    browser.resize(width)
-    overflow = "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
-    assert browser.run(overflow) == 0
-    assert browser.run(LOW_CONTRASTS) == []
+    assert_fits_and_is_readable(browser, scheme, width)
     ground = browser.run("return getComputedStyle(document.body).backgroundColor")
     assert (ground == "rgb(255, 255, 255)") == (scheme == "light")
 

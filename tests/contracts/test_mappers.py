@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from mapping_tasks import NOTHING_KNOWN, task_with_given_cameras
-from small_scene import INTRINSICS, NAMES, write_photographs
+from small_scene import INTRINSICS, NAMES
 
 import colmap_affrect
 from colmap_affrect.errors import OptionError
@@ -16,15 +16,13 @@ from colmap_affrect.mappers.base import MAPPERS, MappingTask
 
 
 @pytest.fixture(scope="module")
-def task(tmp_path_factory: pytest.TempPathFactory) -> MappingTask:
+def task(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> MappingTask:
     """Four photographs, verified."""
-    folder = tmp_path_factory.mktemp("mappers")
-    write_photographs(folder / "photos")
-    path = folder / "database.db"
+    path = tmp_path_factory.mktemp("mappers") / "database.db"
     cameras = {"camera_model": "PINHOLE", "camera_params": INTRINSICS}
-    colmap_affrect.extract_features(path, folder / "photos", (), "single", cameras)
+    colmap_affrect.extract_features(path, photos, (), "single", cameras, "unrectified-rootsift")
     colmap_affrect.match_exhaustive(path)
-    return replace(task_with_given_cameras(path), image_path=folder / "photos")
+    return replace(task_with_given_cameras(path), image_path=photos)
 
 
 @pytest.mark.parametrize("name", MAPPERS.names())

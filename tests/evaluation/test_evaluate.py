@@ -20,11 +20,11 @@ from colmap_affrect.evaluation import evaluate as module
 from colmap_affrect.evaluation.costs import IMAGE_STEPS
 from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate
 from colmap_affrect.evaluation.evd import Evd
+from colmap_affrect.evaluation.imc import Imc
 from colmap_affrect.evaluation.pair_matches import MatchedPair
 from colmap_affrect.evaluation.protocol import PairResult
 from colmap_affrect.evaluation.recipe_features import RecipeFeatures
 from colmap_affrect.evaluation.records import RecordFile
-from colmap_affrect.evaluation.relative_pose import RelativePoseProtocol
 from colmap_affrect.evaluation.results import Evaluation, RecipeResult, Solved
 from colmap_affrect.matchers import nearest
 from colmap_affrect.stages.context import Resources
@@ -230,7 +230,7 @@ def test_intervals_of_a_category_are_over_its_pairs() -> None:
         for category, members in errors.items()
         for error in members
     ]
-    intervals = module._intervals(RelativePoseProtocol(), results, 0)
+    intervals = module._intervals(Imc(), results, 0)
     assert (intervals["20°"], intervals["100°"]) == ((1.0, 1.0), (0.0, 0.0))
     assert intervals["all"] == (0.0, pytest.approx(0.3))
 

@@ -12,7 +12,6 @@ from planar_pairs import write_pair
 
 from colmap_affrect.evaluation.evd import Evd
 from colmap_affrect.evaluation.homographies import (
-    HomographyProtocol,
     TrueHomography,
     oriented,
     transfer_errors,
@@ -111,14 +110,14 @@ def test_counts_are_of_both_estimators() -> None:
         PairResult(error, 9, 9, {"magsac_error": other}, name=str(error)) for error, other in errors
     ]
     failed = PairResult(float("inf"), 0, name="failed", failure="unreadable")
-    counts = HomographyProtocol().summarize([*results, failed])
+    counts = Evd().summarize([*results, failed])
     assert list(counts.values()) == [1, 1, 1, 2, 2, 2, 0, 0, 1, 2, 2, 3]
     assert list(counts)[2:7:4] == ["< 3 px", "MAGSAC: < 1 px"]
 
 
 def score(points1: np.ndarray, points2: np.ndarray) -> PairScore:
     pair = EvaluationPair("", (None, None), truth=TrueHomography(TRUTH, SIZE1, SIZE2))
-    return HomographyProtocol().score(pair, points1, points2, 3)
+    return Evd().score(pair, points1, points2, 3)
 
 
 def test_matches_of_which_half_are_wrong_give_the_homography() -> None:

@@ -14,7 +14,7 @@ from small_scene import FOCAL_PX, IMAGE_SIZE, photograph
 from synthetic import write_image
 
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.correspondences import CorrespondenceProtocol, recalls
+from colmap_affrect.evaluation.correspondences import recalls
 from colmap_affrect.evaluation.pairs import Pairs
 from colmap_affrect.evaluation.protocol import Dataset, EvaluationPair, PairResult
 from colmap_affrect.evaluation.truth_checks import correspondence_doubts
@@ -74,7 +74,7 @@ def test_matches_of_another_geometry_score_worse() -> None:
     points2 = points1 + np.stack([300.0 / depths, np.zeros(200)], axis=1)
     truth = np.hstack([points1[:30], points2[:30]])
     pair = EvaluationPair("", (None, None), truth=truth)
-    protocol = CorrespondenceProtocol(max_num_iterations=10_000, num_magsac_estimates=3)
+    protocol = Pairs(max_num_iterations=10_000, num_magsac_estimates=3)
     right = protocol.score(pair, points1[30:], points2[30:], 0)
     assert right.error < 0.01
     assert right.details["wxbs_score"] >= 19 / 20 - 1e-9  # all but the threshold 0

@@ -11,9 +11,9 @@ import pytest
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.conventions import pixel_from_colmap
+from colmap_affrect.evaluation.imc import Imc
 from colmap_affrect.evaluation.protocol import EvaluationPair, PairResult
 from colmap_affrect.evaluation.relative_pose import (
-    RelativePoseProtocol,
     posed_image,
     posed_pair,
     rays,
@@ -59,7 +59,7 @@ def matches(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_exact_matches_give_the_pose() -> None:
-    score = RelativePoseProtocol().score(make_pair(), *matches(60), 0)
+    score = Imc().score(make_pair(), *matches(60), 0)
     assert score.error == pytest.approx(0, abs=1e-4)
     assert score.details["direction_error_deg"] == pytest.approx(0, abs=1e-4)
     assert (score.num_inliers, score.num_correct) == (60, 60)
@@ -73,7 +73,7 @@ def test_wrong_true_rotation_is_the_rotation_error(degrees: float) -> None:
     # The second camera is turned about its own centre: the direction in its frame turns along.
     wrong = turn((0, 0, 1), degrees)
     pair = make_pair(pose2=(wrong @ POSE2[0], wrong @ POSE2[1]))
-    score = RelativePoseProtocol().score(pair, *matches(60), 0)
+    score = Imc().score(pair, *matches(60), 0)
     assert score.error == pytest.approx(degrees, abs=1e-4)
 
 
@@ -82,7 +82,7 @@ def test_wrong_true_position_is_the_direction_error() -> None:
     across = np.cross(baseline, (0, 0, 1))
     across *= np.linalg.norm(baseline) / np.linalg.norm(across)
     moved = POSE2[1] - baseline + math.cos(0.2) * baseline + math.sin(0.2) * across
-    score = RelativePoseProtocol().score(make_pair(pose2=(POSE2[0], moved)), *matches(60), 0)
+    score = Imc().score(make_pair(pose2=(POSE2[0], moved)), *matches(60), 0)
     assert score.error == pytest.approx(0, abs=1e-4)
     assert score.details["direction_error_deg"] == pytest.approx(math.degrees(0.2), abs=1e-4)
     assert score.num_correct < 60
@@ -90,7 +90,7 @@ def test_wrong_true_position_is_the_direction_error() -> None:
 
 def test_distortion_is_respected_unless_switched_off() -> None:
     points = matches(200)
-    straight = RelativePoseProtocol(threshold_px=0.2)
+    straight = Imc(threshold_px=0.2)
     bent = straight.changed(use_distortion=False)
     assert straight.score(make_pair(), *points, 0).num_inliers == 200
     score = bent.score(make_pair(), *points, 0)
@@ -102,7 +102,7 @@ def test_threshold_is_in_pixels_of_the_mean_focal_length() -> None:
     points1, points2 = matches(300)
     noise = np.random.default_rng(1).uniform(-0.6, 0.6, points1.shape)
     counts = [
-        RelativePoseProtocol(threshold_px=threshold_px, max_num_iterations=1000)
+        Imc(threshold_px=threshold_px, max_num_iterations=1000)
         .score(make_pair(), points1 + noise, points2, 0)
         .num_inliers
         for threshold_px in (0.1, 2.0)
@@ -116,7 +116,7 @@ def test_hundred_thousand_iterations_find_what_a_thousand_do_not() -> None:
     points1, points2 = matches(120)
     points2[30:] = np.random.default_rng(5).uniform(0, 600, (90, 2))
     # A quarter of the matches is right: a thousand samples miss a good one four times in ten.
-    many = RelativePoseProtocol(confidence=0.99)
+    many = Imc(confidence=0.99)
     few = many.changed(max_num_iterations=1_000)
     assert few.score(make_pair(), points1, points2, 1).error > 5
     score = many.score(make_pair(), points1, points2, 1)
@@ -127,7 +127,7 @@ def test_hundred_thousand_iterations_find_what_a_thousand_do_not() -> None:
 def test_seed_decides_the_result() -> None:
     points1, points2 = matches(100)
     points2 = points2 + np.random.default_rng(2).normal(0, 1, points2.shape)
-    protocol = RelativePoseProtocol(max_num_iterations=100)
+    protocol = Imc(max_num_iterations=100)
     first, again, other = (
         protocol.score(make_pair(), points1, points2, seed) for seed in (0, 0, 1)
     )
@@ -137,15 +137,15 @@ def test_seed_decides_the_result() -> None:
 
 @pytest.mark.parametrize("count", [0, 5])
 def test_too_few_matches_are_a_failure(count: int) -> None:
-    score = RelativePoseProtocol().score(make_pair(), *matches(count), 0)
+    score = Imc().score(make_pair(), *matches(count), 0)
     assert (score.error, score.num_inliers) == (math.inf, 0)
-    assert RelativePoseProtocol().success(score) == 0
+    assert Imc().success(score) == 0
 
 
 def test_all_matches_in_one_place_never_count_as_a_right_pose() -> None:
     points = np.full((20, 2), 100.0)
-    score = RelativePoseProtocol().score(make_pair(), points, points, 0)
-    assert RelativePoseProtocol().success(score) == 0
+    score = Imc().score(make_pair(), points, points, 0)
+    assert Imc().success(score) == 0
 
 
 def test_points_that_are_not_finite_are_never_inliers() -> None:
@@ -186,7 +186,7 @@ def test_summary_has_shares_by_category_in_order_and_counts_failures() -> None:
         result("20°", 5.0, 1.0),
         result("20°", 15.0, 1.0),
     ]
-    summary = RelativePoseProtocol().summarize(results)
+    summary = Imc().summarize(results)
     names = ["20°", "100°", "all", "all < 10°", "all < 20°", "pose AUC 10°"]
     assert list(summary) == [*names, *(f"GC-RANSAC: {name}" for name in names)]
     expected = [1 / 3, 0, 1 / 4, 2 / 4, 3 / 4, (0.25 + 0.5) / 4]
@@ -197,7 +197,7 @@ def test_summary_has_shares_by_category_in_order_and_counts_failures() -> None:
 def test_refinement_on_all_inliers_beats_one_sample_of_them() -> None:
     points1, points2 = matches(300)
     noise = np.random.default_rng(4).normal(0, 1.0, (2, *points1.shape))
-    score = RelativePoseProtocol(max_num_iterations=500).score(
+    score = Imc(max_num_iterations=500).score(
         make_pair(), points1 + noise[0], points2 + noise[1], 0
     )
     assert score.details["gc_error"] < 0.7 * score.error

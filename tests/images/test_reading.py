@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import PIL.ExifTags
 import PIL.Image
 import pytest
 from numpy.testing import assert_allclose
-from synthetic import blobs, centroid, jpeg_with_orientation, texture, write_image
+from synthetic import blobs, centroid, jpeg_with_orientation, png_of_size, texture, write_image
 
 from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.errors import ImageError
@@ -214,12 +213,6 @@ def test_twelve_bits_in_sixteen_look_like_eight() -> None:
     deep = in_eight_bits(twelve, tones(twelve))
     assert np.corrcoef(deep.ravel(), image.ravel())[0, 1] > 0.99
     assert np.ptp(deep) == 255
-
-
-def png_of_size(width: int, height: int) -> bytes:
-    """A PNG that claims to have a size; what follows the header is missing."""
-    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", 0)
 
 
 def test_photograph_of_absurd_size_is_refused_by_its_header(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from h5_files import (
     write_photos,
 )
 from numpy.testing import assert_allclose, assert_array_equal
-from small_scene import INTRINSICS, write_photographs
+from small_scene import INTRINSICS
 
 import colmap_affrect
 from colmap_affrect.colmap import pycolmap
@@ -44,12 +44,11 @@ def targets(tmp_path: Path) -> tuple[Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def finished(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Photographs of the small scene and the output folder of a run."""
-    folder = tmp_path_factory.mktemp("run")
-    write_photographs(folder / "photos")
-    colmap_affrect.run(folder / "photos", folder / "out", RunOptions(cameras=PINHOLE))
-    return folder / "photos", folder / "out"
+    out = tmp_path_factory.mktemp("run") / "out"
+    colmap_affrect.run(photos, out, RunOptions(cameras=PINHOLE), page=False)
+    return photos, out
 
 
 def test_our_own_files_are_read_by_hlocs_rules(finished: tuple[Path, Path]) -> None:

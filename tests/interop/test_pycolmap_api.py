@@ -30,13 +30,6 @@ from colmap_affrect.stages.verify import recorded_verification
 
 
 @pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("photos")
-    write_photographs(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def sift(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A SIFT database of COLMAP: two images share a camera of known focal length, one has GPS."""
     path = tmp_path_factory.mktemp("sift") / "old.db"

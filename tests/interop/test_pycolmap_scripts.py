@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from room_panoramas import write_panoramas
-from small_scene import NAMES, write_photographs
+from small_scene import NAMES
 
 import colmap_affrect
 from colmap_affrect import pycolmap as replaced
@@ -30,17 +30,11 @@ from colmap_affrect.interop.pycolmap_options import (
     verification_options,
 )
 from colmap_affrect.matchers.nearest import NearestOptions
+from colmap_affrect.progress import Progress
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 
 COARSE = {"rectifier": "identity", "max_image_size_px": 320}
-
-
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("photos")
-    write_photographs(folder)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -242,7 +236,7 @@ def test_frames_of_a_rig_are_verified_together_and_not_matched_within(tmp_path: 
 
 @pytest.mark.long
 def test_cancelled_token_stops_and_what_is_done_is_kept(photos: Path, tmp_path: Path) -> None:
-    class Cancelling(colmap_affrect.progress.Progress):  # type: ignore[misc]
+    class Cancelling(Progress):
         """Cancels after the first image."""
 
         def stage(self, name: str, total: int, unit: str) -> Any:

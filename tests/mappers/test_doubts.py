@@ -186,6 +186,29 @@ def test_views_from_nearly_one_place(tmp_path: Path) -> None:
     assert any(text.startswith("hardly any parallax") for text in find_doubts(model, task).model)
 
 
+def move_near(images: list[pycolmap.Image], share: float) -> None:
+    """Bring cameras towards the first of them, all but this share of the way."""
+    center = images[0].projection_center()
+    for image in images[1:]:
+        rotation = image.cam_from_world().rotation
+        near = center + share * (image.projection_center() - center)
+        pose = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ near))
+        image.frame.set_cam_from_world(image.camera_id, pose)
+
+
+@pytest.mark.parametrize(("share", "num_doubted"), [(0.001, 4), (0.3, 0)])
+def test_images_of_nearly_one_place(tmp_path: Path, share: float, num_doubted: int) -> None:
+    model, task = scene(tmp_path, 6)
+    images = sorted(
+        (model.reconstruction.images[i] for i in model.reconstruction.reg_image_ids()),
+        key=lambda image: image.name,
+    )
+    move_near(images[:4], share)
+    reasons = find_doubts(model, task).images
+    doubted = [name for name, text in reasons.items() if "nearly the same place as" in text]
+    assert doubted == [image.name for image in images[:num_doubted]]
+
+
 def test_tracks_of_two_views_tie_nothing_unless_images_are_bridged(tmp_path: Path) -> None:
     model, task = scene(tmp_path)
     for point_id in sorted(model.reconstruction.point3D_ids()):

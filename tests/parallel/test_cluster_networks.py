@@ -13,7 +13,6 @@ import torch
 from local_cluster import local_cluster
 from random_weights import write_comparing_lightglue
 from results import hdf5_content
-from small_scene import write_photographs
 
 from colmap_affrect.errors import OptionError, StaleStoreError, WeightsError
 from colmap_affrect.parallel.cluster import connected
@@ -37,10 +36,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def extracted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def extracted(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An output folder before matching."""
-    photos, out = tmp_path_factory.mktemp("photos"), tmp_path_factory.mktemp("out")
-    write_photographs(photos)
+    out = tmp_path_factory.mktemp("out")
     with Workspace(out).locked() as workspace:
         extract(Context(workspace), Inputs.of(photos), RECIPE)
         choose_pairs(Context(workspace))

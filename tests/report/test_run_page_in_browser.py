@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from browser import LOW_CONTRASTS, Browser, chromium, needs_chromium, until_drawn
+from browser import Browser, assert_fits_and_is_readable, chromium, needs_chromium, until_drawn
 from small_run import NAMES, make_run_page
 
 pytestmark = [needs_chromium, pytest.mark.long]
@@ -88,8 +88,4 @@ def test_hostile_names_stay_text(browser: Browser) -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1400])
 def test_page_fits_and_is_readable(browser: Browser, scheme: str, width: int) -> None:
-    browser.prefer(scheme)
-    browser.resize(width)
-    overflow = "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
-    assert browser.run(overflow) == 0
-    assert browser.run(LOW_CONTRASTS) == []
+    assert_fits_and_is_readable(browser, scheme, width)

@@ -22,17 +22,9 @@ def run_images(call: Call, tmp_path: Path) -> Call:
 
 
 @pytest.fixture(scope="session")
-def small_photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The four photographs of the small scene; nothing may be changed there."""
-    folder = tmp_path_factory.mktemp("small scene")
-    write_photographs(folder)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def undisturbed(small_photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+def undisturbed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
     """A finished run of the small scene, fast features; nothing may be changed in it."""
-    return run_undisturbed(small_photos, tmp_path_factory.mktemp("undisturbed") / "out", FAST)
+    return run_undisturbed(photos, tmp_path_factory.mktemp("undisturbed") / "out", FAST)
 
 
 @pytest.fixture

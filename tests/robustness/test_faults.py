@@ -90,10 +90,8 @@ class Disturbed:
 
 
 @pytest.fixture
-def disturbed(
-    small_photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call
-) -> Disturbed:
-    return Disturbed(small_photos, Workspace(tmp_path / "out"), undisturbed, call)
+def disturbed(photos: Path, tmp_path: Path, undisturbed: Undisturbed, call: Call) -> Disturbed:
+    return Disturbed(photos, Workspace(tmp_path / "out"), undisturbed, call)
 
 
 def assert_says_what_to_do(ended: Ended, path: Path) -> None:

@@ -31,9 +31,9 @@ def run_on_cores(cores: set[int], photos: Path, out: Path) -> dict[str, object]:
 @pytest.mark.long
 @pytest.mark.skipif(available_cores() < 2, reason="needs two cores")
 def test_results_do_not_depend_on_the_run_nor_on_the_number_of_cores(
-    small_photos: Path, tmp_path: Path
+    photos: Path, tmp_path: Path
 ) -> None:
     cores = sorted(os.sched_getaffinity(0))
-    one = run_on_cores({cores[0]}, small_photos, tmp_path / "one")
+    one = run_on_cores({cores[0]}, photos, tmp_path / "one")
     assert one["registered"]
-    assert run_on_cores(set(cores[:2]), small_photos, tmp_path / "two") == one
+    assert run_on_cores(set(cores[:2]), photos, tmp_path / "two") == one

@@ -136,7 +136,7 @@ ROWS: list[tuple[str, str, tuple[str, ...]]] = [
     (
         "Ctrl-C while Python deletes an object",
         "repeated, so that the command ends with 130 and no traceback",
-        ("cli/test_cli.py::test_interrupt_that_python_cannot_raise_is_repeated",),
+        ("cli/test_processes.py::test_interrupt_that_python_cannot_raise_is_repeated",),
     ),
     # Escapes, files, resources
     (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from colmap_affrect.recipes import EscalateOptions
@@ -54,6 +56,17 @@ def test_promising_pairs_and_the_best_of_images_outside_join() -> None:
     assert hopeless.joining(BEST_ONE) == [("b", "d")]
     assert hopeless.joining(EscalateOptions(num_best_pairs=0)) == []
     assert graph({**INLIERS, "ad": 50}, {"cd": 9}).joining(BEST_ONE) == []
+
+
+def test_pairs_that_a_level_brought_nothing_stop_but_for_the_best_of_each_part() -> None:
+    inliers = {"ab": 200, "bc": 200, "de": 50, "ad": 0, "ae": 0, "be": 0, "cf": 0, "bf": 0}
+    stalled = {("a", "d"), ("b", "e"), ("b", "f")}
+    consistent = {"ad": PROMISING + 3, "ae": PROMISING, "be": PROMISING - 1, "bf": 0, "cf": 0}
+    pairs = dataclasses.replace(graph(inliers, consistent, "e"), stalled=stalled)
+    assert pairs.joining(BEST_ONE) == [("a", "d"), ("a", "e"), ("c", "f")]
+    pairs = dataclasses.replace(pairs, stalled=stalled | {("c", "f")})
+    assert pairs.joining(BEST_ONE) == [("a", "d"), ("a", "e"), ("c", "f")]
+    assert pairs.hanging(BEST_ONE) == [("d", "e"), ("a", "e")]
 
 
 def test_verified_and_promising_pairs_of_loose_images_climb() -> None:

@@ -20,6 +20,7 @@ from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.pairs.connectivity import weakly_connected_images
 from colmap_affrect.progress import Progress
+from colmap_affrect.project.atomic_files import FileTransaction
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
@@ -417,6 +418,28 @@ def test_killed_run_goes_on_to_the_same_result(
 
     with monkeypatch.context() as patch:
         patch.setattr(escalation, where, killed)
+        with pytest.raises(KeyboardInterrupt):
+            escalate(workspace)
+    escalate(workspace)
+    same_state(workspace, climbed[0])
+
+
+@pytest.mark.long
+def test_run_killed_between_two_changes_of_its_matches_goes_on_to_the_same_result(
+    before: Workspace,
+    climbed: tuple[Workspace, StageReport],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    workspace, commit = copy(before, tmp_path / "killed"), FileTransaction.commit
+
+    def killed(changes: FileTransaction) -> None:
+        commit(changes)
+        if changes._path == workspace.matches:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FileTransaction, "commit", killed)
         with pytest.raises(KeyboardInterrupt):
             escalate(workspace)
     escalate(workspace)

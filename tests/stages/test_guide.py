@@ -10,7 +10,7 @@ import pytest
 from command import Call
 from numpy.testing import assert_array_equal
 from results import database_content
-from small_scene import INTRINSICS, NAMES, write_photographs
+from small_scene import INTRINSICS, NAMES
 
 from colmap_affrect import pipeline
 from colmap_affrect.colmap import pycolmap
@@ -44,9 +44,7 @@ ALWAYS = GuidedOptions(enabled="always")
 
 
 @pytest.fixture(scope="module")
-def before(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    photos = tmp_path_factory.mktemp("photos")
-    write_photographs(photos)
+def before(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     workspace = Workspace(tmp_path_factory.mktemp("before"))
     cameras = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
     with workspace.locked():

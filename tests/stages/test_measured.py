@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from small_scene import INTRINSICS, NAMES, write_photographs
+from small_scene import INTRINSICS, NAMES
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
@@ -51,16 +51,15 @@ def _shapeless() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def climbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Workspace, Counts]:
+def climbed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Workspace, Counts]:
     """All pairs have climbed to the level without measured frames; what they had before."""
     folder = tmp_path_factory.mktemp("climbed")
-    write_photographs(folder / "photos")
     (folder / "recipe.toml").write_text(RECIPE)
     workspace = Workspace(folder / "out")
     cameras = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
     with workspace.locked():
         context = Context(workspace)
-        inputs = Inputs.of(folder / "photos", cameras=cameras)
+        inputs = Inputs.of(photos, cameras=cameras)
         extract(context, inputs, load_recipe(str(folder / "recipe.toml")))
         choose_pairs(context)
         match(context)

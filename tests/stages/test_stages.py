@@ -49,13 +49,6 @@ DIGITS = 9
 
 
 @pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("photos č")
-    write_photographs(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def finished(
     photos: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Workspace, ReconstructionReport]:

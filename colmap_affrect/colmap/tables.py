@@ -1,0 +1,137 @@
+"""What a COLMAP database holds, read by SQLite itself, of all versions of COLMAP."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+MAX_NUM_IMAGES = 2**31 - 1
+"""COLMAP's id of a pair is the smaller image id times this, plus the larger one."""
+
+SENSOR_CAMERA = 0
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A row of the table of cameras; the size is in px, the model a number of COLMAP's."""
+
+    width: int
+    height: int
+    has_prior_focal: bool
+    model: int
+    params: Any
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What a database holds, without the data of keypoints and matches.
+
+    Attributes:
+        cameras: by id.
+        names: of the images, by id.
+        camera_ids: by image id.
+        frame_images: ids of the images that are in a frame.
+        num_frames: number of frames.
+        keypoints: rows and columns by image id.
+        descriptors: type and rows by image id.
+        matches: number of raw matches by pair id.
+        geometries: number of inliers and configuration by pair id.
+    """
+
+    cameras: dict[int, Camera]
+    names: dict[int, str]
+    camera_ids: dict[int, int]
+    frame_images: set[int]
+    num_frames: int
+    keypoints: dict[int, tuple[int, int]]
+    descriptors: dict[int, tuple[int, int]]
+    matches: dict[int, int]
+    geometries: dict[int, tuple[int, int]]
+
+    def num_keypoints(self) -> dict[str, int]:
+        """Return the number of keypoints of the images that have a row of them, by name."""
+        return {
+            name: self.keypoints[image_id][0]
+            for image_id, name in self.names.items()
+            if image_id in self.keypoints
+        }
+
+    def matched_pairs(self) -> set[tuple[str, str]]:
+        """Return the sorted names of each pair that has a row of raw matches."""
+        pairs = (sorted(map(self._label, pair_images(pair_id))) for pair_id in self.matches)
+        return {(first, second) for first, second in pairs}
+
+    def pair_label(self, pair_id: int) -> str:
+        """Return the names of a pair for a message."""
+        return " - ".join(map(self._label, pair_images(pair_id)))
+
+    def _label(self, image_id: int) -> str:
+        return self.names.get(image_id, f"image {image_id}")
+
+    def summary(self) -> str:
+        """Return the numbers of what there is."""
+        features = sum(rows for rows, _ in self.keypoints.values())
+        raw = sum(count > 0 for count in self.matches.values())
+        verified = sum(count > 0 for count, _ in self.geometries.values())
+        return (
+            f"{len(self.names)} images, {len(self.cameras)} cameras, {features} keypoints, "
+            f"{raw} matched and {verified} verified pairs"
+        )
+
+
+def pair_images(pair_id: int) -> tuple[int, int]:
+    """Return the image ids of a pair, the smaller one first."""
+    return pair_id // MAX_NUM_IMAGES, pair_id % MAX_NUM_IMAGES
+
+
+def read_tables(connection: sqlite3.Connection) -> Tables:
+    """Read all tables but the data of keypoints, descriptors and matches."""
+    rows = partial(rows_of, connection)
+    images = list(rows("image_id name camera_id", "images"))
+    cameras = rows("camera_id width height prior_focal_length model params", "cameras")
+    return Tables(
+        cameras={
+            int(key): Camera(int(width), int(height), bool(prior), int(model), params)
+            for key, width, height, prior, model, params in cameras
+        },
+        names={int(key): str(name) for key, name, _ in images},
+        camera_ids={int(key): int(camera_id) for key, _, camera_id in images},
+        frame_images={
+            int(key)
+            for key, kind in rows("data_id sensor_type", "frame_data")
+            if kind == SENSOR_CAMERA
+        },
+        num_frames=sum(1 for _ in rows("frame_id", "frames")),
+        keypoints=_numbers(rows("image_id rows cols", "keypoints")),
+        descriptors=_numbers(rows("image_id type rows", "descriptors")),
+        matches={int(key): int(count) for key, count in rows("pair_id rows", "matches")},
+        geometries=_numbers(rows("pair_id rows config", "two_view_geometries")),
+    )
+
+
+def rows_of(connection: sqlite3.Connection, columns: str, table: str) -> Iterable[tuple[Any, ...]]:
+    """Return columns of a table, row by row; nothing if there is no such table.
+
+    Args:
+        connection: to a database of any version of COLMAP.
+        columns: names with spaces between; those that the table lacks are 0.
+        table: its name.
+    """
+    known = columns_of(connection, table)
+    if not known:
+        return ()
+    present = ", ".join(name if name in known | {"rowid"} else "0" for name in columns.split())
+    # All names are those of COLMAP's tables, written down in this package.
+    return connection.execute(f"SELECT {present} FROM {table}")  # noqa: S608
+
+
+def columns_of(connection: sqlite3.Connection, table: str) -> set[str]:
+    """Return the columns of a table, none if there is no such table."""
+    return {str(row[1]) for row in connection.execute(f"PRAGMA table_info({table})")}
+
+
+def _numbers(rows: Iterable[Any]) -> dict[int, tuple[int, int]]:
+    return {int(key): (int(first), int(second)) for key, first, second in rows}

@@ -1,0 +1,285 @@
+"""What happens to runs that are killed, disks that are full, databases that are damaged. Usage:
+
+    python tests/benchmarks/campaign.py --output-path out/campaign --kills 150 --calls 100
+
+Each trial disturbs a small run (of the sample scene, or of the folders given) by chance, lets it
+end undisturbed, and compares features, matches, database and models byte by byte with those of a
+run that nothing disturbed. Trials with a database let commands read one that is damaged: they have
+to refuse it in one line, or to read it. Prints a line for each trial and a table; exits with 1 if
+anything was lost or went wrong, and leaves the folders of such trials. Every second folder is run
+with all stages, escalation and guided matches included.
+
+Calls are those of the system that change files, found and killed at by ``strace``; full disks are
+file systems in memory, which only root can mount. The same seed makes the same choices, but
+moments depend on how fast the machine is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from command import Ended, start
+from damaged import BYTES, STATEMENTS, damage_bytes, damage_rows, pages
+from ended import assert_readable, end_again_and_again
+from machine import describe_machine, table
+from results import Undisturbed, results, run_arguments, run_undisturbed
+
+from colmap_affrect.cli import main as main_of_package
+
+SAMPLE = Path(__file__).parents[2] / "sample_scenes" / "courtyard" / "images"
+KILLS_IN_ONE_FOLDER = 3
+SMALL = ("--set", "max_image_size_px=320")
+ALL_STAGES = ("--recipe", "on-demand", "--set", "guided.enabled=always")
+CALLS = "write,pwrite64,fsync,fdatasync,rename,ftruncate,unlink,mkdir,rmdir,fallocate"
+
+
+def content(out: Path) -> dict[str, Any]:
+    """All results of a run: what :func:`results.results` has, and each file of the models."""
+    models = sorted(out.glob("sparse/**/*.bin"))
+    return results(out) | {
+        str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest() for path in models
+    }
+
+
+@dataclass(frozen=True)
+class Case:
+    """Photographs, options, and the run that nothing disturbs."""
+
+    photos: Path
+    options: tuple[str, ...]
+    folder: Path
+
+    @cached_property
+    def undisturbed(self) -> Undisturbed:
+        """The run; made when it is first asked for."""
+        return run_undisturbed(self.photos, self.folder / "undisturbed", self.options)
+
+    @cached_property
+    def content(self) -> dict[str, Any]:
+        """Its results."""
+        return content(self.undisturbed.out)
+
+    @cached_property
+    def calls(self) -> dict[str, list[int]]:
+        """For each kind of call that changes files of the run, which ones of its thread do so."""
+        out, trace = self.folder / "traced", self.folder / "trace.txt"
+        run_traced(["-y", "-s", "0", "-o", trace], self.arguments(out))
+        counts, found = Counter[tuple[str, str]](), defaultdict[str, list[int]](list)
+        for line in trace.read_text(encoding="utf-8", errors="replace").splitlines():
+            if called := re.match(r"(\d+) +(\w+)[(]", line):
+                counts[called[1], called[2]] += 1
+                if str(out) in line:
+                    found[called[2]].append(counts[called[1], called[2]])
+        return dict(found)
+
+    def arguments(self, out: Path) -> list[str]:
+        return run_arguments(self.photos, out, self.options)
+
+    def assert_finishes(self, out: Path) -> None:
+        """Run again without disturbance and have the same results."""
+        ended = forked(*self.arguments(out), output=self.folder / "output")
+        assert ended.code == 0, ended.stderr
+        found = content(out)
+        different = [key for key in self.content if found.get(key) != self.content[key]]
+        assert found.keys() == self.content.keys(), set(found) ^ set(self.content)
+        assert not different, f"other {', '.join(different)} than of the undisturbed run"
+
+
+def ended_in(process: subprocess.Popen[str], timeout_s: float = 300) -> Ended:
+    with process:
+        stdout, stderr = process.communicate(timeout=timeout_s)
+    return Ended(process.returncode, stdout, stderr.splitlines())
+
+
+def forked(*arguments: object, output: Path) -> Ended:
+    """Run a command in a fork of this process, which has all modules already."""
+    paths = [output.with_suffix(suffix) for suffix in (".out", ".err")]
+    if not (child := os.fork()):
+        for number, path in enumerate(paths, 1):
+            os.dup2(os.open(path, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
+        try:
+            code = main_of_package([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = int(end.code or 0)
+        except BaseException:  # noqa: BLE001 - this process must not go on as its parent
+            traceback.print_exc()
+            code = 1
+        sys.stdout.flush()
+        os._exit(code)
+    _, status = os.waitpid(child, 0)
+    stdout, stderr = (path.read_text(encoding="utf-8") for path in paths)
+    return Ended(os.waitstatus_to_exitcode(status), stdout, stderr.splitlines())
+
+
+def run_traced(options: Sequence[object], arguments: Sequence[str]) -> int:
+    """Run under ``strace`` and return the exit code."""
+    command = ["strace", "-f", "-qq", *map(str, options), "-e", f"trace={CALLS}"]
+    command += [sys.executable, "-m", "colmap_affrect", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.returncode
+
+
+def kills(case: Case, out: Path, chance: random.Random) -> str:
+    """Kill a run at random moments, several times in one folder."""
+    stages = end_again_and_again(
+        case.photos, out, case.options, case.undisturbed.worked_s,
+        [signal.SIGKILL] * KILLS_IN_ONE_FOLDER, chance,
+    )  # fmt: skip
+    case.assert_finishes(out)
+    return ", ".join(stages)
+
+
+def calls(case: Case, out: Path, chance: random.Random) -> str:
+    """Kill a run when it enters a system call that changes a file of its results."""
+    while True:
+        kind = chance.choice(sorted(case.calls))
+        number = chance.choice(case.calls[kind])
+        inject = ["-e", f"inject={kind}:signal=SIGKILL:when={number}", "-o", "/dev/null"]
+        if run_traced(inject, case.arguments(out)) != 0:
+            break
+        shutil.rmtree(out)
+    assert_readable(out)
+    case.assert_finishes(out)
+    return kind
+
+
+def disks(case: Case, out: Path, chance: random.Random) -> str:
+    """Run on a disk that is too small, and again on one that has grown."""
+    needed = sum(p.stat().st_size for p in case.undisturbed.out.rglob("*") if p.is_file())
+    num_kib = chance.randrange(8, needed * 11 // 10 // 1024)
+    disk = out.with_name("disk")
+    disk.mkdir(exist_ok=True)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={num_kib}k", "none", disk], check=True)
+    try:
+        ended = ended_in(start(*case.arguments(disk / "out")))
+        if ended.code:
+            assert ended.code == 1, (ended.code, ended.stderr)
+            assert len(ended.stderr) == 1, ended.stderr
+            assert "free space" in ended.stderr[0], ended.stderr
+        subprocess.run(["mount", "-o", "remount,size=2g", disk], check=True)
+        case.assert_finishes(disk / "out")
+    finally:
+        subprocess.run(["umount", disk], check=True)
+    return f"{num_kib} KiB, exit code {ended.code}"
+
+
+def reads(path: Path, case: Case, out: Path) -> str:
+    """Let commands read a database; each has to refuse it in one line, or to do its work."""
+    before, codes = path.read_bytes(), []
+    inputs = ["--image-path", case.photos, *SMALL]
+    for command in (
+        ["map", "-q", "--from-database", path, "--output-path", out / "map"],
+        ["extract", "-q", "--from-database", path, "--output-path", out / "extract", *inputs],
+        ["doctor", path],
+    ):
+        ended = forked(*command, output=out / "output")
+        codes.append(ended.code)
+        assert ended.code in (0, 1, 3), (command[0], ended)
+        assert "Traceback" not in "".join(ended.stderr), (command[0], ended)
+        if ended.code == 1 and command[0] != "doctor":
+            assert len(ended.errors) == len(ended.stderr) == 1, (command[0], ended)
+    assert path.read_bytes() == before, "the database was changed"
+    return f"exit codes of map, extract, doctor: {codes}"
+
+
+def damaged_pages(case: Case, out: Path, chance: random.Random) -> str:
+    """Read a database of which one page is noise."""
+    path = copy_of_database(case, out)
+    done = damage_bytes(path, pages, chance)
+    return f"{done}; {reads(path, case, out)}"
+
+
+def databases(case: Case, out: Path, chance: random.Random) -> str:
+    """Read a database with something else wrong."""
+    path = copy_of_database(case, out)
+    if chance.random() < 0.5:
+        done = damage_rows(path, chance.choice(STATEMENTS), chance)
+    else:
+        done = damage_bytes(path, chance.choice(BYTES), chance)
+    return f"{done}; {reads(path, case, out)}"
+
+
+def copy_of_database(case: Case, out: Path) -> Path:
+    out.mkdir(parents=True)
+    return Path(shutil.copy(case.undisturbed.out / "database.db", out / "any.db"))
+
+
+TRIALS: dict[str, tuple[Callable[[Case, Path, random.Random], str], int]] = {
+    "kills": (kills, KILLS_IN_ONE_FOLDER),
+    "calls": (calls, 1),
+    "disks": (disks, 1),
+    "pages": (damaged_pages, 1),
+    "databases": (databases, 1),
+}
+"""Kinds of trials, and how many disturbances each has."""
+
+
+def campaign(cases: Sequence[Case], kind: str, count: int, seed: int, folder: Path) -> list[str]:
+    """Make trials of a kind; return what went wrong."""
+    trial, num_each = TRIALS[kind]
+    wrong = []
+    for index in range(-(-count // num_each)):
+        case, begun = cases[index % len(cases)], time.monotonic()
+        name = f"{kind} {index} ({case.folder.name})"
+        out = folder / f"{kind}-{index}"
+        shutil.rmtree(out, ignore_errors=True)
+        try:
+            told = trial(case, out, random.Random(f"{seed} {kind} {index}"))
+            shutil.rmtree(out, ignore_errors=True)
+        except (AssertionError, subprocess.TimeoutExpired) as error:
+            told = f"WRONG: {error}"
+            wrong.append(f"{name}: {told}")
+        print(f"{name}: {told}; {time.monotonic() - begun:.0f} s", flush=True)
+    return wrong
+
+
+def main() -> int:
+    """Make the trials and print a table of them."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--output-path", type=Path, required=True)
+    parser.add_argument("--image-path", type=Path, nargs="+", default=[SAMPLE])
+    parser.add_argument("--seed", type=int, default=0)
+    for kind in TRIALS:
+        parser.add_argument(f"--{kind}", type=int, default=0, metavar="N")
+    arguments = parser.parse_args()
+    folder = arguments.output_path.resolve()
+    cases = []
+    for number, path in enumerate(arguments.image_path):
+        options = SMALL if number % 2 else (*SMALL, *ALL_STAGES)
+        cases.append(Case(path.resolve(), options, folder / path.parent.name))
+    for case in cases:
+        shutil.rmtree(case.folder, ignore_errors=True)
+        case.folder.mkdir(parents=True)
+    print(describe_machine(), flush=True)
+    rows, wrong = [], []
+    for kind in TRIALS:
+        if count := vars(arguments)[kind]:
+            found = campaign(cases, kind, count, arguments.seed, folder)
+            rows.append((kind, str(count), str(len(found))))
+            wrong += found
+    print(table(("trials", "disturbances", "trials that went wrong"), rows))
+    print("\n".join(wrong))
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

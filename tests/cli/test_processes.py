@@ -1,0 +1,164 @@
+"""The command line in processes of its own: streams, terminals and Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import shutil
+import signal
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import pytest
+from command import Call, on_photographs, run_in_process_of_its_own, start
+
+from colmap_affrect.project.workspace import Workspace
+
+TIMEOUT_S = 60
+
+
+@pytest.mark.long
+def test_json_goes_to_stdout_alone_and_progress_to_stderr(photos: Path, tmp_path: Path) -> None:
+    done = run_in_process_of_its_own("run", *on_photographs(photos, tmp_path / "out"), "--json")
+    assert done.code == 0, done.stderr
+    report = done.report
+    assert report["images_registered"] == 3
+    assert report == json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
+    lines = done.stderr
+    assert "extract: 3/3 images" in lines
+    assert "match: 3/3 pairs" in lines
+    # What COLMAP prints is in the log.
+    stages = ("extract", "match", "verify", "map", "pictures")
+    assert all(line.split(":")[0] in stages for line in lines)
+    log = (tmp_path / "out" / "run.log").read_text(encoding="utf-8")
+    assert "colmap-affrect" in log
+    assert ".cc:" in log
+
+
+@pytest.mark.long
+def test_quiet_prints_the_result_only_and_verbose_every_image(
+    photos: Path, tmp_path: Path, call: Call
+) -> None:
+    arguments = on_photographs(photos, tmp_path / "out")
+    done = run_in_process_of_its_own("run", *arguments, "-q", python=("-W", "error"))
+    assert (done.code, done.stderr) == (0, [])
+    assert done.stdout.startswith("registered  3 of 3 images\n")
+    done = call("extract", *arguments, "--overwrite", "--verbose")
+    assert done.code == 0
+    assert done.stdout.startswith("extract: 3 done in ")
+    assert any(line.startswith("DEBUG: a.png: ") for line in done.stderr)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("line", ["extract: 1/3 images", "match: 1/3 pairs", "verify: 3/3 pairs"])
+def test_interrupt_ends_with_130_and_a_later_run_completes(
+    photos: Path, tmp_path: Path, line: str
+) -> None:
+    arguments = ["run", *on_photographs(photos, tmp_path / "out")]
+    with start(*arguments) as process:
+        while (printed := process.stderr.readline().strip()) != line:
+            assert printed, process.wait()
+        os.kill(process.pid, signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=TIMEOUT_S)
+    assert (process.returncode, stdout) == (130, "")
+    lines = stderr.splitlines()
+    assert lines[-1] == "interrupted; run the same command again to go on"
+    stages = ("extract: ", "match: ", "verify: ", "map: ")
+    assert all(text.startswith(stages) for text in lines[:-1])
+    assert not Workspace(tmp_path / "out").report.exists()
+    done = run_in_process_of_its_own(*arguments, "-q")
+    assert (done.code, done.stderr) == (0, [])
+    assert done.stdout.startswith("registered  3 of 3 images")
+
+
+INTERRUPTED_WHILE_DELETING = """
+import argparse, os, signal, time
+from colmap_affrect import cli
+
+class Deleted:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.2)
+
+def command(options):
+    Deleted()
+    time.sleep(20.0)
+    return 0
+
+class Parser:
+    def parse_args(self, arguments):
+        return argparse.Namespace(function=command)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+cli.build_parser = Parser
+cli.main_of_process()
+"""
+
+
+@pytest.mark.long
+def test_interrupt_that_python_cannot_raise_is_repeated() -> None:
+    """It was printed with its traceback, and the command went on and ended with 0."""
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_WHILE_DELETING],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+    )  # fmt: skip
+    assert done.returncode == 130
+    assert done.stderr == "interrupted; run the same command again to go on\n"
+
+
+ENDLESS = {
+    "incremental": [
+        "ba_global_max_refinements=1000000000", "ba_global_max_refinement_change=0",
+    ],
+    "global": ["max_num_irls_iterations=1000000000", "irls_step_convergence_threshold=-1"],
+}  # fmt: skip
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+def test_interrupted_mapping_ends_with_130_and_leaves_no_half_written_models(
+    verified: Path, tmp_path: Path, mapper: str
+) -> None:
+    out = Path(shutil.copytree(verified, tmp_path / "out"))
+    arguments = ["map", "--output-path", str(out), "--mapper", mapper, "--overwrite"]
+    with start(*arguments, "--mapper-options", *ENDLESS[mapper]) as process:
+        if mapper == "incremental":
+            assert process.stderr.readline() == "map: 2/3 images\n"
+        while not (out / "sparse.partial" / "raw").exists():
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=TIMEOUT_S)
+    assert (process.returncode, stdout) == (130, "")
+    assert stderr == "interrupted; run the same command again to go on\n"
+    assert not list(out.glob("sparse*"))
+    assert not (out / "report.json").exists()
+    done = run_in_process_of_its_own(*arguments, "-q")
+    assert (done.code, done.stderr) == (0, [])
+    assert done.stdout.startswith("registered  3 of 3 images\n")
+    preset = "colmap for verification, sparse for mapping"
+    assert f"preset      {preset}, {mapper} mapper\n" in done.stdout
+
+
+@pytest.mark.long
+def test_terminal_gets_bars(photos: Path, tmp_path: Path) -> None:
+    controller, terminal = pty.openpty()
+    termios.tcsetwinsize(terminal, (24, 80))
+    arguments = on_photographs(photos, tmp_path / "out")
+    with start("extract", *arguments, stderr=terminal) as process:
+        os.close(terminal)
+        shown = b""
+        try:
+            while data := os.read(controller, 4096):
+                shown += data
+        except OSError:  # Linux tells the end of a terminal so.
+            pass
+        finally:
+            os.close(controller)
+    assert process.returncode == 0
+    assert b"extract: 100%" in shown
+    assert b"3/3" in shown

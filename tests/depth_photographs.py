@@ -1,0 +1,46 @@
+"""Photographs with known depth, for tests of depth maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from colmap_affrect.conventions import pixel_from_colmap
+from colmap_affrect.data import Photograph
+from colmap_affrect.images.reading import read_gray
+
+COURTYARD = Path(__file__).parents[1] / "sample_scenes" / "courtyard"
+
+FLOAT32_RTOL = 1e-6
+"""Rounding to float32 after float64 arithmetic."""
+
+CAMERA = np.array([[30.0, 0.0, 4.2], [0.0, 21.0, 2.9], [0.0, 0.0, 1.0]])
+"""Of an image of 12 x 8 px: principal point off the middle, pixels not square."""
+
+
+def photograph(name="a.jpg", size=(12, 8), camera_matrix=CAMERA, path=None):
+    return Photograph(np.zeros(size[::-1], np.uint8), name, path, camera_matrix)
+
+
+def slanted_plane(size, camera_matrix):
+    """Depth along the axis and along the rays of the plane n . X = 3 seen by a camera."""
+    normal = np.array([0.3, -0.5, 1.0])
+    columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    rays = np.stack(
+        [
+            (columns - camera_matrix[0, 2]) / camera_matrix[0, 0],
+            (rows - camera_matrix[1, 2]) / camera_matrix[1, 1],
+            np.ones(size[::-1]),
+        ],
+        axis=-1,
+    )
+    z_depth = 3.0 / (rays @ normal)
+    return z_depth, z_depth * np.linalg.norm(rays, axis=-1)
+
+
+def courtyard_photograph(name):
+    camera = np.diag([1080.0, 1080.0, 1.0])
+    camera[:2, 2] = pixel_from_colmap(np.array([360.0, 270.0]))
+    path = COURTYARD / "images" / name
+    return Photograph(read_gray(path), name, path, camera)
