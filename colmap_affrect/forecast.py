@@ -49,7 +49,7 @@ class Forecast:
             num_images: to extract and map.
             num_pairs: to match and verify, if all images are new.
             by_network: a network matches them.
-            may_climb: a stage ``escalate`` follows, of which nothing is known before it begins.
+            may_climb: pairs may be matched again with more warps; how many nobody knows before.
             clock: gives seconds.
         """
         match_cost = COSTS["match by network" if by_network else "match"]
@@ -71,7 +71,7 @@ class Forecast:
         if name == "match":
             self._expect_pairs(total)
         self._stages[name] = _Stage(known.cost, total)
-        self._may_climb &= name != "escalate"
+        self._may_climb &= name not in ("cameras", "guide", "map")
         self._current, self._start_s = name, self._clock()
 
     def _expect_pairs(self, count: int) -> None:

@@ -74,10 +74,13 @@ def test_stages_that_nothing_was_known_of_count_from_when_they_begin() -> None:
     assert forecast.left_s() is None
     run_stage(forecast, clock, "extract", 10, 60.0)
     assert forecast.text() == "whole run: about 7 min left without further warps"
-    forecast.begin("escalate", 90)
+    forecast.begin("escalate, level 1", 90)
     clock.now_s += 60.0
     forecast.advance(9)
-    assert forecast.text() == "whole run: about 16 min left"
+    assert forecast.text() == "whole run: about 16 min left without further warps"
+    forecast.end()
+    forecast.begin("cameras", 10)
+    assert forecast.text() == "whole run: about 7 min left"
 
 
 def test_forecast_is_in_lines_and_log_and_not_where_nothing_is_shown(
