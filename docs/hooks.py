@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import tempfile
 from pathlib import Path
@@ -55,7 +56,7 @@ def functions_page() -> str:
     """Return the docstrings of the public functions and classes."""
     parts = []
     for name in sorted(colmap_affrect.__all__):
-        text = getattr(colmap_affrect, name).__doc__
+        text = inspect.getdoc(getattr(colmap_affrect, name))
         parts.append(f"## {name}\n\n```text\n{text}\n```\n")
     return "# Functions\n\n" + "\n".join(parts)
 

@@ -7,8 +7,11 @@ import logging
 
 import pytest
 
-from colmap_affrect.forecast import COSTS, Forecast
+from colmap_affrect.forecast import COSTS, MAP_COST_PER_IMAGE, Forecast
 from colmap_affrect.progress import Progress
+
+MAP_COST = COSTS["map"] + MAP_COST_PER_IMAGE * 100
+"""Of each of a hundred images."""
 
 
 class Clock:
@@ -38,7 +41,7 @@ def test_what_has_begun_is_measured_and_the_rest_is_guessed_from_it() -> None:
         assert forecast.text() == ""  # says too little
     clock.now_s += 2.0
     forecast.advance(1)
-    guessed = 4950 * (COSTS["match"] + COSTS["verify"]) + 100 * COSTS["map"]
+    guessed = 4950 * (COSTS["match"] + COSTS["verify"]) + 100 * MAP_COST
     assert forecast.left_s() == pytest.approx(2.0 * (95 + guessed))
     forecast.end()
     run_stage(forecast, clock, "match", 4950, 0.01)
@@ -60,11 +63,11 @@ def test_images_that_are_known_leave_their_pairs_out() -> None:
     forecast = Forecast(100, 4950, clock=clock)
     run_stage(forecast, clock, "extract", 10, 1.0)
     pairs_ahead = round(4950 * (1 - 0.9**2))
-    left_s = pairs_ahead * (COSTS["match"] + COSTS["verify"]) + 100 * COSTS["map"]
+    left_s = pairs_ahead * (COSTS["match"] + COSTS["verify"]) + 100 * MAP_COST
     assert forecast.left_s() == pytest.approx(left_s)
     run_stage(forecast, clock, "match", 0, 0.0)
     run_stage(forecast, clock, "verify", 0, 0.0)
-    assert forecast.left_s() == pytest.approx(100 * COSTS["map"])
+    assert forecast.left_s() == pytest.approx(100 * MAP_COST)
 
 
 def test_stages_that_nothing_was_known_of_count_from_when_they_begin() -> None:
@@ -73,11 +76,14 @@ def test_stages_that_nothing_was_known_of_count_from_when_they_begin() -> None:
     run_stage(forecast, clock, "HardTFeat.pth", 10, 1.0)  # a download says nothing of the rest
     assert forecast.left_s() is None
     run_stage(forecast, clock, "extract", 10, 60.0)
-    assert forecast.text() == "whole run: about 7 min left without further warps"
-    forecast.begin("escalate", 90)
+    assert forecast.text() == "whole run: about 8 min left without further warps"
+    forecast.begin("escalate, level 1", 90)
     clock.now_s += 60.0
     forecast.advance(9)
-    assert forecast.text() == "whole run: about 16 min left"
+    assert forecast.text() == "whole run: about 18 min left without further warps"
+    forecast.end()
+    forecast.begin("cameras", 10)
+    assert forecast.text() == "whole run: about 8 min left"
 
 
 def test_forecast_is_in_lines_and_log_and_not_where_nothing_is_shown(
@@ -95,6 +101,6 @@ def test_forecast_is_in_lines_and_log_and_not_where_nothing_is_shown(
                 clock.now_s += 60.0
                 advance(1)
     assert lines.getvalue().splitlines()[4] == (
-        "extract: 10/20 images, whole run: about 24 min left"
+        "extract: 10/20 images, whole run: about 30 min left"
     )
-    assert caplog.messages == ["whole run: about 29 min left"]
+    assert caplog.messages == ["whole run: about 35 min left"]

@@ -92,8 +92,9 @@ def compare(
         for request in requests:
             _record(request, overwrite=overwrite)
         results = []
-        for request in requests:
-            result = _finished(request) or _run(request, progress)
+        for number, request in enumerate(requests, 1):
+            title = f"method {number} of {len(requests)}, {request.method.label}"
+            result = _finished(request) or _run(request, progress, title)
             results.append(replace(result, failures={**unreadable, **result.failures}))
         comparison = Comparison(
             image_names=tuple(plan.names),
@@ -344,7 +345,7 @@ def _finished(request: Request) -> MethodResult | None:
     return MethodResult.from_mapping(request.method.label, content["result"])
 
 
-def _run(request: Request, progress: Progress) -> MethodResult:
+def _run(request: Request, progress: Progress, title: str) -> MethodResult:
     """Run a method in a process of its own; what it prints goes to ``run.log`` in its folder."""
     failed = ""
     with (
@@ -356,8 +357,8 @@ def _run(request: Request, progress: Progress) -> MethodResult:
         for line in process.stdout or ():
             event = json.loads(line)
             if "stage" in event:
-                title = f"{request.method.label}: {event['stage']}"
-                advance = stage.enter_context(progress.stage(title, event["total"], event["unit"]))
+                name, total = f"{title}: {event['stage']}", event["total"]
+                advance = stage.enter_context(progress.stage(name, total, event["unit"]))
             elif "advance" in event:
                 advance(event["advance"])
             elif "end" in event:

@@ -146,7 +146,8 @@ def _graphs_and_models(
 
 
 def _difference(graph: Mapping[Pair, int], first: Mapping[Pair, int]) -> str:
-    return f", {len(graph.keys() - first.keys())} new, {len(first.keys() - graph.keys())} lost"
+    counts = {"new": len(graph.keys() - first.keys()), "lost": len(first.keys() - graph.keys())}
+    return "".join(f", {count} {what}" for what, count in counts.items() if count)
 
 
 def _warps(

@@ -39,6 +39,8 @@ def read_table(
     except csv.Error as error:
         raise OptionError(f"{where}, line {reader.line_num}: {error}") from error
     header = [cell.strip() for cell in rows[0][1]] if rows else []
+    if len(header) == 1 and ";" in header[0]:
+        raise OptionError(f"{where}: separate cells by commas, and write numbers with a point")
     for column in header:
         if column not in columns:
             raise OptionError(f"{where}: unknown column '{column}'{suggestion(column, columns)}")

@@ -96,34 +96,12 @@ def escalate(
     if colmap_database.unverified_pairs(context.workspace.database):
         escalation.write()  # it was killed there
     climbed: set[Pair] = set()
-    total = escalation.num_steps_ahead()
-    with context.progress.stage("escalate", total, "steps") as advance:
-        forecast = _Forecast(total, advance)
-        while work := escalation.next_work():
-            level, todo = work
-            escalation.climb(todo, level, forecast.step)
-            climbed |= set(todo)
-            forecast.lower(escalation.num_steps_ahead())
-        escalation.write()
+    while work := escalation.next_work():
+        level, todo = work
+        escalation.climb(todo, level)
+        climbed |= set(todo)
+    escalation.write()
     return StageReport("escalate", time.perf_counter() - start, len(climbed))
-
-
-class _Forecast:
-    """A progress bar of steps of which most may turn out needless: it ends full all the same."""
-
-    def __init__(self, total: int, advance: Callable[[int], None]) -> None:
-        self._ahead, self._advance = total, advance
-
-    def step(self, count: int) -> None:
-        """Some steps are done."""
-        self.lower(self._ahead - count)
-
-    def lower(self, ahead: int) -> None:
-        """At most so many are left; more than were expected do not move the bar back."""
-        news = self._ahead - max(ahead, 0)
-        if news > 0:
-            self._ahead -= news
-            self._advance(news)
 
 
 def pair_levels(context: Context) -> dict[str, int]:
@@ -297,21 +275,14 @@ class Escalation:
                     return level, todo
         return None
 
-    def num_steps_ahead(self) -> int:
-        """Return how many steps are left if no pair succeeds."""
-        graph, tried = self.graph(), self.matches.tried_levels(self.pairs)
-        pairs = {*graph.joining(self.options), *graph.hanging(self.options)}
-        steps = 0
-        for level in self.levels:
-            todo = [pair for pair in pairs if tried[pair] < level]
-            steps += len(self._images_to_extend(todo, level)) + len(todo)
-        return steps
-
-    def climb(self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]) -> None:
+    def climb(self, pairs: Sequence[Pair], level: int) -> None:
         """Match pairs with the features of a level and keep what has more inliers."""
-        self._extend(self._images_to_extend(pairs, level), level, advance)
-        if pairs:
-            self._match_again(pairs, level, advance)
+        names = self._images_to_extend(pairs, level)
+        title, total = f"escalate, level {level}", len(names) + len(pairs)
+        with self.context.progress.stage(title, total, "steps") as advance:
+            self._extend(names, level, advance)
+            if pairs:
+                self._match_again(pairs, level, advance)
         self.write()
 
     def write(self) -> None:

@@ -116,6 +116,7 @@ def test_distances_of_photographs_and_marked_points_give_the_scale(
         ("name,x,y,z\na.png,0,0\nb.png,1,1,1", "line 2: z is missing"),
         ("name,x,y\na.png,0,nan\n", "y is not finite"),
         ("name,x,h\n", "unknown column 'h'"),
+        ("name;x;y;z\na.png;1,5;2;3\n", "separate cells by commas"),
     ],
 )
 def test_positions_that_leave_the_model_open_are_refused(
