@@ -56,6 +56,8 @@ CHECKS: dict[str, Check] = {
         "rows whose matrices or cameras have more or less data than they should, or no finite "
         "numbers", "delete these rows; two-view geometries are made anew by 'colmap "
         "geometric_verifier'"),
+    "bad-name": ("error", "images without a name, or with one that is not UTF-8",
+        "rename these files and import them again into a new database"),
     "unsafe-name": ("warning", "image names that lead out of the image folder",
         "rename these images; programs that write a file per image would write elsewhere"),
     "no-keypoints": ("warning", "images without keypoints, which cannot be registered",
@@ -105,9 +107,17 @@ Problems = dict[str, list[str]]
 """What was found: by kind, the images, pairs or cameras concerned, none if it is the database."""
 
 FATAL_FOR_IMAGES = frozenset(
-    {"no-camera", "camera-model", "camera-panorama", "camera-size", "camera-params", "frame-links"}
+    {
+        "bad-name",
+        "no-camera",
+        "camera-model",
+        "camera-panorama",
+        "camera-size",
+        "camera-params",
+        "frame-links",
+    }
 )
-"""Problems of cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
+"""Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
 
 FATAL = FATAL_FOR_IMAGES | {
     "keypoint-columns", "keypoint-data", "keypoints-not-finite", "self-pair", "unknown-pair",
@@ -257,6 +267,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> tuple[Tables, Problems
         if verdict != "ok":
             raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
         tables = _read_tables(connection)
+        _check_names(connection, found)
         _check_cameras(tables, found)
         _check_links(connection, found)
         _check_matrices(connection, found)
@@ -366,6 +377,13 @@ def _camera_like(model: int) -> pycolmap.Camera | None:
         return pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
     except (ValueError, RuntimeError, TypeError):
         return None
+
+
+def _check_names(connection: sqlite3.Connection, found: Problems) -> None:
+    for image_id, raw in connection.execute("SELECT image_id, CAST(name AS BLOB) FROM images"):
+        name = raw.decode("utf-8", "replace")
+        if not name or "\0" in name or name.encode() != raw:
+            found["bad-name"].append(f"image {image_id}: {name!r}")
 
 
 def _check_links(connection: sqlite3.Connection, found: Problems) -> None:

@@ -45,7 +45,7 @@ from colmap_affrect.project.feature_index import Entries, entries, forget
 FORMAT_VERSION = 2
 MAX_INT16 = 32767
 STATIONARY = "stationary_cells"
-FILTERED = "is_filtered"
+FINISHED = "finished_list"
 
 
 @dataclass(frozen=True)
@@ -179,9 +179,13 @@ def _complete_groups(group: h5py.Group, path: str = "") -> Iterator[tuple[str, h
             yield from _complete_groups(inner, f"{path}/{key}" if path else key)
 
 
-def _digests_and_counts(file: h5py.File) -> Iterator[tuple[str, tuple[str, int]]]:
+def _indexed(file: h5py.File) -> Entries:
+    found: Entries = {}
     for name, group in _complete_groups(file):
-        yield name, (str(group.attrs.get("content", "")), len(group["keypoints"]))
+        width, height = group["image_size"][()].tolist()
+        content = str(group.attrs.get("content", ""))
+        found[name] = content, len(group["keypoints"]), (width, height)
+    return found
 
 
 DATASETS = {
@@ -211,7 +215,7 @@ class FeatureStore(_Store):
         if not self.path.exists():
             return {}
         with self._open("r") as file:
-            return entries(self.path, lambda: dict(_digests_and_counts(file)))
+            return entries(self.path, lambda: _indexed(file))
 
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:
@@ -237,7 +241,7 @@ class FeatureStore(_Store):
 
     def contents(self) -> dict[str, str]:
         """Return for each image the digest of the files that it was extracted from, if known."""
-        return {name: content for name, (content, _) in self._entries().items()}
+        return {name: content for name, (content, *_) in self._entries().items()}
 
     def record_contents(self, contents: Mapping[str, str]) -> None:
         """Put on record what images were extracted from."""
@@ -322,7 +326,7 @@ class FeatureStore(_Store):
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of features of each image."""
-        return {name: count for name, (_, count) in self._entries().items()}
+        return {name: count for name, (_, count, _) in self._entries().items()}
 
     def image_size(self, name: str) -> tuple[int, int]:
         """Return the (width, height) of one image in px."""
@@ -332,11 +336,7 @@ class FeatureStore(_Store):
 
     def image_sizes(self) -> dict[str, tuple[int, int]]:
         """Return the (width, height) of each image in px."""
-        names = self.names()
-        if not names:
-            return {}
-        with self._open("r") as file:
-            return {name: tuple(file[name]["image_size"][()].tolist()) for name in names}
+        return {name: size for name, (*_, size) in self._entries().items()}
 
     def read_frames(self, name: str) -> NDArray[np.float32]:
         """Read the (N, 2, 3) frames of one image."""
@@ -401,6 +401,7 @@ class MatchStore(_Store):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
+            file.attrs[FINISHED] = ""
             for key, group in list(_complete_groups(file)):
                 if (
                     key in keys
@@ -422,17 +423,30 @@ class MatchStore(_Store):
         with self._open("a") as file:
             file.attrs[STATIONARY] = json.dumps([(s, found.tolist()) for s, found in cells.items()])
 
-    def is_filtered(self) -> bool:
-        """Tell whether all matches have been looked at for what never moves."""
+    def has(self, pairs: Sequence[tuple[str, str]]) -> NDArray[np.bool_]:
+        """Tell, as (N,) bools, which of N pairs are there and complete."""
         if not self.path.exists():
-            return True
+            return np.zeros(len(pairs), np.bool_)
         with self._open("r") as file:
-            return bool(file.attrs.get(FILTERED, True))
+            keys = (pair_key(*pair) for pair in pairs)
+            there = (key in file and file[key].attrs.get("complete", False) for key in keys)
+            return np.fromiter(there, np.bool_, len(pairs))
 
-    def mark_filtered(self, is_filtered: bool) -> None:
-        """Keep whether all matches have been looked at for what never moves."""
+    def finished_list(self) -> str | None:
+        """Return the digest of the list whose pairs have all been matched and looked at.
+
+        Empty if a run has begun with another one since, None if nothing is known.
+        """
+        if not self.path.exists():
+            return None
+        with self._open("r") as file:
+            found = file.attrs.get(FINISHED)
+            return None if found is None else str(found)
+
+    def record_finished_list(self, digest: str) -> None:
+        """Keep the digest of the list that is finished, empty while there is none."""
         with self._open("a") as file:
-            file.attrs[FILTERED] = is_filtered
+            file.attrs[FINISHED] = digest
 
     def levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
         """Return the level of escalation that the matches of each pair are from."""

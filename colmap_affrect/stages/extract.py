@@ -198,11 +198,12 @@ def extract(
     names = inputs.names()
     if image_names:
         names = checked_names(folder, image_names, "image_names")
-    inputs.check_names(names)
+    contents, options = Contents(workspace.contents), recipe.extraction
+    digests = {name: contents.digest(inputs.files(name, options)) for name in names}
+    if overwrite or digests != context.features.contents():  # else they were seen to be good
+        inputs.check_names(names)
     whole = inputs.photographs.without_mask(names)
-    extractor = prepared_recipe(context, recipe.extraction, names)
-    contents = Contents(workspace.contents)
-    digests = {name: contents.digest(inputs.files(name, extractor.options)) for name in names}
+    extractor = prepared_recipe(context, options, names)
     if not overwrite:
         refuse_other_photographs(workspace, inputs.image_path, digests)
     _record(workspace, inputs, recipe, extractor, later or {}, overwrite=overwrite)
