@@ -432,6 +432,11 @@ class MatchStore(_Store):
             there = (key in file and file[key].attrs.get("complete", False) for key in keys)
             return np.fromiter(there, np.bool_, len(pairs))
 
+    def num_pairs(self) -> int:
+        """Return the number of pairs that are there, without a look at each."""
+        with self._open("r") as file:
+            return sum(len(group) for group in file.values())
+
     def finished_list(self) -> str | None:
         """Return the digest of the list whose pairs have all been matched and looked at.
 

@@ -59,7 +59,8 @@ def match(
     context.workspace.record_options("match", record, overwrite=overwrite)
     matches, digest = context.matches, sha256_of(context.workspace.pairs)
     finished = matches.finished_list()
-    missing = pairs.at(slice(0) if finished == digest else ~matches.has(pairs))
+    is_finished = finished == digest and matches.num_pairs() == len(pairs)
+    missing = pairs.at(slice(0) if is_finished else ~matches.has(pairs))
     if missing:
         matches.record_finished_list("")
     with context.progress.stage("match", len(missing), "pairs") as advance:
