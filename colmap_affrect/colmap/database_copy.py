@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
+from colmap_affrect.colmap.check_texts import FATAL, FATAL_FOR_IMAGES
+from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.reading import DAMAGED, open_read_only
 from colmap_affrect.errors import DatabaseError

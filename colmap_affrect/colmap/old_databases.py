@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import FATAL
+from colmap_affrect.colmap.check_texts import FATAL
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import DatabaseError

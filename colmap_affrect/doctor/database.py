@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from colmap_affrect.colmap.check_texts import CHECKS
 from colmap_affrect.colmap.checks import (
-    CHECKS,
     Tables,
     check_database,
     check_image_files,

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_affrect.colmap.checks import CHECKS, SEVERITIES, Check, Severity
+from colmap_affrect.colmap.check_texts import CHECKS, SEVERITIES, Check, Severity
 from colmap_affrect.progress import Progress
 
 MAX_ITEMS_SHOWN = 5
