@@ -6,6 +6,7 @@ import json
 import platform
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -304,8 +305,9 @@ def map_and_report(
         extended=tuple(before),
         advice=advice(context, missing, models),
     )
+    is_known = workspace.page.exists() and _says_the_same(workspace.report, result)
     replace_text(workspace.report, result.to_json())
-    if page:
+    if page and not is_known:
         write_run_page(
             workspace,
             result,
@@ -314,9 +316,21 @@ def map_and_report(
             image_path_of(workspace),
             context.progress,
         )
-    else:
+    elif not page:
         workspace.page.unlink(missing_ok=True)  # of an earlier run
     return result
+
+
+def _says_the_same(path: Path, report: ReconstructionReport) -> bool:
+    """Tell whether a run found everything done, and a report of before differs by its times."""
+    if any(stage.num_done for stage in report.stages if stage.name != "pairs"):
+        return False
+    with suppress(OSError, ValueError):
+        known = json.loads(path.read_text(encoding="utf-8"))
+        now = json.loads(json.dumps(report.to_mapping()))
+        told = [{k: v for k, v in content.items() if k != "stages"} for content in (known, now)]
+        return bool(told[0] == told[1])
+    return False
 
 
 def _require_photographs(context: Context) -> None:

@@ -96,6 +96,7 @@ def _check(connection: sqlite3.Connection, path: Path) -> tuple[Tables, Problems
         if verdict != "ok":
             raise DatabaseError(f"{path}: damaged ({verdict.splitlines()[-1]})")
         tables = read_tables(connection)
+        _check_names(connection, found)
         _check_cameras(tables, found)
         _check_links(connection, found)
         _check_matrices(connection, found)
@@ -166,6 +167,13 @@ def _camera_like(model: int) -> pycolmap.Camera | None:
         return pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
     except (ValueError, RuntimeError, TypeError):
         return None
+
+
+def _check_names(connection: sqlite3.Connection, found: Problems) -> None:
+    for image_id, raw in connection.execute("SELECT image_id, CAST(name AS BLOB) FROM images"):
+        name = raw.decode("utf-8", "replace")
+        if not name or "\0" in name or name.encode() != raw:
+            found["bad-name"].append(f"image {image_id}: {name!r}")
 
 
 def _check_links(connection: sqlite3.Connection, found: Problems) -> None:

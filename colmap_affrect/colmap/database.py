@@ -6,9 +6,12 @@ index out of range would later end the Python process.
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import os
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
@@ -32,9 +36,12 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         # A Ctrl-C while pycolmap converts a Path would become a TypeError.
         database = pycolmap.Database.open(str(path))
     except RuntimeError as error:
+        with suppress(OSError):
+            if shutil.disk_usage(path.parent).free < BYTES_OF_EMPTY_DATABASE:
+                full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                raise cannot_write(path, full) from error
         raise DatabaseError(
-            f"{path}: not a usable COLMAP database, in use by another program, or the disk is "
-            f"full ({error})"
+            f"{path}: not a usable COLMAP database, or in use by another program ({error})"
         ) from error
     try:
         with closing(database):
@@ -140,15 +147,25 @@ def keypoint_counts(path: Path) -> dict[str, int]:
         }
 
 
-def unverified_pairs(path: Path) -> list[tuple[int, int]]:
-    """Return the pairs of image ids with raw matches and no two-view geometry, good or bad."""
+def unverified_pairs(path: Path) -> NDArray[np.int64]:
+    """Return the (N, 2) image ids with raw matches and no two-view geometry, good or bad."""
     with open_database(path) as database:
-        pairs = [
-            pycolmap.pair_id_to_image_pair(pair_id)
-            for pair_id, count in zip(*database.read_num_matches(), strict=True)
-            if count > 0
-        ]
-        return [pair for pair in pairs if not database.exists_two_view_geometry(*pair)]
+        pair_ids, counts = map(np.asarray, database.read_num_matches())
+        verified, _ = database.read_two_view_geometry_num_inliers()
+        rest = np.setdiff1d(pair_ids[counts > 0].astype(np.int64), verified)
+        pairs = np.stack(np.divmod(rest, MAX_NUM_IMAGES), axis=1)
+        is_new = [not database.exists_two_view_geometry(*pair) for pair in pairs]
+        return pairs[np.array(is_new, np.bool_)]
+
+
+def lack_matches(database: pycolmap.Database, image_ids: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Tell which of (N, 2) image ids have no row of raw matches; not those with an id of 0."""
+    low, high = np.sort(image_ids, axis=1).T
+    matched, _ = database.read_num_matches()
+    lacking: NDArray[np.bool_] = (low > 0) & ~np.isin(low * MAX_NUM_IMAGES + high, matched)
+    for row in np.flatnonzero(lacking):  # a row of none does not count there
+        lacking[row] = not database.exists_matches(*image_ids[row])
+    return lacking
 
 
 def colmap_keypoints(lafs: NDArray[np.floating]) -> NDArray[np.float32]:

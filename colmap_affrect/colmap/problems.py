@@ -37,6 +37,8 @@ CHECKS: dict[str, Check] = {
         "rows whose matrices or cameras have more or less data than they should, or no finite "
         "numbers", "delete these rows; two-view geometries are made anew by 'colmap "
         "geometric_verifier'"),
+    "bad-name": ("error", "images without a name, or with one that is not UTF-8",
+        "rename these files and import them again into a new database"),
     "unsafe-name": ("warning", "image names that lead out of the image folder",
         "rename these images; programs that write a file per image would write elsewhere"),
     "no-keypoints": ("warning", "images without keypoints, which cannot be registered",
@@ -83,9 +85,17 @@ CHECKS: dict[str, Check] = {
 """The problems of a database by kind."""
 
 FATAL_FOR_IMAGES = frozenset(
-    {"no-camera", "camera-model", "camera-panorama", "camera-size", "camera-params", "frame-links"}
+    {
+        "bad-name",
+        "no-camera",
+        "camera-model",
+        "camera-panorama",
+        "camera-size",
+        "camera-params",
+        "frame-links",
+    }
 )
-"""Problems of cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
+"""Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
 
 FATAL = FATAL_FOR_IMAGES | {
     "keypoint-columns", "keypoint-data", "keypoints-not-finite", "self-pair", "unknown-pair",

@@ -204,7 +204,7 @@ def verify(
         advance: called with the number of pairs that are done.
     """
     todo = unverified_pairs(path)
-    if not todo:
+    if not len(todo):
         return
     require_database_space(path, len(todo))
     with open_database(path) as database:
@@ -232,7 +232,7 @@ def verify(
         done: list[tuple[tuple[int, int], pycolmap.TwoViewGeometry]] = []
         tasks = (
             ((one, two), (side(one), side(two)), database.read_matches(one, two))
-            for one, two in todo
+            for one, two in map(tuple, todo)
         )
         try:
             for item in map_ordered(estimate, tasks, available_cores()):

@@ -157,7 +157,7 @@ class _Plan:
         if options.pairs != PairOptions(match_list_path=options.pairs.match_list_path):
             raise OptionError("pairs: a comparison matches all pairs, or those of match_list_path")
         if options.pairs.match_list_path:
-            pairs = read_pairs(Path(options.pairs.match_list_path), names)
+            pairs = list(read_pairs(Path(options.pairs.match_list_path), names))
         truth = _ground_truth(options.ground_truth_path, names)
         options = replace(options, mapping=mapping)
         files = {file.file_name: file for group in lacking.values() for file in group}

@@ -16,7 +16,6 @@ from colmap_affrect.errors import AffrectError, WorkspaceError
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.atomic_files import NEW_SUFFIX
 from colmap_affrect.project.contents import Contents
-from colmap_affrect.project.stores import pair_key
 from colmap_affrect.project.workspace import COPY_STAGES, INPUTS, STAGES, Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
@@ -194,15 +193,15 @@ class _FolderExamination:
             self._add_unusable("pairs-unusable", self.workspace.pairs, error)
             return
         try:
-            complete = Context(self.workspace).matches.complete(pair_key(*pair) for pair in pairs)
+            is_there = Context(self.workspace).matches.has(pairs)
         except (AffrectError, *DAMAGED_HDF5) as error:
             self._add_unusable("matches-unusable", path, error)
             return
-        self.found.checked.append(f"{path}: matches of {len(complete)} pairs of {len(pairs)}")
+        self.found.checked.append(f"{path}: matches of {is_there.sum()} pairs of {len(pairs)}")
         known, written = set(tables.names.values()), tables.matched_pairs()
         missing, lost = [], []
-        for pair in pairs:
-            if pair_key(*pair) not in complete:
+        for pair, is_matched in zip(pairs, is_there, strict=True):
+            if not is_matched:
                 missing.append(" - ".join(pair))
             elif known.issuperset(pair) and pair not in written:
                 lost.append(" - ".join(pair))

@@ -238,7 +238,7 @@ def match_image_pairs(
     if "match_list_path" not in asked:
         raise PairListError("pairing_options: give match_list_path, a file with two names per line")
 
-    def choose(context: Context) -> list[Pair]:
+    def choose(context: Context) -> Iterable[Pair]:
         return read_pairs(Path(asked["match_list_path"]), context.features.names())
 
     given = _Given(database_path, matching_options, verification_options, device, ours)

@@ -1,15 +1,68 @@
-"""What a pair is, and the options of how pairs are chosen."""
+"""What a pair is, lists of millions of them, and the options of how pairs are chosen."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Annotated, Literal, overload
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from colmap_affrect.options import Options, within
 
 Pair = tuple[str, str]
 """Names of two photographs, in order."""
+
+AT_ONCE = 1 << 16
+"""Pairs that are given names together."""
+
+
+class PairList(Sequence[Pair]):
+    """Pairs as the numbers of their images, which get their names one after the other.
+
+    All pairs of 5,000 images take 100 MB, as tuples of names they would take 20 times as much.
+
+    Attributes:
+        names: of the images, sorted.
+        numbers: (N, 2) int32, which of the names each pair has.
+    """
+
+    def __init__(self, names: Sequence[str], numbers: NDArray[np.integer]) -> None:
+        """Keep them as they are."""
+        self.names, self.numbers = names, numbers.astype(np.int32, copy=False).reshape(-1, 2)
+
+    @classmethod
+    def of(cls, pairs: Iterable[Pair]) -> PairList:
+        """Make a list of any pairs, in their order."""
+        if isinstance(pairs, PairList):
+            return pairs
+        listed = list(pairs)
+        names = sorted({name for pair in listed for name in pair})
+        number = {name: index for index, name in enumerate(names)}
+        return cls(names, np.array([(number[a], number[b]) for a, b in listed], np.int32))
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @overload
+    def __getitem__(self, index: int) -> Pair: ...
+    @overload
+    def __getitem__(self, index: slice) -> PairList: ...
+    def __getitem__(self, index: int | slice) -> Pair | PairList:
+        if isinstance(index, slice):
+            return PairList(self.names, self.numbers[index])
+        first, second = self.numbers[index].tolist()
+        return self.names[first], self.names[second]
+
+    def __iter__(self) -> Iterator[Pair]:
+        for start in range(0, len(self), AT_ONCE):
+            for first, second in self.numbers[start : start + AT_ONCE].tolist():
+                yield self.names[first], self.names[second]
+
+    def at(self, which: NDArray[np.bool_] | NDArray[np.integer] | slice) -> PairList:
+        """Return the pairs of a slice, of a mask (N,), or at indices in their order."""
+        return PairList(self.names, self.numbers[which])
 
 
 class PairOptions(Options):

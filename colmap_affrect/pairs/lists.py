@@ -5,15 +5,15 @@ from __future__ import annotations
 import difflib
 import itertools
 import re
-from collections import defaultdict, deque
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.errors import PairListError
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.project.atomic_files import replace_lines
 
 MAX_NAMES_IN_MESSAGE = 5
@@ -90,71 +90,82 @@ def _candidates(
     )
 
 
-def ordered_for_reuse(pairs: Sequence[Pair], num_images: int) -> list[Pair]:
+def ordered_for_reuse(pairs: Iterable[Pair], num_images: int) -> PairList:
     """Order pairs so that those of the same images come close together.
 
     Images are numbered by walking breadth first through the graph of pairs. Then come, block by
     block, the pairs of ``num_images`` with as many others: memory must hold twice as many.
     """
-    numbers = _breadth_first(pairs)
-    keyed = []
-    for pair in pairs:
-        low, high = sorted((numbers[pair[0]], numbers[pair[1]]))
-        keyed.append((low // num_images, high // num_images, low, high, pair))
-    return [pair for *_, pair in sorted(keyed)]
+    listed = PairList.of(pairs)
+    low, high = np.sort(_breadth_first(listed)[listed.numbers], axis=1).T
+    return listed.at(np.lexsort((high, low, high // num_images, low // num_images)))
 
 
-def _breadth_first(pairs: Sequence[Pair]) -> dict[str, int]:
+def _breadth_first(pairs: PairList) -> NDArray[np.int32]:
     """Number the images of pairs; those that share pairs get near numbers."""
-    others = defaultdict(list)
-    for first, second in sorted(pairs):
-        others[first].append(second)
-        others[second].append(first)
-    numbers: dict[str, int] = {}
-    for start in sorted(others):
-        reached = deque([start])
+    count = len(pairs.names)
+    first, second = pairs.numbers.T.astype(np.int64)
+    both = np.concatenate([first * count + second, second * count + first])
+    both.sort()
+    starts = np.searchsorted(both, np.arange(count + 1) * count)
+    numbers, order = np.full(count, -1, np.int32), list[int]()
+    for start in range(count):
+        if numbers[start] >= 0:
+            continue
+        numbers[start], reached = 0, deque([start])
         while reached:
-            name = reached.popleft()
-            if name not in numbers:
-                numbers[name] = len(numbers)
-                reached.extend(other for other in others[name] if other not in numbers)
+            image = reached.popleft()
+            order.append(image)
+            others = both[starts[image] : starts[image + 1]] % count
+            new = others[numbers[others] < 0]
+            numbers[new] = 0
+            reached.extend(new.tolist())
+    numbers[order] = np.arange(len(order))
     return numbers
 
 
-def read_pairs(path: Path, names: Sequence[str]) -> list[Pair]:
+def read_pairs(path: Path, names: Sequence[str]) -> PairList:
     """Read a pair list as COLMAP and hloc write it: two names per line.
 
     Names may be separated by spaces, a tab or a comma, and may contain spaces. Empty lines and
     lines that begin with # are skipped; pairs given twice, in either order, count once; pairs of an
-    image with itself are dropped. Raises PairListError when the file is unreadable or a name is not
-    among ``names``.
+    image with itself are dropped. The pairs are sorted. Raises PairListError when the file is
+    unreadable or a name is not among ``names``.
     """
+    ordered = sorted(set(names))
+    number = {name: index for index, name in enumerate(ordered)}
+    problems: list[tuple[int, str]] = []
+
+    def codes(lines: Iterable[str]) -> Iterator[int]:
+        for count, line in enumerate(lines, start=1):
+            pair = _split_fast(line.rstrip("\n"), number) or _split(line.strip(), number)
+            if pair:
+                low, high = sorted((number[pair[0]], number[pair[1]]))
+                if low < high:
+                    yield low * len(ordered) + high
+            elif line.strip() and not line.lstrip().startswith("#"):
+                problems.append((count, line.strip()))
+
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        with path.open(encoding="utf-8-sig") as file:
+            found = np.fromiter(codes(file), np.int64)
     except (OSError, UnicodeDecodeError) as error:
         raise PairListError(f"{path}: cannot be read ({error})") from error
-    known = set(names)
-    pairs: dict[Pair, None] = {}
-    problems = []
-    for number, line in enumerate(lines, start=1):
-        pair = _split(line, known) or _split(line.strip(), known)
-        if pair is None and (not line.strip() or line.lstrip().startswith("#")):
-            continue
-        if pair is None:
-            problems.append((number, line))
-        elif pair[0] != pair[1]:
-            pairs[min(pair), max(pair)] = None
     if problems:
         more = len(problems) - MAX_NAMES_IN_MESSAGE
         shown = (
-            f"line {number}: {line.strip()!r}{_suggestion(line, names)}"
-            for number, line in problems[:MAX_NAMES_IN_MESSAGE]
+            f"line {count}: {line!r}{_suggestion(line, ordered)}"
+            for count, line in problems[:MAX_NAMES_IN_MESSAGE]
         )
         listed = "; ".join(shown) + (f"; and {more} more" * (more > 0))
         raise PairListError(f"{path}: names that are not among the images: {listed}")
-    if not pairs:
+    found.sort()  # np.unique takes seven times as much memory
+    found = found[np.flatnonzero(np.diff(found, prepend=-1))]
+    if not len(found):
         raise PairListError(f"{path}: holds no pair of two different images")
-    return sorted(pairs)
+    numbers = np.empty((len(found), 2), np.int32)
+    np.divmod(found, len(ordered), out=(numbers[:, 0], numbers[:, 1]), casting="unsafe")
+    return PairList(ordered, numbers)
 
 
 def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) -> None:
@@ -169,7 +180,15 @@ def write_pairs(path: Path, pairs: Iterable[Pair], names: Iterable[str] = ()) ->
     replace_lines(path, (f"{first}{separator}{second}\n" for first, second in pairs))
 
 
-def _split(line: str, known: set[str]) -> Pair | None:
+def _split_fast(line: str, known: Collection[str]) -> Pair | None:
+    """Split a line as :func:`write_pairs` makes them, else as others do."""
+    first, _, second = line.partition("\t" if "\t" in line else " ")
+    if first in known and second in known and "," not in line:
+        return first, second
+    return _split(line, known)
+
+
+def _split(line: str, known: Collection[str]) -> Pair | None:
     for separator in (r"\t", r"\s*[\t,]\s*|\s+", " "):
         for match in re.finditer(separator, line):
             first, second = line[: match.start()], line[match.end() :]

@@ -11,8 +11,10 @@ from pathlib import Path
 from colmap_affrect.errors import WorkspaceError
 from colmap_affrect.project.atomic_files import replace_text
 
-Entries = dict[str, tuple[str, int]]
-"""By image: the digest of the files that it was extracted from, and the number of features."""
+Size = tuple[int, int]
+Entries = dict[str, tuple[str, int, Size]]
+"""By image: the digest of the files that it was extracted from, the number of features, and
+(width, height) in px."""
 
 MIN_NUM_KEPT = 500
 """Fewer are read as fast."""
@@ -36,7 +38,7 @@ def entries(path: Path, read: Callable[[], Entries]) -> Entries:
     if path not in _known:
         with suppress(OSError, ValueError, TypeError):
             found = json.loads(kept.read_text(encoding="utf-8"))
-            _known[path] = found[0], {n: (str(c), int(k)) for n, (c, k) in found[1].items()}
+            _known[path] = found[0], {n: (c, k, (w, h)) for n, (c, k, (w, h)) in found[1].items()}
     if path not in _known or _known[path][0] != stamp:
         _known[path] = stamp, dict(sorted(read().items()))
         if len(_known[path][1]) >= MIN_NUM_KEPT and time.time_ns() > stamp[3] + MIN_AGE_NS:

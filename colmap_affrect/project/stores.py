@@ -17,13 +17,10 @@ the attribute ``complete``, of another program, does not count.
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -31,21 +28,13 @@ from numpy.typing import NDArray
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import LocalFeatures, of_one_size, union
-from colmap_affrect.errors import StaleStoreError, StoreError
-from colmap_affrect.project.atomic_files import (
-    FileTransaction,
-    apply_journal,
-    cannot_write,
-    journal_of,
-    replace_bytes,
-    uninterrupted,
-)
+from colmap_affrect.errors import StoreError
 from colmap_affrect.project.feature_index import Entries, entries, forget
+from colmap_affrect.project.group_store import GroupStore, complete_groups
 
-FORMAT_VERSION = 2
 MAX_INT16 = 32767
 STATIONARY = "stationary_cells"
-FILTERED = "is_filtered"
+FINISHED = "finished_list"
 
 
 @dataclass(frozen=True)
@@ -67,128 +56,13 @@ class PairMatches:
     level: int = 0
 
 
-class _Store:
-    """A HDF5 file of complete groups that were all made with the same options."""
-
-    kind = ""
-
-    def __init__(self, path: Path, options_digest: str = "") -> None:
-        """Name the file, and the options that its content must have been made with (any if '')."""
-        self.path = path
-        self.options_digest = options_digest
-
-    @contextmanager
-    def _open(self, mode: str) -> Iterator[h5py.File]:
-        """Open to read ("r"), or to write ("a") all that the block changes or nothing.
-
-        HDF5 itself is only let at memory when writing: a full disk ends its process, and a kill
-        between two of its writes leaves a file that cannot be read.
-        """
-        if mode == "r":
-            with self._opened(None) as file:
-                yield file
-            return
-        with uninterrupted():
-            if not self.path.exists():
-                self._create()
-            with FileTransaction(self.path) as changes:
-                with self._opened(changes) as file:
-                    yield file
-                try:
-                    changes.commit()
-                except OSError as error:
-                    raise cannot_write(self.path, error) from error
-
-    @contextmanager
-    def _opened(self, changes: FileTransaction | None) -> Iterator[h5py.File]:
-        try:
-            if changes is None:
-                apply_journal(self.path)
-            with h5py.File(changes or self.path, "r+" if changes else "r") as file:
-                self._check_format(file)
-                yield file
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            raise StoreError(
-                f"{self.path}: cannot be opened as HDF5 ({error}); if it is damaged or another "
-                "program has it open, close that program or run again with --overwrite"
-            ) from error
-
-    def _create(self) -> None:
-        """Make the file without groups."""
-        content = io.BytesIO()
-        with h5py.File(content, "w") as file:
-            file.attrs["format"] = f"colmap_affrect/{self.kind}"
-            file.attrs["format_version"] = FORMAT_VERSION
-            file.attrs["pixel_origin"] = "center"
-            file.attrs["options_digest"] = self.options_digest
-        journal_of(self.path).unlink(missing_ok=True)
-        replace_bytes(self.path, content.getvalue())
-
-    def _check_format(self, file: h5py.File) -> None:
-        known = file.attrs.get("format")
-        version = file.attrs.get("format_version")
-        if known != f"colmap_affrect/{self.kind}" or version != FORMAT_VERSION:
-            found = f"{known} {version}" if known else "a file of another program"
-            raise StoreError(
-                f"{self.path}: expected {self.kind} of format version {FORMAT_VERSION}, found "
-                f"{found}; use another --output-path"
-            )
-        if self.options_digest and file.attrs.get("options_digest") != self.options_digest:
-            raise StaleStoreError(
-                f"{self.path}: was made with other options than config.toml beside it records; "
-                "run again with --overwrite"
-            )
-
-    def complete(self, keys: Iterable[str]) -> set[str]:
-        """Return those of the keys whose group is there and complete."""
-        if not self.path.exists():
-            return set()
-        with self._open("r") as file:
-            return {key for key in keys if key in file and file[key].attrs.get("complete", False)}
-
-    def names(self) -> list[str]:
-        """Return the sorted names of all complete groups."""
-        if not self.path.exists():
-            return []
-        with self._open("r") as file:
-            return sorted(name for name, _ in _complete_groups(file))
-
-    @staticmethod
-    def _write(file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:
-        if key in file:
-            del file[key]
-        group = file.create_group(key)
-        for name, values in datasets.items():
-            group.create_dataset(name, data=values)
-        group.attrs.update(attributes)
-        group.attrs["complete"] = True
-
-
-def _complete_groups(group: h5py.Group, path: str = "") -> Iterator[tuple[str, h5py.Group]]:
-    """Yield the paths of all complete groups, and these.
-
-    Their datasets are not opened, which takes long, and links are not followed.
-    """
-    is_complete = group.attrs.get("complete", False)
-    if is_complete:
-        yield path, group
-    for key in group.keys() - (DATASETS if is_complete else set()):
-        is_link = not isinstance(group.get(key, getlink=True), h5py.HardLink)
-        inner = None if is_link else group[key]
-        if isinstance(inner, h5py.Group):
-            yield from _complete_groups(inner, f"{path}/{key}" if path else key)
-
-
-def _digests_and_counts(file: h5py.File) -> Iterator[tuple[str, tuple[str, int]]]:
-    for name, group in _complete_groups(file):
-        yield name, (str(group.attrs.get("content", "")), len(group["keypoints"]))
-
-
-DATASETS = {
-    "descriptors", "image_size", "keypoints", "lafs", "level_ends", "matches0",
-    "matching_scores0", "rectification_ids", "scores", "exact", "candidates",
-}  # fmt: skip
-"""What complete groups hold; groups too, where a file has become a folder."""
+def _indexed(file: h5py.File) -> Entries:
+    found: Entries = {}
+    for name, group in complete_groups(file):
+        width, height = group["image_size"][()].tolist()
+        content = str(group.attrs.get("content", ""))
+        found[name] = content, len(group["keypoints"]), (width, height)
+    return found
 
 
 def frame_datasets(lafs: NDArray[np.floating]) -> dict[str, NDArray[np.float32]]:
@@ -201,7 +75,7 @@ def frame_datasets(lafs: NDArray[np.floating]) -> dict[str, NDArray[np.float32]]
     return {"lafs": stored, "scales": scales.astype(np.float32), "oris": oris}
 
 
-class FeatureStore(_Store):
+class FeatureStore(GroupStore):
     """Local features by image name."""
 
     kind = "features"
@@ -211,7 +85,7 @@ class FeatureStore(_Store):
         if not self.path.exists():
             return {}
         with self._open("r") as file:
-            return entries(self.path, lambda: dict(_digests_and_counts(file)))
+            return entries(self.path, lambda: _indexed(file))
 
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:
@@ -237,7 +111,7 @@ class FeatureStore(_Store):
 
     def contents(self) -> dict[str, str]:
         """Return for each image the digest of the files that it was extracted from, if known."""
-        return {name: content for name, (content, _) in self._entries().items()}
+        return {name: content for name, (content, *_) in self._entries().items()}
 
     def record_contents(self, contents: Mapping[str, str]) -> None:
         """Put on record what images were extracted from."""
@@ -322,7 +196,7 @@ class FeatureStore(_Store):
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of features of each image."""
-        return {name: count for name, (_, count) in self._entries().items()}
+        return {name: count for name, (_, count, _) in self._entries().items()}
 
     def image_size(self, name: str) -> tuple[int, int]:
         """Return the (width, height) of one image in px."""
@@ -332,11 +206,7 @@ class FeatureStore(_Store):
 
     def image_sizes(self) -> dict[str, tuple[int, int]]:
         """Return the (width, height) of each image in px."""
-        names = self.names()
-        if not names:
-            return {}
-        with self._open("r") as file:
-            return {name: tuple(file[name]["image_size"][()].tolist()) for name in names}
+        return {name: size for name, (*_, size) in self._entries().items()}
 
     def read_frames(self, name: str) -> NDArray[np.float32]:
         """Read the (N, 2, 3) frames of one image."""
@@ -367,7 +237,7 @@ def hloc_matches(pair: PairMatches) -> dict[str, NDArray[np.generic]]:
     }
 
 
-class MatchStore(_Store):
+class MatchStore(GroupStore):
     """Raw matches by pair of image names."""
 
     kind = "matches"
@@ -401,7 +271,8 @@ class MatchStore(_Store):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            for key, group in list(_complete_groups(file)):
+            file.attrs[FINISHED] = ""
+            for key, group in list(complete_groups(file)):
                 if (
                     key in keys
                     or not names.isdisjoint(key.split("/"))
@@ -422,17 +293,35 @@ class MatchStore(_Store):
         with self._open("a") as file:
             file.attrs[STATIONARY] = json.dumps([(s, found.tolist()) for s, found in cells.items()])
 
-    def is_filtered(self) -> bool:
-        """Tell whether all matches have been looked at for what never moves."""
+    def has(self, pairs: Sequence[tuple[str, str]]) -> NDArray[np.bool_]:
+        """Tell, as (N,) bools, which of N pairs are there and complete."""
         if not self.path.exists():
-            return True
+            return np.zeros(len(pairs), np.bool_)
         with self._open("r") as file:
-            return bool(file.attrs.get(FILTERED, True))
+            keys = (pair_key(*pair) for pair in pairs)
+            there = (key in file and file[key].attrs.get("complete", False) for key in keys)
+            return np.fromiter(there, np.bool_, len(pairs))
 
-    def mark_filtered(self, is_filtered: bool) -> None:
-        """Keep whether all matches have been looked at for what never moves."""
+    def num_pairs(self) -> int:
+        """Return the number of pairs that are there, without a look at each."""
+        with self._open("r") as file:
+            return sum(len(group) for group in file.values())
+
+    def finished_list(self) -> str | None:
+        """Return the digest of the list whose pairs have all been matched and looked at.
+
+        Empty if a run has begun with another one since, None if nothing is known.
+        """
+        if not self.path.exists():
+            return None
+        with self._open("r") as file:
+            found = file.attrs.get(FINISHED)
+            return None if found is None else str(found)
+
+    def record_finished_list(self, digest: str) -> None:
+        """Keep the digest of the list that is finished, empty while there is none."""
         with self._open("a") as file:
-            file.attrs[FILTERED] = is_filtered
+            file.attrs[FINISHED] = digest
 
     def levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
         """Return the level of escalation that the matches of each pair are from."""
@@ -482,7 +371,7 @@ class GuidedPair:
     num_inliers: int
 
 
-class GuidedStore(_Store):
+class GuidedStore(GroupStore):
     """Which pairs were matched again by their geometry."""
 
     kind = "guided matches"

@@ -12,9 +12,11 @@ from colmap_affrect.colmap.database_copy import copy_with_frames
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.images.headers import header_size
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.shown import such_as
 from colmap_affrect.stages.changes import source_files
 from colmap_affrect.stages.context import Context
 
@@ -38,21 +40,23 @@ def copy_verified(
     workspace = context.workspace
     if image_path and not image_path.is_dir():
         raise DatabaseError(f"--image-path {image_path}: no such folder")
-    if not workspace.database.exists():
+    contents = Contents(workspace.contents)
+    digest, before = contents.digest(source_files(source)), contents.recorded("copy")
+    if digest != before or not workspace.database.exists():
         refuse_unusable(source)
     given = {"database": str(source.resolve()), "image_path": _absolute(image_path)}
     workspace.record_options("copy", given, overwrite=overwrite)
-    contents = Contents(workspace.contents)
-    digest, before = contents.digest(source_files(source)), contents.recorded("copy")
     warnings = {}
     if digest != before:
         if before:
             warnings[str(source)] = "has changed; its copy and the models are made anew"
-            logger.warning("%s: %s", source, warnings[str(source)])
         workspace.rewind()
         contents.record("copy", digest)
     if not workspace.database.exists():
         copy_with_frames(source, workspace.database)
+    warnings |= _other_sizes(workspace.database, image_path) if image_path else {}
+    for name, what in warnings.items():
+        logger.warning("%s: %s", name, what)
     record_cameras(workspace.database, workspace.cameras)
     workspace.record_options("verify", verification.to_mapping())
     num_pairs = colmap_database.num_matched_pairs(workspace.database)
@@ -65,6 +69,17 @@ def copy_verified(
         verify(workspace.database, verification, advance=advance)
     wall_s = time.perf_counter() - start
     return StageReport("verify", wall_s, todo, num_pairs - todo, warnings=warnings)
+
+
+def _other_sizes(database: Path, image_path: Path) -> dict[str, str]:
+    """Tell which photographs cannot be those that a database was made from."""
+    cameras = colmap_database.read_cameras(database)
+    sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
+    odd = [n for n, size in sizes.items() if header_size(image_path / n) not in (None, size)]
+    if not odd:
+        return {}
+    line = f"{len(odd)} photographs have another size than their cameras, such as {such_as(odd)}"
+    return {str(image_path): f"{line}: the database was made from others"}
 
 
 def is_copy(workspace: Workspace) -> bool:

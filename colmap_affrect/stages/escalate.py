@@ -93,7 +93,7 @@ def escalate(
     escalation = Escalation(context, options)
     if overwrite:
         escalation.undo()
-    if colmap_database.unverified_pairs(context.workspace.database):
+    if len(colmap_database.unverified_pairs(context.workspace.database)):
         escalation.write()  # it was killed there
     climbed: set[Pair] = set()
     while work := escalation.next_work():

@@ -196,26 +196,23 @@ def extract(
     workspace, folder = context.workspace, Path(inputs.image_path)
     inputs.check()
     _require_usable_cameras(workspace, inputs)
-    names = inputs.names()
-    if image_names:
-        names = checked_names(folder, image_names, "image_names")
-    inputs.check_names(names)
+    chosen = checked_names(folder, image_names, "image_names") if image_names else []
+    names = chosen or inputs.names()
+    contents, options = Contents(workspace.contents), recipe.extraction
+    digests = {name: contents.digest(inputs.files(name, options)) for name in names}
+    if overwrite or digests != context.features.contents():  # else they were seen to be good
+        inputs.check_names(names)
     whole = inputs.photographs.without_mask(names)
-    extractor = prepared_recipe(context, recipe.extraction, names)
-    contents = Contents(workspace.contents)
-    digests = {name: contents.digest(inputs.files(name, extractor.options)) for name in names}
+    extractor = prepared_recipe(context, options, names)
     if not overwrite:
         refuse_other_photographs(workspace, inputs.image_path, digests)
     _record(workspace, inputs, recipe, extractor, later or {}, overwrite=overwrite)
-    warnings = forget_changed(context, inputs, digests, contents, are_all=not image_names)
+    warnings = forget_changed(context, inputs, digests, contents, are_all=not chosen)
     _start_database(workspace)
     done = context.features.complete(names)
     missing = [name for name in names if name not in done]
     _refuse_foreign_features(workspace, missing)
-    if not (inputs.image_list_path or image_names):
-        warnings |= not_named(folder, names) if inputs.from_database else left_out(folder)
-    if whole:
-        warnings["masks"] = f"{len(whole)} images have none and are used whole, as {whole[0]} is"
+    warnings |= _passed_over(inputs, names, whole, is_list=bool(chosen))
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
     failures = _extract_missing(context, inputs, extractor, missing, digests, warnings)
@@ -237,6 +234,18 @@ def _require_some(folder: Path, names: Sequence[str], failures: Mapping[str, str
             f"{folder}: none of the {len(names)} images can be used; the first: "
             f"{failures[names[0]]}"
         )
+
+
+def _passed_over(
+    inputs: Inputs, names: Sequence[str], whole: Sequence[str], *, is_list: bool
+) -> dict[str, str]:
+    """Tell which photographs are left out, and which have no mask."""
+    folder, found = Path(inputs.image_path), dict[str, str]()
+    if not (inputs.image_list_path or is_list):
+        found |= not_named(folder, names) if inputs.from_database else left_out(folder)
+    if whole:
+        found["masks"] = f"{len(whole)} images have none and are used whole, as {whole[0]} is"
+    return found
 
 
 def _require_usable_cameras(workspace: Workspace, inputs: Inputs) -> None:

@@ -7,12 +7,15 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 
+import numpy as np
+
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.features.weights import digests_by_name, resolve
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.base import Pair, PairList
+from colmap_affrect.project.contents import sha256_of
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.stores import PairMatches, pair_key
+from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import recorded_extraction, write_images_and_keypoints
@@ -54,21 +57,25 @@ def match(
     digests = digests_by_name(resolve(options.weights, context.resources.weights_path))
     record = options.to_mapping() | ({WEIGHTS: digests} if digests else {})
     context.workspace.record_options("match", record, overwrite=overwrite)
-    done = context.matches.complete(pair_key(*pair) for pair in pairs)
-    missing = [pair for pair in pairs if pair_key(*pair) not in done]
+    matches, digest = context.matches, sha256_of(context.workspace.pairs)
+    finished = matches.finished_list()
+    is_finished = finished == digest and matches.num_pairs() == len(pairs)
+    missing = pairs.at(slice(0) if is_finished else ~matches.has(pairs))
     if missing:
-        context.matches.mark_filtered(False)
+        matches.record_finished_list("")
     with context.progress.stage("match", len(missing), "pairs") as advance:
         match_pairs(context, missing, options, advance)
     warnings = {}
-    if options.filter_stationary_matches and not context.matches.is_filtered():
-        if line := StationaryFilter(context.features, context.matches).learn(pairs):
+    if missing or finished == "":  # else those of an older version
+        is_asked = options.filter_stationary_matches
+        if is_asked and (line := StationaryFilter(context.features, matches).learn(pairs)):
             warnings["matches"] = line
             logger.warning("matches: %s", line)
-        context.matches.mark_filtered(True)
+    if finished != digest:
+        matches.record_finished_list(digest)
     write_matches(context, pairs)
     wall_s = time.perf_counter() - start
-    return StageReport("match", wall_s, len(missing), len(done), warnings=warnings)
+    return StageReport("match", wall_s, len(missing), len(pairs) - len(missing), warnings=warnings)
 
 
 def match_pairs(
@@ -101,16 +108,11 @@ def match_pairs(
 def write_matches(context: Context, pairs: Sequence[Pair]) -> None:
     """Put the raw matches that the database lacks into it, after images and keypoints."""
     write_images_and_keypoints(context)
-    path = context.workspace.database
+    path, listed = context.workspace.database, PairList.of(pairs)
     ids = colmap_database.image_ids(path)
+    known_ids = np.array([ids.get(name, 0) for name in listed.names], np.int64)
     with colmap_database.open_database(path) as database:
-        lacking = [
-            pair
-            for pair in pairs
-            if pair[0] in ids
-            and pair[1] in ids
-            and not database.exists_matches(ids[pair[0]], ids[pair[1]])
-        ]
+        lacking = listed.at(colmap_database.lack_matches(database, known_ids[listed.numbers]))
         if not lacking:
             return
         for (first, second), found in zip(lacking, context.matches.read(lacking), strict=True):

@@ -12,7 +12,7 @@ from pathlib import Path
 from colmap_affrect.errors import PairListError
 from colmap_affrect.matchers.base import Matches
 from colmap_affrect.matchers.nearest import NearestOptions
-from colmap_affrect.pairs.base import Pair, PairOptions
+from colmap_affrect.pairs.base import Pair, PairList, PairOptions
 from colmap_affrect.pairs.by_place import pairs_by_place
 from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.pairs.low_resolution import NUM_STRONGEST, low_resolution_pairs
@@ -157,7 +157,7 @@ def _forget_lost(context: Context, lost: Collection[Pair]) -> dict[str, str]:
     return {str(context.workspace.pairs): why}
 
 
-def listed_pairs(context: Context) -> list[Pair]:
+def listed_pairs(context: Context) -> PairList:
     """Return the pairs of the list whose images have features."""
     context.workspace.require("pairs")
     if not context.workspace.pairs.exists():
@@ -166,4 +166,4 @@ def listed_pairs(context: Context) -> list[Pair]:
             "'colmap-affrect pairs' and then match again"
         )
     names = context.features.names()
-    return read_pairs(context.workspace.pairs, names) if len(names) > 1 else []
+    return read_pairs(context.workspace.pairs, names) if len(names) > 1 else PairList.of(())

@@ -115,6 +115,8 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
     ("no-prior-focal", ["UPDATE cameras SET prior_focal_length = 0"], ["camera 1 (90 x 60)"]),
     ("no-frame", ["DELETE FROM frame_data WHERE data_id = 3"], ["side/č.png"]),
     ("no-frame", ["UPDATE frame_data SET sensor_type = 1 WHERE data_id = 3"], ["side/č.png"]),
+    ("bad-name", ["UPDATE images SET name = x'61FF' WHERE image_id = 1"], ["image 1: 'a\ufffd'"]),
+    ("bad-name", ["UPDATE images SET name = '' WHERE image_id = 1"], ["image 1: ''"]),
     ("unsafe-name", ["UPDATE images SET name = 'x/../../y' WHERE image_id = 1"], ["x/../../y"]),
     ("unsafe-name", ["UPDATE images SET name = '/etc/x' WHERE image_id = 1"], ["/etc/x"]),
     (

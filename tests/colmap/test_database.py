@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,13 +16,14 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
     colmap_keypoints,
     image_ids,
+    lack_matches,
     open_database,
     write_keypoints,
     write_matches,
 )
 from colmap_affrect.colmap.initial_cameras import import_images
 from colmap_affrect.data import Rectification
-from colmap_affrect.errors import DatabaseError
+from colmap_affrect.errors import DatabaseError, WorkspaceError
 from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import lafs_from_keypoints, rotation, transform_frames
 from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
@@ -273,3 +276,26 @@ def test_write_matches_refuses_what_would_crash_colmap(
             write_matches(database, *pair, matches)
         assert database.num_matches() == 0
         assert database.num_matched_image_pairs() == 0
+
+
+def test_database_that_cannot_be_made_on_a_full_disk_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "any.db").mkdir()
+    with pytest.raises(DatabaseError, match="not a usable COLMAP database"):
+        image_ids(tmp_path / "any.db")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=4096))
+    with pytest.raises(
+        WorkspaceError, match=r"any\.db: cannot be written \(No space left on device"
+    ):
+        image_ids(tmp_path / "any.db")
+
+
+def test_pairs_without_a_row_of_matches_are_those_that_lack_them(database_path: Path) -> None:
+    with open_database(database_path) as database:
+        for image_id in (1, 2, 3):
+            write_keypoints(database, image_id, some_frames(3))
+        write_matches(database, 1, 2, np.zeros((0, 2), np.int64))
+        write_matches(database, 1, 3, np.array([[0, 1]]))
+        pairs = np.array([[2, 1], [1, 3], [3, 2], [0, 2]])
+        assert lack_matches(database, pairs).tolist() == [False, False, True, False]

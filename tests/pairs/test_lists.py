@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from colmap_affrect.errors import PairListError
-from colmap_affrect.pairs.base import Pair
+from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.pairs.lists import (
     exhaustive_pairs,
     most_similar_pairs,
@@ -66,14 +66,14 @@ def num_read(pairs: Sequence[Pair], num_kept: int) -> int:
 def test_ordered_pairs_are_the_same_pairs(num_images: int) -> None:
     pairs = [("a", "b"), ("c", "d"), ("b", "c"), ("x", "y"), ("a", "y")]
     assert sorted(ordered_for_reuse(pairs, num_images)) == sorted(pairs)
-    assert ordered_for_reuse([], num_images) == []
+    assert list(ordered_for_reuse([], num_images)) == []
 
 
 def test_few_images_are_read_again_for_all_pairs() -> None:
     pairs = exhaustive_pairs([f"{index:02d}" for index in range(40)])
     ordered = ordered_for_reuse(pairs, 5)
     assert num_read(ordered, 10) <= 8 * 9 // 2 * 10 < num_read(pairs, 10) // 2
-    assert ordered_for_reuse(pairs, 40) == pairs
+    assert list(ordered_for_reuse(pairs, 40)) == pairs
 
 
 def test_few_images_are_read_again_for_near_ones_whose_names_are_in_disorder() -> None:
@@ -148,7 +148,7 @@ def test_most_similar_pairs_leave_no_image_out() -> None:
 )
 def test_read_pairs_takes_space_tab_and_comma(pair_list: Path, line: str) -> None:
     pair_list.write_bytes(f"{line}\n".encode())
-    assert read_pairs(pair_list, NAMES) == [("a.png", "b.png")]
+    assert list(read_pairs(pair_list, NAMES)) == [("a.png", "b.png")]
 
 
 @pytest.mark.parametrize("separator", [" ", "\t", ",", ", ", "  "])
@@ -156,17 +156,17 @@ def test_read_pairs_takes_names_with_spaces_and_commas(pair_list: Path, separato
     pairs = [("new wing/a 1.png", "new wing/b.png"), ("a.png", "č, d.png")]
     text = "".join(f"{first}{separator}{second}\n" for first, second in pairs)
     pair_list.write_text(text, encoding="utf-8")
-    assert read_pairs(pair_list, NAMES) == sorted(pairs)
+    assert list(read_pairs(pair_list, NAMES)) == sorted(pairs)
 
 
 def test_read_pairs_skips_comments_and_empty_lines(pair_list: Path) -> None:
     pair_list.write_text("# a.png b.png\n\n   \n  # more\na.png new wing/b.png\n")
-    assert read_pairs(pair_list, NAMES) == [("a.png", "new wing/b.png")]
+    assert list(read_pairs(pair_list, NAMES)) == [("a.png", "new wing/b.png")]
 
 
 def test_read_pairs_counts_a_pair_once_and_drops_self_pairs(pair_list: Path) -> None:
     pair_list.write_text("b.png a.png\na.png a.png\na.png b.png\na.png b.png\n")
-    assert read_pairs(pair_list, NAMES) == [("a.png", "b.png")]
+    assert list(read_pairs(pair_list, NAMES)) == [("a.png", "b.png")]
 
 
 def test_read_pairs_lists_unknown_names_with_line_and_suggestion(pair_list: Path) -> None:
@@ -225,7 +225,31 @@ def test_written_list_reads_back(
     path = tmp_path_factory.getbasetemp() / "written.txt"
     pairs = exhaustive_pairs(names)
     write_pairs(path, pairs)
-    assert read_pairs(path, names) == pairs
+    assert list(read_pairs(path, names)) == pairs
+
+
+def test_list_of_pairs_is_a_sequence_of_them() -> None:
+    pairs = [("b", "a"), ("a", "c"), ("d", "b")]
+    listed = PairList.of(pairs)
+    assert PairList.of(listed) is listed
+    assert [*listed] == pairs
+    assert (len(listed), listed[1], listed[-1]) == (3, pairs[1], pairs[2])
+    assert [*listed[1:]] == pairs[1:] == [*listed.at(np.array([False, True, True]))]
+    assert [*listed.at(np.array([2, 0]))] == [pairs[2], pairs[0]]
+    assert not PairList.of([])
+    with pytest.raises(IndexError):
+        listed[3]
+
+
+def test_all_pairs_of_thousands_are_read_and_ordered_as_numbers(tmp_path: Path) -> None:
+    names = [f"{index:04d}.png" for index in range(400)]
+    write_pairs(tmp_path / "pairs.txt", itertools.combinations(names, 2), names)
+    tracemalloc.start()
+    try:
+        pairs = ordered_for_reuse(read_pairs(tmp_path / "pairs.txt", names), 40)
+        assert tracemalloc.get_traced_memory()[1] < 80 * len(pairs)  # as tuples of names 400
+    finally:
+        tracemalloc.stop()
 
 
 def test_all_pairs_of_thousands_are_written_without_keeping_them(tmp_path: Path) -> None:
@@ -236,4 +260,4 @@ def test_all_pairs_of_thousands_are_written_without_keeping_them(tmp_path: Path)
         assert tracemalloc.get_traced_memory()[1] < 3_000_000  # as lists of pairs and lines 7 MB
     finally:
         tracemalloc.stop()
-    assert read_pairs(tmp_path / "pairs.txt", names) == exhaustive_pairs(names)
+    assert list(read_pairs(tmp_path / "pairs.txt", names)) == exhaustive_pairs(names)

@@ -26,7 +26,9 @@ def never() -> Entries:
 
 def found(path: Path, *names: str) -> list[str]:
     """What is found in a file that holds some images; none are given where it is not to be read."""
-    return list(entries(path, lambda: dict.fromkeys(names, ("ab", 3)) if names else never()))
+    return list(
+        entries(path, lambda: dict.fromkeys(names, ("ab", 3, (4, 5))) if names else never())
+    )
 
 
 def new_process(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -262,9 +262,8 @@ def test_files_of_text_may_begin_with_a_byte_order_mark(trio: Path, tmp_path: Pa
     assert load_recipe(str(recipe)).extraction.rectifier.name == "identity"
     names = list_images(trio)
     assert list_images(trio, written("list.txt", f"{names[0]}\n")) == names[:1]
-    assert read_pairs(written("pairs.txt", f"{names[0]}\t{names[1]}\n"), names) == [
-        (names[0], names[1])
-    ]
+    listed = written("pairs.txt", f"{names[0]}\t{names[1]}\n")
+    assert [*read_pairs(listed, names)] == [(names[0], names[1])]
     table = CameraOptions(cameras_path=str(written("table.csv", "name,focal_px\na.png,300\n")))
     assert read_given_cameras(table)["a.png"].focal_px == 300.0
     written("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n")

@@ -25,6 +25,10 @@ ROWS = [
         "UPDATE images SET camera_id = 999 WHERE image_id = 1",
         "images whose camera does not exist (",
     ),
+    (
+        "UPDATE images SET name = x'ff00fe' WHERE image_id = 1",
+        "with one that is not UTF-8 (image 1",
+    ),
     ("UPDATE keypoints SET rows = 100000 WHERE image_id = 1", "less data than rows and columns ("),
     ("UPDATE keypoints SET rows = -1 WHERE image_id = 1", "less data than rows and columns ("),
     ("UPDATE keypoints SET data = substr(data, 1, 100)", "less data than rows and columns ("),

@@ -26,8 +26,16 @@ ROWS: list[tuple[str, str, tuple[str, ...]]] = [
     ),
     (
         "the same in a database of the user's own, by functions with pycolmap's names",
-        "refused in a line that names the photographs and says to begin a new database",
+        "argued: refused in a line that names the photographs and says to begin a new database. "
+        "It is the user's, may hold what other programs made of the same features, and these "
+        "functions, like pycolmap's, only add to it",
         (f"{CHANGED}::test_changed_photograph_of_a_users_database_is_named",),
+    ),
+    (
+        "the same behind another program's database, by map --from-database",
+        "argued: it does not say what its features were extracted from, so only another size of a "
+        "photograph can be told, in a line; a database that was damaged since discards no model",
+        (f"{CHANGED}::test_photograph_of_another_size_than_its_camera_is_told_by_map",),
     ),
     (
         "photograph deleted or renamed",
@@ -73,7 +81,7 @@ ROWS: list[tuple[str, str, tuple[str, ...]]] = [
     ),
     (
         "camera_id=999, rows=100000, rows=-1, short blobs, camera model 12345, NaN parameters, "
-        "width 2^63, keypoints at 1e30",
+        "width 2^63, keypoints at 1e30, half a pose of a pair, names that are not UTF-8",
         "one line that names the rows; doctor reports the same as errors",
         (
             f"{HOSTILE}::test_hostile_rows_are_one_line",
@@ -183,8 +191,13 @@ ROWS: list[tuple[str, str, tuple[str, ...]]] = [
     ),
     (
         "32000 x 32000 PNG of 1 MB",
-        "left out by its header with a line; 512 megapixels are read",
-        ("images/test_reading.py::test_photograph_of_absurd_size_is_refused_by_its_header",),
+        "left out by its header with a line, also by COLMAP's SIFT in compare; 512 megapixels are "
+        "read",
+        (
+            "images/test_reading.py::test_photograph_of_absurd_size_is_refused_by_its_header",
+            "comparison/test_methods.py::"
+            "test_sift_passes_over_photographs_and_masks_of_absurd_size",
+        ),
     ),
     (
         "TIFF with an EXIF orientation (found beside the review: turned by OpenCV, not by COLMAP)",
@@ -192,18 +205,36 @@ ROWS: list[tuple[str, str, tuple[str, ...]]] = [
         ("images/test_reading.py::test_header_and_pixels_are_those_that_are_stored",),
     ),
     (
-        "5,000 images: repeating a finished extract",
-        "features.h5 is gone through once, and not at all while its index fits",
+        "5,000 images: repeating a finished extract, or run",
+        "features.h5 is gone through once, and not at all while its index fits; no header, no pair "
+        "is looked at and the page stays: 2.6 s of processor time for run",
         (
             "project/test_feature_index.py::"
             "test_another_process_reads_the_index_and_none_that_is_stale_or_damaged",
+            "stages/test_stages.py::test_idle_run_looks_at_no_header_and_leaves_the_page",
         ),
     ),
     (
         "5,000 images: all pairs as a list",
-        "the list is written without keeping it. Left: match and later stages read it as pairs of "
-        "strings; twelve million pairs take days to match, and a warning names --pairs retrieval",
-        ("pairs/test_lists.py::test_all_pairs_of_thousands_are_written_without_keeping_them",),
+        "written without keeping it; pairs, match and verify have it as numbers of images. Left: "
+        "on-demand recipes look at all pairs as names, since which climb depends on all others; "
+        "twelve million pairs take days to match, and a warning names --pairs retrieval",
+        (
+            "pairs/test_lists.py::test_all_pairs_of_thousands_are_written_without_keeping_them",
+            "pairs/test_lists.py::test_all_pairs_of_thousands_are_read_and_ordered_as_numbers",
+        ),
+    ),
+    (
+        "kills at random moments and single system calls, full disks, damaged pages and databases",
+        "all resumed to identical results or refused in one line: tests/benchmarks/campaign.py. A "
+        "kill between two changes of the matches, which lost climbed pairs, is a test of its own",
+        (
+            "stages/test_escalate.py::"
+            "test_run_killed_between_two_changes_of_its_matches_goes_on_to_the_same_result",
+            "stages/test_stationary.py::"
+            "test_matches_that_a_killed_run_did_not_look_at_are_looked_at_by_the_next",
+            "colmap/test_database.py::test_database_that_cannot_be_made_on_a_full_disk_says_so",
+        ),
     ),
     (
         "max_image_size_px=4000 takes 5.2 GiB",

@@ -201,6 +201,28 @@ def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
     assert database_content(copy.database) == tables
 
 
+def test_idle_run_looks_at_no_header_and_leaves_the_page(
+    copy: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("colmap_affrect.pipeline.write_run_page", None)
+    monkeypatch.setattr("colmap_affrect.colmap.initial_cameras.read_camera_tags", None)
+    monkeypatch.setattr("colmap_affrect.project.stores.MatchStore.has", None)
+    run(photos, copy.path, OPTIONS)
+    copy.page.unlink()
+    with pytest.raises(TypeError, match="NoneType"):
+        run(photos, copy.path, OPTIONS)
+
+
+def test_pair_whose_matches_are_lost_is_matched_again(
+    finished: tuple[Workspace, ReconstructionReport], copy: Workspace, photos: Path
+) -> None:
+    with h5py.File(copy.matches, "a") as file:
+        del file["a.png"]["b c.png"]
+    report = run(photos, copy.path, OPTIONS)
+    assert (report.stages[2].num_done, report.stages[2].num_kept) == (1, 5)
+    assert hdf5_content(copy.matches) == hdf5_content(finished[0].matches)
+
+
 @pytest.mark.parametrize("name", NAMES[1:3])
 def test_image_whose_features_are_lost_gets_the_same_again(
     finished: tuple[Workspace, ReconstructionReport], copy: Workspace, photos: Path, name: str

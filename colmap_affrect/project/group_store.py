@@ -1,0 +1,141 @@
+"""A HDF5 file of groups that are complete or do not count, which changes as a whole."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from colmap_affrect.errors import StaleStoreError, StoreError
+from colmap_affrect.project.atomic_files import (
+    FileTransaction,
+    apply_journal,
+    cannot_write,
+    journal_of,
+    replace_bytes,
+    uninterrupted,
+)
+
+FORMAT_VERSION = 2
+
+DATASETS = {
+    "descriptors", "image_size", "keypoints", "lafs", "level_ends", "matches0",
+    "matching_scores0", "rectification_ids", "scores", "exact", "candidates",
+}  # fmt: skip
+"""What complete groups hold; groups too, where a file has become a folder."""
+
+
+class GroupStore:
+    """A HDF5 file of complete groups that were all made with the same options."""
+
+    kind = ""
+
+    def __init__(self, path: Path, options_digest: str = "") -> None:
+        """Name the file, and the options that its content must have been made with (any if '')."""
+        self.path = path
+        self.options_digest = options_digest
+
+    @contextmanager
+    def _open(self, mode: str) -> Iterator[h5py.File]:
+        """Open to read ("r"), or to write ("a") all that the block changes or nothing.
+
+        HDF5 itself is only let at memory when writing: a full disk ends its process, and a kill
+        between two of its writes leaves a file that cannot be read.
+        """
+        if mode == "r":
+            with self._opened(None) as file:
+                yield file
+            return
+        with uninterrupted():
+            if not self.path.exists():
+                self._create()
+            with FileTransaction(self.path) as changes:
+                with self._opened(changes) as file:
+                    yield file
+                try:
+                    changes.commit()
+                except OSError as error:
+                    raise cannot_write(self.path, error) from error
+
+    @contextmanager
+    def _opened(self, changes: FileTransaction | None) -> Iterator[h5py.File]:
+        try:
+            if changes is None:
+                apply_journal(self.path)
+            with h5py.File(changes or self.path, "r+" if changes else "r") as file:
+                self._check_format(file)
+                yield file
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
+            raise StoreError(
+                f"{self.path}: cannot be opened as HDF5 ({error}); if it is damaged or another "
+                "program has it open, close that program or run again with --overwrite"
+            ) from error
+
+    def _create(self) -> None:
+        """Make the file without groups."""
+        content = io.BytesIO()
+        with h5py.File(content, "w") as file:
+            file.attrs["format"] = f"colmap_affrect/{self.kind}"
+            file.attrs["format_version"] = FORMAT_VERSION
+            file.attrs["pixel_origin"] = "center"
+            file.attrs["options_digest"] = self.options_digest
+        journal_of(self.path).unlink(missing_ok=True)
+        replace_bytes(self.path, content.getvalue())
+
+    def _check_format(self, file: h5py.File) -> None:
+        known = file.attrs.get("format")
+        version = file.attrs.get("format_version")
+        if known != f"colmap_affrect/{self.kind}" or version != FORMAT_VERSION:
+            found = f"{known} {version}" if known else "a file of another program"
+            raise StoreError(
+                f"{self.path}: expected {self.kind} of format version {FORMAT_VERSION}, found "
+                f"{found}; use another --output-path"
+            )
+        if self.options_digest and file.attrs.get("options_digest") != self.options_digest:
+            raise StaleStoreError(
+                f"{self.path}: was made with other options than config.toml beside it records; "
+                "run again with --overwrite"
+            )
+
+    def complete(self, keys: Iterable[str]) -> set[str]:
+        """Return those of the keys whose group is there and complete."""
+        if not self.path.exists():
+            return set()
+        with self._open("r") as file:
+            return {key for key in keys if key in file and file[key].attrs.get("complete", False)}
+
+    def names(self) -> list[str]:
+        """Return the sorted names of all complete groups."""
+        if not self.path.exists():
+            return []
+        with self._open("r") as file:
+            return sorted(name for name, _ in complete_groups(file))
+
+    @staticmethod
+    def _write(file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:
+        if key in file:
+            del file[key]
+        group = file.create_group(key)
+        for name, values in datasets.items():
+            group.create_dataset(name, data=values)
+        group.attrs.update(attributes)
+        group.attrs["complete"] = True
+
+
+def complete_groups(group: h5py.Group, path: str = "") -> Iterator[tuple[str, h5py.Group]]:
+    """Yield the paths of all complete groups, and these.
+
+    Their datasets are not opened, which takes long, and links are not followed.
+    """
+    is_complete = group.attrs.get("complete", False)
+    if is_complete:
+        yield path, group
+    for key in group.keys() - (DATASETS if is_complete else set()):
+        is_link = not isinstance(group.get(key, getlink=True), h5py.HardLink)
+        inner = None if is_link else group[key]
+        if isinstance(inner, h5py.Group):
+            yield from complete_groups(inner, f"{path}/{key}" if path else key)
