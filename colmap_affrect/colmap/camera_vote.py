@@ -207,7 +207,10 @@ def forget_votes(path: Path, records: Mapping[int, CameraRecord]) -> dict[int, C
 
 
 def voting_pairs(
-    path: Path, unknown: Collection[int], extracted_px: ExtractedPx
+    path: Path,
+    unknown: Collection[int],
+    extracted_px: ExtractedPx,
+    silent: Collection[tuple[str, str]] = (),
 ) -> list[VotingPair]:
     """Read the verified pairs that can say something about cameras, strongest first.
 
@@ -215,9 +218,12 @@ def voting_pairs(
         path: of the database.
         unknown: ids of the cameras that are asked for.
         extracted_px: see :data:`~colmap_affrect.colmap.verification.ExtractedPx`.
+        silent: pairs of image names that are not asked.
     """
     with open_database(path) as database:
         images = {image.image_id: image.camera_id for image in database.read_all_images()}
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        left_out = set(map(frozenset, silent))
         cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
         pair_ids, geometries = database.read_two_view_geometries()
         ids = map(pycolmap.pair_id_to_image_pair, pair_ids)
@@ -228,6 +234,7 @@ def voting_pairs(
             and geometry.F is not None
             and geometry.config not in PLANAR
             and any(images[image_id] in unknown for image_id in pair)
+            and frozenset(names[image_id] for image_id in pair) not in left_out
         ]
         useful.sort(key=lambda item: (-len(item[1].inlier_matches), item[0]))
         chosen, num = [], Counter[int]()

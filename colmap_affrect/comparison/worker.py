@@ -15,7 +15,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -56,7 +56,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import escalate
+from colmap_affrect.stages.escalate import escalate, unmeasured_pairs
 from colmap_affrect.stages.extract import Inputs, extract
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import match
@@ -204,7 +204,8 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
         context = Context(workspace, request.resources, progress=told)
         with watch.step("verify"):
             verify_matches(context, options)
-            _vote(request, workspace, options, extracted_px(context))
+            silent = unmeasured_pairs(context)
+            _vote(request, workspace, options, extracted_px(context), silent)
         with watch.step("map"):
             guide(context)
             _, models = map_guided(context, mapper)
@@ -250,6 +251,7 @@ def _vote(
     workspace: Workspace,
     verification: VerificationOptions,
     size_px: ExtractedPx = None,
+    silent: Collection[Pair] = (),
 ) -> None:
     """Let the pairs vote on cameras if they are to do that."""
     if request.focal_vote:
@@ -259,6 +261,7 @@ def _vote(
             verification,
             size_px,
             may_share=request.may_share,
+            silent=silent,
         )
 
 

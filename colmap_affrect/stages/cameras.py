@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Collection
 from pathlib import Path
 
 from colmap_affrect.colmap.camera_records import (
@@ -19,10 +20,12 @@ from colmap_affrect.colmap.camera_vote import (
     voting_pairs,
 )
 from colmap_affrect.colmap.verification import ExtractedPx, VerificationOptions, verify
+from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import is_copy
+from colmap_affrect.stages.escalate import unmeasured_pairs
 from colmap_affrect.stages.extract import Inputs
 from colmap_affrect.stages.verify import extracted_px, recorded_verification
 
@@ -49,6 +52,7 @@ def choose_cameras(context: Context, *, may_share: bool = True) -> StageReport:
         recorded_verification(workspace),
         size_px,
         may_share=may_share,
+        silent=[] if copied else unmeasured_pairs(context),
         progress=context.progress,
     )
     records = read_camera_records(workspace.cameras)
@@ -63,6 +67,7 @@ def hold_vote(
     size_px: ExtractedPx = None,
     *,
     may_share: bool,
+    silent: Collection[Pair] = (),
     progress: Progress = SILENT,
 ) -> None:
     """Vote on the cameras of a database whose pairs are verified, unless that was done.
@@ -77,6 +82,7 @@ def hold_vote(
         verification: options.
         size_px: that photographs were shrunk to before extraction.
         may_share: whether cameras of images of one size may turn out to be the same.
+        silent: pairs that do not vote.
         progress: counts the pairs that vote.
     """
     records = read_camera_records(records_path)
@@ -84,7 +90,7 @@ def hold_vote(
         records = forget_votes(database_path, records)
         verify(database_path, verification, size_px)
         unknown = {key for key, record in records.items() if record.source == "guess"}
-        pairs = voting_pairs(database_path, unknown, size_px)
+        pairs = voting_pairs(database_path, unknown, size_px, silent)
         records = CameraVote(records, pairs, may_share).decide(progress)
         write_camera_records(records_path, records)
         for line in notable_lines(r for r in records.values() if r.low_px is not None):

@@ -46,7 +46,7 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace, temporary_folder
 from colmap_affrect.recipes import EscalateOptions
-from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images
+from colmap_affrect.stages.climbing import ClimbingGraph, connected_parts, insecure_images
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import (
     Inputs,
@@ -151,21 +151,30 @@ def first_level_database(context: Context) -> Iterator[Path | None]:
         yield path
 
 
-@contextmanager
-def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | None]:
-    """Give a copy of the database without the pairs that no match of measured frames supports.
+def unmeasured_pairs(context: Context) -> list[Pair]:
+    """Return the verified pairs that no match of measured frames supports.
 
-    And these pairs; None where there are none, or no others.
+    None where the others tie fewer than half of the images that all of them tie.
     """
     if all(level.features.has_shapes for level in recorded_extraction(context.workspace).levels):
-        yield None
-        return
+        return []
     escalation = Escalation(context, EscalateOptions())
     inliers = verified_inliers(context)
-    doubted = [
+    found = [
         pair for pair, indices in inliers.items() if not escalation.measured(pair, indices).any()
     ]
-    if len(doubted) in (0, len(inliers)):
+    num_tied, num_tied_by_others = (
+        max(map(len, connected_parts(pairs)), default=0)
+        for pairs in (inliers, inliers.keys() - found)
+    )
+    return found if num_tied_by_others >= MIN_SHARE * num_tied else []
+
+
+@contextmanager
+def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | None]:
+    """Give a copy of the database without :func:`unmeasured_pairs`, and these; None without any."""
+    doubted = unmeasured_pairs(context)
+    if not doubted:
         yield None
         return
     with _copied_database(context) as path:

@@ -190,8 +190,6 @@ def _map(
             return map_database(mapper, task, sparse, advance), 0
         path, doubted = found
         num_tied = _num_tied(context, context.workspace.database)
-        if _num_tied(context, path) < MIN_SHARE * num_tied:
-            return map_database(mapper, task, sparse, advance), 0
         first = path.with_name("sparse")
         models = map_database(mapper, replace(task, database_path=path), first, advance)
         num = _num_registered(models)

@@ -262,6 +262,9 @@ def test_only_the_strongest_pairs_of_an_image_vote(
     assert len(voting_pairs(path, {1, 2, 3}, None)) == 3
     assert len(found := voting_pairs(path, {1}, None)) == 2
     assert all(1 in pair.cameras for pair in found)
+    with open_database(path) as database:
+        one, two = sorted(image.name for image in database.read_all_images())[:2]
+    assert len(voting_pairs(path, {1, 2, 3}, None, [(two, one)])) == 2
     monkeypatch.setattr(camera_vote, "MAX_PAIRS_OF_IMAGE", 1)
     assert len(voting_pairs(path, {1, 2, 3}, None)) == 2
 
