@@ -305,31 +305,23 @@ def map_and_report(
         extended=tuple(before),
         advice=advice(context, missing, models),
     )
-    is_known = workspace.page.exists() and _says_the_same(workspace.report, result)
-    replace_text(workspace.report, result.to_json())
-    if page and not is_known:
-        write_run_page(
-            workspace,
-            result,
-            names,
-            pair_inliers,
-            image_path_of(workspace),
-            context.progress,
-        )
-    elif not page:
-        workspace.page.unlink(missing_ok=True)  # of an earlier run
+    text = result.to_json()
+    keeps_page = page and workspace.page.exists() and _says_the_same(workspace.report, text)
+    if not keeps_page:
+        workspace.page.unlink(missing_ok=True)  # a kill leaves none beside another report
+    replace_text(workspace.report, text)
+    if page and not keeps_page:
+        image_path = image_path_of(workspace)
+        write_run_page(workspace, result, names, pair_inliers, image_path, context.progress)
     return result
 
 
-def _says_the_same(path: Path, report: ReconstructionReport) -> bool:
-    """Tell whether a run found everything done, and a report of before differs by its times."""
-    if any(stage.num_done for stage in report.stages if stage.name != "pairs"):
-        return False
+def _says_the_same(path: Path, report: str) -> bool:
+    """Tell whether a run had nothing to do and a report of before differs only in its stages."""
     with suppress(OSError, ValueError):
-        known = json.loads(path.read_text(encoding="utf-8"))
-        now = json.loads(json.dumps(report.to_mapping()))
-        told = [{k: v for k, v in content.items() if k != "stages"} for content in (known, now)]
-        return bool(told[0] == told[1])
+        known, new = json.loads(path.read_text(encoding="utf-8")), json.loads(report)
+        done = [stage["num_done"] for stage in new["stages"] if stage["name"] != "pairs"]
+        return not any(done) and {**known, "stages": ()} == {**new, "stages": ()}
     return False
 
 

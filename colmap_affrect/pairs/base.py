@@ -21,7 +21,7 @@ AT_ONCE = 1 << 16
 class PairList(Sequence[Pair]):
     """Pairs as the numbers of their images, which get their names one after the other.
 
-    All pairs of 5,000 images take 100 MB, as tuples of names they would take 20 times as much.
+    All pairs of 5,000 images take 100 MB, as tuples of names they would take many times as much.
 
     Attributes:
         names: of the images, sorted.

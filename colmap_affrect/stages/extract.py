@@ -196,8 +196,8 @@ def extract(
     workspace, folder = context.workspace, Path(inputs.image_path)
     inputs.check()
     _require_usable_cameras(workspace, inputs)
-    chosen = checked_names(folder, image_names, "image_names") if image_names else []
-    names = chosen or inputs.names()
+    names = inputs.names()
+    names = checked_names(folder, image_names, "image_names") if image_names else names
     contents, options = Contents(workspace.contents), recipe.extraction
     digests = {name: contents.digest(inputs.files(name, options)) for name in names}
     if overwrite or digests != context.features.contents():  # else they were seen to be good
@@ -207,12 +207,12 @@ def extract(
     if not overwrite:
         refuse_other_photographs(workspace, inputs.image_path, digests)
     _record(workspace, inputs, recipe, extractor, later or {}, overwrite=overwrite)
-    warnings = forget_changed(context, inputs, digests, contents, are_all=not chosen)
+    warnings = forget_changed(context, inputs, digests, contents, are_all=not image_names)
     _start_database(workspace)
     done = context.features.complete(names)
     missing = [name for name in names if name not in done]
     _refuse_foreign_features(workspace, missing)
-    warnings |= _passed_over(inputs, names, whole, is_list=bool(chosen))
+    warnings |= _passed_over(inputs, names, whole, is_list=bool(image_names))
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
     failures = _extract_missing(context, inputs, extractor, missing, digests, warnings)

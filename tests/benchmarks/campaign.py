@@ -258,8 +258,11 @@ def main() -> int:
     parser.add_argument("--output-path", type=Path, required=True)
     parser.add_argument("--image-path", type=Path, nargs="+", default=[SAMPLE])
     parser.add_argument("--seed", type=int, default=0)
-    for kind in TRIALS:
-        parser.add_argument(f"--{kind}", type=int, default=0, metavar="N")
+    parser.add_argument("--kills", type=int, default=0, help="at random moments")
+    parser.add_argument("--calls", type=int, default=0, help="kills at system calls")
+    parser.add_argument("--disks", type=int, default=0, help="that are full")
+    parser.add_argument("--pages", type=int, default=0, help="of noise, in databases")
+    parser.add_argument("--databases", type=int, default=0, help="with other damage")
     arguments = parser.parse_args()
     folder = arguments.output_path.resolve()
     cases = []

@@ -208,9 +208,12 @@ def test_idle_run_looks_at_no_header_and_leaves_the_page(
     monkeypatch.setattr("colmap_affrect.colmap.initial_cameras.read_camera_tags", None)
     monkeypatch.setattr("colmap_affrect.project.stores.MatchStore.has", None)
     run(photos, copy.path, OPTIONS)
-    copy.page.unlink()
-    with pytest.raises(TypeError, match="NoneType"):
-        run(photos, copy.path, OPTIONS)
+    report = json.loads(copy.report.read_text(encoding="utf-8"))
+    copy.report.write_text(json.dumps({**report, "recipe": "another"}))
+    for _ in range(2):  # the second finds the report of the first, and no page
+        with pytest.raises(TypeError, match="NoneType"):
+            run(photos, copy.path, OPTIONS)
+        assert not copy.page.exists()
 
 
 def test_pair_whose_matches_are_lost_is_matched_again(
