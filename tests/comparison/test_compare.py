@@ -329,7 +329,7 @@ def test_request_of_another_version_is_one_line(tmp_path) -> None:
         Request.read(tmp_path / "request.json")
 
 
-def run_here(request: Request, progress: Progress) -> MethodResult:
+def run_here(request: Request, progress: Progress, _: str) -> MethodResult:
     """Run a method in this process, by way of the request that its own would read."""
     worker.compute(Request.read(request.path), progress)
     return module._finished(request)
