@@ -32,7 +32,7 @@ class SparseMapper(IncrementalMapper):
     """Incremental mapping; what it leaves out, images and models, is joined by bridges.
 
     Pairs that contradict the loops they stand in are left out when that explains the others
-    better.
+    better; a model that has all images and contradicts no others stays as it is.
     """
 
     Options = SparseOptions
@@ -48,6 +48,8 @@ class SparseMapper(IncrementalMapper):
             return [MappedModel(model) for model in models]
         contradicting = check_loops(graph, random_seed).contradicting
         trusted = graph.without(contradicting)
+        if models and trusted.is_explained_by(models[0]):
+            return [MappedModel(model) for model in models]
         if contradicting:
             reduced = output_path / "reduced.db"
             copy_without_pairs(task.database_path, reduced, contradicting)
