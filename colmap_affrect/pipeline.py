@@ -40,6 +40,7 @@ from colmap_affrect.stages.guide import (
     current,
     guide,
     guided_counts,
+    pairs_to_guide,
     recorded_guiding,
     restore_exact,
 )
@@ -360,7 +361,7 @@ def map_guided(
         reports.append(report)
         if extend or is_copy(context.workspace):
             return reports, models
-        if not images_in_need(context, sparse, min_num_tracks):
+        if not pairs_to_guide(context, images_in_need(context, sparse, min_num_tracks)):
             return reports, models
         before = [pair.names for pair in current(context)]
         replace_text(sparse / GUIDED_BEFORE, json.dumps(before))

@@ -45,6 +45,7 @@ def choose_cameras(context: Context, *, may_share: bool = True) -> StageReport:
     workspace.require("verify")
     copied = is_copy(workspace)
     size_px = None if copied else extracted_px(context)
+    is_new = needs_vote(read_camera_records(workspace.cameras))
     may_share = may_share and not copied and Inputs.recorded(workspace).cameras.mode == "auto"
     hold_vote(
         workspace.database,
@@ -56,7 +57,7 @@ def choose_cameras(context: Context, *, may_share: bool = True) -> StageReport:
         progress=context.progress,
     )
     records = read_camera_records(workspace.cameras)
-    found = sum(record.source == "pairs" for record in records.values())
+    found = is_new * sum(record.source == "pairs" for record in records.values())
     return StageReport("cameras", time.perf_counter() - start, found, len(records) - found)
 
 

@@ -207,7 +207,7 @@ ROWS: list[tuple[str, str, tuple[str, ...]]] = [
     (
         "5,000 images: repeating a finished extract, or run",
         "features.h5 is gone through once, and not at all while its index fits; no header, no pair "
-        "is looked at and the page stays: 2.8 s of processor time for run",
+        "is looked at and the page stays: about 3 s of processor time for run",
         (
             "project/test_feature_index.py::"
             "test_another_process_reads_the_index_and_none_that_is_stale_or_damaged",
