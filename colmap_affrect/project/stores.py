@@ -387,12 +387,11 @@ class GuidedStore(GroupStore):
 
     def read(self) -> list[GuidedPair]:
         """Read all pairs."""
-        keys = self.names()
-        if not keys:
-            return []
-        found = []
+        found: list[GuidedPair] = []
+        if not self.path.exists():
+            return found
         with self._open("r") as file:
-            for group in (file[key] for key in keys):
+            for _, group in sorted(complete_groups(file), key=lambda item: item[0]):
                 first, second = (str(name) for name in group.attrs["names"])
                 exact, candidates = group["exact"][()], group["candidates"][()]
                 count = int(group.attrs["num_inliers"])

@@ -10,7 +10,7 @@ COLMAP's own guided matching.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -118,10 +118,10 @@ def restore_exact(context: Context, pairs: Collection[Pair] | None = None) -> No
     context.guided.write([replace(pair, num_inliers=0) for pair in guided])
 
 
-def exact_inliers(context: Context) -> dict[Pair, Matches]:
-    """Return the inliers of each verified pair without guided matches."""
-    guided = {pair.names: pair.exact for pair in current(context) if pair.num_inliers}
-    return {**verified_inliers(context), **guided}
+def exact_inliers(context: Context, guided: Iterable[GuidedPair]) -> dict[Pair, Matches]:
+    """Return the inliers of each verified pair without the matches of :func:`current` ones."""
+    exact = {pair.names: pair.exact for pair in guided if pair.num_inliers}
+    return {**verified_inliers(context), **exact}
 
 
 def guided_matches(context: Context) -> dict[tuple[int, int], Matches]:
@@ -194,14 +194,15 @@ class Guiding:
 
     def todo(self, images: Collection[str] | None) -> tuple[list[Pair], int]:
         """Return the pairs to guide, and how many are done."""
-        exact = exact_inliers(self.context)
+        known = current(self.context)
+        exact = exact_inliers(self.context, known)
         if images is None:
             is_auto = self.options.enabled == "auto"
             images = weak_images(exact, self.options.min_num_tracks) if is_auto else self.ids
         if self.options.enabled == "never":
             images = ()
         chosen = [pair for pair in exact if not set(pair).isdisjoint(images)]
-        done = {pair.names for pair in current(self.context)}
+        done = {pair.names for pair in known}
         return [pair for pair in chosen if pair not in done], sum(p in done for p in chosen)
 
     def guide(

@@ -28,6 +28,7 @@ from colmap_affrect.stages import guide as stage
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, extract
 from colmap_affrect.stages.guide import (
+    current,
     exact_inliers,
     guide,
     guided_counts,
@@ -87,7 +88,7 @@ def test_pairs_gain_and_what_was_there_stays_on_record(before: Workspace, contex
     assert counts["matches_after"] > 1.05 * counts["matches_before"]
     for pair, indices in exact.items():
         assert len(verified[pair]) >= len(indices)
-        assert_array_equal(exact_inliers(context)[pair], indices)
+        assert_array_equal(exact_inliers(context, current(context))[pair], indices)
         for side in (0, 1):
             assert len(np.unique(verified[pair][:, side])) == len(verified[pair])
     raw = [raw_matches(item.database) for item in (before, context.workspace)]
@@ -103,7 +104,7 @@ def raw_matches(path: Path) -> list[tuple[int, bytes]]:
 
 def test_guided_matches_are_right(guided: Context) -> None:
     """A geometry of the first inliers explains nearly all that came later."""
-    exact, verified = exact_inliers(guided), verified_inliers(guided)
+    exact, verified = exact_inliers(guided, current(guided)), verified_inliers(guided)
     frames = {name: guided.features.read(name).keypoints for name in NAMES}
     for pair, indices in verified.items():
         known = {*map(tuple, exact[pair])}
@@ -213,7 +214,7 @@ def test_models_of_guided_pairs_are_adjusted_by_exact_matches(guided: Context) -
     map_images(guided, mapper())
     model = pycolmap.Reconstruction(guided.workspace.sparse / "0")
     assert model.num_reg_images() == 4
-    exact, verified = exact_inliers(guided), verified_inliers(guided)
+    exact, verified = exact_inliers(guided, current(guided)), verified_inliers(guided)
     seen = {image.name: [p.point3D_id if p.has_point3D() else -1 for p in image.points2D]
             for image in model.images.values()}  # fmt: skip
     tied = {(name, row[side]) for pair, rows in exact.items() for row in rows.tolist()
@@ -234,7 +235,7 @@ def test_guided_matches_are_the_inliers_that_came_by_guiding(
 ) -> None:
     assert guided_matches(context) == {}
     ids = image_ids(guided.workspace.database)
-    exact, verified = exact_inliers(guided), verified_inliers(guided)
+    exact, verified = exact_inliers(guided, current(guided)), verified_inliers(guided)
     found = guided_matches(guided)
     assert len(found) == guided_counts(guided)["pairs"]
     for pair, inliers in verified.items():
