@@ -5,13 +5,12 @@ from __future__ import annotations
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import h5py
+from command import start
 from results import run_arguments, wait_until_at_work
 
 from colmap_affrect.colmap.database import open_database
@@ -19,20 +18,9 @@ from colmap_affrect.project.atomic_files import journal_of
 from colmap_affrect.project.workspace import Workspace
 
 
-def restore_interrupt() -> None:
-    """Test runners in the background ignore SIGINT, and their children inherit that."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 def end_after(delay_s: float, number: signal.Signals, arguments: Sequence[str], out: Path) -> bool:
     """Start a run and send it a signal; tell whether it was still at work then."""
-    with subprocess.Popen(
-        [sys.executable, "-m", "colmap_affrect", *arguments],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=restore_interrupt,  # noqa: PLW1509  (nothing here uses threads)
-    ) as process:
+    with start(*arguments) as process:
         wait_until_at_work(process, out)
         time.sleep(delay_s)
         process.send_signal(number)

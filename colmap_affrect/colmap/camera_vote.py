@@ -221,8 +221,9 @@ def voting_pairs(
         silent: pairs of image names that are not asked.
     """
     with open_database(path) as database:
-        images = {image.image_id: image.camera_id for image in database.read_all_images()}
-        names = {image.image_id: image.name for image in database.read_all_images()}
+        read = database.read_all_images()
+        images = {image.image_id: image.camera_id for image in read}
+        names = {image.image_id: image.name for image in read}
         left_out = set(map(frozenset, silent))
         cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
         pair_ids, geometries = database.read_two_view_geometries()
