@@ -32,6 +32,7 @@ class _Kept:
     bridges: tuple[Bridge, ...]
     taken_out: Mapping[str, str]
     rival_focals_px: Mapping[str, tuple[float, float]]
+    displaced: tuple[str, ...] = ()
 
 
 _KEPT = TypeAdapter(_Kept)
@@ -39,8 +40,8 @@ _KEPT = TypeAdapter(_Kept)
 
 def write_arrivals(model: MappedModel, folder: Path) -> None:
     """Keep what :func:`read_arrivals` needs; nothing where COLMAP's model says it all."""
-    if model.bridges or model.taken_out or model.rival_focals_px:
-        kept = _Kept(model.bridges, model.taken_out, model.rival_focals_px)
+    kept = _Kept(model.bridges, model.taken_out, model.rival_focals_px, model.displaced)
+    if kept != _Kept((), {}, {}):
         replace_text(folder / FILE_NAME, _KEPT.dump_json(kept, indent=2).decode() + "\n")
 
 
@@ -57,7 +58,7 @@ def read_arrivals(reconstruction: pycolmap.Reconstruction, folder: Path) -> Mapp
         kept = _KEPT.validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
         raise StoreError(f"{path}: damaged") from error
-    return MappedModel(reconstruction, kept.bridges, kept.taken_out, kept.rival_focals_px)
+    return MappedModel(reconstruction, **vars(kept))
 
 
 def arrivals(model: MappedModel, task: MappingTask) -> dict[str, Arrival]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import num_long_tracks, registered_names, write_model
+from colmap_affrect.colmap.poses import disagreeing_images, model_poses
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.arrivals import arrivals, read_arrivals, write_arrivals
@@ -20,9 +21,11 @@ from colmap_affrect.mappers.last_adjustment import MIN_NUM_TRACKS, adjust_last
 from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.mappers.starts import (
+    Judged,
     Start,
     focals_px,
     rival_focals_px,
+    rivals_of_best,
     runaways,
     started,
     starts,
@@ -136,7 +139,7 @@ class _Attempts:
         self._most = self._limit + MAX_HOLDING_ATTEMPTS
         self._done = 0
         self._ran: set[int] = set()
-        self._focals: list[tuple[float, dict[str, float]]] = []
+        self._judged: list[Judged] = []
 
     def go_on(self, best: list[MappedModel]) -> bool:
         """Tell whether there is another attempt, after the best models so far."""
@@ -152,16 +155,23 @@ class _Attempts:
         return self._done < len(self._starts) and not _is_well_tied(best[0].reconstruction)
 
     def judge(self, found: list[MappedModel]) -> None:
-        """Keep how well the largest model of an attempt agrees with the pairs, and its focals."""
+        """Keep how well the largest model of an attempt agrees with the pairs."""
         if found and len(self._starts) > 1:
             model = found[0].reconstruction
-            self._focals.append((graph_of(self._task).score_of(model), focals_px(model)))
+            score = graph_of(self._task).score_of(model)
+            self._judged.append(Judged(score, focals_px(model), model_poses(model)))
 
     def with_rivals(self, best: list[MappedModel]) -> list[MappedModel]:
-        """Return models whose largest one knows the focal lengths of those as good as it."""
-        if not self._focals:
+        """Return models whose largest one knows what those as good as it say otherwise."""
+        rivals = rivals_of_best(self._judged)
+        if not best or not rivals:
             return best
-        return [replace(best[0], rival_focals_px=rival_focals_px(self._focals)), *best[1:]]
+        poses = model_poses(best[0].reconstruction)
+        displaced = {name for each in rivals for name in disagreeing_images(poses, each.poses)}
+        first = replace(
+            best[0], rival_focals_px=rival_focals_px(rivals), displaced=tuple(sorted(displaced))
+        )
+        return [first, *best[1:]]
 
     def next(
         self, database_path: Path, output_path: Path, show: Callable[[int], None]

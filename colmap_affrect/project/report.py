@@ -6,10 +6,12 @@ import csv
 import dataclasses
 import io
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+from colmap_affrect.shown import such_as
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -37,6 +39,14 @@ def _some(lines: Iterable[str]) -> list[str]:
     return (
         [*shown[:MAX_LINES], f"            and {more} more, see report.json"] if more > 1 else shown
     )
+
+
+def _by_story(stories: Mapping[str, str], start: str) -> list[str]:
+    """Return a line for each of the first few stories, with the images that it is true of."""
+    names = defaultdict(list)
+    for name, story in stories.items():
+        names[story].append(name)
+    return _some(f"{start:12}{such_as(same, MAX_LINES)}: {story}" for story, same in names.items())
 
 
 def by_level(level: str, count: int) -> str:
@@ -164,17 +174,17 @@ class ModelSummary:
 
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
-        lines: list[str] = []
-        lines += _some(
-            f"            {name}: focal lengths from {low:.0f} to {high:.0f} px fit as well"
+        rivals = {
+            name: f"focal lengths from {low:.0f} to {high:.0f} px fit as well"
             for name, (low, high) in self.rival_focals_px.items()
-        )
+        }
+        lines = _by_story(rivals, "")
         lines += _some(
             f"came in     {name} {item.text()}"
             for name, item in self.arrivals.items()
             if item.how != "tracks"
         )
-        lines += _some(f"doubtful    {name}: {why}" for name, why in self.doubtful.items())
+        lines += _by_story(self.doubtful, "doubtful")
         lines += [f"doubtful    the whole model: {why}" for why in self.doubts]
         lines += [
             f"points      {self.num_points3D}, each in {self.mean_track_length:.2f} images",
@@ -331,7 +341,7 @@ class ReconstructionReport:
         if self.extended:
             lines += [f"extended    {len(self.extended)} were there, {len(self.added)} came in"]
             lines += [f"            new {name}" for name in self.added]
-        lines += _some(f"            not {name}: {why}" for name, why in self.unregistered.items())
+        lines += _by_story(self.unregistered, "        not")
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
         if counts := [
             by_level(*item) for item in self.pair_levels.items() if item[0] != "none" and item[1]

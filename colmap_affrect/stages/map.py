@@ -310,6 +310,11 @@ def advice(
     if sum(map(bool, colmap_database.keypoint_counts(workspace.database).values())) < 2:
         return (TOO_FEW,)
     texts = []
+    if models and models[0].rival_focals_px:
+        texts.append(
+            "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
+            "several focal lengths fit"
+        )
     if is_copy(workspace):
         texts.append("run --from-database, with --image-path, makes new features for its images")
     else:

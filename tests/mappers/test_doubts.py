@@ -248,7 +248,11 @@ def test_how_images_came_in_is_kept_beside_the_model(tmp_path: Path) -> None:
     name = last(model).name
     bridge = Bridge(("a.jpg", name), (name,), 32, 36, 0.031)
     mapped = MappedModel(
-        model.reconstruction, (bridge,), {"č.jpg": "only 3 points hold it"}, {name: (700.0, 900.0)}
+        model.reconstruction,
+        (bridge,),
+        {"č.jpg": "only 3 points hold it"},
+        {name: (700.0, 900.0)},
+        (name,),
     )
     write_arrivals(mapped, tmp_path)
     read = read_arrivals(model.reconstruction, tmp_path)

@@ -159,8 +159,11 @@ def test_summary_says_what_cannot_be_trusted() -> None:
 
 
 def test_long_lists_end_where_the_screen_does() -> None:
-    report = replace(REPORT, unregistered={f"{i}.png": "no features" for i in range(100)})
+    report = replace(REPORT, unregistered={f"{i}.png": f"pair {i}" for i in range(100)})
     assert "and 88 more, see report.json" in report.summary()
+    report = replace(REPORT, unregistered={f"{i}.png": "no features" for i in range(100)})
+    assert "        not 0.png, 1.png," in report.summary()
+    assert "10.png, 11.png and 88 more: no features\n" in report.summary()
     assert len(report.to_mapping()["unregistered"]) == 100
 
 
