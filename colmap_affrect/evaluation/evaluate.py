@@ -13,6 +13,7 @@ import logging
 import math
 import sys
 import time
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,8 +25,10 @@ from numpy.typing import NDArray
 
 from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import AffrectError, EvaluationError, OptionError
-from colmap_affrect.evaluation.costs import PAIR_STEPS, ImageCost
+from colmap_affrect.evaluation.evd import Evd
+from colmap_affrect.evaluation.imc import Imc
 from colmap_affrect.evaluation.pair_matches import MatchedPair, PairMatcher
+from colmap_affrect.evaluation.pairs import Pairs
 from colmap_affrect.evaluation.plots import write_plots
 from colmap_affrect.evaluation.protocol import (
     GROUP,
@@ -35,19 +38,24 @@ from colmap_affrect.evaluation.protocol import (
     PairResult,
     PairScore,
 )
-from colmap_affrect.evaluation.published import COMPLEXITY, published
-from colmap_affrect.evaluation.recipe_features import RecipeFeatures
-from colmap_affrect.evaluation.records import RecordFile
-from colmap_affrect.evaluation.registry import make_protocol
+from colmap_affrect.evaluation.recipe_features import (
+    PAIR_STEPS,
+    ImageCost,
+    RecipeFeatures,
+    RecordFile,
+)
 from colmap_affrect.evaluation.results import (
+    COMPLEXITY,
     PAIR_RESULT,
     SECONDS,
     Evaluation,
     Interval,
     RecipeResult,
     Solved,
+    published,
 )
 from colmap_affrect.evaluation.statistics import bootstrap_intervals, paired_test
+from colmap_affrect.evaluation.svp import Svp
 from colmap_affrect.images.reading import require_png
 from colmap_affrect.options import digest_of
 from colmap_affrect.pipeline import installed_versions
@@ -56,6 +64,30 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.context import Resources
+
+PROTOCOLS: Mapping[str, type[EvaluationProtocol]] = {
+    protocol.name: protocol for protocol in (Evd, Svp, Imc, Pairs)
+}
+
+
+def make_protocol(name: str, settings: Sequence[str] = ()) -> EvaluationProtocol:
+    """Return a protocol, some of its options changed by ``KEY=VALUE``.
+
+    Raises OptionError for an unknown protocol or option, or a value that it cannot have.
+    """
+    if name not in PROTOCOLS:
+        raise OptionError(f"unknown protocol '{name}': known are {', '.join(PROTOCOLS)}")
+    values = {}
+    for setting in settings:
+        key, separator, text = (part.strip() for part in setting.partition("="))
+        if not separator:
+            raise OptionError(f"{setting}: expected KEY=VALUE")
+        try:
+            values[key] = tomllib.loads(f"value = {text}")["value"]
+        except ValueError:
+            values[key] = text
+    return PROTOCOLS[name].from_mapping(values, name)
+
 
 logger = logging.getLogger(__name__)
 

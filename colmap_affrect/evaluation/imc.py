@@ -28,17 +28,17 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.posed_scenes import (
+from colmap_affrect.evaluation.protocol import Dataset, counted
+from colmap_affrect.evaluation.relative_pose import (
     Names,
+    PosedImage,
     PosedScenes,
     missing_notes,
+    posed_image,
     posed_pairs,
     scene_images,
 )
-from colmap_affrect.evaluation.protocol import Dataset
-from colmap_affrect.evaluation.relative_pose import PosedImage, posed_image
 from colmap_affrect.evaluation.truth_checks import (
-    counted,
     image_size,
     pose_contradictions,
     rotation_fault,
@@ -89,7 +89,7 @@ class Imc(PosedScenes):
         empty = ", ".join(name for limit in BINS[1:] if (name := f"{limit / 10:.1f}") not in used)
         notes = [
             *list_notes,
-            *counted(unclear, "listed pairs are of images that are not there", unclear),
+            *counted(unclear, "listed pairs are of images that are not there"),
             *missing_notes(list(bins), wanted, files, lacking, "calibration"),
             *size_notes,
             *(pose_contradictions(pairs[::-1]) if self.check_truth else ()),
@@ -157,7 +157,7 @@ def _read_lists(folder: Path) -> tuple[dict[int, list[str]], list[str]]:
             notes.append(f"{path.name} {fault}: its pairs count as of less covisibility")
     for lower, upper in itertools.pairwise(sorted(lists)):
         extra = sorted(set(lists[upper]) - set(lists[lower]))
-        notes += counted(extra, f"pairs of list 0.{upper} are not in list 0.{lower}", extra)
+        notes += counted(extra, f"pairs of list 0.{upper} are not in list 0.{lower}")
     return lists, notes
 
 
@@ -207,8 +207,8 @@ def _posed(
         camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
         found[name] = posed_image(f"{scene}/{path.name}", path, camera, calibrations[name].pose)
     return found, [
-        *counted(scaled, "images are of another size than their K, which is scaled", scaled),
-        *counted(unfitting, "images are of another shape than their K", unfitting),
+        *counted(scaled, "images are of another size than their K, which is scaled"),
+        *counted(unfitting, "images are of another shape than their K"),
     ]
 
 

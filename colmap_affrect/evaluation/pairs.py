@@ -23,7 +23,7 @@ centre of the first pixel (default), ``corner`` when it is its corner. ``convent
 
 Scores: of homographies as :mod:`evd <colmap_affrect.evaluation.evd>` has them; of poses as
 :mod:`svp <colmap_affrect.evaluation.svp>`; of correspondences as WxBS, see
-:mod:`correspondences <colmap_affrect.evaluation.correspondences>`.
+:mod:`correspondences <colmap_affrect.evaluation.pairs>`.
 """
 
 from __future__ import annotations
@@ -32,8 +32,10 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, ClassVar
+from statistics import fmean, median_low
+from typing import Annotated, Any, ClassVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,7 +43,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import is_unsafe
 from colmap_affrect.conventions import colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.correspondences import CorrespondenceProtocol, mean_recalls
 from colmap_affrect.evaluation.homographies import (
     HomographyProtocol,
     TrueHomography,
@@ -49,9 +50,11 @@ from colmap_affrect.evaluation.homographies import (
 )
 from colmap_affrect.evaluation.protocol import (
     GROUP,
+    POSITIVE,
     Dataset,
     EvaluationImage,
     EvaluationPair,
+    EvaluationProtocol,
     PairResult,
     PairScore,
     finite_numbers,
@@ -66,9 +69,74 @@ from colmap_affrect.evaluation.truth_checks import (
     size_of,
     true_homography,
 )
-from colmap_affrect.evaluation.two_views import Points
+from colmap_affrect.evaluation.two_views import Points, symmetric_epipolar_distances
 from colmap_affrect.images.reading import read_gray
+from colmap_affrect.options import within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
+
+WXBS_THRESHOLDS_PX = tuple(range(20))
+"""The score of WxBS is the mean over these of the share of correspondences that agree."""
+
+SHOWN_THRESHOLDS_PX = (1, 2, 3, 5, 10, 20)
+
+
+class CorrespondenceProtocol(EvaluationProtocol):
+    """Score of matches by the fundamental matrix that they give by OpenCV's USAC_MAGSAC."""
+
+    epipolar_threshold_px: Annotated[float, POSITIVE] = 1.0
+    """Largest noise that USAC_MAGSAC reckons with for fundamental matrices."""
+    num_magsac_estimates: Annotated[int, within(1, 1_000_000_000)] = 5
+    """Of so many orders of the matches the one of median error counts."""
+
+    def score(
+        self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
+    ) -> PairScore:
+        """Score matches of a pair whose truth is (N, 4) correspondences x1, y1, x2, y2.
+
+        ``error`` is the median of their symmetric epipolar distances in px. Details:
+        ``wxbs_score``, and ``recall_Kpx``, the share of them within K px.
+        """
+        ransac = self.ransac(cv2.USAC_MAGSAC, self.epipolar_threshold_px, random_seed)
+        found = []
+        for number, reseeded in enumerate(ransac.reseeded(self.num_magsac_estimates)):
+            matrix, num_inliers = reseeded.fundamental_matrix(points1, points2)
+            distances = symmetric_epipolar_distances(matrix, *np.hsplit(pair.truth, 2))
+            found.append((float(np.median(distances)), num_inliers, number, distances))
+        error, num_inliers, _, distances = median_low(found)
+        return PairScore(error, num_inliers, None, recalls(distances))
+
+    def success(self, score: PairScore) -> float:
+        """Return the score of WxBS."""
+        return score.details["wxbs_score"]
+
+    def settings(self) -> dict[str, Any]:
+        """See :class:`EvaluationProtocol`."""
+        return {
+            "correspondences": "OpenCV USAC_MAGSAC fundamental matrix; error: median symmetric "
+            "epipolar distance sqrt(d1^2 + d2^2), px; WxBS score: mean over thresholds 0, 1, ... "
+            "19 px of the share of correspondences within",
+            **super().settings(),
+        }
+
+
+def recalls(distances_px: NDArray[np.float64]) -> dict[str, float]:
+    """Return the score of WxBS, and shares of (N,) distances up to single thresholds."""
+
+    def share(limit_px: float) -> float:
+        return float((distances_px <= limit_px).mean())
+
+    return {
+        "wxbs_score": float(np.mean([share(limit) for limit in WXBS_THRESHOLDS_PX])),
+        **{f"recall_{limit}px": share(limit) for limit in SHOWN_THRESHOLDS_PX},
+    }
+
+
+def mean_recalls(results: Sequence[PairResult]) -> dict[str, float]:
+    """Return the means of :func:`recalls` over results, at least one, under names for people."""
+    keys = {"WxBS score": "wxbs_score"}
+    keys |= {f"within {limit} px": f"recall_{limit}px" for limit in SHOWN_THRESHOLDS_PX}
+    return {name: fmean(result.details[key] for result in results) for name, key in keys.items()}
+
 
 LIST = "pairs.json"
 KINDS = ("homography", "correspondences", "relative_pose")

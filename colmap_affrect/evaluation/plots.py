@@ -14,9 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from colmap_affrect.evaluation.costs import IMAGE_STEPS, PAIR_STEPS
-from colmap_affrect.evaluation.published import PublishedRow
-from colmap_affrect.evaluation.results import Evaluation, complexity_columns
+from colmap_affrect.evaluation.recipe_features import IMAGE_STEPS, PAIR_STEPS
+from colmap_affrect.evaluation.results import Evaluation, PublishedRow, complexity_columns
 from colmap_affrect.project.atomic_files import replace_bytes
 
 SIZE_IN = (8.0, 5.0)

@@ -16,6 +16,7 @@ from pydantic import BeforeValidator
 from colmap_affrect.errors import AffrectError, EvaluationError
 from colmap_affrect.evaluation.two_views import Points, Ransac
 from colmap_affrect.options import Options, within
+from colmap_affrect.shown import such_as
 
 Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value is None else value)]
 """Infinite where JSON has null."""
@@ -199,6 +200,11 @@ def with_truth(
         note = f"{pair.name}: cannot be evaluated and counts as failed: {error}"
         return Dataset((replace(pair, problem=str(error)),), (note,))
     return Dataset((pair,), tuple(f"{pair.name}: {doubt}" for doubt in doubts if doubt))
+
+
+def counted(names: Sequence[str], what: str) -> list[str]:
+    """Return a note of how many there are of something, with examples; nothing of nothing."""
+    return [f"{len(names)} {what}: {such_as(names)}"] if names else []
 
 
 def read_numbers(path: Path) -> NDArray[np.float64]:

@@ -23,22 +23,20 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, relative_pose
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.posed_scenes import (
+from colmap_affrect.evaluation.protocol import Dataset, EvaluationPair, counted
+from colmap_affrect.evaluation.relative_pose import (
     Names,
+    PosedImage,
     PosedScenes,
+    category_start,
     missing_notes,
+    posed_image,
     posed_pairs,
+    rotation_angle_deg,
     scene_images,
     stem,
 )
-from colmap_affrect.evaluation.protocol import Dataset, EvaluationPair
-from colmap_affrect.evaluation.relative_pose import (
-    PosedImage,
-    category_start,
-    posed_image,
-    rotation_angle_deg,
-)
-from colmap_affrect.evaluation.truth_checks import counted, image_size, pose_contradictions
+from colmap_affrect.evaluation.truth_checks import image_size, pose_contradictions
 from colmap_affrect.images.reading import IMAGE_SUFFIXES
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
@@ -81,7 +79,7 @@ class Svp(PosedScenes):
         lacking = {n: faults.get(n, "not in images.txt") for n in names if n not in cameras}
         bad = [f"line {number}" for number in bad_lines]
         notes = [
-            *counted(bad, f"lines that are no pair of {list_path.name}", bad),
+            *counted(bad, f"lines that are no pair of {list_path.name}"),
             *missing_notes(listed_names, names, files, lacking, "pose or camera"),
             *_difficulty_notes(listed, poses),
             *_size_notes(pairs),
@@ -185,7 +183,7 @@ def _difficulty_notes(listed: Sequence[ListedPair], poses: Mapping[str, Pose]) -
         if (found := difficulty(poses, *pair.names)) != pair.difficulty
     ]
     what = f"of {len(listed)} listed difficulties contradict the poses, which are used"
-    return counted(wrong, what, wrong)
+    return counted(wrong, what)
 
 
 def _size_notes(pairs: Sequence[EvaluationPair]) -> list[str]:
@@ -200,7 +198,7 @@ def _size_notes(pairs: Sequence[EvaluationPair]) -> list[str]:
         for posed, size in zip(images, sizes, strict=True)
         if size and size != (posed.camera.width, posed.camera.height)
     ]
-    return counted(wrong, "images are of another size than their intrinsics", wrong)
+    return counted(wrong, "images are of another size than their intrinsics")
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:

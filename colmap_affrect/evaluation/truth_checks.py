@@ -10,7 +10,7 @@ pairs where the truth is of poses.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -87,11 +87,6 @@ POSE_MISTAKES: dict[str, Callable[[Pose], Pose]] = {
     "translation is the position of the camera": lambda pose: (pose[0], -pose[0] @ pose[1]),
 }
 """What turns a pose that was stored in a wrong way into the right one."""
-
-
-def counted(items: Sequence[object], what: str, examples: Iterable[str]) -> list[str]:
-    """Return a note of how many there are of something, with examples; nothing of nothing."""
-    return [f"{len(items)} {what}: {such_as(examples)}"] if items else []
 
 
 def rotation_fault(rotation: NDArray[np.float64]) -> str:

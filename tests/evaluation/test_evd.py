@@ -9,9 +9,9 @@ import pytest
 from planar_pairs import TRUTH, write_extreme_views, write_pair
 
 from colmap_affrect.errors import EvaluationError, OptionError
+from colmap_affrect.evaluation.evaluate import PROTOCOLS, make_protocol
 from colmap_affrect.evaluation.evd import Evd
 from colmap_affrect.evaluation.protocol import PairScore
-from colmap_affrect.evaluation.registry import PROTOCOLS, make_protocol
 
 UNCHECKED = Evd(check_truth=False)
 
