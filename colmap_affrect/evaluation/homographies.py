@@ -84,10 +84,7 @@ class HomographyProtocol(EvaluationProtocol):
     def score(
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
     ) -> PairScore:
-        """Score matches of a pair whose truth is a :class:`TrueHomography`.
-
-        ``error`` is that of the paper's RANSAC; the details are those of USAC_MAGSAC.
-        """
+        """Score by the paper's RANSAC; the details are those of USAC_MAGSAC."""
         truth: TrueHomography = pair.truth
         plain = self.ransac(cv2.RANSAC, self.threshold_px, random_seed)
         magsac = self.ransac(cv2.USAC_MAGSAC, self.magsac_threshold_px, random_seed)
@@ -121,7 +118,7 @@ class HomographyProtocol(EvaluationProtocol):
         }
 
     def settings(self) -> dict[str, Any]:
-        """Return everything that decides the errors, and what they are."""
+        """See :class:`EvaluationProtocol`."""
         return {
             "homography_error": "mean over the visible part of image 1, every 4th pixel in x and "
             "y, of the Euclidean distance in image 2 between truth and estimate, px",

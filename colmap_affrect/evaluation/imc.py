@@ -39,11 +39,10 @@ from colmap_affrect.evaluation.relative_pose import (
     scene_images,
 )
 from colmap_affrect.evaluation.truth_checks import (
-    image_size,
+    image_sizes,
     pose_contradictions,
     rotation_fault,
 )
-from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 SET_FOLDER = "set_100"
 LIST_FOLDER = "new-vis-pairs"
@@ -189,7 +188,7 @@ def _posed(
 ) -> tuple[dict[str, PosedImage], list[str]]:
     """Give images their cameras; also say whose intrinsics are of another size."""
     names = sorted(files.keys() & calibrations.keys())
-    sizes = map_ordered(lambda name: image_size(files[name]), names, available_cores())
+    sizes = image_sizes(files[name] for name in names)
     found: dict[str, PosedImage] = {}
     scaled, unfitting = [], []
     for name, size in zip(names, sizes, strict=True):

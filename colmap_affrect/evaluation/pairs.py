@@ -22,8 +22,7 @@ tables and plots and may be left out, and so may ``pixel_origin``: ``center`` wh
 centre of the first pixel (default), ``corner`` when it is its corner. ``convention`` is for people.
 
 Scores: of homographies as :mod:`evd <colmap_affrect.evaluation.evd>` has them; of poses as
-:mod:`svp <colmap_affrect.evaluation.svp>`; of correspondences as WxBS, see
-:mod:`correspondences <colmap_affrect.evaluation.pairs>`.
+:mod:`svp <colmap_affrect.evaluation.svp>`; of correspondences as WxBS.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from statistics import fmean, median_low
 from typing import Annotated, Any, ClassVar
 
@@ -61,7 +60,7 @@ from colmap_affrect.evaluation.protocol import (
     read_numbers,
     with_truth,
 )
-from colmap_affrect.evaluation.relative_pose import RelativePoseProtocol, posed_image
+from colmap_affrect.evaluation.relative_pose import RelativePoseProtocol, posed_image, stem
 from colmap_affrect.evaluation.truth_checks import (
     correspondence_doubts,
     pose_contradictions,
@@ -73,6 +72,16 @@ from colmap_affrect.evaluation.two_views import Points, symmetric_epipolar_dista
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.options import within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
+
+LIST = "pairs.json"
+KINDS = ("homography", "correspondences", "relative_pose")
+KEYS = ("name", "image1", "image2", "category", *KINDS)
+INTRINSICS = dict.fromkeys(("intrinsics1", "intrinsics2"), (3, 3))
+POSE_SHAPES = {"rotation": (3, 3), "translation": (3,), **INTRINSICS}
+ORIGINS = ("center", "corner")
+
+MAX_OFF_CENTRE = 0.25
+"""A principal point further from the middle, in image sizes, does not fit the image."""
 
 WXBS_THRESHOLDS_PX = tuple(range(20))
 """The score of WxBS is the mean over these of the share of correspondences that agree."""
@@ -138,21 +147,6 @@ def mean_recalls(results: Sequence[PairResult]) -> dict[str, float]:
     return {name: fmean(result.details[key] for result in results) for name, key in keys.items()}
 
 
-LIST = "pairs.json"
-KINDS = ("homography", "correspondences", "relative_pose")
-KEYS = ("name", "image1", "image2", "category", *KINDS)
-POSE_SHAPES = {
-    "rotation": (3, 3),
-    "translation": (3,),
-    "intrinsics1": (3, 3),
-    "intrinsics2": (3, 3),
-}
-ORIGINS = ("center", "corner")
-
-MAX_OFF_CENTRE = 0.25
-"""A principal point further from the middle, in image sizes, does not fit the image."""
-
-
 class Pairs(HomographyProtocol, CorrespondenceProtocol, RelativePoseProtocol):
     """Homographies, epipolar geometries and relative poses of any pairs."""
 
@@ -201,18 +195,17 @@ class Pairs(HomographyProtocol, CorrespondenceProtocol, RelativePoseProtocol):
             counts = super().summarize(homographies)
             columns |= {f"homographies: {name}": count for name, count in counts.items()}
         if marked := having("wxbs_score"):
-            columns |= {
-                f"correspondences: {name}": share for name, share in mean_recalls(marked).items()
-            }
+            recalls = mean_recalls(marked)
+            columns |= {f"correspondences: {name}": share for name, share in recalls.items()}
         if poses := having("direction_error_deg"):
             columns |= {
                 f"poses, {name}" if GROUP in name else f"poses{GROUP}{name}": share
-                for name, share in self.columns(poses, {}).items()
+                for name, share in self.columns(poses, ()).items()
             }
         return columns
 
 
-def _read_list(path: Path) -> tuple[list[Mapping[str, Any]], float]:
+def _read_list(path: Path) -> tuple[list[dict[str, Any]], float]:
     """Read ``pairs.json``; also return what must be added to its coordinates for pixel centres."""
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
@@ -237,9 +230,8 @@ def _read_list(path: Path) -> tuple[list[Mapping[str, Any]], float]:
         if names.count(name) > 1:
             raise EvaluationError(f"{path}: two pairs are called '{name}'; give them names")
     corner_px = float(pixel_from_colmap(np.zeros(1))[0])
-    return [
-        {**entry, "name": name} for name, entry in zip(names, entries, strict=True)
-    ], corner_px if origin == "corner" else 0.0
+    listed = [{**entry, "name": name} for name, entry in zip(names, entries, strict=True)]
+    return listed, corner_px if origin == "corner" else 0.0
 
 
 def _named(entry: Any, path: Path, number: int) -> str:
@@ -258,8 +250,7 @@ def _named(entry: Any, path: Path, number: int) -> str:
         raise EvaluationError(
             f"{where}: needs one of {', '.join(KINDS)}, and has {' and '.join(kinds) or 'none'}"
         )
-    stems = [PurePosixPath(entry[key]).with_suffix("").as_posix() for key in ("image1", "image2")]
-    return str(entry.get("name") or " ".join(stems))
+    return str(entry.get("name") or f"{stem(entry['image1'])} {stem(entry['image2'])}")
 
 
 @dataclass(frozen=True)
@@ -278,17 +269,14 @@ class _Entry:
 
     def load(self) -> Dataset:
         """Return the pair, and notes where there is something to say about it."""
+        values = self.values
         first, second = (
-            EvaluationImage(self.values[key], self.folder / self.values[key])
-            for key in ("image1", "image2")
+            EvaluationImage(values[key], self.folder / values[key]) for key in ("image1", "image2")
         )
-        category = str(self.values.get("category", ""))
-        pair = EvaluationPair(self.values["name"], (first, second), category)
-        readers = dict(
-            zip(KINDS, (self._homography, self._correspondences, self._pose), strict=True)
-        )
-        (kind,) = self.values.keys() & set(KINDS)
-        return with_truth(pair, [first.path, second.path], readers[kind])
+        pair = EvaluationPair(values["name"], (first, second), str(values.get("category", "")))
+        readers = self._homography, self._correspondences, self._pose
+        (read,) = (read for kind, read in zip(KINDS, readers, strict=True) if kind in values)
+        return with_truth(pair, [first.path, second.path], read)
 
     def _numbers(self, key: str) -> Any:
         """Return numbers, out of a text file where its name is given."""

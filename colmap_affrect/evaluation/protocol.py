@@ -104,12 +104,7 @@ class PairResult(PairScore):
 
 @dataclass(frozen=True)
 class Dataset:
-    """The pairs of a dataset that can be evaluated.
-
-    Attributes:
-        notes: what is missing or odd, in words: files that are not there (counted), truth that
-            failed its sanity check (named).
-    """
+    """The pairs of a dataset that can be evaluated, and what is missing or odd, in words."""
 
     pairs: tuple[EvaluationPair, ...]
     notes: tuple[str, ...] = ()
@@ -125,16 +120,14 @@ class Dataset:
 
 
 class EvaluationProtocol(Options, ABC):
-    """Loads a dataset, scores matches, and sums up, as one of the paper's tables does.
-
-    A class variable ``error_title`` says what the error of a score is, with its unit, and
-    ``category_title`` what the categories are, empty without: both for axes of plots.
-    """
+    """Loads a dataset, scores matches, and sums up, as one of the paper's tables does."""
 
     name: ClassVar[str]
     """As the command line has it."""
     error_title: ClassVar[str]
+    """What the error of a score is, with its unit, for axes of plots."""
     category_title: ClassVar[str] = ""
+    """What the categories are; empty without."""
 
     threshold_px: Annotated[float, POSITIVE] = 0.5
     """Of an inlier of plain RANSAC (the paper: 0.5)."""
@@ -171,9 +164,8 @@ class EvaluationProtocol(Options, ABC):
     def summarize(self, results: Sequence[PairResult]) -> dict[str, float]:
         """Return the columns of the protocol's table by name, in order (counts or shares).
 
-        Failed pairs are among the results. A name ``group: column`` puts the column into a
-        table of its own. The frame adds the column ``seconds``, all time that the recipe took.
-        Names are those of ``published.published`` where the paper has the same number. Of an empty
+        Failed pairs are among the results. A name ``group: column`` puts the column into a table
+        of its own. Names are those of the paper's rows where it has the same number. Of an empty
         sequence all columns are 0.
         """
 
@@ -192,9 +184,8 @@ def with_truth(
     ``paths`` must be there; ``read`` returns the pair with its truth, and what is odd about it.
     """
     try:
-        for path in paths:
-            if not path.is_file():
-                raise EvaluationError(f"{path}: missing")
+        if missing := [path for path in paths if not path.is_file()]:
+            raise EvaluationError(f"{missing[0]}: missing")
         pair, doubts = read(pair)
     except AffrectError as error:
         note = f"{pair.name}: cannot be evaluated and counts as failed: {error}"

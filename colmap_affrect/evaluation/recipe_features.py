@@ -86,7 +86,6 @@ class ImageCost:
         area_mpx: area of all warps in megapixels, the image itself not counted.
         num_keypoints: features of the image and of its warps.
         num_regions: different parts of the image that are warped.
-        plan_s, warp_s, detect_s, describe_s: seconds.
     """
 
     area_mpx: float = 0.0
@@ -99,11 +98,6 @@ class ImageCost:
     describe_s: float = 0.0
 
     @property
-    def warps_per_region(self) -> float:
-        """Mean number of warps of a region, 0 where nothing is warped."""
-        return self.num_warps / self.num_regions if self.num_regions else 0.0
-
-    @property
     def total_s(self) -> float:
         """Seconds of all steps."""
         return sum(self.seconds().values())
@@ -114,13 +108,9 @@ class ImageCost:
 
     def complexity(self) -> dict[str, float]:
         """Return what the paper's table of complexity has."""
-        return {
-            "area_mpx": self.area_mpx,
-            "num_keypoints": self.num_keypoints,
-            "num_regions": self.num_regions,
-            "num_warps": self.num_warps,
-            "warps_per_region": self.warps_per_region,
-        }
+        known = {key: value for key, value in vars(self).items() if not key.endswith("_s")}
+        per_region = self.num_warps / self.num_regions if self.num_regions else 0.0
+        return {**known, "warps_per_region": per_region}
 
     @classmethod
     def total(cls, costs: Sequence[Self]) -> Self:
@@ -147,10 +137,7 @@ class _TimedExtractor(ImageExtractor):
         return self.plans[-1]
 
     def execute(
-        self,
-        photograph: Photograph,
-        plan: RectificationPlan,
-        level: int = 0,
+        self, photograph: Photograph, plan: RectificationPlan, level: int = 0
     ) -> LocalFeatures:
         with self.watch.step("warp"):
             return super().execute(photograph, plan, level)
@@ -188,10 +175,7 @@ logger = logging.getLogger(__name__)
 
 
 class RecipeFeatures:
-    """Features by image, level by level of escalation.
-
-    ``NAME.h5`` holds the features and ``NAME.jsonl`` what they cost. The cost of an image is
-    written first, so that its features never lack it.
+    """Features by image, level by level of escalation: ``NAME.h5``, and their cost ``NAME.jsonl``.
 
     Attributes:
         store: the features; other options than those on record are refused.
@@ -212,16 +196,13 @@ class RecipeFeatures:
         """Find everything that the recipe needs.
 
         ``path`` is that of the files, without suffix; ``inputs`` is what the images depend on, for
-        the record; ``overwrite`` discards what is there, which is refused if it is of other
-        options.
+        the record. Files of other options are refused unless ``overwrite`` discards them.
         """
         self._images, self.resources = images, resources
         self._extractor = prepare(options, resources, list(images))
         weights = digests_by_name(self._extractor.weights)
         self.settings = {**inputs, **options.to_mapping(), "weights": weights}
-        features_path, costs_path = (
-            path.with_name(f"{path.name}{suffix}") for suffix in (".h5", ".jsonl")
-        )
+        features_path, costs_path = (path.with_name(path.name + s) for s in (".h5", ".jsonl"))
         if overwrite:
             features_path.unlink(missing_ok=True)
             costs_path.unlink(missing_ok=True)
@@ -260,16 +241,14 @@ class RecipeFeatures:
                 advance(1)
 
     def _extract(self, name: str, level: int) -> None:
-        image = self._images[name]
-        found, cost = extract_measured(
-            self._extractor, image.path, image.name, image.intrinsics, level
-        )
+        image, extractor = self._images[name], self._extractor
+        found, cost = extract_measured(extractor, image.path, image.name, image.intrinsics, level)
         logger.debug("%s: %d features", name, len(found.features))
         if found.warning:
             logger.warning("%s: %s", name, found.warning)
-        self._costs.append(
-            {"image": name, "level": level, "cost": vars(cost), "warning": found.warning}
-        )
+        # First, so that features never lack their cost.
+        record = {"image": name, "level": level, "cost": vars(cost), "warning": found.warning}
+        self._costs.append(record)
         if level:
             self.store.extend(name, found.features)
         else:

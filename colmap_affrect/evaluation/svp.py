@@ -36,9 +36,8 @@ from colmap_affrect.evaluation.relative_pose import (
     scene_images,
     stem,
 )
-from colmap_affrect.evaluation.truth_checks import image_size, pose_contradictions
+from colmap_affrect.evaluation.truth_checks import image_sizes, pose_contradictions
 from colmap_affrect.images.reading import IMAGE_SUFFIXES
-from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
 CATEGORY_DEG = 10
@@ -60,10 +59,11 @@ class Svp(PosedScenes):
         listed, bad_lines = read_pair_list(list_path)
         cameras, faults = read_camera_poses(folder / "0")
         poses = {name: pose for name, (_, pose) in cameras.items()}
-        files = scene_images(folder / "images")
+        images = folder / "images"
+        files = scene_images(images)
         posed = {
             name: posed_image(
-                f"{scene}/{path.relative_to(folder / 'images').as_posix()}", path, *cameras[name]
+                f"{scene}/{path.relative_to(images).as_posix()}", path, *cameras[name]
             )
             for name, path in files.items()
             if name in cameras
@@ -77,9 +77,8 @@ class Svp(PosedScenes):
         empty = ", ".join(f"{tens * CATEGORY_DEG}°" for tens in sorted(wanted - left))
         names = list(dict.fromkeys(name for pair in listed_names for name in pair))
         lacking = {n: faults.get(n, "not in images.txt") for n in names if n not in cameras}
-        bad = [f"line {number}" for number in bad_lines]
         notes = [
-            *counted(bad, f"lines that are no pair of {list_path.name}"),
+            *counted(bad_lines, f"lines that are no pair of {list_path.name}"),
             *missing_notes(listed_names, names, files, lacking, "pose or camera"),
             *_difficulty_notes(listed, poses),
             *_size_notes(pairs),
@@ -102,8 +101,8 @@ def difficulty(poses: Mapping[str, Pose], name1: str, name2: str) -> int:
     return int(rotation_angle_deg(rotation) // CATEGORY_DEG)
 
 
-def read_pair_list(path: Path) -> tuple[list[ListedPair], list[int]]:
-    """Read a pair list; also return the numbers of the lines that could not be understood."""
+def read_pair_list(path: Path) -> tuple[list[ListedPair], list[str]]:
+    """Read a pair list; also name the lines that could not be understood."""
     pairs, bad = [], []
     for number, line in _lines(path):
         words = line.split()
@@ -111,7 +110,7 @@ def read_pair_list(path: Path) -> tuple[list[ListedPair], list[int]]:
             listed = int(words[2]) if len(words) == 3 else None
             pairs.append(ListedPair((stem(words[0]), stem(words[1])), listed))
         else:
-            bad.append(number)
+            bad.append(f"line {number}")
     return pairs, bad
 
 
@@ -120,8 +119,7 @@ def read_camera_poses(
 ) -> tuple[dict[str, tuple[pycolmap.Camera, Pose]], dict[str, str]]:
     """Read ``images.txt`` and ``cameras.txt``; EvaluationError when that cannot be done.
 
-    Returns cameras and cam_from_world poses by image name without suffix, and why others are not
-    usable.
+    Returns cameras and poses by image name without suffix, and why others are not usable.
     """
     lines = (line.split() for _, line in _lines(model_path / "cameras.txt"))
     cameras = {camera_id: words for camera_id, *words in lines}
@@ -182,20 +180,19 @@ def _difficulty_notes(listed: Sequence[ListedPair], poses: Mapping[str, Pose]) -
         if pair.difficulty is not None and poses.keys() >= set(pair.names)
         if (found := difficulty(poses, *pair.names)) != pair.difficulty
     ]
-    what = f"of {len(listed)} listed difficulties contradict the poses, which are used"
-    return counted(wrong, what)
+    return counted(
+        wrong, f"of {len(listed)} listed difficulties contradict the poses, which are used"
+    )
 
 
 def _size_notes(pairs: Sequence[EvaluationPair]) -> list[str]:
     """Count images that have another size in px than their intrinsics are for."""
-    images: list[PosedImage] = list(
-        {posed.image.name: posed for pair in pairs for posed in pair.truth}.values()
-    )
-    sizes = map_ordered(lambda posed: image_size(posed.image.path), images, available_cores())
+    images: dict[str, PosedImage] = {im.image.name: im for pair in pairs for im in pair.truth}
+    paths = [posed.image.path for posed in images.values()]
     wrong = [
-        f"{posed.image.name} ({size[0]} x {size[1]} px, intrinsics for "
+        f"{name} ({size[0]} x {size[1]} px, intrinsics for "
         f"{posed.camera.width} x {posed.camera.height} px)"
-        for posed, size in zip(images, sizes, strict=True)
+        for (name, posed), size in zip(images.items(), image_sizes(paths), strict=True)
         if size and size != (posed.camera.width, posed.camera.height)
     ]
     return counted(wrong, "images are of another size than their intrinsics")
