@@ -95,6 +95,7 @@ def test_settings_of_a_protocol_are_read_by_their_type() -> None:
         ("threshold_px=wide", "expected float"),
         ("threshold_px=-1", "is outside"),
         ("check_truth=perhaps", "expected bool"),
+        ("threshold_px=" + 20_000 * "[", "expected float"),
     ):
         with pytest.raises(OptionError, match=message):
             make_protocol("evd", [setting])
