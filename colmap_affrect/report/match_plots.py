@@ -23,11 +23,7 @@ PLOT_HEIGHT, GAP = 300.0, 8.0
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Two photographs side by side.
-
-    Attributes:
-        widths: of the two photographs; both are ``PLOT_HEIGHT`` high.
-    """
+    """Two photographs of given widths side by side, both ``PLOT_HEIGHT`` high."""
 
     names: Pair
     widths: tuple[float, float]
@@ -54,7 +50,6 @@ class MatchPlot:
     """The inliers of a pair, to be drawn over its photographs.
 
     Attributes:
-        num_inliers: as verified.
         num_from_warps: inliers with a feature from a warp.
         plain, warped: SVG paths of the lines of the others and of these.
         missing: why there are no lines; empty if there are, or nothing was verified.
@@ -120,10 +115,7 @@ def _read_inliers(
 
 
 def _plot(
-    num_inliers: int,
-    shown: SideBySide,
-    ends: NDArray[np.float64],
-    from_warps: NDArray[np.bool_],
+    num_inliers: int, shown: SideBySide, ends: NDArray[np.float64], from_warps: NDArray[np.bool_]
 ) -> MatchPlot:
     points = ends * [[shown.widths[0], PLOT_HEIGHT], [shown.widths[1], PLOT_HEIGHT]]
     points[:, 1, 0] += shown.second_left

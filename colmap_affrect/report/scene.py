@@ -53,9 +53,8 @@ class View3D:
     def script_data(self, index: Mapping[str, int], kinds: Mapping[str, str]) -> dict[str, Any]:
         """Return what the script of the page reads.
 
-        Args:
-            index: of the photographs on the page, by name.
-            kinds: name of the colour that the style has for each camera.
+        ``index`` is that of the photographs on the page, ``kinds`` the names of the colours that
+        the style has for their cameras.
         """
         cameras = [
             {
@@ -130,11 +129,7 @@ def _read(path: Path, max_num_points: int) -> Model:
     registered_names(path)
     model = pycolmap.Reconstruction(path)
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
-    sizes = []
-    for image in images:
-        camera = model.cameras[image.camera_id]
-        focal_px = camera.mean_focal_length()
-        sizes.append([camera.width / focal_px / 2, camera.height / focal_px / 2])
+    cameras = [model.cameras[image.camera_id] for image in images]
     ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
     if len(ids) > max_num_points:
         ids = np.random.default_rng(0).choice(ids, max_num_points, replace=False)
@@ -143,7 +138,7 @@ def _read(path: Path, max_num_points: int) -> Model:
         tuple(image.name for image in images),
         np.array([image.projection_center() for image in images]).reshape(-1, 3),
         np.array([image.cam_from_world().rotation.matrix().T for image in images]),
-        np.array(sizes),
+        np.array([np.array([c.width, c.height]) / c.mean_focal_length() / 2 for c in cameras]),
         np.array([point.xyz for point in points]).reshape(-1, 3),
         np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
     )
