@@ -52,6 +52,10 @@ class Span:
         numbers = [float(value) for value in values]
         return cls(sum(numbers) / len(numbers), min(numbers), max(numbers))
 
+    def text(self, varying: str) -> str:
+        """Write the one value, or a mean and a range as ``{0.mean}``, ``{0.min}``, ``{0.max}``."""
+        return f"{self.mean:g}" if self.min == self.max else varying.format(self)
+
 
 @dataclass(frozen=True)
 class SeedResult:
@@ -64,7 +68,6 @@ class SeedResult:
         mean_track_length: images per point.
         mean_observations: observed points per registered image.
         num_observations: observed points of each image of the largest model.
-        pair_inliers: verified pairs and their numbers of inliers.
         scores: against ground truth; None where there is none.
         wall_s: seconds of ``verify`` and ``map``.
         doubtful: images of the largest model that cannot be trusted, with the reason.

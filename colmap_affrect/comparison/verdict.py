@@ -5,6 +5,7 @@ Gains are counted in photographs registered, or registered correctly where there
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -54,8 +55,7 @@ class Change:
     """What one method does better or worse than another.
 
     Attributes:
-        gained: images that it usually registers and the other does not, sorted.
-        lost: the other way round.
+        gained: images that it usually registers and the other does not, sorted; lost: the opposite.
         mean: more images on average over the seeds.
         time_ratio: of their total times; 0 where the other one took none.
     """
@@ -148,18 +148,11 @@ def changes(comparison: Comparison) -> list[str]:
 
     Rectified methods are set against our own features without warps too.
     """
-    reference = reference_of(comparison)
-    texts = [
-        _change_text(method, reference)
-        for method in comparison.finished
-        if reference and method is not reference
-    ]
-    texts += [
-        _change_text(method, unrectified)
-        for unrectified in filter(is_unrectified, comparison.finished)
-        for method in filter(is_rectified, comparison.finished)
-    ]
-    return texts
+    finished, reference = comparison.finished, reference_of(comparison)
+    rectified, plain = filter(is_rectified, finished), filter(is_unrectified, finished)
+    pairs = [(method, reference) for method in finished if reference and method is not reference]
+    pairs += [(method, other) for other, method in itertools.product(plain, rectified)]
+    return [_change_text(*pair) for pair in pairs]
 
 
 def _change_text(method: MethodResult, reference: MethodResult) -> str:
@@ -274,12 +267,8 @@ def _registers(comparison: Comparison) -> str:
     return "correctly registers" if comparison.has_ground_truth else "registers"
 
 
-def _number(span: Span | None) -> str:
-    if span is None:
-        return "0"
-    if span.min == span.max:
-        return f"{span.mean:g}"
-    return f"{span.mean:.1f} on average ({span.min:g} to {span.max:g})"
+def _number(span: Span) -> str:
+    return span.text("{0.mean:.1f} on average ({0.min:g} to {0.max:g})")
 
 
 def _seconds(value: float) -> str:

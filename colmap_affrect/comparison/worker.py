@@ -186,7 +186,7 @@ def _pair(names: Mapping[int, str], ids: tuple[int, int]) -> Pair:
 
 def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
     """Verify and map a copy of the database of the method, unless that is done."""
-    folder = request.seed_folder(seed)
+    folder = request.folder / f"seed-{seed}"
     result_path, database_path = folder / "result.json", folder / "database.db"
     if result_path.exists():
         return SeedResult.from_mapping(json.loads(result_path.read_text(encoding="utf-8")))
@@ -195,7 +195,7 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
     copy_database(request.folder / "database.db", database_path)
     with open_database(database_path) as database:
         database.clear_two_view_geometries()
-    names = {image_id: name for name, image_id in image_ids(database_path).items()}
+        names = {image.image_id: image.name for image in database.read_all_images()}
     watch, told = Stopwatch(), _OfSeed(progress, seed)
     options = request.verification.changed(random_seed=seed)
     mapper = MAPPERS.make(request.mapping.changed(random_seed=seed))
@@ -255,21 +255,14 @@ def _vote(
 ) -> None:
     """Let the pairs vote on cameras if they are to do that."""
     if request.focal_vote:
-        hold_vote(
-            workspace.database,
-            workspace.cameras,
-            verification,
-            size_px,
-            may_share=request.may_share,
-            silent=silent,
-        )
+        paths, may_share = (workspace.database, workspace.cameras), request.may_share
+        hold_vote(*paths, verification, size_px, may_share=may_share, silent=silent)
 
 
 class _Costs:
     """Seconds and memory that a method has taken, over all processes that worked on it.
 
-    Attributes:
-        failures: images that could not be used, with the reason.
+    Also its failures: images that could not be used, with the reason.
     """
 
     def __init__(self, path: Path) -> None:

@@ -114,7 +114,7 @@ RECTIFIERS: Registry[Rectifier] = Registry(
         "asift": "colmap_affrect.rectifiers.whole_image:Asift",
         "affnet-shapes": "colmap_affrect.rectifiers.whole_image:AffNetShapes",
         "depth-planes": "colmap_affrect.rectifiers.depth_planes:DepthPlanes",
-        "depth-affnet": "colmap_affrect.rectifiers.depth_affnet:DepthAffNet",
+        "depth-affnet": "colmap_affrect.rectifiers.depth_planes:DepthAffNet",
         "dense-shapes": "colmap_affrect.rectifiers.dense:DenseShapes",
     },
     default="dense-shapes",
