@@ -115,10 +115,7 @@ def compare(
 class _Plan:
     """A comparison whose options have been checked.
 
-    Attributes:
-        names: all images given, sorted.
-        not_compared: learned methods that would have been compared with their weights, and how
-            these are had.
+    ``not_compared`` says which learned methods lack their weights, and how these are had.
     """
 
     image_path: Path

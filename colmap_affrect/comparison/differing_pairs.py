@@ -37,12 +37,7 @@ def pair_rows(methods: Sequence[MethodResult]) -> list[tuple[Pair, list[int]]]:
 
 @dataclass(frozen=True)
 class ChosenPair:
-    """A pair to draw, and the two methods that differ on it.
-
-    Attributes:
-        before: the method with fewer inliers, or the one that does not rectify.
-        after: the other one.
-    """
+    """A pair to draw, and two methods: of fewer inliers, or without rectification, and of more."""
 
     names: Pair
     before: MethodResult

@@ -96,16 +96,11 @@ def _bars(columns: Sequence[Column], comparison: Comparison) -> list[dict[str, A
     total = max(1, len(comparison.image_names))
     bars = []
     for column in columns:
-        spans = [column.method.registered, column.method.correct]
-        known = [span for span in spans if span]
-        texts = [span_text(span, digits_of([span.mean], 1)) for span in known]
-        bars.append(
-            {
-                "column": column,
-                "shares": [span.mean / total for span in known],
-                "text": ", ".join([f"{texts[0]} of {total}", *(f"{t} correct" for t in texts[1:])]),
-            }
-        )
+        known = [span for span in (column.method.registered, column.method.correct) if span]
+        first, *correct = (span_text(span, digits_of([span.mean], 1)) for span in known)
+        text = ", ".join([f"{first} of {total}", *(f"{each} correct" for each in correct)])
+        shares = [span.mean / total for span in known]
+        bars.append({"column": column, "shares": shares, "text": text})
     return bars
 
 
@@ -122,18 +117,16 @@ def _graphs_and_models(
     index = {name: number for number, name in enumerate(names)}
     kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
     used = {kind for of_view in kinds for kind in of_view.values()}
+    first, later = graphs[:1], graphs[1:]
     return {
         "cards": cards,
         "layout": layout,
         "edges": [
-            view_graph.differing_edge_paths(names, layout, graph, graphs[0])
-            if number
-            else view_graph.edge_paths(names, layout, graph)
-            for number, graph in enumerate(graphs)
+            *(view_graph.edge_paths(names, layout, graph) for graph in first),
+            *(view_graph.differing_edge_paths(names, layout, graph, *first) for graph in later),
         ],
         "edge_notes": [
-            f"{len(graph)} verified pairs" + (_difference(graph, graphs[0]) if number else "")
-            for number, graph in enumerate(graphs)
+            f"{len(graph)} verified pairs{_difference(graph, graphs[0])}" for graph in graphs
         ],
         "views": views,
         "kinds": {kind: text for kind, text in KINDS.items() if kind in used},
@@ -222,11 +215,7 @@ class Mark(Node):
 
 @dataclass(frozen=True)
 class Card:
-    """A photograph on the contact sheet.
-
-    Attributes:
-        number: from 1, the same everywhere on the page.
-    """
+    """A photograph on the contact sheet; it has the same number everywhere on the page."""
 
     number: int
     name: str
@@ -236,28 +225,16 @@ class Card:
 
 def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
     """Return the contact sheet."""
-    with_truth = {
-        name
-        for column in columns
-        for seed in column.method.seeds
-        if seed.scores is not None
-        for pair in seed.scores.pair_errors_deg
-        for name in pair
-    }
+    scores = [seed.scores for column in columns for seed in column.method.seeds if seed.scores]
+    with_truth = {name for item in scores for pair in item.pair_errors_deg for name in pair}
     usually_registered = [column.method.usually_registered for column in columns]
-    only = comparison.only_registered_by
+    only = comparison.only_registered_by if len(columns) > 1 else {}
     registered_by_none = set(comparison.registered_by_none)
     cards = []
     for number, name in enumerate(comparison.image_names, 1):
+        truth, alone = name in with_truth, only.get(name)
         marks = tuple(
-            _mark(
-                column,
-                number,
-                name,
-                has_ground_truth=name in with_truth,
-                is_only=only.get(name) == column.name and len(columns) > 1,
-            )
-            for column in columns
+            _mark(c, number, name, has_truth=truth, is_only=alone == c.name) for c in columns
         )
         tests = {
             "all": True,
@@ -272,7 +249,7 @@ def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
     return cards
 
 
-def _mark(column: Column, number: int, name: str, *, has_ground_truth: bool, is_only: bool) -> Mark:
+def _mark(column: Column, number: int, name: str, *, has_truth: bool, is_only: bool) -> Mark:
     method, seeds = column.method, column.method.seeds
     registering = [seed for seed in seeds if name in seed.registered_names]
     correct = [s for s in registering if s.scores is not None and name in s.scores.correct_names]
@@ -282,7 +259,7 @@ def _mark(column: Column, number: int, name: str, *, has_ground_truth: bool, is_
         state, text = "always", "registered"
     else:
         state, text = "sometimes", f"registered with {len(registering)} of {len(seeds)} seeds"
-    is_wrong = has_ground_truth and len(correct) < len(registering)
+    is_wrong = has_truth and len(correct) < len(registering)
     if is_wrong:
         text += f", correctly with {len(correct)}" if correct else ", wrongly"
     elif correct:

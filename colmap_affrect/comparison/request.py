@@ -26,11 +26,7 @@ from colmap_affrect.stages.context import Resources
 class Layout:
     """Paths below the folder of a comparison.
 
-    Attributes:
-        inputs: record of what ``shared`` was made from, and of the options all methods have.
-        database: cameras and images, no features.
-        cameras: what is known of the cameras.
-        images: names of the images that COLMAP can read, one a line.
+    ``inputs`` records what ``shared`` was made from, and the options that all methods have.
     """
 
     def __init__(self, path: Path, shared_name: str = "shared") -> None:

@@ -251,13 +251,7 @@ def in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Several methods on one set of photographs.
-
-    Attributes:
-        image_names: all images given, sorted.
-        num_pairs: pairs that were to be matched.
-        settings: cameras, masks, pair list, preset and mapper that all methods had.
-    """
+    """Several methods on one set of photographs, sorted by name, and what all methods had."""
 
     image_names: tuple[str, ...]
     image_path: str

@@ -55,7 +55,7 @@ class Change:
     """What one method does better or worse than another.
 
     Attributes:
-        gained: images that it usually registers and the other does not, sorted; lost: the opposite.
+        gained: images that it usually registers and the other does not, sorted.
         mean: more images on average over the seeds.
         time_ratio: of their total times; 0 where the other one took none.
     """

@@ -67,11 +67,7 @@ class MatchedPair:
 
 @dataclass(frozen=True)
 class PairMatcher:
-    """Matches pairs by the features of a recipe.
-
-    Attributes:
-        max_num_keypoints: of each image, the strongest of all its features; None for all.
-    """
+    """Matches pairs by so many of the strongest features of each image; None for all."""
 
     recipe: Recipe
     features: RecipeFeatures
@@ -168,10 +164,8 @@ def verified_inliers(
 ) -> int:
     """Return the inliers of COLMAP's two-view geometry; 0 if a run would not take it.
 
-    Args:
-        frames: of both images, (M, 2, 3) local affine frames that match, pixel-centre px.
-        sizes: (width, height) of both images in px.
-        extracted_px: longest side that photographs were shrunk to before extraction.
+    ``frames`` are (M, 2, 3) local affine frames that match, pixel-centre px, in images of ``sizes``
+    (width, height), which were shrunk to a longer side of ``extracted_px``.
     """
     options = VerificationOptions(random_seed=VERIFICATION_SEED)
     first, second = (

@@ -255,12 +255,7 @@ def _named(entry: Any, path: Path, number: int) -> str:
 
 @dataclass(frozen=True)
 class _Entry:
-    """An entry of the list.
-
-    Attributes:
-        offset_px: what must be added to coordinates for pixel centres.
-        check: see whether the images confirm the truth.
-    """
+    """An entry of the list; to its coordinates ``offset_px`` must be added for pixel centres."""
 
     values: Mapping[str, Any]
     folder: Path

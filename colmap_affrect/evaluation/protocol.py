@@ -31,9 +31,8 @@ GROUP = ": "
 class EvaluationImage:
     """An image of a dataset.
 
-    Attributes:
-        name: unique in the dataset, the key of its features and depth map.
-        intrinsics: (3, 3) camera matrix in pixel-centre px; None where the dataset has none.
+    ``name`` is the key of its features and depth map; ``intrinsics`` is its (3, 3) camera matrix in
+    pixel-centre px, None where the dataset has none.
     """
 
     name: str
@@ -46,11 +45,9 @@ class EvaluationPair:
     """Two images whose matches are scored.
 
     Attributes:
-        name: unique in the dataset.
         category: of difficulty, as the protocol's tables group pairs; empty where it does not.
         truth: what the score needs; known to the protocol only.
-        problem: why it cannot be scored (a file that is missing, a truth that is not finite); such
-            a pair counts as failed. Empty for the others.
+        problem: why it cannot be scored and counts as failed; empty for the others.
     """
 
     name: str
@@ -68,7 +65,6 @@ class PairScore:
         error: of the protocol (px or degrees); infinite where no model was found.
         num_inliers: of the model that was estimated.
         num_correct: matches that agree with the truth; None where it cannot say.
-        details: further figures by name.
     """
 
     error: Number
@@ -82,13 +78,10 @@ class PairResult(PairScore):
     """The score of one pair by one recipe: what ``evaluation.json`` lists.
 
     Attributes:
-        num_matches: before the estimation.
-        num_keypoints: features of the two images that were matched.
         seconds_by_step: the same by step, ``match`` and ``estimate``.
         level: rectifier of the level of escalation that decided; empty without escalation.
         num_levels: levels whose features were extracted for the pair, 1 without escalation.
-        failure: why there is no score, if an image could not be read or the like; such pairs
-            have an infinite error and count as failed.
+        failure: why the pair counts as failed, with an infinite error.
     """
 
     name: str

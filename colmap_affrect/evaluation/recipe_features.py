@@ -32,9 +32,6 @@ class RecordFile:
     """Records that were all made with the same settings, which are the first line.
 
     A last line that is not complete, of a run that was killed, does not count.
-
-    Attributes:
-        records: all that are there, in order.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:

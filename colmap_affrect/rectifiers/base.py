@@ -31,12 +31,7 @@ class Rectifier(Protocol):
 
 @dataclass(frozen=True)
 class RectifierInputs:
-    """What a rectifier may read beside the photograph.
-
-    Attributes:
-        shapes: the source that its options name; None if they name none.
-        depth: None when the recipe needs no depth.
-    """
+    """What a rectifier may read beside the photograph; None for what its options do not ask for."""
 
     shapes: ShapeSource | None = None
     depth: DepthSource | None = None

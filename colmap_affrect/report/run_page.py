@@ -47,12 +47,7 @@ MAX_NUM_CAMERAS = 200
 
 @dataclass(frozen=True)
 class Fate(view_graph.Node):
-    """What became of a photograph.
-
-    Attributes:
-        kind: one of ``KINDS``, or ``missing``.
-        groups: of ``FILTERS``.
-    """
+    """What became of a photograph: one of ``KINDS``, or ``missing``."""
 
     kind: str
     groups: tuple[str, ...]

@@ -39,7 +39,6 @@ class View3D:
     """A model ready for the page; lengths in units of the view's radius.
 
     Attributes:
-        num_points: points in ``points``.
         points: (N, 3) uint16 positions from -1 to 1 and then (N, 3) uint8 colours, as base64.
         cameras: name and (5, 3) centre and corners of the pyramid of each camera.
         note: what is special about it; empty if nothing is.

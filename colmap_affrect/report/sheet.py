@@ -69,11 +69,9 @@ STYLE: list[str | dict[str, Any]] = [
 
 
 class FigurePage:
-    """A figure that is filled from its top downwards; places are px from its top left corner.
+    """A figure that is filled downwards; places are px from its top left corner.
 
-    Attributes:
-        figure: of any height; what is drawn lies below its top edge, also beyond its bottom.
-        top: where the next section begins.
+    What is drawn also lies beyond its bottom. ``top`` is where the next section begins.
     """
 
     def __init__(self) -> None:

@@ -65,10 +65,9 @@ def class_labels() -> list[str]:
 
 @dataclass(frozen=True)
 class Node:
-    """A photograph in a view graph.
+    """A photograph in a view graph; it has the same number, from 1, everywhere on the page.
 
     Attributes:
-        number: from 1, the same everywhere on the page.
         state: ``always``, ``sometimes`` or ``never`` registered, over the seeds.
         is_wrong: registered, but at a wrong place with some seed.
     """

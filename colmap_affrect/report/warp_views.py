@@ -36,13 +36,10 @@ class WarpView:
 
 @dataclass(frozen=True)
 class WarpedPhotograph:
-    """What one level of a recipe does with a photograph.
+    """What one level of a recipe does with a photograph, and the largest of its warps.
 
-    Attributes:
-        num_warps: all that were planned.
-        regions: the photograph with the regions of the warps in colour.
-        warps: the largest.
-        has_regions: whether warps are meant for parts of the photograph.
+    ``regions`` is the photograph with their regions in colour; ``has_regions`` says whether they
+    are meant for parts of it.
     """
 
     name: str
