@@ -212,6 +212,15 @@ def test_matrices_of_the_script_have_the_inliers(page: Page, comparison: Compari
         np.testing.assert_array_equal(counts, expected)
 
 
+def test_more_photographs_than_fit_into_a_matrix_have_the_table_only(
+    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("colmap_affrect.report.view_graph.MAX_NUM_IN_MATRIX", len(NAMES) - 1)
+    html = write_page(comparison, tmp_path).read_text(encoding="utf-8")
+    assert "data-matrix=" not in html
+    assert "Table of verified pairs" in html
+
+
 def test_models_are_drawn_in_one_frame(page: Page) -> None:
     default, sift = page.data["views"]
     assert [len(view["cameras"]) for view in (sift, default)] == [4, 5]
