@@ -90,30 +90,20 @@ def plot_pairs(
     chosen: Sequence[ChosenPair], pictures: Mapping[str, Picture], output_path: Path
 ) -> list[PairPlots]:
     """Draw the inliers of pairs whose photographs are among the pictures."""
-    sides = {
-        item.names: SideBySide.of(item.names, pictures)
-        for item in chosen
-        if all(name in pictures for name in item.names)
-    }
+    drawable = [item for item in chosen if pictures.keys() >= set(item.names)]
+    sides = {item.names: SideBySide.of(item.names, pictures) for item in drawable}
+    names_of = {item.names: (item.before.name, item.after.name) for item in drawable}
+    methods = {method.name: method for item in drawable for method in (item.before, item.after)}
     drawn: dict[str, dict[Pair, MatchPlot]] = {}
-    methods = {method.name: method for item in chosen for method in (item.before, item.after)}
     for name, method in methods.items():
         workspace = Workspace(output_path / method.folder)
         drawn[name] = plot_inliers(
-            [
-                sides[item.names]
-                for item in chosen
-                if item.names in sides and name in (item.before.name, item.after.name)
-            ],
+            [side for pair, side in sides.items() if name in names_of[pair]],
             method.pair_inliers,
             workspace.path / f"seed-{method.seeds[0].seed}" / "database.db",
             workspace.features,
         )
     return [
-        PairPlots(
-            sides[item.names],
-            {method.name: drawn[method.name][item.names] for method in (item.before, item.after)},
-        )
-        for item in chosen
-        if item.names in sides
+        PairPlots(side, {name: drawn[name][pair] for name in names_of[pair]})
+        for pair, side in sides.items()
     ]

@@ -362,11 +362,8 @@ def _intervals(
 
 def _by_category(results: Sequence[PairResult]) -> dict[str, list[int]]:
     """Return the rows of the pairs of each category, of those that have one."""
-    categories: dict[str, list[int]] = {}
-    for row, result in enumerate(results):
-        if result.category:
-            categories.setdefault(result.category, []).append(row)
-    return categories
+    names = dict.fromkeys(result.category for result in results if result.category)
+    return {name: [row for row, r in enumerate(results) if r.category == name] for name in names}
 
 
 def _fingerprint(truth: Any) -> str:

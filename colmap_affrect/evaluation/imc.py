@@ -19,7 +19,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import h5py
 import numpy as np
@@ -68,22 +68,19 @@ class Imc(PosedScenes):
         lists, list_notes = _read_lists(lists_path)
         calibrations, faults = _read_calibrations(root / "calibration")
         files = scene_images(root / "images")
+        known = calibrations.keys() | faults.keys() | files.keys()
         bins: dict[Names, str] = {}
         unclear = []
         for key, limit in disjoint_bins(lists).items():
-            names = _split(key, calibrations.keys() | faults.keys() | files.keys())
-            if names is None:
-                unclear.append(key)
-            else:
+            if names := _split(key, known):
                 bins[names] = f"{limit / 10:.1f}"
+            else:
+                unclear.append(key)
         posed, size_notes = _posed(scene, files, calibrations)
         pairs = posed_pairs(bins, posed, lambda names: bins[names])
         wanted = sorted({name for names in bins for name in names})
-        lacking = {
-            name: faults.get(name, "no file")
-            for name in wanted
-            if name in files and name not in calibrations
-        }
+        uncalibrated = [name for name in wanted if name in files and name not in calibrations]
+        lacking = {name: faults.get(name, "no file") for name in uncalibrated}
         used = {pair.category for pair in pairs}
         empty = ", ".join(name for limit in BINS[1:] if (name := f"{limit / 10:.1f}") not in used)
         notes = [
@@ -97,11 +94,8 @@ class Imc(PosedScenes):
         return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
 
 
-class Calibration(NamedTuple):
-    """What a calibration file says: (3, 3) K and camera_from_world."""
-
-    matrix: NDArray[np.float64]
-    pose: Pose
+Calibration = tuple[NDArray[np.float64], Pose]
+"""What a calibration file says: (3, 3) K and camera_from_world."""
 
 
 def disjoint_bins(lists: Mapping[int, list[str]]) -> dict[str, int]:
@@ -117,11 +111,8 @@ def read_calibration(path: Path) -> Calibration:
     """Read and check a calibration file; EvaluationError says what is wrong with it."""
     try:
         with h5py.File(path) as file:
-            values = {
-                key: np.asarray(file[key][()], dtype=np.float64)
-                for key in ("K", "R", "T")
-                if key in file
-            }
+            there = [key for key in ("K", "R", "T") if key in file]
+            values = {key: np.asarray(file[key][()], dtype=np.float64) for key in there}
     except (OSError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise EvaluationError(f"cannot be read ({error})") from error
     for key, size in (("K", 9), ("R", 9), ("T", 3)):
@@ -136,7 +127,7 @@ def read_calibration(path: Path) -> Calibration:
         raise EvaluationError("K is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     if fault := rotation_fault(rotation):
         raise EvaluationError(fault)
-    return Calibration(matrix, (rotation, values["T"].ravel()))
+    return matrix, (rotation, values["T"].ravel())
 
 
 def _read_lists(folder: Path) -> tuple[dict[int, list[str]], list[str]]:
@@ -176,11 +167,8 @@ def _read_calibrations(folder: Path) -> tuple[dict[str, Calibration], dict[str, 
 def _split(key: str, known: set[str]) -> Names | None:
     """Split "a-b" where both names are known: names may have dashes in them."""
     words = key.split("-")
-    for number in range(1, len(words)):
-        names = "-".join(words[:number]), "-".join(words[number:])
-        if known.issuperset(names):
-            return names
-    return None
+    splits = (("-".join(words[:k]), "-".join(words[k:])) for k in range(1, len(words)))
+    return next((names for names in splits if known.issuperset(names)), None)
 
 
 def _posed(
@@ -192,7 +180,7 @@ def _posed(
     found: dict[str, PosedImage] = {}
     scaled, unfitting = [], []
     for name, size in zip(names, sizes, strict=True):
-        path, matrix = files[name], calibrations[name].matrix
+        path, (matrix, pose) = files[name], calibrations[name]
         guess = tuple(np.rint(2 * matrix[:2, 2]).astype(int).tolist())
         width, height = size or guess
         example = f"{path.name} ({width} x {height} px, K about {guess[0]} x {guess[1]} px)"
@@ -204,7 +192,7 @@ def _posed(
             scaled.append(example)
         params = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
-        found[name] = posed_image(f"{scene}/{path.name}", path, camera, calibrations[name].pose)
+        found[name] = posed_image(f"{scene}/{path.name}", path, camera, pose)
     return found, [
         *counted(scaled, "images are of another size than their K, which is scaled"),
         *counted(unfitting, "images are of another shape than their K"),

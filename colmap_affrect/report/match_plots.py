@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -72,15 +72,15 @@ def plot_inliers(
 
     The feature store, if it exists, tells which features are from warps.
     """
-    plots = {item.names: MatchPlot(pair_inliers.get(item.names, 0)) for item in shown}
-    verified = [item for item in shown if plots[item.names].num_inliers]
+    counts = {item.names: pair_inliers.get(item.names, 0) for item in shown}
+    plots = {names: MatchPlot(count) for names, count in counts.items()}
+    verified = [item for item in shown if counts[item.names]]
     try:
         found = _read_inliers([item.names for item in verified], database_path, features_path)
     except AffrectError as error:
-        missing = {item.names: replace(plots[item.names], missing=str(error)) for item in verified}
-        return plots | missing
+        return plots | {n: MatchPlot(c, missing=str(error)) for n, c in counts.items() if c}
     for item, (ends, from_warps) in zip(verified, found, strict=True):
-        plots[item.names] = _plot(plots[item.names].num_inliers, item, ends, from_warps)
+        plots[item.names] = _plot(counts[item.names], item, ends, from_warps)
     return plots
 
 

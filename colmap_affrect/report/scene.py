@@ -111,14 +111,12 @@ def read_models(paths: Mapping[str, Path | None]) -> tuple[dict[str, Model], dic
     Returns the models, and what is special about them or why they are missing, by name.
     """
     models: dict[str, Model] = {}
-    notes: dict[str, str] = {}
+    notes = {name: "There is no model." for name, path in paths.items() if path is None}
     max_num_points = min(MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE // max(1, len(paths)))
     for name, path in paths.items():
-        if path is None:
-            notes[name] = "There is no model."
-            continue
         try:
-            models[name] = _read(path, max_num_points)
+            if path is not None:
+                models[name] = _read(path, max_num_points)
         except AffrectError as error:
             notes[name] = f"The model cannot be shown: {error}"
     return (_in_one_frame(models, notes) if models else {}), notes
@@ -149,17 +147,16 @@ def _in_one_frame(models: Mapping[str, Model], notes: dict[str, str]) -> dict[st
     upright = _upright(models[reference])
     framed = {}
     for name, model in models.items():
-        similarity = similarity_of(model, upright)
         if name == reference:
             framed[name] = upright
-        elif similarity is None:
+        elif similarity := similarity_of(model, upright):
+            framed[name] = model.transformed(*similarity)
+        else:
             framed[name] = _upright(model)
             notes[name] = (
                 f"Shares fewer than two photographs at different places with the model of "
                 f"{reference}: drawn in a frame of its own."
             )
-        else:
-            framed[name] = model.transformed(*similarity)
     return framed
 
 
