@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import AffrectError, EvaluationError, OptionError
 from colmap_affrect.evaluation.evd import Evd
-from colmap_affrect.evaluation.imc import Imc
 from colmap_affrect.evaluation.pair_matches import MatchedPair, PairMatcher
 from colmap_affrect.evaluation.pairs import Pairs
 from colmap_affrect.evaluation.plots import write_plots
+from colmap_affrect.evaluation.posed_scenes import Imc, Svp
 from colmap_affrect.evaluation.protocol import (
     GROUP,
     Dataset,
@@ -55,7 +55,6 @@ from colmap_affrect.evaluation.results import (
     published,
 )
 from colmap_affrect.evaluation.statistics import bootstrap_intervals, paired_test
-from colmap_affrect.evaluation.svp import Svp
 from colmap_affrect.images.reading import require_png
 from colmap_affrect.options import digest_of
 from colmap_affrect.pipeline import installed_versions

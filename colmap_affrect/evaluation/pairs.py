@@ -22,7 +22,7 @@ tables and plots and may be left out, and so may ``pixel_origin``: ``center`` wh
 centre of the first pixel (default), ``corner`` when it is its corner. ``convention`` is for people.
 
 Scores: of homographies as :mod:`evd <colmap_affrect.evaluation.evd>` has them; of poses as
-:mod:`svp <colmap_affrect.evaluation.svp>`; of correspondences as WxBS.
+:mod:`svp <colmap_affrect.evaluation.posed_scenes>`; of correspondences as WxBS.
 """
 
 from __future__ import annotations
@@ -58,9 +58,10 @@ from colmap_affrect.evaluation.protocol import (
     PairScore,
     finite_numbers,
     read_numbers,
+    stem,
     with_truth,
 )
-from colmap_affrect.evaluation.relative_pose import RelativePoseProtocol, posed_image, stem
+from colmap_affrect.evaluation.relative_pose import RelativePoseProtocol, posed_image
 from colmap_affrect.evaluation.truth_checks import (
     correspondence_doubts,
     pose_contradictions,

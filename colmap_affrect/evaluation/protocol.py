@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -189,6 +189,15 @@ def with_truth(
 def counted(names: Sequence[str], what: str) -> list[str]:
     """Return a note of how many there are of something, with examples; nothing of nothing."""
     return [f"{len(names)} {what}: {such_as(names)}"] if names else []
+
+
+def stem(name: str) -> str:
+    """Return a name without its suffix.
+
+    >>> stem("left/a.1.png")
+    'left/a.1'
+    """
+    return PurePosixPath(name).with_suffix("").as_posix()
 
 
 def read_numbers(path: Path) -> NDArray[np.float64]:

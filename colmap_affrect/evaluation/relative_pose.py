@@ -7,10 +7,9 @@ the datasets whose truth COLMAP made. Points of matches are pixel-centre, as eve
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from statistics import median_low
 from typing import Annotated, Any, ClassVar
 
@@ -21,28 +20,21 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, area_under_curve, pose_errors, relative_pose
 from colmap_affrect.conventions import colmap_from_pixel, pixel_from_colmap
-from colmap_affrect.errors import EvaluationError
 from colmap_affrect.evaluation.protocol import (
     POSITIVE,
-    Dataset,
     EvaluationImage,
     EvaluationPair,
     EvaluationProtocol,
     PairResult,
     PairScore,
-    counted,
 )
 from colmap_affrect.evaluation.two_views import Points, Ransac, sampson_distances
-from colmap_affrect.images.reading import IMAGE_SUFFIXES
 from colmap_affrect.options import within
 
 CORRECT_PX = 3.0
 """A match agrees with a pose up to this Sampson distance."""
 
 MAX_AUC_ERROR_DEG = 10.0
-
-Names = tuple[str, str]
-"""Of the images of a pair, without suffix."""
 
 ESTIMATORS = {"": "", "GC-RANSAC: ": "gc_"}
 """What the names of columns begin with, and those of details of scores, by estimator."""
@@ -195,82 +187,3 @@ def rays(
         return np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
     matrix = np.asarray(camera.calibration_matrix())
     return np.asarray((pixels - matrix[:2, 2]) / np.diag(matrix)[:2])
-
-
-class PosedScenes(RelativePoseProtocol):
-    """A protocol whose dataset is a scene or a folder of scenes."""
-
-    scene_pattern: ClassVar[str]
-    """Of the file or folder that makes a folder a scene."""
-    dataset_title: ClassVar[str]
-
-    def load(self, dataset_path: Path) -> Dataset:
-        """Read a scene, or all in a folder; EvaluationError when no pair can be evaluated."""
-        folders = [dataset_path, *sorted(dataset_path.glob("*/"))]
-        paths = [path for folder in folders for path in sorted(folder.glob(self.scene_pattern))]
-        if not paths:
-            raise EvaluationError(
-                f"{dataset_path}: has no {self.scene_pattern}, nor has a folder in it; give a "
-                f"scene of {self.dataset_title}, or the folder of its scenes"
-            )
-        dataset = Dataset.united(map(self.load_scene, paths))
-        if not dataset.pairs:
-            notes = "; ".join(dataset.notes)
-            raise EvaluationError(f"{dataset_path}: no pair can be evaluated; {notes}")
-        return dataset
-
-    @abstractmethod
-    def load_scene(self, path: Path) -> Dataset:
-        """Read a scene by the path of what makes it one."""
-
-
-def stem(name: str) -> str:
-    """Return a name without its suffix.
-
-    >>> stem("left/a.1.png")
-    'left/a.1'
-    """
-    return PurePosixPath(name).with_suffix("").as_posix()
-
-
-def scene_images(folder: Path) -> dict[str, Path]:
-    """Return all images below a folder by their names without suffix."""
-    return {
-        stem(path.relative_to(folder).as_posix()): path
-        for path in sorted(folder.rglob("*"))
-        if path.suffix.lower() in IMAGE_SUFFIXES
-    }
-
-
-def posed_pairs(
-    listed: Iterable[Names], posed: Mapping[str, PosedImage], category: Callable[[Names], str]
-) -> list[EvaluationPair]:
-    """Return the pairs of images that are there, by category and name, each once."""
-    pairs = [
-        posed_pair(posed[names[0]], posed[names[1]], category(names))
-        for names in listed
-        if posed.keys() >= set(names)
-    ]
-    unique = {pair.name: pair for pair in pairs}.values()
-    return sorted(unique, key=lambda pair: (category_start(pair.category), pair.name))
-
-
-def missing_notes(
-    listed: Sequence[Names],
-    names: Sequence[str],
-    files: Mapping[str, Path],
-    lacking: Mapping[str, str],
-    what: str,
-) -> list[str]:
-    """Count listed pairs, and the names of their images, without a file or a truth (``what``).
-
-    ``files`` has the files by name, ``lacking`` the reasons why there is no truth.
-    """
-    lost = sum(any(n not in files or n in lacking for n in pair) for pair in listed)
-    of = f"of {len(names)} listed images"
-    faults = [f"{name} ({why})" for name, why in lacking.items()]
-    return [
-        *([f"{lost} of {len(listed)} listed pairs are left out"] if lost else []),
-        *counted([name for name in names if name not in files], f"{of} are not in images/"),
-        *counted(faults, f"{of} have no usable {what}"),
-    ]

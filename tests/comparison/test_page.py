@@ -15,8 +15,7 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.comparison.differing_pairs import choose_pairs, plot_pairs
-from colmap_affrect.comparison.page import write_page
+from colmap_affrect.comparison.page import choose_pairs, plot_pairs, write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.verdict import verdict
 from colmap_affrect.report.match_plots import PLOT_HEIGHT
