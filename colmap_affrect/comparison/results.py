@@ -269,18 +269,15 @@ class Comparison:
     def model_paths(self, output_path: Path) -> dict[str, Path | None]:
         """Return the folder of the first model of each finished method; None for none."""
         shown = {method.name: method.shown_seed for method in self.finished}
-        return {
-            name: output_path / seed.model_path if seed else None for name, seed in shown.items()
-        }
+        return {name: output_path / s.model_path if s else None for name, s in shown.items()}
 
     @property
     def only_registered_by(self) -> dict[str, str]:
         """Image name to the one method that usually registers it."""
-        by_image = {
-            name: [m.name for m in self.finished if name in m.usually_registered]
-            for name in self.image_names
-        }
-        return {name: methods[0] for name, methods in by_image.items() if len(methods) == 1}
+        usual = {method.name: method.usually_registered for method in self.finished}
+        counts = Counter(name for names in usual.values() for name in names)
+        found = {name: method for method, names in usual.items() for name in names}
+        return {name: found[name] for name in self.image_names if counts[name] == 1}
 
     @property
     def registered_by_none(self) -> tuple[str, ...]:

@@ -236,25 +236,20 @@ def unstable_poses(comparison: Comparison) -> list[str]:
 
 def contradictions(comparison: Comparison) -> list[str]:
     """Doubt poses that differ between methods; the method with most contradictions comes first."""
-    names = {
-        (method.name, other): images
-        for method in comparison.finished
-        for other, images in method.disagreements.items()
-        if images
+    images_of = {
+        m.name: {k: v for k, v in m.disagreements.items() if v} for m in comparison.finished
     }
     texts = []
-    while names:
-        partners = {
-            method.name: [other for name, other in names if name == method.name]
-            for method in comparison.finished
-        }
-        worst = max(partners, key=lambda name: len(partners[name]))
-        images = sorted({image for other in partners[worst] for image in names[worst, other]})
+    while any(images_of.values()):
+        worst = max(images_of, key=lambda name: len(images_of[name]))
+        others = images_of.pop(worst)
+        images = sorted({image for names in others.values() for image in names})
         texts.append(
-            f"Doubtful: {worst} disagrees with {_listed(partners[worst])} about the pose of "
+            f"Doubtful: {worst} disagrees with {_listed(others)} about the pose of "
             f"{_listed(images)}; repeated or symmetric structures can do that."
         )
-        names = {pair: images for pair, images in names.items() if worst not in pair}
+        for remaining in images_of.values():
+            remaining.pop(worst, None)
     return texts
 
 
