@@ -15,7 +15,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -123,19 +123,21 @@ def _match_sift(request: Request, costs: _Costs, progress: Progress, *, affine: 
         copy_database(base, path)
     rename_images(path, {image_id: name for name, image_id in image_ids(base).items()})
     names = request.layout.image_names()
-    with costs.stage("extract") as needed:
-        if needed:
-            with progress.stage("extract", len(names), "images") as advance:
-                costs.failures = extract_sift(
-                    path, request.image_path, names, request.masks, affine=affine
-                )
-                advance(len(names))
     pairs = read_pairs(request.layout.pairs, names)
-    with costs.stage("match") as needed:
-        if needed:
-            with progress.stage("match", len(pairs), "pairs") as advance:
-                match_sift(path, pairs, request.folder / "pairs-by-id.txt")
-                advance(len(pairs))
+
+    def extract_all() -> None:
+        with progress.stage("extract", len(names), "images") as advance:
+            images = request.image_path, names, request.masks
+            costs.failures = extract_sift(path, *images, affine=affine)
+            advance(len(names))
+
+    def match_all() -> None:
+        with progress.stage("match", len(pairs), "pairs") as advance:
+            match_sift(path, pairs, request.folder / "pairs-by-id.txt")
+            advance(len(pairs))
+
+    costs.stage("extract", extract_all)
+    costs.stage("match", match_all)
 
 
 def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Progress) -> None:
@@ -147,19 +149,17 @@ def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Pro
         from_database=request.layout.database,
         masks=request.masks,
     )
-    with costs.stage("extract") as needed:
-        if needed:
-            costs.failures = extract(context, inputs, recipe).failures
+
+    def extract_all() -> None:
+        costs.failures = extract(context, inputs, recipe).failures
+
+    costs.stage("extract", extract_all)
     choose_pairs(context, PairOptions(match_list_path=str(request.layout.pairs.resolve())))
-    with costs.stage("match") as needed:
-        if needed:
-            match(context)
+    costs.stage("match", lambda: match(context))
     if request.method.climbs:
         verification = request.verification.changed(random_seed=request.seeds[0])
         verify_matches(replace(context, progress=SILENT), verification)
-        with costs.stage("escalate") as needed:
-            if needed:
-                escalate(context)
+        costs.stage("escalate", lambda: escalate(context))
 
 
 def _count_features(database_path: Path) -> tuple[dict[str, int], dict[Pair, int]]:
@@ -274,11 +274,9 @@ class _Costs:
         self._finished: list[str] = known.get("finished", [])
         self._earlier_peak = int(known.get("peak_memory_bytes", 0))
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[bool]:
-        """Measure a block; yields whether it still has something to do."""
+    def stage(self, name: str, work: Callable[[], object]) -> None:
+        """Do and measure some work, unless it is finished."""
         if name in self._finished:
-            yield False
             return
         ended, start, before = threading.Event(), time.perf_counter(), self.wall_s.get(name, 0.0)
 
@@ -293,7 +291,7 @@ class _Costs:
         thread = threading.Thread(target=measure_regularly, daemon=True)
         thread.start()
         try:
-            yield True
+            work()
             self._finished = sorted({*self._finished, name})
         finally:
             ended.set()

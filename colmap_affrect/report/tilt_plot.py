@@ -165,11 +165,6 @@ def _draw_ball(axes: Axes, item: TiltClass, radius: float, disc: Wedge) -> None:
 def _draw_mark(axes: Axes, item: TiltClass) -> None:
     ((x, y),) = plane_points(np.array([[item.tilt, item.angle_rad]]))
     axes.plot(x, y, "o", color=item.color, markeredgecolor=DARK, markersize=6, clip_on=False)
-    axes.annotate(
-        item.label,
-        (x, y),
-        (0, 5),
-        textcoords="offset points",
-        ha="center",
-        path_effects=[withStroke(linewidth=2.5, foreground="white")],
-    )
+    effects = [withStroke(linewidth=2.5, foreground="white")]
+    place: dict[str, Any] = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center"}
+    axes.annotate(item.label, (x, y), path_effects=effects, **place)
