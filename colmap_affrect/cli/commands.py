@@ -210,8 +210,7 @@ def compare(options: argparse.Namespace) -> int:
 
 def evaluate(options: argparse.Namespace) -> int:
     from colmap_affrect.comparison.methods import parse_methods
-    from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate
-    from colmap_affrect.evaluation.registry import make_protocol
+    from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate, make_protocol
 
     evaluation = evaluate(
         make_protocol(options.protocol, options.protocol_options),

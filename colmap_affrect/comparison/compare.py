@@ -115,12 +115,7 @@ def compare(
 class _Plan:
     """A comparison whose options have been checked.
 
-    Attributes:
-        options: with checked mapping options.
-        names: all images given, sorted.
-        truth: true poses; None without ground truth.
-        not_compared: learned methods that would have been compared with their weights, and how
-            these are had.
+    ``not_compared`` says which learned methods lack their weights, and how these are had.
     """
 
     image_path: Path
@@ -193,11 +188,12 @@ class _Plan:
     def settings(self) -> dict[str, Any]:
         """Return what all methods had, for the report."""
         inputs = self.inputs()
-        paths = ("image_list_path", "from_database", "ground_truth_path")
+        keys = ("image_list_path", "from_database", "ground_truth_path")
+        paths: dict[str, Path | None] = {key: getattr(self.options, key) for key in keys}
         return {
             "camera": inputs["camera"],
             "masks": self.options.masks.to_mapping(),
-            **{key: _absolute(getattr(self.options, key)) for key in paths},
+            **{key: str(path.resolve()) if path else "" for key, path in paths.items()},
             "match_list_path": self.options.pairs.match_list_path,
             "not_compared": self.not_compared,
             "preset": self.options.mapping.preset_name,
@@ -236,10 +232,6 @@ def _without_seed(options: Options) -> dict[str, Any]:
     return {key: value for key, value in options.to_mapping().items() if key != "random_seed"}
 
 
-def _absolute(path: Path | None) -> str:
-    return str(path.resolve()) if path else ""
-
-
 def _fingerprint(lines: Sequence[str]) -> dict[str, Any]:
     """Return what a list can be recognised by; the number comes first in messages."""
     digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()
@@ -267,13 +259,12 @@ def _share(plan: _Plan, *, overwrite: bool) -> dict[str, str]:
     layout, inputs = plan.layout, plan.inputs()
     if layout.inputs.exists():
         known = json.loads(layout.inputs.read_text(encoding="utf-8"))
-        difference = first_difference(known, inputs)
-        if difference and not overwrite:
-            raise StaleStoreError(
-                f"{layout.path}: methods were compared there with {difference}; use --overwrite "
-                "to discard these results, or another --output-path"
-            )
-        if difference:
+        if difference := first_difference(known, inputs):
+            if not overwrite:
+                raise StaleStoreError(
+                    f"{layout.path}: methods were compared there with {difference}; use "
+                    "--overwrite to discard these results, or another --output-path"
+                )
             shutil.rmtree(layout.methods, ignore_errors=True)
             shutil.rmtree(layout.shared)
     elif layout.shared.exists() or layout.methods.exists():
@@ -323,26 +314,23 @@ def _record(request: Request, *, overwrite: bool) -> None:
     folder, path, name = request.folder, request.path, request.method.label
     if path.exists() and overwrite:
         shutil.rmtree(folder)
-    if path.exists():
-        known = Request.read(path)
-        difference = first_difference(known.decisive(), request.decisive())
-        if difference:
-            raise StaleStoreError(
-                f"{folder}: {name} was run there with {difference}; use --overwrite to redo the "
-                "methods that are named, another name (NAME=RECIPE), or another --output-path"
-            )
+    known = Request.read(path).decisive() if path.exists() else request.decisive()
+    if difference := first_difference(known, request.decisive()):
+        raise StaleStoreError(
+            f"{folder}: {name} was run there with {difference}; use --overwrite to redo the "
+            "methods that are named, another name (NAME=RECIPE), or another --output-path"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     replace_text(path, request.to_json())
 
 
 def _finished(request: Request) -> MethodResult | None:
     """Return the result of a method that has been run with the same seeds."""
-    if not request.result.exists():
-        return None
-    content = json.loads(request.result.read_text(encoding="utf-8"))
-    if content["seeds"] != list(request.seeds):
-        return None
-    return MethodResult.from_mapping(request.method.label, content["result"])
+    if request.result.exists():
+        content = json.loads(request.result.read_text(encoding="utf-8"))
+        if content["seeds"] == list(request.seeds):
+            return MethodResult.from_mapping(request.method.label, content["result"])
+    return None
 
 
 def _run(request: Request, progress: Progress, title: str) -> MethodResult:
@@ -385,41 +373,28 @@ def _ending(code: int) -> str:
 
 def _measured(results: Sequence[MethodResult], plan: _Plan) -> tuple[MethodResult, ...]:
     """Add what needs the models: scores against ground truth, and where models contradict."""
-    poses = {
-        (result.name, seed.seed): read_poses(plan.layout.path / seed.model_path)
-        if seed.model_path
-        else {}
-        for result in results
-        for seed in result.seeds
-    }
-    first = plan.options.seeds[0]
+    folder, truth = plan.layout.path, plan.truth
 
-    def scored(result: MethodResult, seed: SeedResult) -> SeedResult:
-        if plan.truth is None:
-            return seed
-        scores = pose_scores(poses[result.name, seed.seed], plan.truth, plan.names)
-        return replace(seed, scores=scores)
+    def poses_of(seed: SeedResult) -> Poses:
+        return read_poses(folder / seed.model_path) if seed.model_path else {}
 
-    def contradicting(name: str, seed: int, result: MethodResult) -> tuple[str, ...]:
-        """Compare a model with that of a method with the first seed."""
-        return disagreeing_images(poses.get((result.name, first), {}), poses.get((name, seed), {}))
-
+    all_poses = {result.name: [poses_of(seed) for seed in result.seeds] for result in results}
     measured = []
     for result in results:
-        unstable = {
-            image
-            for seed in result.seeds[1:]
-            for image in contradicting(result.name, seed.seed, result)
-        }
+        seeds, (first, *later) = result.seeds, all_poses[result.name] or [{}]
+        if truth is not None:
+            found = zip(seeds, all_poses[result.name], strict=True)
+            seeds = tuple(replace(s, scores=pose_scores(p, truth, plan.names)) for s, p in found)
+        unstable = {image for poses in later for image in disagreeing_images(first, poses)}
         others = {
-            other.name: contradicting(other.name, first, result)
-            for other in results
-            if other is not result
+            name: disagreeing_images(first, poses[0])
+            for name, poses in all_poses.items()
+            if poses and name != result.name
         }
         measured.append(
             replace(
                 result,
-                seeds=tuple(scored(result, seed) for seed in result.seeds),
+                seeds=seeds,
                 unstable_names=tuple(sorted(unstable)),
                 disagreements={other: images for other, images in others.items() if images},
             )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import string
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -43,24 +45,14 @@ class Column:
 
 def columns_of(comparison: Comparison) -> list[Column]:
     """Give each method that finished a letter and a colour, the best first."""
-    return [
-        Column(
-            chr(ord("A") + index) if index < 26 else str(index + 1),
-            METHOD_COLORS[index % len(METHOD_COLORS)],
-            method,
-        )
-        for index, method in enumerate(ranked(comparison.finished))
-    ]
+    letters = [*string.ascii_uppercase, *map(str, range(27, len(comparison.finished) + 1))]
+    marks = zip(letters, itertools.cycle(METHOD_COLORS), ranked(comparison.finished), strict=False)
+    return [Column(*mark) for mark in marks]
 
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table of methods.
-
-    Attributes:
-        key: for programs, as in ``comparison.json``.
-        best: which cells have the best value, where methods differ.
-    """
+    """A line of the table of methods, and which cells have the best value, where methods differ."""
 
     key: str
     title: str
@@ -109,13 +101,14 @@ def _model_rows(methods: Sequence[MethodResult], comparison: Comparison) -> list
     def measured(key: str, title: str, digits: int = 1, better: Better = None) -> Row:
         return _row(key, title, [method.span(key) for method in methods], digits, better)
 
-    correct, splits = [method.correct for method in methods], [_splits(m) for m in methods]
-    keypoints = [list(method.num_keypoints.values()) for method in methods]
+    keypoints = [method.num_keypoints.values() for method in methods]
     means = [Span.of([fmean(counts)]) if counts else None for counts in keypoints]
+    correct = [method.correct for method in methods]
+    splits = [_splits(method) for method in methods]
     return [
         measured("registered", f"Registered, of {given}", better=max),
         _row("correct", f"Registered correctly, of {given}", correct, better=max),
-        Row("models", "Images in each model", splits, tuple(False for _ in splits)),
+        Row("models", "Images in each model", splits, (False,) * len(splits)),
         measured("verified_pairs", f"Verified pairs, of {comparison.num_pairs:,}"),
         measured("points3D", "3D points", 0, max),
         measured("mean_track_length", "Images per 3D point", 2),
@@ -160,12 +153,12 @@ def _cost_rows(methods: Sequence[MethodResult]) -> list[Row]:
         return _row(key, title, spans, digits, min)
 
     seconds = [method.stage_seconds for method in methods]
-    stages = {stage for known in seconds for stage in known}
+    stages = sorted({stage for known in seconds for stage in known}, key=STAGES.index)
     memory = [method.peak_memory_bytes / BYTES_PER_MB for method in methods]
     return [
         *(
-            costs(f"{stage}_s", f"Seconds to {stage}", 1, [known.get(stage) for known in seconds])
-            for stage in sorted(stages, key=STAGES.index)
+            costs(f"{s}_s", f"Seconds to {s}", 1, [known.get(s) for known in seconds])
+            for s in stages
         ),
         costs("total_s", "Seconds in all", 1, [method.total_s for method in methods]),
         costs("peak_memory_bytes", "Peak memory, MB", 0, memory),
@@ -191,6 +184,5 @@ def _splits(method: MethodResult) -> str:
     splits = [" + ".join(str(len(m)) for m in s.model_names) or "none" for s in method.seeds]
     if len(set(splits)) == 1:
         return splits[0]
-    return "; ".join(
-        f"seed {seed.seed}: {split}" for seed, split in zip(method.seeds, splits, strict=True)
-    )
+    pairs = zip(method.seeds, splits, strict=True)
+    return "; ".join(f"seed {seed.seed}: {split}" for seed, split in pairs)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from math import log
 from pathlib import Path
 from typing import Any
 
 from colmap_affrect.colmap.poses import AUC_THRESHOLDS_DEG, MAX_CORRECT_ERROR_DEG
-from colmap_affrect.comparison.contact_sheet import FILTERS, KINDS, cards_of
-from colmap_affrect.comparison.differing_pairs import choose_pairs, pair_rows, plot_pairs
 from colmap_affrect.comparison.method_table import (
     Column,
     columns_of,
@@ -16,7 +17,7 @@ from colmap_affrect.comparison.method_table import (
     span_text,
     summary_rows,
 )
-from colmap_affrect.comparison.results import Comparison
+from colmap_affrect.comparison.results import Comparison, MethodResult
 from colmap_affrect.comparison.verdict import cautions, changes, headline
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.options import flat
@@ -24,8 +25,10 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import page, view_graph
-from colmap_affrect.report.pictures import photograph_pictures, thumbnails
+from colmap_affrect.report.match_plots import MatchPlot, SideBySide, plot_inliers
+from colmap_affrect.report.pictures import Picture, photograph_pictures, thumbnails
 from colmap_affrect.report.scene import read_scene
+from colmap_affrect.report.view_graph import Node
 from colmap_affrect.report.warp_views import rectifies, warped_photographs
 from colmap_affrect.stages.context import Resources
 
@@ -95,16 +98,11 @@ def _bars(columns: Sequence[Column], comparison: Comparison) -> list[dict[str, A
     total = max(1, len(comparison.image_names))
     bars = []
     for column in columns:
-        spans = [column.method.registered, column.method.correct]
-        known = [span for span in spans if span]
-        texts = [span_text(span, digits_of([span.mean], 1)) for span in known]
-        bars.append(
-            {
-                "column": column,
-                "shares": [span.mean / total for span in known],
-                "text": ", ".join([f"{texts[0]} of {total}", *(f"{t} correct" for t in texts[1:])]),
-            }
-        )
+        known = [span for span in (column.method.registered, column.method.correct) if span]
+        first, *correct = (span_text(span, digits_of([span.mean], 1)) for span in known)
+        text = ", ".join([f"{first} of {total}", *(f"{each} correct" for each in correct)])
+        shares = [span.mean / total for span in known]
+        bars.append({"column": column, "shares": shares, "text": text})
     return bars
 
 
@@ -121,18 +119,16 @@ def _graphs_and_models(
     index = {name: number for number, name in enumerate(names)}
     kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
     used = {kind for of_view in kinds for kind in of_view.values()}
+    first, later = graphs[:1], graphs[1:]
     return {
         "cards": cards,
         "layout": layout,
         "edges": [
-            view_graph.differing_edge_paths(names, layout, graph, graphs[0])
-            if number
-            else view_graph.edge_paths(names, layout, graph)
-            for number, graph in enumerate(graphs)
+            *(view_graph.edge_paths(names, layout, graph) for graph in first),
+            *(view_graph.differing_edge_paths(names, layout, graph, *first) for graph in later),
         ],
         "edge_notes": [
-            f"{len(graph)} verified pairs" + (_difference(graph, graphs[0]) if number else "")
-            for number, graph in enumerate(graphs)
+            f"{len(graph)} verified pairs{_difference(graph, graphs[0])}" for graph in graphs
         ],
         "views": views,
         "kinds": {kind: text for kind, text in KINDS.items() if kind in used},
@@ -177,3 +173,207 @@ def _warps(
     except AffrectError as error:
         content["warped_error"] = str(error)
     return content
+
+
+FILTERS = {
+    "all": "All",
+    "differ": "Methods differ",
+    "seeds": "Seeds disagree",
+    "wrong": "Registered wrongly",
+    "doubtful": "Doubtful",
+    "none": "Registered by none",
+}
+
+
+KINDS = {
+    "shared": "registered by other methods, too",
+    "only": "registered by this method only",
+    "doubtful": "contradicts other seeds or methods",
+    "wrong": "at a wrong place",
+}
+"""How cameras are drawn; each has a colour of this name."""
+
+
+@dataclass(frozen=True)
+class Mark(Node):
+    """What one method does with one photograph.
+
+    Attributes:
+        is_doubtful: registered in poses that contradict those of other seeds or methods.
+        is_only: usually registered by no other method.
+    """
+
+    column: Column
+    is_doubtful: bool
+    is_only: bool
+
+    @property
+    def kind(self) -> str:
+        """One of ``KINDS``."""
+        if self.is_wrong:
+            return "wrong"
+        return "doubtful" if self.is_doubtful else "only" if self.is_only else "shared"
+
+
+@dataclass(frozen=True)
+class Card:
+    """A photograph on the contact sheet; it has the same number everywhere on the page."""
+
+    number: int
+    name: str
+    marks: tuple[Mark, ...]
+    groups: tuple[str, ...]
+
+
+def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
+    """Return the contact sheet."""
+    scores = [seed.scores for column in columns for seed in column.method.seeds if seed.scores]
+    with_truth = {name for item in scores for pair in item.pair_errors_deg for name in pair}
+    usually_registered = [column.method.usually_registered for column in columns]
+    only = comparison.only_registered_by if len(columns) > 1 else {}
+    registered_by_none = set(comparison.registered_by_none)
+    cards = []
+    for number, name in enumerate(comparison.image_names, 1):
+        truth, alone = name in with_truth, only.get(name)
+        marks = tuple(
+            _mark(c, number, name, has_truth=truth, is_only=alone == c.name) for c in columns
+        )
+        tests = {
+            "all": True,
+            "differ": len({name in names for names in usually_registered}) > 1,
+            "seeds": any(mark.state == "sometimes" for mark in marks),
+            "wrong": any(mark.is_wrong for mark in marks),
+            "doubtful": any(mark.is_doubtful for mark in marks),
+            "none": name in registered_by_none,
+        }
+        groups = tuple(group for group, passes in tests.items() if passes)
+        cards.append(Card(number, name, marks, groups))
+    return cards
+
+
+def _mark(column: Column, number: int, name: str, *, has_truth: bool, is_only: bool) -> Mark:
+    method, seeds = column.method, column.method.seeds
+    registering = [seed for seed in seeds if name in seed.registered_names]
+    correct = [s for s in registering if s.scores is not None and name in s.scores.correct_names]
+    if not registering:
+        state, text = "never", "not registered"
+    elif len(registering) == len(seeds):
+        state, text = "always", "registered"
+    else:
+        state, text = "sometimes", f"registered with {len(registering)} of {len(seeds)} seeds"
+    is_wrong = has_truth and len(correct) < len(registering)
+    if is_wrong:
+        text += f", correctly with {len(correct)}" if correct else ", wrongly"
+    elif correct:
+        text += ", correctly"
+    is_unstable = name in method.unstable_names
+    others = [other for other, names in method.disagreements.items() if name in names]
+    if is_unstable:
+        text += ", in poses that contradict each other from seed to seed"
+    if others:
+        text += f", in a pose that contradicts that of {' and '.join(others)}"
+    return Mark(
+        number,
+        name,
+        state,
+        is_wrong,
+        f"{column.name}: {text}",
+        column=column,
+        is_doubtful=is_unstable or bool(others),
+        is_only=is_only,
+    )
+
+
+MAX_NUM_PAIRS = 6
+MAX_PAIRS_OF_IMAGE = 2
+FEW_INLIERS = 20
+
+
+def contrast(counts: Sequence[int]) -> float:
+    """Tell how much numbers of inliers differ: by a ratio, in which few count as hardly any.
+
+    >>> contrast([0, 200]) > contrast([1000, 2000]) > contrast([0, 10]) > contrast([7, 7])
+    True
+    """
+    return log((max(counts) + FEW_INLIERS) / (min(counts) + FEW_INLIERS))
+
+
+def pair_rows(methods: Sequence[MethodResult]) -> list[tuple[Pair, list[int]]]:
+    """Return the verified pairs with their inliers by method, those that differ most first."""
+    pairs = sorted({pair for method in methods for pair in method.pair_inliers})
+    rows = [(pair, [method.pair_inliers.get(pair, 0) for method in methods]) for pair in pairs]
+    return sorted(rows, key=lambda row: -contrast(row[1]))
+
+
+@dataclass(frozen=True)
+class ChosenPair:
+    """A pair to draw, and two methods: of fewer inliers, or without rectification, and of more."""
+
+    names: Pair
+    before: MethodResult
+    after: MethodResult
+
+    @property
+    def difference(self) -> float:
+        """How much the two methods differ."""
+        methods = (self.before, self.after)
+        return contrast([method.pair_inliers.get(self.names, 0) for method in methods])
+
+
+def choose_pairs(methods: Sequence[MethodResult], rectifying: Collection[str]) -> list[ChosenPair]:
+    """Return the pairs with the largest differences, each image in at most two of them.
+
+    Where some methods warp photographs (``rectifying``) and others do not, the best of the one kind
+    is compared with the best of the other; else the best method with the worst.
+    """
+    warped = [method for method in methods if method.name in rectifying]
+    plain = [method for method in methods if method.name not in rectifying]
+
+    def chosen(pair: Pair) -> ChosenPair:
+        def key(method: MethodResult) -> int:
+            return method.pair_inliers.get(pair, 0)
+
+        if warped and plain:
+            return ChosenPair(pair, max(plain, key=key), max(warped, key=key))
+        return ChosenPair(pair, min(methods, key=key), max(methods, key=key))
+
+    pairs = sorted({pair for method in methods for pair in method.pair_inliers})
+    uses: Counter[str] = Counter()
+    found: list[ChosenPair] = []
+    for item in sorted(map(chosen, pairs), key=lambda item: -item.difference):
+        fits = all(uses[name] < MAX_PAIRS_OF_IMAGE for name in item.names)
+        if fits and item.difference > 0 and len(found) < MAX_NUM_PAIRS:
+            found.append(item)
+            uses.update(item.names)
+    return found
+
+
+@dataclass(frozen=True)
+class PairPlots:
+    """Two photographs side by side, and what the methods before and after found, by name."""
+
+    shown: SideBySide
+    plots: Mapping[str, MatchPlot]
+
+
+def plot_pairs(
+    chosen: Sequence[ChosenPair], pictures: Mapping[str, Picture], output_path: Path
+) -> list[PairPlots]:
+    """Draw the inliers of pairs whose photographs are among the pictures."""
+    drawable = [item for item in chosen if pictures.keys() >= set(item.names)]
+    sides = {item.names: SideBySide.of(item.names, pictures) for item in drawable}
+    names_of = {item.names: (item.before.name, item.after.name) for item in drawable}
+    methods = {method.name: method for item in drawable for method in (item.before, item.after)}
+    drawn: dict[str, dict[Pair, MatchPlot]] = {}
+    for name, method in methods.items():
+        workspace = Workspace(output_path / method.folder)
+        drawn[name] = plot_inliers(
+            [side for pair, side in sides.items() if name in names_of[pair]],
+            method.pair_inliers,
+            workspace.path / f"seed-{method.seeds[0].seed}" / "database.db",
+            workspace.features,
+        )
+    return [
+        PairPlots(side, {name: drawn[name][pair] for name in names_of[pair]})
+        for pair, side in sides.items()
+    ]

@@ -26,14 +26,7 @@ from colmap_affrect.stages.context import Resources
 class Layout:
     """Paths below the folder of a comparison.
 
-    Attributes:
-        path: that folder.
-        shared: folder of what all methods begin with.
-        inputs: record of what ``shared`` was made from, and of the options all methods have.
-        database: cameras and images, no features.
-        cameras: what is known of the cameras.
-        images: names of the images that COLMAP can read, one a line.
-        methods: folder of the folders of the methods.
+    ``inputs`` records what ``shared`` was made from, and the options that all methods have.
     """
 
     def __init__(self, path: Path, shared_name: str = "shared") -> None:
@@ -98,10 +91,6 @@ class Request:
         """Folder of the results of the method."""
         return self.layout.methods / self.method.folder_name
 
-    def seed_folder(self, seed: int) -> Path:
-        """Folder of the results of one seed."""
-        return self.folder / f"seed-{seed}"
-
     @property
     def path(self) -> Path:
         """File that holds this request."""
@@ -122,7 +111,8 @@ class Request:
         recipe = self.method.recipe
         if recipe is None:
             return {"sift": self.method.label}
-        options = {"recipe": _what_decides(recipe)}
+        decisive = {key: value for key, value in recipe.to_mapping().items() if key != "mapping"}
+        options = {"recipe": decisive}
         return {**options, "climbing_seed": self.seeds[0]} if self.method.climbs else options
 
     def to_json(self) -> str:
@@ -139,8 +129,3 @@ class Request:
                 f"{path}: is of another version of colmap-affrect; use --overwrite, or another "
                 "--output-path"
             ) from error
-
-
-def _what_decides(recipe: Recipe) -> dict[str, Any]:
-    """Return the options that decide features and matches."""
-    return {key: value for key, value in recipe.to_mapping().items() if key != "mapping"}

@@ -52,6 +52,10 @@ class Span:
         numbers = [float(value) for value in values]
         return cls(sum(numbers) / len(numbers), min(numbers), max(numbers))
 
+    def text(self, varying: str) -> str:
+        """Write the one value, or a mean and a range as ``{0.mean}``, ``{0.min}``, ``{0.max}``."""
+        return f"{self.mean:g}" if self.min == self.max else varying.format(self)
+
 
 @dataclass(frozen=True)
 class SeedResult:
@@ -64,7 +68,6 @@ class SeedResult:
         mean_track_length: images per point.
         mean_observations: observed points per registered image.
         num_observations: observed points of each image of the largest model.
-        pair_inliers: verified pairs and their numbers of inliers.
         scores: against ground truth; None where there is none.
         wall_s: seconds of ``verify`` and ``map``.
         doubtful: images of the largest model that cannot be trusted, with the reason.
@@ -248,13 +251,7 @@ def in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Several methods on one set of photographs.
-
-    Attributes:
-        image_names: all images given, sorted.
-        num_pairs: pairs that were to be matched.
-        settings: cameras, masks, pair list, preset and mapper that all methods had.
-    """
+    """Several methods on one set of photographs, sorted by name, and what all methods had."""
 
     image_names: tuple[str, ...]
     image_path: str
@@ -272,18 +269,15 @@ class Comparison:
     def model_paths(self, output_path: Path) -> dict[str, Path | None]:
         """Return the folder of the first model of each finished method; None for none."""
         shown = {method.name: method.shown_seed for method in self.finished}
-        return {
-            name: output_path / seed.model_path if seed else None for name, seed in shown.items()
-        }
+        return {name: output_path / s.model_path if s else None for name, s in shown.items()}
 
     @property
     def only_registered_by(self) -> dict[str, str]:
         """Image name to the one method that usually registers it."""
-        by_image = {
-            name: [m.name for m in self.finished if name in m.usually_registered]
-            for name in self.image_names
-        }
-        return {name: methods[0] for name, methods in by_image.items() if len(methods) == 1}
+        usual = {method.name: method.usually_registered for method in self.finished}
+        counts = Counter(name for names in usual.values() for name in names)
+        found = {name: method for method, names in usual.items() for name in names}
+        return {name: found[name] for name in self.image_names if counts[name] == 1}
 
     @property
     def registered_by_none(self) -> tuple[str, ...]:

@@ -49,9 +49,10 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
 def _row(method: MethodResult, comparison: Comparison) -> list[str]:
     if method.failed:
         return [method.name, "failed"]
-    row = [
+    return [
         method.name,
         f"{_span(method.registered)} of {len(comparison.image_names)}",
+        *([_span(method.correct)] if comparison.has_ground_truth else []),
         _span(method.span("verified_pairs")),
         _mean(method.span("points3D"), 0),
         _mean(method.span("mean_track_length"), 2),
@@ -59,9 +60,6 @@ def _row(method: MethodResult, comparison: Comparison) -> list[str]:
         f"{method.total_s:.1f}",
         f"{method.peak_memory_bytes / 1e6:.0f}",
     ]
-    if comparison.has_ground_truth:
-        row.insert(2, _span(method.correct))
-    return row
 
 
 def _mean(span: Span | None, digits: int) -> str:
@@ -69,12 +67,7 @@ def _mean(span: Span | None, digits: int) -> str:
 
 
 def _span(span: Span | None) -> str:
-    """Return the mean and, if it varies, the range."""
-    if span is None:
-        return "-"
-    if span.min == span.max:
-        return f"{span.mean:g}"
-    return f"{span.mean:.1f} [{span.min:g}-{span.max:g}]"
+    return span.text("{0.mean:.1f} [{0.min:g}-{0.max:g}]") if span else "-"
 
 
 def to_json(comparison: Comparison) -> str:
@@ -85,33 +78,27 @@ def to_json(comparison: Comparison) -> str:
 
 def to_csv(comparison: Comparison) -> str:
     """Return ``comparison.csv``: a row for each method and seed, and for each failed method."""
-    rows = [
-        {**_method_cells(method, comparison), **_seed_cells(method, seed)}
-        for method in comparison.methods
-        for seed in method.seeds
-    ]
+    images = len(comparison.image_names)
+    rows = [_cells(method, seed, images) for method in comparison.finished for seed in method.seeds]
     rows += [
-        {"method": method.name, "images": len(comparison.image_names), "failed": method.failed}
+        {"method": method.name, "images": images, "failed": method.failed}
         for method in comparison.methods
         if method.failed
     ]
     return csv_text(rows)
 
 
-def _method_cells(method: MethodResult, comparison: Comparison) -> dict[str, Any]:
-    return {
+def _cells(method: MethodResult, seed: SeedResult, images: int) -> dict[str, Any]:
+    """Return what is known of a method, and all single numbers of a seed."""
+    cells = {
         "method": method.name,
-        "images": len(comparison.image_names),
+        "images": images,
         "failed": "",
         "keypoints": sum(method.num_keypoints.values()),
         "raw_matches": sum(method.raw_matches.values()),
         "peak_memory_bytes": method.peak_memory_bytes,
+        **_numbers(seed.to_mapping()),
     }
-
-
-def _seed_cells(method: MethodResult, seed: SeedResult) -> dict[str, Any]:
-    """Return all single numbers of a seed."""
-    cells = _numbers(seed.to_mapping())
     if seed.scores:
         scores = seed.scores.to_mapping()
         cells |= {"correct": len(seed.scores.correct_names), **_numbers(scores)}

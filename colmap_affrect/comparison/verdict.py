@@ -5,6 +5,7 @@ Gains are counted in photographs registered, or registered correctly where there
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -55,7 +56,6 @@ class Change:
 
     Attributes:
         gained: images that it usually registers and the other does not, sorted.
-        lost: the other way round.
         mean: more images on average over the seeds.
         time_ratio: of their total times; 0 where the other one took none.
     """
@@ -148,18 +148,11 @@ def changes(comparison: Comparison) -> list[str]:
 
     Rectified methods are set against our own features without warps too.
     """
-    reference = reference_of(comparison)
-    texts = [
-        _change_text(method, reference)
-        for method in comparison.finished
-        if reference and method is not reference
-    ]
-    texts += [
-        _change_text(method, unrectified)
-        for unrectified in filter(is_unrectified, comparison.finished)
-        for method in filter(is_rectified, comparison.finished)
-    ]
-    return texts
+    finished, reference = comparison.finished, reference_of(comparison)
+    rectified, plain = filter(is_rectified, finished), filter(is_unrectified, finished)
+    pairs = [(method, reference) for method in finished if reference and method is not reference]
+    pairs += [(method, other) for other, method in itertools.product(plain, rectified)]
+    return [_change_text(*pair) for pair in pairs]
 
 
 def _change_text(method: MethodResult, reference: MethodResult) -> str:
@@ -243,25 +236,20 @@ def unstable_poses(comparison: Comparison) -> list[str]:
 
 def contradictions(comparison: Comparison) -> list[str]:
     """Doubt poses that differ between methods; the method with most contradictions comes first."""
-    names = {
-        (method.name, other): images
-        for method in comparison.finished
-        for other, images in method.disagreements.items()
-        if images
+    images_of = {
+        m.name: {k: v for k, v in m.disagreements.items() if v} for m in comparison.finished
     }
     texts = []
-    while names:
-        partners = {
-            method.name: [other for name, other in names if name == method.name]
-            for method in comparison.finished
-        }
-        worst = max(partners, key=lambda name: len(partners[name]))
-        images = sorted({image for other in partners[worst] for image in names[worst, other]})
+    while any(images_of.values()):
+        worst = max(images_of, key=lambda name: len(images_of[name]))
+        others = images_of.pop(worst)
+        images = sorted({image for names in others.values() for image in names})
         texts.append(
-            f"Doubtful: {worst} disagrees with {_listed(partners[worst])} about the pose of "
+            f"Doubtful: {worst} disagrees with {_listed(others)} about the pose of "
             f"{_listed(images)}; repeated or symmetric structures can do that."
         )
-        names = {pair: images for pair, images in names.items() if worst not in pair}
+        for remaining in images_of.values():
+            remaining.pop(worst, None)
     return texts
 
 
@@ -274,12 +262,8 @@ def _registers(comparison: Comparison) -> str:
     return "correctly registers" if comparison.has_ground_truth else "registers"
 
 
-def _number(span: Span | None) -> str:
-    if span is None:
-        return "0"
-    if span.min == span.max:
-        return f"{span.mean:g}"
-    return f"{span.mean:.1f} on average ({span.min:g} to {span.max:g})"
+def _number(span: Span) -> str:
+    return span.text("{0.mean:.1f} on average ({0.min:g} to {0.max:g})")
 
 
 def _seconds(value: float) -> str:

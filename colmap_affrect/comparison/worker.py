@@ -15,7 +15,7 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -123,19 +123,21 @@ def _match_sift(request: Request, costs: _Costs, progress: Progress, *, affine: 
         copy_database(base, path)
     rename_images(path, {image_id: name for name, image_id in image_ids(base).items()})
     names = request.layout.image_names()
-    with costs.stage("extract") as needed:
-        if needed:
-            with progress.stage("extract", len(names), "images") as advance:
-                costs.failures = extract_sift(
-                    path, request.image_path, names, request.masks, affine=affine
-                )
-                advance(len(names))
     pairs = read_pairs(request.layout.pairs, names)
-    with costs.stage("match") as needed:
-        if needed:
-            with progress.stage("match", len(pairs), "pairs") as advance:
-                match_sift(path, pairs, request.folder / "pairs-by-id.txt")
-                advance(len(pairs))
+
+    def extract_all() -> None:
+        with progress.stage("extract", len(names), "images") as advance:
+            images = request.image_path, names, request.masks
+            costs.failures = extract_sift(path, *images, affine=affine)
+            advance(len(names))
+
+    def match_all() -> None:
+        with progress.stage("match", len(pairs), "pairs") as advance:
+            match_sift(path, pairs, request.folder / "pairs-by-id.txt")
+            advance(len(pairs))
+
+    costs.stage("extract", extract_all)
+    costs.stage("match", match_all)
 
 
 def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Progress) -> None:
@@ -147,19 +149,17 @@ def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Pro
         from_database=request.layout.database,
         masks=request.masks,
     )
-    with costs.stage("extract") as needed:
-        if needed:
-            costs.failures = extract(context, inputs, recipe).failures
+
+    def extract_all() -> None:
+        costs.failures = extract(context, inputs, recipe).failures
+
+    costs.stage("extract", extract_all)
     choose_pairs(context, PairOptions(match_list_path=str(request.layout.pairs.resolve())))
-    with costs.stage("match") as needed:
-        if needed:
-            match(context)
+    costs.stage("match", lambda: match(context))
     if request.method.climbs:
         verification = request.verification.changed(random_seed=request.seeds[0])
         verify_matches(replace(context, progress=SILENT), verification)
-        with costs.stage("escalate") as needed:
-            if needed:
-                escalate(context)
+        costs.stage("escalate", lambda: escalate(context))
 
 
 def _count_features(database_path: Path) -> tuple[dict[str, int], dict[Pair, int]]:
@@ -186,7 +186,7 @@ def _pair(names: Mapping[int, str], ids: tuple[int, int]) -> Pair:
 
 def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
     """Verify and map a copy of the database of the method, unless that is done."""
-    folder = request.seed_folder(seed)
+    folder = request.folder / f"seed-{seed}"
     result_path, database_path = folder / "result.json", folder / "database.db"
     if result_path.exists():
         return SeedResult.from_mapping(json.loads(result_path.read_text(encoding="utf-8")))
@@ -195,7 +195,7 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
     copy_database(request.folder / "database.db", database_path)
     with open_database(database_path) as database:
         database.clear_two_view_geometries()
-    names = {image_id: name for name, image_id in image_ids(database_path).items()}
+        names = {image.image_id: image.name for image in database.read_all_images()}
     watch, told = Stopwatch(), _OfSeed(progress, seed)
     options = request.verification.changed(random_seed=seed)
     mapper = MAPPERS.make(request.mapping.changed(random_seed=seed))
@@ -255,21 +255,14 @@ def _vote(
 ) -> None:
     """Let the pairs vote on cameras if they are to do that."""
     if request.focal_vote:
-        hold_vote(
-            workspace.database,
-            workspace.cameras,
-            verification,
-            size_px,
-            may_share=request.may_share,
-            silent=silent,
-        )
+        paths, may_share = (workspace.database, workspace.cameras), request.may_share
+        hold_vote(*paths, verification, size_px, may_share=may_share, silent=silent)
 
 
 class _Costs:
     """Seconds and memory that a method has taken, over all processes that worked on it.
 
-    Attributes:
-        failures: images that could not be used, with the reason.
+    Also its failures: images that could not be used, with the reason.
     """
 
     def __init__(self, path: Path) -> None:
@@ -281,11 +274,9 @@ class _Costs:
         self._finished: list[str] = known.get("finished", [])
         self._earlier_peak = int(known.get("peak_memory_bytes", 0))
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[bool]:
-        """Measure a block; yields whether it still has something to do."""
+    def stage(self, name: str, work: Callable[[], object]) -> None:
+        """Do and measure some work, unless it is finished."""
         if name in self._finished:
-            yield False
             return
         ended, start, before = threading.Event(), time.perf_counter(), self.wall_s.get(name, 0.0)
 
@@ -300,7 +291,7 @@ class _Costs:
         thread = threading.Thread(target=measure_regularly, daemon=True)
         thread.start()
         try:
-            yield True
+            work()
             self._finished = sorted({*self._finished, name})
         finally:
             ended.set()

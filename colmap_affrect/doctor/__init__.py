@@ -32,11 +32,8 @@ def diagnose(
 ) -> Diagnosis:
     """Examine the installation and, if a path is given, an output folder or a COLMAP database.
 
-    Args:
-        path: output folder of colmap-affrect, or any COLMAP database; damaged ones too.
-        image_path: folder of the photographs, whose sizes are compared with the cameras.
-        weights_path: folder in which weights of networks are looked for first.
-        progress: where the reading of photographs is shown.
+    ``path`` may be damaged. With the folder of the photographs their sizes are compared with the
+    cameras. Weights of networks are looked for in ``weights_path`` first.
     """
     findings = Findings(progress)
     if image_path is not None and not image_path.is_dir():

@@ -59,8 +59,7 @@ class _FolderExamination:
     """Examines an output folder that nobody else is working in."""
 
     def __init__(self, found: Findings, workspace: Workspace) -> None:
-        self.found = found
-        self.workspace = workspace
+        self.found, self.workspace = found, workspace
 
     def examine(self, image_path: Path | None) -> None:
         """Add what is found in the folder."""
@@ -224,8 +223,7 @@ class _FolderExamination:
                 sizes.append(len(registered_names(folder)))
             except AffrectError as error:
                 self._add_unusable("model-damaged", folder, error)
-        self.found.checked.append(
-            f"{sparse}: models of {', '.join(map(str, sizes)) or 'no'} images"
-        )
+        listed = ", ".join(map(str, sizes)) or "no"
+        self.found.checked.append(f"{sparse}: models of {listed} images")
         if not folders:
             self._add("no-model", sparse)

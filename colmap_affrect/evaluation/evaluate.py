@@ -13,6 +13,7 @@ import logging
 import math
 import sys
 import time
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,9 +25,11 @@ from numpy.typing import NDArray
 
 from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import AffrectError, EvaluationError, OptionError
-from colmap_affrect.evaluation.costs import PAIR_STEPS, ImageCost
+from colmap_affrect.evaluation.evd import Evd
 from colmap_affrect.evaluation.pair_matches import MatchedPair, PairMatcher
+from colmap_affrect.evaluation.pairs import Pairs
 from colmap_affrect.evaluation.plots import write_plots
+from colmap_affrect.evaluation.posed_scenes import Imc, Svp
 from colmap_affrect.evaluation.protocol import (
     GROUP,
     Dataset,
@@ -35,17 +38,21 @@ from colmap_affrect.evaluation.protocol import (
     PairResult,
     PairScore,
 )
-from colmap_affrect.evaluation.published import COMPLEXITY, published
-from colmap_affrect.evaluation.recipe_features import RecipeFeatures
-from colmap_affrect.evaluation.records import RecordFile
-from colmap_affrect.evaluation.registry import make_protocol
+from colmap_affrect.evaluation.recipe_features import (
+    PAIR_STEPS,
+    ImageCost,
+    RecipeFeatures,
+    RecordFile,
+)
 from colmap_affrect.evaluation.results import (
+    COMPLEXITY,
     PAIR_RESULT,
     SECONDS,
     Evaluation,
     Interval,
     RecipeResult,
     Solved,
+    published,
 )
 from colmap_affrect.evaluation.statistics import bootstrap_intervals, paired_test
 from colmap_affrect.images.reading import require_png
@@ -59,10 +66,32 @@ from colmap_affrect.stages.context import Resources
 
 logger = logging.getLogger(__name__)
 
+PROTOCOLS: Mapping[str, type[EvaluationProtocol]] = {
+    protocol.name: protocol for protocol in (Evd, Svp, Imc, Pairs)
+}
 DEFAULT_RECIPES = ("unrectified-rootsift", "default")
 
 NOTHING: NDArray[np.float64] = np.zeros((0, 2))
 """Matches of a pair that could not be matched."""
+
+
+def make_protocol(name: str, settings: Sequence[str] = ()) -> EvaluationProtocol:
+    """Return a protocol, some of its options changed by ``KEY=VALUE``.
+
+    Raises OptionError for an unknown protocol or option, or a value that it cannot have.
+    """
+    if name not in PROTOCOLS:
+        raise OptionError(f"unknown protocol '{name}': known are {', '.join(PROTOCOLS)}")
+    values = {}
+    for setting in settings:
+        key, separator, text = (part.strip() for part in setting.partition("="))
+        if not separator:
+            raise OptionError(f"{setting}: expected KEY=VALUE")
+        try:
+            values[key] = tomllib.loads(f"value = {text}")["value"]
+        except (ValueError, RecursionError):
+            values[key] = text
+    return PROTOCOLS[name].from_mapping(values, name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,9 +100,8 @@ class EvaluateOptions:
 
     Attributes:
         recipes: by name as the command line takes them, or as methods.
-        baseline: label of the recipe that the others are tested against; None for none.
-        max_num_keypoints: budget: of each image the strongest of all its features are matched; None
-            for all.
+        baseline: label of the recipe that the others are tested against.
+        max_num_keypoints: of each image so many of its strongest features are matched; None: all.
         random_seed: of the estimators and the statistics.
     """
 
@@ -117,7 +145,7 @@ def evaluate(
         inputs = {"protocol": chosen.name, "dataset_path": str(dataset_path.resolve())}
         rest = (dataset.pairs, output_path, inputs, settings, options)
         runs = [_Run(method, chosen, *rest, overwrite=overwrite) for method in methods]
-        results = {run.method.label: run.results(progress) for run in runs}
+        results = {run.label: run.results(progress) for run in runs}
         baseline = results.get(options.baseline or "")
         evaluation = Evaluation(
             protocol=chosen.name,
@@ -127,7 +155,7 @@ def evaluate(
             settings=settings,
             baseline=options.baseline or "",
             notes=dataset.notes,
-            recipes=tuple(run.summarized(results[run.method.label], baseline) for run in runs),
+            recipes=tuple(run.summarized(results[run.label], baseline) for run in runs),
             published=tuple(published(chosen.name)),
             published_complexity=tuple(published(COMPLEXITY)),
             versions=installed_versions(),
@@ -191,8 +219,8 @@ class _Run:
 
         Features depend on ``inputs``, and scores on ``settings`` beside them; both are recorded.
         """
-        self.method, self.protocol, self.pairs, self.options = method, protocol, pairs, options
-        self.recipe = _recipe(method)
+        self.label, self.recipe = method.label, _recipe(method)
+        self.protocol, self.pairs, self.options = protocol, pairs, options
         images = {image.name: image for p in pairs if not p.problem for image in p.images}
         self.features = RecipeFeatures(
             output_path / "features" / method.folder_name,
@@ -222,8 +250,8 @@ class _Run:
             if truths.get(record["name"]) == record["truth"]
         }
         todo = [pair for pair in self.pairs if not pair.problem and pair.name not in done]
-        budget, title = self.options.max_num_keypoints, self.method.label
-        matcher = PairMatcher(self.recipe, self.features, budget, title, progress)
+        budget = self.options.max_num_keypoints
+        matcher = PairMatcher(self.recipe, self.features, budget, self.label, progress)
         for result in matcher.run(todo, self._scored):
             if not result.failure:
                 values = json.loads(PAIR_RESULT.dump_json(result))
@@ -240,7 +268,7 @@ class _Run:
         except AffrectError as error:
             return self._failed(pair, str(error))
         except Exception as error:
-            logger.exception("%s: %s cannot be scored", self.method.label, pair.name)
+            logger.exception("%s: %s cannot be scored", self.label, pair.name)
             return self._failed(pair, f"{type(error).__name__}: {error}")
         estimate_s = time.perf_counter() - start
         return PairResult(
@@ -257,11 +285,10 @@ class _Run:
 
     def _failed(self, pair: EvaluationPair, failure: str = "") -> PairResult:
         """Return the result of a pair that has no matches."""
-        failures = self.features.failures
-        lost = [failures[image.name] for image in pair.images if image.name in failures]
-        why = failure or pair.problem or "; ".join(lost)
-        score = PairScore(math.inf, 0)
-        if not pair.problem and not failure:
+        score, why = PairScore(math.inf, 0), failure or pair.problem
+        if not why:
+            failures = self.features.failures
+            why = "; ".join(failures[im.name] for im in pair.images if im.name in failures)
             score = self.protocol.score(pair, NOTHING, NOTHING, self.options.random_seed)
         return PairResult(**vars(score), name=pair.name, category=pair.category, failure=why)
 
@@ -274,9 +301,8 @@ class _Run:
             for image in pair.images:
                 num_levels[image.name] = max(num_levels.get(image.name, 0), result.num_levels)
         costs = self.features.costs(num_levels)
-        cost = ImageCost.mean(costs)
+        cost, seed = ImageCost.mean(costs), self.options.random_seed
         seconds = sum(cost.total_s for cost in costs) + sum(result.seconds for result in results)
-        seed = self.options.random_seed
         timed = [result.seconds_by_step for result in results if result.seconds_by_step]
         per_pair = {
             step: math.fsum(seconds[step] for seconds in timed) / max(1, len(timed))
@@ -287,16 +313,14 @@ class _Run:
         if baseline is not None and baseline is not results:
             p_value = paired_test(successes, self._successes(baseline), seed)
         (interval,) = bootstrap_intervals(len(results), lambda rows: [successes[rows].mean()], seed)
+        by_category = _by_category(results).items()
         return RecipeResult(
-            name=self.method.label,
+            name=self.label,
             description=self.recipe.summary,
             summary={**self.protocol.summarize(results), SECONDS: seconds},
             intervals=_intervals(self.protocol, results, seed),
             solved=Solved(float(successes.mean()), interval),
-            solved_by_category={
-                category: float(successes[rows].mean())
-                for category, rows in _by_category(results).items()
-            },
+            solved_by_category={name: float(successes[rows].mean()) for name, rows in by_category},
             p_value=p_value,
             num_images=len(costs),
             complexity=cost.complexity(),
@@ -337,11 +361,8 @@ def _intervals(
 
 def _by_category(results: Sequence[PairResult]) -> dict[str, list[int]]:
     """Return the rows of the pairs of each category, of those that have one."""
-    categories: dict[str, list[int]] = {}
-    for row, result in enumerate(results):
-        if result.category:
-            categories.setdefault(result.category, []).append(row)
-    return categories
+    names = dict.fromkeys(result.category for result in results if result.category)
+    return {name: [row for row, r in enumerate(results) if r.category == name] for name in names}
 
 
 def _fingerprint(truth: Any) -> str:

@@ -43,11 +43,11 @@ class Evd(HomographyProtocol):
                 f"{dataset_path}: holds neither 1/NAME.png, 2/NAME.png, h/NAME.txt nor "
                 "NAME_1.png, NAME_2.png, H_NAME_1_2.txt"
             )
-        notes = []
-        if is_evd and len(found) < NUM_PAPER_PAIRS:
-            notes.append(f"{len(found)} pairs; the dataset of the paper has {NUM_PAPER_PAIRS}")
-        loaded = map_ordered(self._load_pair, found, available_cores())
-        return Dataset.united([Dataset((), tuple(notes)), *loaded])
+        dataset = Dataset.united(map_ordered(self._load_pair, found, available_cores()))
+        if not is_evd or len(found) >= NUM_PAPER_PAIRS:
+            return dataset
+        note = f"{len(found)} pairs; the dataset of the paper has {NUM_PAPER_PAIRS}"
+        return Dataset(dataset.pairs, (note, *dataset.notes))
 
     def _load_pair(self, found: tuple[EvaluationPair, Path]) -> Dataset:
         pair, homography_path = found
@@ -68,13 +68,11 @@ def _extreme_views(folder: Path) -> list[tuple[EvaluationPair, Path]]:
     names = {path.stem for path in (folder / "h").glob("*.txt")}
     for part in ("1", "2"):
         names |= {p.stem for p in (folder / part).glob("*") if p.suffix.lower() in IMAGE_SUFFIXES}
-    return [
-        (
-            EvaluationPair(name, (_image(folder, f"1/{name}"), _image(folder, f"2/{name}"))),
-            folder / "h" / f"{name}.txt",
-        )
-        for name in sorted(names)
-    ]
+    found = []
+    for name in sorted(names):
+        images = _image(folder, f"1/{name}"), _image(folder, f"2/{name}")
+        found.append((EvaluationPair(name, images), folder / "h" / f"{name}.txt"))
+    return found
 
 
 def _sequences(folder: Path) -> list[tuple[EvaluationPair, Path]]:

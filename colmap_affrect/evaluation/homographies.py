@@ -46,13 +46,7 @@ GRID_STEP_PX = 4
 
 @dataclass(frozen=True)
 class TrueHomography:
-    """The truth of a pair.
-
-    Attributes:
-        matrix: (3, 3) image2_from_image1, with a positive third coordinate where it is visible.
-        size1: (width, height) of image 1 in px.
-        size2: (width, height) of image 2 in px.
-    """
+    """The truth of a pair."""
 
     matrix: Homography
     size1: Size
@@ -90,18 +84,13 @@ class HomographyProtocol(EvaluationProtocol):
     def score(
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
     ) -> PairScore:
-        """Score matches of a pair whose truth is a :class:`TrueHomography`.
-
-        ``error`` is that of the paper's RANSAC; the details are those of USAC_MAGSAC.
-        """
+        """Score by the paper's RANSAC; the details are those of USAC_MAGSAC."""
         truth: TrueHomography = pair.truth
         plain = self.ransac(cv2.RANSAC, self.threshold_px, random_seed)
         magsac = self.ransac(cv2.USAC_MAGSAC, self.magsac_threshold_px, random_seed)
         estimate, num_inliers = plain.homography(points1, points2)
-        others = [
-            ransac.homography(points1, points2)
-            for ransac in magsac.reseeded(self.num_magsac_estimates)
-        ]
+        reseeded = magsac.reseeded(self.num_magsac_estimates)
+        others = [ransac.homography(points1, points2) for ransac in reseeded]
         return PairScore(
             truth.error_px(estimate),
             num_inliers,
@@ -129,7 +118,7 @@ class HomographyProtocol(EvaluationProtocol):
         }
 
     def settings(self) -> dict[str, Any]:
-        """Return everything that decides the errors, and what they are."""
+        """See :class:`EvaluationProtocol`."""
         return {
             "homography_error": "mean over the visible part of image 1, every 4th pixel in x and "
             "y, of the Euclidean distance in image 2 between truth and estimate, px",
@@ -140,23 +129,19 @@ class HomographyProtocol(EvaluationProtocol):
         }
 
 
-def transfer_errors(
-    homography: NDArray[np.floating], points1: NDArray[np.floating], points2: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def transfer_errors(matrix: Homography, points1: Points, points2: Points) -> NDArray[np.float64]:
     """Return the (N,) distances in image 2, in px, of (N, 2) points 1 carried over to points 2."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        distances = np.linalg.norm(project(homography, points1) - points2, axis=1)
-    return np.where(third_coordinates(homography, points1) > 0, distances, np.inf)
+        distances = np.linalg.norm(project(matrix, points1) - points2, axis=1)
+    return np.where(third_coordinates(matrix, points1) > 0, distances, np.inf)
 
 
-def third_coordinates(
-    homography: NDArray[np.floating], points: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def third_coordinates(homography: Homography, points: Points) -> NDArray[np.float64]:
     """Return the (N,) third coordinates of (N, 2) points carried over, before the division."""
     return np.asarray(points @ homography[2, :2] + homography[2, 2])
 
 
-def visible_points(truth: NDArray[np.floating], size1: Size, size2: Size) -> Points:
+def visible_points(truth: Homography, size1: Size, size2: Size) -> Points:
     """Return the (N, 2) points of image 1 that image 2 shows by a true homography.
 
     They are every ``GRID_STEP_PX``-th pixel centre in x and y; sizes are (width, height) in px.

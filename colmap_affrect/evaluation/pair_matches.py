@@ -42,7 +42,6 @@ class MatchedPair:
 
     Attributes:
         points: (M, 2) pixel-centre px of the matches in each image.
-        num_keypoints: features of the two images that were matched.
         level: rectifier of the level of escalation that counts, ``none`` when no level was
             verified; empty without escalation.
         num_levels: that were tried.
@@ -68,11 +67,7 @@ class MatchedPair:
 
 @dataclass(frozen=True)
 class PairMatcher:
-    """Matches pairs by the features of a recipe.
-
-    Attributes:
-        max_num_keypoints: of each image, the strongest of all its features; None for all.
-    """
+    """Matches pairs by so many of the strongest features of each image; None for all."""
 
     recipe: Recipe
     features: RecipeFeatures
@@ -94,22 +89,21 @@ class PairMatcher:
             names = sorted({image.name for pair in todo for image in pair.images})
             title = f"{self.title}, {chosen.name}" if len(levels) > 1 else self.title
             self.features.extract(names, level, title, self.progress)
-            lost = [pair for pair in todo if self._is_lost(pair)]
-            yield from (finish(best[pair.name]) for pair in lost if pair.name in best)
-            todo = [pair for pair in todo if not self._is_lost(pair)]
-            with self.progress.stage(title, len(todo), "pairs") as advance:
-                climbing = []
-                for found, result in self._level(level, todo, best, finish):
+            usable = []
+            for pair in todo:
+                if not any(image.name in self.features.failures for image in pair.images):
+                    usable.append(pair)
+                elif pair.name in best:
+                    yield finish(best[pair.name])
+            todo = []
+            with self.progress.stage(title, len(usable), "pairs") as advance:
+                for found, result in self._level(level, usable, best, finish):
                     best[found.pair.name] = found
                     if result is None:
-                        climbing.append(found.pair)
+                        todo.append(found.pair)
                     else:
                         yield result
                     advance(1)
-            todo = climbing
-
-    def _is_lost(self, pair: EvaluationPair) -> bool:
-        return any(image.name in self.features.failures for image in pair.images)
 
     def _level(
         self,
@@ -170,10 +164,8 @@ def verified_inliers(
 ) -> int:
     """Return the inliers of COLMAP's two-view geometry; 0 if a run would not take it.
 
-    Args:
-        frames: of both images, (M, 2, 3) local affine frames that match, pixel-centre px.
-        sizes: (width, height) of both images in px.
-        extracted_px: longest side that photographs were shrunk to before extraction.
+    ``frames`` are (M, 2, 3) local affine frames that match, pixel-centre px, in images of ``sizes``
+    (width, height), which were shrunk to a longer side of ``extracted_px``.
     """
     options = VerificationOptions(random_seed=VERIFICATION_SEED)
     first, second = (

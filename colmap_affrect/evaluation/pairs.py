@@ -22,8 +22,7 @@ tables and plots and may be left out, and so may ``pixel_origin``: ``center`` wh
 centre of the first pixel (default), ``corner`` when it is its corner. ``convention`` is for people.
 
 Scores: of homographies as :mod:`evd <colmap_affrect.evaluation.evd>` has them; of poses as
-:mod:`svp <colmap_affrect.evaluation.svp>`; of correspondences as WxBS, see
-:mod:`correspondences <colmap_affrect.evaluation.correspondences>`.
+:mod:`svp <colmap_affrect.evaluation.posed_scenes>`; of correspondences as WxBS.
 """
 
 from __future__ import annotations
@@ -31,9 +30,11 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
-from typing import Any, ClassVar
+from pathlib import Path
+from statistics import fmean, median_low
+from typing import Annotated, Any, ClassVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,7 +42,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import is_unsafe
 from colmap_affrect.conventions import colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.correspondences import CorrespondenceProtocol, mean_recalls
 from colmap_affrect.evaluation.homographies import (
     HomographyProtocol,
     TrueHomography,
@@ -49,13 +49,16 @@ from colmap_affrect.evaluation.homographies import (
 )
 from colmap_affrect.evaluation.protocol import (
     GROUP,
+    POSITIVE,
     Dataset,
     EvaluationImage,
     EvaluationPair,
+    EvaluationProtocol,
     PairResult,
     PairScore,
     finite_numbers,
     read_numbers,
+    stem,
     with_truth,
 )
 from colmap_affrect.evaluation.relative_pose import RelativePoseProtocol, posed_image
@@ -66,23 +69,83 @@ from colmap_affrect.evaluation.truth_checks import (
     size_of,
     true_homography,
 )
-from colmap_affrect.evaluation.two_views import Points
+from colmap_affrect.evaluation.two_views import Points, symmetric_epipolar_distances
 from colmap_affrect.images.reading import read_gray
+from colmap_affrect.options import within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 LIST = "pairs.json"
 KINDS = ("homography", "correspondences", "relative_pose")
 KEYS = ("name", "image1", "image2", "category", *KINDS)
-POSE_SHAPES = {
-    "rotation": (3, 3),
-    "translation": (3,),
-    "intrinsics1": (3, 3),
-    "intrinsics2": (3, 3),
-}
+INTRINSICS = dict.fromkeys(("intrinsics1", "intrinsics2"), (3, 3))
+POSE_SHAPES = {"rotation": (3, 3), "translation": (3,), **INTRINSICS}
 ORIGINS = ("center", "corner")
 
 MAX_OFF_CENTRE = 0.25
 """A principal point further from the middle, in image sizes, does not fit the image."""
+
+WXBS_THRESHOLDS_PX = tuple(range(20))
+"""The score of WxBS is the mean over these of the share of correspondences that agree."""
+
+SHOWN_THRESHOLDS_PX = (1, 2, 3, 5, 10, 20)
+
+
+class CorrespondenceProtocol(EvaluationProtocol):
+    """Score of matches by the fundamental matrix that they give by OpenCV's USAC_MAGSAC."""
+
+    epipolar_threshold_px: Annotated[float, POSITIVE] = 1.0
+    """Largest noise that USAC_MAGSAC reckons with for fundamental matrices."""
+    num_magsac_estimates: Annotated[int, within(1, 1_000_000_000)] = 5
+    """Of so many orders of the matches the one of median error counts."""
+
+    def score(
+        self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
+    ) -> PairScore:
+        """Score matches of a pair whose truth is (N, 4) correspondences x1, y1, x2, y2.
+
+        ``error`` is the median of their symmetric epipolar distances in px. Details:
+        ``wxbs_score``, and ``recall_Kpx``, the share of them within K px.
+        """
+        ransac = self.ransac(cv2.USAC_MAGSAC, self.epipolar_threshold_px, random_seed)
+        found = []
+        for number, reseeded in enumerate(ransac.reseeded(self.num_magsac_estimates)):
+            matrix, num_inliers = reseeded.fundamental_matrix(points1, points2)
+            distances = symmetric_epipolar_distances(matrix, *np.hsplit(pair.truth, 2))
+            found.append((float(np.median(distances)), num_inliers, number, distances))
+        error, num_inliers, _, distances = median_low(found)
+        return PairScore(error, num_inliers, None, recalls(distances))
+
+    def success(self, score: PairScore) -> float:
+        """Return the score of WxBS."""
+        return score.details["wxbs_score"]
+
+    def settings(self) -> dict[str, Any]:
+        """See :class:`EvaluationProtocol`."""
+        return {
+            "correspondences": "OpenCV USAC_MAGSAC fundamental matrix; error: median symmetric "
+            "epipolar distance sqrt(d1^2 + d2^2), px; WxBS score: mean over thresholds 0, 1, ... "
+            "19 px of the share of correspondences within",
+            **super().settings(),
+        }
+
+
+def recalls(distances_px: NDArray[np.float64]) -> dict[str, float]:
+    """Return the score of WxBS, and shares of (N,) distances up to single thresholds."""
+
+    def share(limit_px: float) -> float:
+        return float((distances_px <= limit_px).mean())
+
+    return {
+        "wxbs_score": float(np.mean([share(limit) for limit in WXBS_THRESHOLDS_PX])),
+        **{f"recall_{limit}px": share(limit) for limit in SHOWN_THRESHOLDS_PX},
+    }
+
+
+def mean_recalls(results: Sequence[PairResult]) -> dict[str, float]:
+    """Return the means of :func:`recalls` over results, at least one, under names for people."""
+    keys = {"WxBS score": "wxbs_score"}
+    keys |= {f"within {limit} px": f"recall_{limit}px" for limit in SHOWN_THRESHOLDS_PX}
+    return {name: fmean(result.details[key] for result in results) for name, key in keys.items()}
 
 
 class Pairs(HomographyProtocol, CorrespondenceProtocol, RelativePoseProtocol):
@@ -133,18 +196,17 @@ class Pairs(HomographyProtocol, CorrespondenceProtocol, RelativePoseProtocol):
             counts = super().summarize(homographies)
             columns |= {f"homographies: {name}": count for name, count in counts.items()}
         if marked := having("wxbs_score"):
-            columns |= {
-                f"correspondences: {name}": share for name, share in mean_recalls(marked).items()
-            }
+            recalls = mean_recalls(marked)
+            columns |= {f"correspondences: {name}": share for name, share in recalls.items()}
         if poses := having("direction_error_deg"):
             columns |= {
                 f"poses, {name}" if GROUP in name else f"poses{GROUP}{name}": share
-                for name, share in self.columns(poses, {}).items()
+                for name, share in self.columns(poses, ()).items()
             }
         return columns
 
 
-def _read_list(path: Path) -> tuple[list[Mapping[str, Any]], float]:
+def _read_list(path: Path) -> tuple[list[dict[str, Any]], float]:
     """Read ``pairs.json``; also return what must be added to its coordinates for pixel centres."""
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
@@ -169,9 +231,8 @@ def _read_list(path: Path) -> tuple[list[Mapping[str, Any]], float]:
         if names.count(name) > 1:
             raise EvaluationError(f"{path}: two pairs are called '{name}'; give them names")
     corner_px = float(pixel_from_colmap(np.zeros(1))[0])
-    return [
-        {**entry, "name": name} for name, entry in zip(names, entries, strict=True)
-    ], corner_px if origin == "corner" else 0.0
+    listed = [{**entry, "name": name} for name, entry in zip(names, entries, strict=True)]
+    return listed, corner_px if origin == "corner" else 0.0
 
 
 def _named(entry: Any, path: Path, number: int) -> str:
@@ -190,18 +251,12 @@ def _named(entry: Any, path: Path, number: int) -> str:
         raise EvaluationError(
             f"{where}: needs one of {', '.join(KINDS)}, and has {' and '.join(kinds) or 'none'}"
         )
-    stems = [PurePosixPath(entry[key]).with_suffix("").as_posix() for key in ("image1", "image2")]
-    return str(entry.get("name") or " ".join(stems))
+    return str(entry.get("name") or f"{stem(entry['image1'])} {stem(entry['image2'])}")
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """An entry of the list.
-
-    Attributes:
-        offset_px: what must be added to coordinates for pixel centres.
-        check: see whether the images confirm the truth.
-    """
+    """An entry of the list; to its coordinates ``offset_px`` must be added for pixel centres."""
 
     values: Mapping[str, Any]
     folder: Path
@@ -210,17 +265,14 @@ class _Entry:
 
     def load(self) -> Dataset:
         """Return the pair, and notes where there is something to say about it."""
+        values = self.values
         first, second = (
-            EvaluationImage(self.values[key], self.folder / self.values[key])
-            for key in ("image1", "image2")
+            EvaluationImage(values[key], self.folder / values[key]) for key in ("image1", "image2")
         )
-        category = str(self.values.get("category", ""))
-        pair = EvaluationPair(self.values["name"], (first, second), category)
-        readers = dict(
-            zip(KINDS, (self._homography, self._correspondences, self._pose), strict=True)
-        )
-        (kind,) = self.values.keys() & set(KINDS)
-        return with_truth(pair, [first.path, second.path], readers[kind])
+        pair = EvaluationPair(values["name"], (first, second), str(values.get("category", "")))
+        readers = self._homography, self._correspondences, self._pose
+        (read,) = (read for kind, read in zip(KINDS, readers, strict=True) if kind in values)
+        return with_truth(pair, [first.path, second.path], read)
 
     def _numbers(self, key: str) -> Any:
         """Return numbers, out of a text file where its name is given."""

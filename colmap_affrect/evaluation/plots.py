@@ -14,13 +14,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from colmap_affrect.evaluation.costs import IMAGE_STEPS, PAIR_STEPS
-from colmap_affrect.evaluation.published import PublishedRow
-from colmap_affrect.evaluation.results import Evaluation, complexity_columns
+from colmap_affrect.evaluation.recipe_features import IMAGE_STEPS, PAIR_STEPS
+from colmap_affrect.evaluation.results import Evaluation, PublishedRow, complexity_columns
 from colmap_affrect.project.atomic_files import replace_bytes
 
-SIZE_IN = (8.0, 5.0)
-DPI = 120
+SIZE_IN, DPI = (8.0, 5.0), 120
 ERROR_LIMITS = (0.1, 100.0)
 GRID = "#DDDDDD"
 BARS = "#DDE3EA"
@@ -57,15 +55,11 @@ def _figure(height_in: float = SIZE_IN[1]) -> Figure:
     return figure
 
 
-def _color(number: int) -> str:
-    return f"C{number % 10}"
-
-
 def _published(evaluation: Evaluation) -> Iterator[tuple[PublishedRow, dict[str, Any]]]:
     """Yield the paper's rows with their style, in other colours than the recipes if there are."""
     for number, row in enumerate(evaluation.published, len(evaluation.recipes)):
         label = f"paper: {row.method} ({row.table})"
-        yield row, dict(color=_color(number), label=label, **PAPER_STYLE)
+        yield row, dict(color=f"C{number}", label=label, **PAPER_STYLE)
 
 
 def _errors(evaluation: Evaluation) -> Figure:
@@ -77,7 +71,7 @@ def _errors(evaluation: Evaluation) -> Figure:
         errors = sorted(pair.error for pair in recipe.pairs if pair.error < high)
         steps = [low, *(max(error, low) for error in errors), high]
         counts = [0, *range(1, len(errors) + 1), len(errors)]
-        style: dict[str, Any] = dict(color=_color(number), linewidth=2, clip_on=False, zorder=3)
+        style: dict[str, Any] = dict(color=f"C{number}", linewidth=2, clip_on=False, zorder=3)
         axes.step(steps, counts, where="post", label=recipe.name, **style)
     for row, style in _published(evaluation):
         points = sorted(
@@ -115,7 +109,7 @@ def _success_by_category(evaluation: Evaluation) -> Figure:
         axes.text(place, 0.01, f"{size}", ha="center", va="bottom", fontsize=7, color="#667788")
     for number, recipe in enumerate(evaluation.recipes):
         shares = [recipe.solved_by_category[name] for name in categories]
-        axes.plot(places, shares, marker="o", markersize=4, color=_color(number), label=recipe.name)
+        axes.plot(places, shares, marker="o", markersize=4, color=f"C{number}", label=recipe.name)
     for row, style in _published(evaluation):
         if any(name in row.values for name in categories):
             axes.plot(places, [row.values.get(name, math.nan) for name in categories], **style)
@@ -140,14 +134,12 @@ def _times(evaluation: Evaluation) -> Figure:
     rows = range(len(recipes))
     figure = _figure(1.6 + 2 * ROW_IN * len(recipes))
     upper, lower = figure.subplots(2, 1)
-    for axes, steps, unit, first in (
-        (upper, IMAGE_STEPS, "image", 0),
-        (lower, PAIR_STEPS, "pair", len(IMAGE_STEPS)),
-    ):
+    plots = (upper, IMAGE_STEPS, "image", 0), (lower, PAIR_STEPS, "pair", len(IMAGE_STEPS))
+    for axes, steps, unit, first in plots:
         left = np.zeros(len(recipes))
         for number, step in enumerate(steps, first):
             widths = np.array([recipe.seconds_per_step[step] for recipe in recipes])
-            axes.barh(rows, widths, left=left, color=_color(number), label=step)
+            axes.barh(rows, widths, left=left, color=f"C{number}", label=step)
             left += widths
         _label_bars(axes, left.tolist(), 8)
         axes.set_yticks(rows, [recipe.name for recipe in recipes])
@@ -163,7 +155,7 @@ def _complexity(evaluation: Evaluation) -> Figure:
     recipes, paper = evaluation.recipes, evaluation.published_complexity
     names = [*(recipe.name for recipe in recipes), *(f"paper: {row.method}" for row in paper)]
     columns = [*map(complexity_columns, recipes), *(row.values for row in paper)]
-    colors = [*map(_color, range(len(recipes))), *["#BBBBBB"] * len(paper)]
+    colors = [*(f"C{number}" for number in range(len(recipes))), *["#BBBBBB"] * len(paper)]
     figure = _figure(1.2 + ROW_IN * len(names))
     panels = figure.subplots(1, len(columns[0]), sharey=True)
     for axes, title in zip(panels, columns[0], strict=True):

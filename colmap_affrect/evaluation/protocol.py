@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -16,6 +16,7 @@ from pydantic import BeforeValidator
 from colmap_affrect.errors import AffrectError, EvaluationError
 from colmap_affrect.evaluation.two_views import Points, Ransac
 from colmap_affrect.options import Options, within
+from colmap_affrect.shown import such_as
 
 Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value is None else value)]
 """Infinite where JSON has null."""
@@ -30,9 +31,8 @@ GROUP = ": "
 class EvaluationImage:
     """An image of a dataset.
 
-    Attributes:
-        name: unique in the dataset, the key of its features and depth map.
-        intrinsics: (3, 3) camera matrix in pixel-centre px; None where the dataset has none.
+    ``name`` is the key of its features and depth map; ``intrinsics`` is its (3, 3) camera matrix in
+    pixel-centre px, None where the dataset has none.
     """
 
     name: str
@@ -45,11 +45,9 @@ class EvaluationPair:
     """Two images whose matches are scored.
 
     Attributes:
-        name: unique in the dataset.
         category: of difficulty, as the protocol's tables group pairs; empty where it does not.
         truth: what the score needs; known to the protocol only.
-        problem: why it cannot be scored (a file that is missing, a truth that is not finite); such
-            a pair counts as failed. Empty for the others.
+        problem: why it cannot be scored and counts as failed; empty for the others.
     """
 
     name: str
@@ -67,7 +65,6 @@ class PairScore:
         error: of the protocol (px or degrees); infinite where no model was found.
         num_inliers: of the model that was estimated.
         num_correct: matches that agree with the truth; None where it cannot say.
-        details: further figures by name.
     """
 
     error: Number
@@ -81,13 +78,10 @@ class PairResult(PairScore):
     """The score of one pair by one recipe: what ``evaluation.json`` lists.
 
     Attributes:
-        num_matches: before the estimation.
-        num_keypoints: features of the two images that were matched.
         seconds_by_step: the same by step, ``match`` and ``estimate``.
         level: rectifier of the level of escalation that decided; empty without escalation.
         num_levels: levels whose features were extracted for the pair, 1 without escalation.
-        failure: why there is no score, if an image could not be read or the like; such pairs
-            have an infinite error and count as failed.
+        failure: why the pair counts as failed, with an infinite error.
     """
 
     name: str
@@ -103,12 +97,7 @@ class PairResult(PairScore):
 
 @dataclass(frozen=True)
 class Dataset:
-    """The pairs of a dataset that can be evaluated.
-
-    Attributes:
-        notes: what is missing or odd, in words: files that are not there (counted), truth that
-            failed its sanity check (named).
-    """
+    """The pairs of a dataset that can be evaluated, and what is missing or odd, in words."""
 
     pairs: tuple[EvaluationPair, ...]
     notes: tuple[str, ...] = ()
@@ -124,16 +113,14 @@ class Dataset:
 
 
 class EvaluationProtocol(Options, ABC):
-    """Loads a dataset, scores matches, and sums up, as one of the paper's tables does.
-
-    A class variable ``error_title`` says what the error of a score is, with its unit, and
-    ``category_title`` what the categories are, empty without: both for axes of plots.
-    """
+    """Loads a dataset, scores matches, and sums up, as one of the paper's tables does."""
 
     name: ClassVar[str]
     """As the command line has it."""
     error_title: ClassVar[str]
+    """What the error of a score is, with its unit, for axes of plots."""
     category_title: ClassVar[str] = ""
+    """What the categories are; empty without."""
 
     threshold_px: Annotated[float, POSITIVE] = 0.5
     """Of an inlier of plain RANSAC (the paper: 0.5)."""
@@ -170,9 +157,8 @@ class EvaluationProtocol(Options, ABC):
     def summarize(self, results: Sequence[PairResult]) -> dict[str, float]:
         """Return the columns of the protocol's table by name, in order (counts or shares).
 
-        Failed pairs are among the results. A name ``group: column`` puts the column into a
-        table of its own. The frame adds the column ``seconds``, all time that the recipe took.
-        Names are those of ``published.published`` where the paper has the same number. Of an empty
+        Failed pairs are among the results. A name ``group: column`` puts the column into a table
+        of its own. Names are those of the paper's rows where it has the same number. Of an empty
         sequence all columns are 0.
         """
 
@@ -191,14 +177,27 @@ def with_truth(
     ``paths`` must be there; ``read`` returns the pair with its truth, and what is odd about it.
     """
     try:
-        for path in paths:
-            if not path.is_file():
-                raise EvaluationError(f"{path}: missing")
+        if missing := [path for path in paths if not path.is_file()]:
+            raise EvaluationError(f"{missing[0]}: missing")
         pair, doubts = read(pair)
     except AffrectError as error:
         note = f"{pair.name}: cannot be evaluated and counts as failed: {error}"
         return Dataset((replace(pair, problem=str(error)),), (note,))
     return Dataset((pair,), tuple(f"{pair.name}: {doubt}" for doubt in doubts if doubt))
+
+
+def counted(names: Sequence[str], what: str) -> list[str]:
+    """Return a note of how many there are of something, with examples; nothing of nothing."""
+    return [f"{len(names)} {what}: {such_as(names)}"] if names else []
+
+
+def stem(name: str) -> str:
+    """Return a name without its suffix.
+
+    >>> stem("left/a.1.png")
+    'left/a.1'
+    """
+    return PurePosixPath(name).with_suffix("").as_posix()
 
 
 def read_numbers(path: Path) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ the datasets whose truth COLMAP made. Points of matches are pixel-centre, as eve
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median_low
@@ -42,12 +42,7 @@ ESTIMATORS = {"": "", "GC-RANSAC: ": "gc_"}
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image with the truth about its camera.
-
-    Attributes:
-        camera: intrinsics with distortion.
-        pose: cam_from_world, (3, 3) rotation and (3,) translation.
-    """
+    """An image with the truth about its camera; the pose is cam_from_world."""
 
     image: EvaluationImage
     camera: pycolmap.Camera
@@ -99,22 +94,20 @@ class RelativePoseProtocol(EvaluationProtocol):
     """Rotation error below which a pair counts."""
 
     def settings(self) -> dict[str, Any]:
-        """Return everything that decides scores."""
+        """See :class:`EvaluationProtocol`."""
         estimators = "OpenCV findEssentialMat, RANSAC and USAC_ACCURATE"
         return {"estimators": estimators, **super().settings()}
 
     def score(
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
     ) -> PairScore:
-        """Score (M, 2) and (M, 2) matched points, pixel-centre px of the stored images.
+        """Score by the paper's RANSAC: the error is that of the rotation, in degrees.
 
-        The error is that of the rotation by the paper's RANSAC, in degrees. Details:
-        ``direction_error_deg``, the angle between the directions of the translations, and the same
-        by GC-RANSAC, ``gc_...``. ``num_correct`` matches are within ``CORRECT_PX`` of the true
-        epipolar lines, wrong ones by chance among them.
+        Details: ``direction_error_deg``, the angle between the directions of the translations, and
+        the same by GC-RANSAC, ``gc_...``. ``num_correct`` matches are within ``CORRECT_PX`` of the
+        true epipolar lines, wrong ones by chance among them.
         """
-        cameras = (pair.truth[0].camera, pair.truth[1].camera)
-        truth = true_pose(pair)
+        cameras, truth = [image.camera for image in pair.truth], true_pose(pair)
         rays1, rays2 = (
             rays(camera, points, use_distortion=self.use_distortion)
             for camera, points in zip(cameras, (points1, points2), strict=True)
@@ -130,20 +123,11 @@ class RelativePoseProtocol(EvaluationProtocol):
         plain = self.ransac(cv2.RANSAC, self.threshold_px / focal_px, random_seed)
         gc = self.ransac(cv2.USAC_ACCURATE, self.gc_threshold_px / focal_px, random_seed)
         error, direction_error, num_inliers = estimate(plain)
-        gc_error, gc_direction_error, gc_num_inliers = median_low(
-            map(estimate, gc.reseeded(self.num_gc_estimates))
-        )
-        return PairScore(
-            error,
-            num_inliers,
-            int((focal_px * sampson_distances(truth, rays1, rays2) < CORRECT_PX).sum()),
-            {
-                "direction_error_deg": direction_error,
-                "gc_error": gc_error,
-                "gc_direction_error_deg": gc_direction_error,
-                "gc_num_inliers": gc_num_inliers,
-            },
-        )
+        by_gc = median_low(map(estimate, gc.reseeded(self.num_gc_estimates)))
+        num_correct = int((focal_px * sampson_distances(truth, rays1, rays2) < CORRECT_PX).sum())
+        details = {"direction_error_deg": direction_error}
+        details |= zip(("gc_error", "gc_direction_error_deg", "gc_num_inliers"), by_gc, strict=True)
+        return PairScore(error, num_inliers, num_correct, details)
 
     def success(self, score: PairScore) -> float:
         """Return 1 if the rotation error is below the limit, else 0."""
@@ -155,41 +139,29 @@ class RelativePoseProtocol(EvaluationProtocol):
         Also below 10 and 20 degrees, and the area under the curve of the larger of rotation and
         direction error up to 10 degrees; then the same by GC-RANSAC.
         """
-        by_category: dict[str, list[PairResult]] = {}
-        for result in sorted(results, key=lambda result: category_start(result.category)):
-            by_category.setdefault(result.category, []).append(result)
-        return self.columns(results, by_category)
+        categories = {result.category for result in results}
+        return self.columns(results, sorted(categories, key=category_start))
 
-    def columns(
-        self, results: Sequence[PairResult], by_category: Mapping[str, Sequence[PairResult]]
-    ) -> dict[str, float]:
-        """Return the columns of :meth:`summarize`, by some categories and of all results."""
-        shares = [
-            *((category, members, self.max_error_deg) for category, members in by_category.items()),
-            ("all", results, self.max_error_deg),
-            ("all < 10°", results, 10.0),
-            ("all < 20°", results, 20.0),
-        ]
+    def columns(self, results: Sequence[PairResult], categories: Iterable[str]) -> dict[str, float]:
+        """Return the columns of :meth:`summarize`, of some categories and of all results."""
+        shares = {name: [r for r in results if r.category == name] for name in categories}
+        limits = {"all": self.max_error_deg, "all < 10°": 10.0, "all < 20°": 20.0}
         columns: dict[str, float] = {}
         for group, prefix in ESTIMATORS.items():
-            for title, members, limit in shares:
-                below = [rotation < limit for rotation, _ in _errors(members, prefix)]
+            for title, members in {**shares, **dict.fromkeys(limits, results)}.items():
+                limit = limits.get(title, self.max_error_deg)
+                below = [_errors(result, prefix)[0] < limit for result in members]
                 columns[group + title] = sum(below) / max(1, len(below))
-            errors = _errors(results, prefix)
-            area = area_under_curve(map(max, errors), len(errors), MAX_AUC_ERROR_DEG)
+            errors = [max(_errors(result, prefix)) for result in results]
+            area = area_under_curve(errors, len(errors), MAX_AUC_ERROR_DEG)
             columns[f"{group}pose AUC {MAX_AUC_ERROR_DEG:g}°"] = area
         return columns
 
 
-def _errors(results: Sequence[PairResult], prefix: str) -> list[tuple[float, float]]:
+def _errors(result: PairResult, prefix: str) -> tuple[float, float]:
     """Return the errors of rotation and direction by an estimator; infinite for failed pairs."""
-    return [
-        (
-            result.details.get(f"{prefix}error", math.inf) if prefix else result.error,
-            result.details.get(f"{prefix}direction_error_deg", math.inf),
-        )
-        for result in results
-    ]
+    rotation = result.details.get(f"{prefix}error", math.inf) if prefix else result.error
+    return rotation, result.details.get(f"{prefix}direction_error_deg", math.inf)
 
 
 def category_start(category: str) -> float:

@@ -5,18 +5,23 @@ from __future__ import annotations
 import json
 import math
 import textwrap
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Self
 
 from pydantic import Field, TypeAdapter
 
 from colmap_affrect.comparison.tables import aligned
-from colmap_affrect.evaluation.costs import STEPS
 from colmap_affrect.evaluation.protocol import GROUP, Number, PairResult
-from colmap_affrect.evaluation.published import PublishedRow
+from colmap_affrect.evaluation.recipe_features import STEPS
 from colmap_affrect.project.report import csv_text
+
+DATA = Path(__file__).with_name("published.toml")
+COMPLEXITY = "complexity"
+"""Stands for a protocol: the paper's table of areas, keypoints, regions and warps per image."""
 
 Interval = tuple[Number, Number]
 
@@ -28,6 +33,30 @@ SECONDS = "seconds"
 
 WIDTH = 100
 MAX_NOTES = 12
+
+
+@dataclass(frozen=True)
+class PublishedRow:
+    """What a table (number and subject) of the paper says of one method.
+
+    ``values`` are by column; those that our summaries have too are called the same.
+    """
+
+    method: str
+    values: Mapping[str, float]
+    table: str
+
+
+def published(protocol: str) -> list[PublishedRow]:
+    """Return the published rows of a protocol, table by table; none if there are none."""
+    return [
+        PublishedRow(
+            method, dict(zip(table["columns"], map(float, values), strict=True)), table["label"]
+        )
+        for table in tomllib.loads(DATA.read_text(encoding="utf-8"))["tables"]
+        if table["protocol"] == protocol
+        for method, values in table["values"].items()
+    ]
 
 
 @dataclass(frozen=True)
@@ -44,10 +73,8 @@ class RecipeResult:
 
     Attributes:
         name: label of the recipe.
-        summary: columns of the protocol's table by name, and ``seconds``, of all steps of all
-            images and pairs together.
+        summary: columns of the protocol's table by name, and ``seconds`` of all steps together.
         intervals: bootstrap intervals (95 %) over pairs of the columns, where there are any.
-        solved: share of the pairs that count as solved.
         solved_by_category: mean success by category, of pairs that have one.
         p_value: of the paired test of success against the baseline; None without.
         num_images: that have features.
@@ -80,11 +107,9 @@ class RecipeResult:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Results of several recipes on one dataset.
+    """Results of several recipes on one dataset; titles are those of the protocol.
 
     Attributes:
-        error_title: what the errors are, with the unit.
-        category_title: what the categories are; empty without.
         settings: everything that decides scores.
         baseline: label of the recipe that the others are tested against; empty for none.
         notes: what is missing or odd in the dataset.
@@ -127,22 +152,13 @@ class Evaluation:
     def to_csv(self) -> str:
         """Return a row for each recipe and pair."""
         rows: list[dict[str, Any]] = []
+        before = ("category", "error", "num_inliers", "num_correct", "num_matches")
         for recipe in self.recipes:
             for pair in recipe.pairs:
-                row = {
-                    "recipe": recipe.name,
-                    "pair": pair.name,
-                    "category": pair.category,
-                    "error": pair.error,
-                    "num_inliers": pair.num_inliers,
-                    "num_correct": pair.num_correct,
-                    "num_matches": pair.num_matches,
-                    "num_keypoints1": pair.num_keypoints[0],
-                    "num_keypoints2": pair.num_keypoints[1],
-                    "seconds": pair.seconds,
-                    "level": pair.level,
-                    "failure": pair.failure,
-                }
+                row: dict[str, Any] = {"recipe": recipe.name, "pair": pair.name}
+                row |= {key: getattr(pair, key) for key in before}
+                row |= {f"num_keypoints{k}": count for k, count in enumerate(pair.num_keypoints, 1)}
+                row |= {key: getattr(pair, key) for key in ("seconds", "level", "failure")}
                 rows.append({**row, **pair.details})
         return csv_text(rows)
 
@@ -177,10 +193,7 @@ def _groups(evaluation: Evaluation) -> list[tuple[str, list[str]]]:
 
 
 def _score_table(evaluation: Evaluation, title: str, columns: Sequence[str]) -> str:
-    rows = [
-        [recipe.name, *(_cell(recipe.summary.get(column), column) for column in columns)]
-        for recipe in evaluation.recipes
-    ]
+    rows = [[recipe.name, *_cells(recipe.summary, columns)] for recipe in evaluation.recipes]
     head = [title or "recipe", *(column.rpartition(GROUP)[2] for column in columns)]
     return aligned([head, *rows, *_published_rows(evaluation.published, columns)])
 
@@ -188,10 +201,7 @@ def _score_table(evaluation: Evaluation, title: str, columns: Sequence[str]) -> 
 def _published_rows(published: Iterable[PublishedRow], columns: Sequence[str]) -> list[list[str]]:
     """Return the paper's rows that have some of the columns."""
     return [
-        [
-            f"paper: {row.method} ({row.table})",
-            *(_cell(row.values.get(column), column) for column in columns),
-        ]
+        [f"paper: {row.method} ({row.table})", *_cells(row.values, columns)]
         for row in published
         if set(columns) & row.values.keys() - {SECONDS}
     ]
@@ -205,14 +215,10 @@ def _chance_table(evaluation: Evaluation) -> str:
     for recipe in evaluation.recipes:
         low, high = recipe.solved.interval
         p_value = ["-" if recipe.p_value is None else f"{recipe.p_value:.3f}"] if test else []
-        interval = f"{low:.2f}-{high:.2f}"
-        used = [
-            fmean(fmean(pair.num_keypoints) for pair in recipe.pairs),
-            fmean(pair.num_matches for pair in recipe.pairs),
-            fmean(pair.num_inliers for pair in recipe.pairs),
-        ]
-        cells = [f"{recipe.solved.mean:.2f}", interval, *p_value, str(recipe.num_failed)]
-        rows.append([recipe.name, *cells, *(f"{value:.0f}" for value in used)])
+        cells = [f"{recipe.solved.mean:.2f}", f"{low:.2f}-{high:.2f}", *p_value]
+        counts = [(fmean(p.num_keypoints), p.num_matches, p.num_inliers) for p in recipe.pairs]
+        used = [f"{fmean(column):.0f}" for column in zip(*counts, strict=True)]
+        rows.append([recipe.name, *cells, str(recipe.num_failed), *used])
     return aligned(rows)
 
 
@@ -252,10 +258,12 @@ def _failures(recipes: Iterable[RecipeResult], said: str) -> list[str]:
     return [f"{text} ({', '.join(names)})" for text, names in texts.items()]
 
 
-def _cell(value: float | None, column: str) -> str:
-    """Format a count, a share or seconds."""
-    if value is None:
-        return ""
-    if column == SECONDS:
-        return f"{value:.1f}"
-    return f"{value:.0f}" if value == math.floor(value) and "px" in column else f"{value:.2f}"
+def _cells(values: Mapping[str, float], columns: Sequence[str]) -> list[str]:
+    """Format counts, shares and seconds; those that are not known are empty."""
+
+    def cell(value: float, column: str) -> str:
+        if column == SECONDS:
+            return f"{value:.1f}"
+        return f"{value:.0f}" if value == math.floor(value) and "px" in column else f"{value:.2f}"
+
+    return [cell(values[column], column) if column in values else "" for column in columns]

@@ -89,11 +89,6 @@ POSE_MISTAKES: dict[str, Callable[[Pose], Pose]] = {
 """What turns a pose that was stored in a wrong way into the right one."""
 
 
-def counted(items: Sequence[object], what: str, examples: Iterable[str]) -> list[str]:
-    """Return a note of how many there are of something, with examples; nothing of nothing."""
-    return [f"{len(items)} {what}: {such_as(examples)}"] if items else []
-
-
 def rotation_fault(rotation: NDArray[np.float64]) -> str:
     """Tell why a (3, 3) matrix is not a rotation; empty if it is one.
 
@@ -113,12 +108,16 @@ def rotation_fault(rotation: NDArray[np.float64]) -> str:
     return "the rotation is not orthogonal"
 
 
-def image_size(path: Path) -> Size | None:
-    """Return (width, height) of an image, None if it cannot be read: it fails when it is used."""
-    try:
-        return size_of(read_gray(path))
-    except ImageError:
-        return None
+def image_sizes(paths: Iterable[Path]) -> Iterator[Size | None]:
+    """Yield (width, height) of images, None for those that cannot be read: they fail when used."""
+
+    def size(path: Path) -> Size | None:
+        try:
+            return size_of(read_gray(path))
+        except ImageError:
+            return None
+
+    return map_ordered(size, paths, available_cores())
 
 
 def size_of(image: GrayImage) -> Size:
@@ -128,14 +127,11 @@ def size_of(image: GrayImage) -> Size:
 
 def plain_features(image: GrayImage) -> MatchableImage:
     """Return features of an (H, W) uint8 image that are not rectified, ready for matching."""
-    recipe = load_recipe(CHECK_RECIPE)
-    found = extract_image(image, recipe.extraction)
+    found = extract_image(image, load_recipe(CHECK_RECIPE).extraction)
     return matchable(found.descriptors, found.keypoints, NearestOptions())
 
 
-def matched_points(
-    image1: MatchableImage, image2: MatchableImage
-) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+def matched_points(image1: MatchableImage, image2: MatchableImage) -> tuple[Points, Points]:
     """Match plain features; return (M, 2) points of each image."""
     rows1, rows2 = match_features(image1, image2, NearestOptions()).indices.T
     return image1.keypoints[rows1], image2.keypoints[rows2]
@@ -175,14 +171,13 @@ def homography_doubts(matrix: Homography, image1: GrayImage, image2: GrayImage) 
         count = int((np.linalg.norm(points1 - points2, axis=1) < SUPPORT_PX).sum())
         return count if count >= max(MIN_SUPPORT, MIN_SUPPORT_FRAC * len(points1)) else 0
 
+    doubt = "is not confirmed by features of the images"
     if not len(visible_points(oriented(matrix, size1, size2), size1, size2)):
         doubt = "shows no part of image 1 in image 2"
     elif support(matrix):
         return ""
-    else:
-        doubt = "is not confirmed by features of the images"
     supports = {mistake: support(suspect) for mistake, suspect in _homography_mistakes(matrix)}
-    best = max(supports, key=lambda mistake: supports[mistake])
+    best = max(supports, key=supports.__getitem__)
     return f"{doubt}; it is {best}" if supports[best] else doubt
 
 
@@ -230,7 +225,7 @@ def correspondence_doubts(correspondences: Points, paths: Sequence[Path]) -> str
     }
     if medians[""] <= MAX_MEDIAN_PX:
         return ""
-    best = min(medians, key=lambda what: medians[what])
+    best = min(medians, key=medians.__getitem__)
     doubt = f"contradict the matches of plain features, by {medians['']:.0f} px in the median"
     return doubt + (best if medians[best] <= MAX_MEDIAN_PX else "")
 
@@ -248,11 +243,10 @@ def pose_contradictions(pairs: Sequence[EvaluationPair]) -> list[str]:
         if len(chosen) < MAX_CHECKED_PAIRS and not images.keys() <= seen.keys():
             chosen.append(pair)
             seen |= images
-    features = dict(zip(seen, _small_features(list(seen.values())), strict=True))
+    features = dict(zip(seen, _small_features(seen.values()), strict=True))
     found: dict[str, list[str]] = {}
     for pair in chosen:
-        mistake = _pose_mistake(pair.truth, features)
-        if mistake is not None:
+        if (mistake := _pose_mistake(pair.truth, features)) is not None:
             found.setdefault(mistake, []).append(pair.name)
     return [
         f"the matches of {len(names)} of {len(chosen)} checked pairs contradict their true poses"
@@ -261,7 +255,7 @@ def pose_contradictions(pairs: Sequence[EvaluationPair]) -> list[str]:
     ]
 
 
-def _small_features(paths: Sequence[Path]) -> Iterator[MatchableImage | None]:
+def _small_features(paths: Iterable[Path]) -> Iterator[MatchableImage | None]:
     """Yield the plain features of shrunk images; None of those that cannot be read."""
     recipe = load_recipe(CHECK_RECIPE, [f"max_image_size_px={CHECK_IMAGE_SIZE_PX}"])
     extractor = prepare(recipe.extraction)
@@ -284,24 +278,25 @@ def _pose_mistake(
     if first is None or second is None:
         return None
     points1, points2 = matched_points(first, second)
-    cameras = (truth[0].camera, truth[1].camera)
-    rays1, rays2 = rays(cameras[0], points1), rays(cameras[1], points2)
-    tolerance = CORRECT_PX / mean_focal_px(cameras)
+    rays1, rays2 = rays(truth[0].camera, points1), rays(truth[1].camera, points2)
+    tolerance = CORRECT_PX / mean_focal_px([posed.camera for posed in truth])
     _, inliers = Ransac(cv2.RANSAC, tolerance, 0.999, 1000).relative_pose(rays1, rays2)
     if inliers.sum() < max(MIN_POSE_CONSENSUS, MIN_POSE_CONSENSUS_FRAC * len(points1)):
         return None
     rays1, rays2 = rays1[inliers], rays2[inliers]
 
-    def agreeing(mistake1: str, mistake2: str) -> float:
-        pose = relative_pose(
-            POSE_MISTAKES[mistake1](truth[0].pose), POSE_MISTAKES[mistake2](truth[1].pose)
+    def agreeing(*mistakes: str) -> float:
+        pose1, pose2 = (
+            POSE_MISTAKES[mistake](posed.pose)
+            for mistake, posed in zip(mistakes, truth, strict=True)
         )
-        return float((sampson_distances(pose, rays1, rays2) < tolerance).mean())
+        distances = sampson_distances(relative_pose(pose1, pose2), rays1, rays2)
+        return float((distances < tolerance).mean())
 
     if agreeing("", "") >= MIN_AGREEING_FRAC:
         return None
     shares = {pair: agreeing(*pair) for pair in itertools.product(POSE_MISTAKES, repeat=2)}
-    best = max(shares, key=lambda pair: shares[pair])
+    best = max(shares, key=shares.__getitem__)
     if shares[best] < MIN_EXPLAINED_FRAC:
         return ""
     if best[0] == best[1]:

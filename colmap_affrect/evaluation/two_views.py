@@ -14,28 +14,23 @@ from colmap_affrect.colmap.poses import Pose
 from colmap_affrect.geometry.epipolar import epipolar_lines, sampson_errors
 from colmap_affrect.geometry.two_views import essential_matrix, homogeneous
 
-Points = NDArray[np.float64]
+Points = NDArray[np.floating]
 Matrix = NDArray[np.float64]
 
-MIN_HOMOGRAPHY_MATCHES = 4
-MIN_FUNDAMENTAL_MATCHES = 8
-MIN_POSE_MATCHES = 6
+MIN_HOMOGRAPHY_MATCHES, MIN_FUNDAMENTAL_MATCHES, MIN_POSE_MATCHES = 4, 8, 6
 """Five points leave several essential matrices, none of which another match supports."""
 
 
 @dataclass(frozen=True)
 class Ransac:
-    """How to look for a model.
-
-    OpenCV draws the same samples every time, so the seed decides the order of the matches.
+    """How to look for a model of (M, 2) and (M, 2) matches.
 
     Attributes:
         method: ``cv2.RANSAC``, ``cv2.USAC_MAGSAC`` or another of OpenCV's.
         threshold: of an inlier (MAGSAC: largest noise) in px; of relative poses in units of the
             focal length.
         confidence: at which to end before all iterations.
-        max_num_iterations: at most.
-        random_seed: decides the order of the matches.
+        random_seed: decides the order of the matches: OpenCV draws the same samples every time.
     """
 
     method: int
@@ -48,24 +43,16 @@ class Ransac:
         """Return as many of the same with seeds that follow each other."""
         return [replace(self, random_seed=self.random_seed + number) for number in range(count)]
 
-    def homography(
-        self, points1: NDArray[np.floating], points2: NDArray[np.floating]
-    ) -> tuple[Matrix | None, int]:
-        """Estimate image2_from_image1 from (M, 2) matches; also return the number of inliers."""
+    def homography(self, points1: Points, points2: Points) -> tuple[Matrix | None, int]:
+        """Estimate image2_from_image1; also return the number of inliers."""
         return self._matrix(cv2.findHomography, MIN_HOMOGRAPHY_MATCHES, points1, points2)
 
-    def fundamental_matrix(
-        self, points1: NDArray[np.floating], points2: NDArray[np.floating]
-    ) -> tuple[Matrix | None, int]:
-        """Estimate F with x2' F x1 = 0 from (M, 2) matches; also return the number of inliers."""
+    def fundamental_matrix(self, points1: Points, points2: Points) -> tuple[Matrix | None, int]:
+        """Estimate F with x2' F x1 = 0; also return the number of inliers."""
         return self._matrix(cv2.findFundamentalMat, MIN_FUNDAMENTAL_MATCHES, points1, points2)
 
     def _matrix(
-        self,
-        find: Callable[..., Any],
-        min_num_matches: int,
-        points1: NDArray[np.floating],
-        points2: NDArray[np.floating],
+        self, find: Callable[..., Any], min_num_matches: int, points1: Points, points2: Points
     ) -> tuple[Matrix | None, int]:
         if len(points1) < min_num_matches:
             return None, 0

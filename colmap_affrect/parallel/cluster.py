@@ -52,12 +52,7 @@ PACKAGES = (
 
 @dataclass(frozen=True)
 class WorkerEnvironment:
-    """What results depend on besides the task.
-
-    Attributes:
-        versions: (package, version) of ``PACKAGES``.
-        files: (path, fingerprint) of files and folders, '' for a missing one.
-    """
+    """What results depend on besides the task: versions of ``PACKAGES``, fingerprints of paths."""
 
     host: str
     versions: tuple[tuple[str, str], ...]
@@ -97,6 +92,7 @@ def _version(package: str) -> str:
 
 
 def _fingerprint(path: Path) -> str:
+    """Return what the content of a file or folder can be known by, '' for a missing one."""
     try:
         if path.is_dir():
             return "folder"
@@ -263,10 +259,7 @@ class Cluster:
         )
 
     def map(
-        self,
-        function: Callable[[Task], Result],
-        tasks: Iterable[Task],
-        files: Sequence[Path] = (),
+        self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
     ) -> Iterator[Result]:
         """See :class:`~colmap_affrect.parallel.executor.Executor`.
 

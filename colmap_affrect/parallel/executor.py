@@ -36,10 +36,7 @@ class Executor(Protocol):
         """Tell whether files and folders are there for the work as they are for this process."""
 
     def map(
-        self,
-        function: Callable[[Task], Result],
-        tasks: Iterable[Task],
-        files: Sequence[Path] = (),
+        self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
     ) -> Iterator[Result]:
         """Yield ``function(task)`` in task order, or raise what it raises; few tasks are in flight.
 
@@ -61,10 +58,7 @@ class Threads:
         return True
 
     def map(
-        self,
-        function: Callable[[Task], Result],
-        tasks: Iterable[Task],
-        files: Sequence[Path] = (),
+        self, function: Callable[[Task], Result], tasks: Iterable[Task], files: Sequence[Path] = ()
     ) -> Iterator[Result]:
         """See :func:`map_ordered`."""
         del files
@@ -147,10 +141,8 @@ def map_ordered(
     """Yield ``function(task)`` in task order; at most two tasks per thread are in flight.
 
     Meanwhile numpy's linear algebra keeps to the calling thread: thread pools of its own in
-    every task would only wait for each other.
-
-    An exception of the function is raised at the place of its task. Work that has not
-    begun is dropped when the iteration ends early.
+    every task would only wait for each other. An exception of the function is raised at the place
+    of its task. Work that has not begun is dropped when the iteration ends early.
     """
     pending: deque[Future[Result]] = deque()
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(num_threads) as pool:

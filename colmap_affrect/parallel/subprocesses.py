@@ -47,9 +47,9 @@ def child(
 
 def end_with_parent() -> None:
     """Make this process end when the one that started it ends, which closes our stdin."""
-    threading.Thread(target=_wait_and_end, daemon=True).start()
 
+    def wait_and_end() -> None:
+        os.read(sys.stdin.fileno(), 1)  # nothing is ever sent: it returns when the pipe is closed
+        os.kill(os.getpid(), signal.SIGKILL)
 
-def _wait_and_end() -> None:
-    os.read(sys.stdin.fileno(), 1)  # nothing is ever sent: it returns when the pipe is closed
-    os.kill(os.getpid(), signal.SIGKILL)
+    threading.Thread(target=wait_and_end, daemon=True).start()

@@ -31,12 +31,7 @@ class Rectifier(Protocol):
 
 @dataclass(frozen=True)
 class RectifierInputs:
-    """What a rectifier may read beside the photograph.
-
-    Attributes:
-        shapes: the source that its options name; None if they name none.
-        depth: None when the recipe needs no depth.
-    """
+    """What a rectifier may read beside the photograph; None for what its options do not ask for."""
 
     shapes: ShapeSource | None = None
     depth: DepthSource | None = None
@@ -114,7 +109,7 @@ RECTIFIERS: Registry[Rectifier] = Registry(
         "asift": "colmap_affrect.rectifiers.whole_image:Asift",
         "affnet-shapes": "colmap_affrect.rectifiers.whole_image:AffNetShapes",
         "depth-planes": "colmap_affrect.rectifiers.depth_planes:DepthPlanes",
-        "depth-affnet": "colmap_affrect.rectifiers.depth_affnet:DepthAffNet",
+        "depth-affnet": "colmap_affrect.rectifiers.depth_planes:DepthAffNet",
         "dense-shapes": "colmap_affrect.rectifiers.dense:DenseShapes",
     },
     default="dense-shapes",

@@ -1,7 +1,8 @@
-"""Rectifier ``depth-planes``: one homography for each planar segment, as if seen from the front.
+"""Rectifiers of planar segments: ``depth-planes``, as if seen from the front; ``depth-affnet``.
 
-The paper's depth-map-based rectification (Sec. 3) after Toft et al. 2020: normals from a depth
-map, their clusters on the sphere, connected segments of each cluster.
+Segments are those of the paper's depth-map-based rectification (Sec. 3) after Toft et al. 2020:
+normals from a depth map, their clusters on the sphere, connected segments of each cluster. The
+paper's DepthAffNet warps each as ``affnet-shapes`` does, by a cover of the shapes inside it.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.conventions import resized_from_original
-from colmap_affrect.data import Mask, Photograph, RectificationPlan
+from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan
 from colmap_affrect.geometry.planes import (
     cluster_normals,
     fronto_parallel_homography,
@@ -23,8 +24,8 @@ from colmap_affrect.geometry.planes import (
 )
 from colmap_affrect.images.masks import connected_regions
 from colmap_affrect.options import Options, within
-from colmap_affrect.rectifiers.base import RectifierOptions, WithInputs
-from colmap_affrect.rectifiers.regions import Region, homography_rectification
+from colmap_affrect.rectifiers.base import CoverOptions, RectifierOptions, WithInputs
+from colmap_affrect.rectifiers.regions import Region, affine_rectification, homography_rectification
 
 MAX_DEPTH_SIZE_PX = 640
 """Larger depth maps are shrunk to this: windows of 5 x 5 px of them see too little of a plane,
@@ -33,11 +34,7 @@ and noise too much (the paper's maps have 512 px)."""
 
 @dataclass(frozen=True)
 class PlanarSegment:
-    """Connected part of an image that shows surfaces of about the same orientation.
-
-    Attributes:
-        normal: (3,) unit normal in camera coordinates, facing the camera.
-    """
+    """Connected part of an image, and its (3,) unit normal in camera coordinates, facing us."""
 
     region: Region
     normal: NDArray[np.float64]
@@ -92,9 +89,8 @@ class DepthPlanes(WithInputs):
             )
             for number, segment in enumerate(segments)
         )
-        outside = None
-        if self.options.keep_original == "outside":
-            outside = ~_union(segments, photograph.size)
+        everywhere = self.options.keep_original == "everywhere"
+        outside = None if everywhere else ~_union(segments, photograph.size)
         return RectificationPlan(photograph.size, items, outside)
 
 
@@ -157,3 +153,34 @@ def _union(segments: list[PlanarSegment], size: tuple[int, int]) -> Mask:
         height, width = segment.region.mask.shape
         mask[top : top + height, left : left + width] |= segment.region.mask
     return mask
+
+
+class DepthAffNetOptions(CoverOptions):
+    """Planar regions from depth, each warped by a cover of the shapes inside it."""
+
+    name: Literal["depth-affnet"] = "depth-affnet"
+    planes: PlaneOptions = PlaneOptions()
+    uses_depth: ClassVar[bool] = True
+
+
+class DepthAffNet(WithInputs):
+    """Planar segments, each warped by the affine maps that cover its shapes."""
+
+    Options = DepthAffNetOptions
+
+    def plan(self, photograph: Photograph) -> RectificationPlan:
+        """Plan the warps of each segment, if its shapes are tilted; DepthError without depth."""
+        options = self.options
+        segments = planar_segments(photograph, self.depth.depth(photograph), options.planes)
+        samples = self.shapes.samples(photograph.gray)
+        items: list[Rectification] = []
+        for number, segment in enumerate(segments):
+            inside = segment.region.contains(samples.points)
+            centers = options.cover(samples.metrics[inside]).centers
+            items += [
+                affine_rectification(
+                    segment.region, tilt, angle, number, area_preserving=options.area_preserving
+                )
+                for tilt, angle in centers.tolist()
+            ]
+        return RectificationPlan(photograph.size, tuple(items))

@@ -51,35 +51,22 @@ def extract_rectified(
     rectifications += plan.items
     if not rectifications:
         return LocalFeatures.empty(extractor.descriptor_size)
-    views = _views(image, rectifications, mask)
+    whole = image, None if mask is None else mask_values(mask)
+    source = image.astype(np.float32)
+    views = [whole if item is None else _warped(source, item, mask) for item in rectifications]
     detected = [extractor.detect(view) for view in views]
     carried = [_carried(*pair) for pair in zip(detected, rectifications, strict=True)]
     keep = [_usable(*pair, plan) for pair in zip(carried, rectifications, strict=True)]
-    warped = slice(1 if with_original else 0, None)
-    _keep_strongest(keep[warped], carried[warped], max_num_rectified)
+    first_id = 0 if with_original else 1
+    _keep_strongest(keep[1 - first_id :], carried[1 - first_id :], max_num_rectified)
     if with_original and plan.replaces_original and plan.items:
         kept = [part.select(mask) for part, mask in zip(carried, keep, strict=True)]
         keep[0] &= ~found_again(carried[0], union(kept[1:]))
     chosen = [features.select(kept) for features, kept in zip(detected, keep, strict=True)]
     described = extractor.describe([view[0] for view in views], chosen)
-    first_id = 0 if with_original else 1
-    return union(
-        [
-            _carried(features, rectification).with_rectification_id(first_id + number)
-            for number, (features, rectification) in enumerate(
-                zip(described, rectifications, strict=True)
-            )
-        ]
-    )
-
-
-def _views(
-    image: GrayImage | ColorImage, rectifications: list[Rectification | None], mask: Mask | None
-) -> list[View]:
-    """Return a warp for each rectification; for None the image itself."""
-    whole = image, None if mask is None else mask_values(mask)
-    source = image.astype(np.float32)
-    return [whole if item is None else _warped(source, item, mask) for item in rectifications]
+    carried = [_carried(*pair) for pair in zip(described, rectifications, strict=True)]
+    numbered = enumerate(carried, first_id)
+    return union([features.with_rectification_id(number) for number, features in numbered])
 
 
 def _warped(source: NDArray[np.float32], rectification: Rectification, mask: Mask | None) -> View:
@@ -119,14 +106,12 @@ def _keep_strongest(keep: list[Mask], features: list[LocalFeatures], limit: int)
     """Clear in ``keep`` all but the ``limit`` strongest of the features of several views."""
     if not keep:
         return
-    kept = np.concatenate(keep)
     responses = np.concatenate([part.responses for part in features])
-    candidates = np.flatnonzero(kept)
-    order = np.argsort(-responses[candidates], kind="stable")
-    kept[candidates[order[limit:]]] = False
-    ends = np.cumsum([len(part) for part in features])
-    for part, mask in zip(np.split(kept, ends[:-1]), keep, strict=True):
-        mask[:] = part
+    candidates = np.flatnonzero(np.concatenate(keep))
+    weak = np.zeros(len(responses), dtype=bool)
+    weak[candidates[np.argsort(-responses[candidates], kind="stable")[limit:]]] = True
+    for mask, part in zip(keep, np.split(weak, np.cumsum(list(map(len, keep)))[:-1]), strict=True):
+        mask[part] = False
 
 
 def found_again(original: LocalFeatures, rectified: LocalFeatures) -> Mask:
@@ -144,8 +129,7 @@ def found_again(original: LocalFeatures, rectified: LocalFeatures) -> Mask:
         return again
     points = np.concatenate([original.keypoints, rectified.keypoints])
     # Larger frames than this have no counterpart worth the search for it.
-    search_px = min(float(radius.max()), MAX_DUPLICATE_RADIUS_PX)
-    neighbors = neighbors_within(points, search_px)
+    neighbors = neighbors_within(points, min(float(radius.max()), MAX_DUPLICATE_RADIUS_PX))
     rows, others = neighbors.of(np.arange(len(original)))
     between = others >= len(original)
     rows, others = rows[between], others[between] - len(original)

@@ -52,8 +52,7 @@ class Asift(WithInputs):
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         """Warp the whole photograph by every map of the covering."""
-        centers = COVERINGS[self.options.covering]()
-        return plan_whole_image(photograph.size, centers, self.options)
+        return plan_whole_image(photograph.size, COVERINGS[self.options.covering](), self.options)
 
 
 class AffNetShapesOptions(CoverOptions):

@@ -89,8 +89,7 @@ def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int
         dict(enumerate(recorder.views, first_id)),
         dict(enumerate(recorder.found, first_id)),
         features,
-        _shapes(extractor, photograph, number),
-        None if warning else _depth(extractor, photograph, number),
+        *_read_again(extractor, photograph, number, with_depth=not warning),
         watch.seconds,
     )
 
@@ -129,29 +128,20 @@ class _Recorder(TimedFeatures):
         return self.found[-1]
 
 
-def _shapes(extractor: ImageExtractor, photograph: Photograph, number: int) -> ShapeSamples | None:
-    """Read the affine shapes again that the rectifier of a level has read; None for none."""
-    source: ShapeSource | None = _read_by(extractor, photograph, number, "shapes")
-    if source is None:
-        return None
-    if isinstance(extractor.options.levels[number].rectifier, DenseShapesOptions):
-        return source.grid(photograph.gray).samples()
-    return source.samples(photograph.gray)
-
-
-def _depth(
-    extractor: ImageExtractor, photograph: Photograph, number: int
-) -> NDArray[np.floating] | None:
-    """Read the depth map again that the rectifier of a level has read; None for none."""
-    source: DepthSource | None = _read_by(extractor, photograph, number, "source")
-    return source.depth(photograph) if source else None
-
-
-def _read_by(extractor: ImageExtractor, photograph: Photograph, number: int, name: str) -> Any:
-    """Return an attribute of the rectifier of a level, None if it does without or is not asked."""
-    if min(photograph.size) < MIN_RECTIFIABLE_PX:
-        return None
-    return getattr(extractor.rectifiers[number], name, None)
+def _read_again(
+    extractor: ImageExtractor, photograph: Photograph, number: int, *, with_depth: bool
+) -> tuple[ShapeSamples | None, NDArray[np.floating] | None]:
+    """Read the shapes and the depth map that the rectifier of a level has read; None for none."""
+    is_asked = min(photograph.size) >= MIN_RECTIFIABLE_PX
+    rectifier = extractor.rectifiers[number] if is_asked else None
+    source: ShapeSource | None = getattr(rectifier, "shapes", None)
+    shapes = None
+    if source and isinstance(extractor.options.levels[number].rectifier, DenseShapesOptions):
+        shapes = source.grid(photograph.gray).samples()
+    elif source:
+        shapes = source.samples(photograph.gray)
+    depth: DepthSource | None = getattr(rectifier, "depth", None)
+    return shapes, depth.depth(photograph) if depth and with_depth else None
 
 
 def describe_level(level: InspectedLevel) -> dict[str, Any]:

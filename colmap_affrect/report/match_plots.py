@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +23,7 @@ PLOT_HEIGHT, GAP = 300.0, 8.0
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Two photographs side by side.
-
-    Attributes:
-        widths: of the two photographs; both are ``PLOT_HEIGHT`` high.
-    """
+    """Two photographs of given widths side by side, both ``PLOT_HEIGHT`` high."""
 
     names: Pair
     widths: tuple[float, float]
@@ -54,7 +50,6 @@ class MatchPlot:
     """The inliers of a pair, to be drawn over its photographs.
 
     Attributes:
-        num_inliers: as verified.
         num_from_warps: inliers with a feature from a warp.
         plain, warped: SVG paths of the lines of the others and of these.
         missing: why there are no lines; empty if there are, or nothing was verified.
@@ -77,15 +72,15 @@ def plot_inliers(
 
     The feature store, if it exists, tells which features are from warps.
     """
-    plots = {item.names: MatchPlot(pair_inliers.get(item.names, 0)) for item in shown}
-    verified = [item for item in shown if plots[item.names].num_inliers]
+    counts = {item.names: pair_inliers.get(item.names, 0) for item in shown}
+    plots = {names: MatchPlot(count) for names, count in counts.items()}
+    verified = [item for item in shown if counts[item.names]]
     try:
         found = _read_inliers([item.names for item in verified], database_path, features_path)
     except AffrectError as error:
-        missing = {item.names: replace(plots[item.names], missing=str(error)) for item in verified}
-        return plots | missing
+        return plots | {n: MatchPlot(c, missing=str(error)) for n, c in counts.items() if c}
     for item, (ends, from_warps) in zip(verified, found, strict=True):
-        plots[item.names] = _plot(plots[item.names].num_inliers, item, ends, from_warps)
+        plots[item.names] = _plot(counts[item.names], item, ends, from_warps)
     return plots
 
 
@@ -120,10 +115,7 @@ def _read_inliers(
 
 
 def _plot(
-    num_inliers: int,
-    shown: SideBySide,
-    ends: NDArray[np.float64],
-    from_warps: NDArray[np.bool_],
+    num_inliers: int, shown: SideBySide, ends: NDArray[np.float64], from_warps: NDArray[np.bool_]
 ) -> MatchPlot:
     points = ends * [[shown.widths[0], PLOT_HEIGHT], [shown.widths[1], PLOT_HEIGHT]]
     points[:, 1, 0] += shown.second_left

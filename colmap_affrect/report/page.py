@@ -74,13 +74,3 @@ def without_folders(text: str, known: Iterable[str] = ()) -> str:
     for folder in known:
         text = text.replace(folder, "")
     return FOLDERS.sub("", text)
-
-
-def number_text(value: float, digits: int = 1) -> str:
-    """Write a number with so many digits after the point, without trailing zeros.
-
-    >>> number_text(3.0), number_text(1234.56), number_text(0.123, 2)
-    ('3', '1,234.6', '0.12')
-    """
-    text = f"{value:,.{digits}f}"
-    return text.rstrip("0").rstrip(".") if "." in text else text

@@ -31,12 +31,7 @@ def thumbnail_size_px(count: int) -> int:
 
 @dataclass(frozen=True)
 class Picture:
-    """An image file as text.
-
-    Attributes:
-        uri: a ``data:`` address with the whole file.
-        width, height: in px.
-    """
+    """An image of some px as text: a ``data:`` address with the whole file."""
 
     uri: str
     width: int

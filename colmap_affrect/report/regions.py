@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from numpy.typing import NDArray
@@ -58,10 +59,8 @@ def bounding_box(item: Rectification, image_size: Size) -> tuple[int, int, int, 
     """Return left, top, width and height of a region in an image of (width, height), in px."""
     if item.region is None:
         return (0, 0, *image_size)
-    columns = np.flatnonzero(item.region.any(axis=0))
-    rows = np.flatnonzero(item.region.any(axis=1))
-    left, top = item.region_origin[0] + int(columns[0]), item.region_origin[1] + int(rows[0])
-    return left, top, int(columns[-1] - columns[0]) + 1, int(rows[-1] - rows[0]) + 1
+    left, top, width, height = cv2.boundingRect(item.region.astype(np.uint8))
+    return left + item.region_origin[0], top + item.region_origin[1], width, height
 
 
 def region_middle(region: Mask, origin: tuple[int, int]) -> NDArray[np.float64]:

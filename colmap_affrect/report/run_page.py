@@ -14,9 +14,10 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import MAX_LINES, ModelSummary, ReconstructionReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import view_graph
-from colmap_affrect.report.page import TEMPLATES, number_text, write_page
+from colmap_affrect.report.page import TEMPLATES, write_page
 from colmap_affrect.report.pictures import thumbnails
 from colmap_affrect.report.scene import read_scene
+from colmap_affrect.shown import such_as
 
 KINDS = {
     "tracks": "registered by common points",
@@ -43,17 +44,10 @@ SOURCES = {
 MAX_NUM_CAMERAS = 200
 """In the table; report.json has all."""
 
-MAX_NAMES = 3
-
 
 @dataclass(frozen=True)
 class Fate(view_graph.Node):
-    """What became of a photograph.
-
-    Attributes:
-        kind: one of ``KINDS``, or ``missing``.
-        groups: of ``FILTERS``.
-    """
+    """What became of a photograph: one of ``KINDS``, or ``missing``."""
 
     kind: str
     groups: tuple[str, ...]
@@ -69,16 +63,8 @@ def write_run_page(
 ) -> Path:
     """Write ``report.html`` into the folder of a run, one file that loads nothing.
 
-    Args:
-        workspace: with models.
-        report: of the run.
-        names: of all photographs.
-        pair_inliers: of the verified pairs, by names.
-        image_path: folder of the photographs; None where it is not known.
-        progress: where to show progress.
-
-    Raises:
-        WorkspaceError: when it cannot be written.
+    ``names`` are those of all photographs, ``image_path`` their folder, None where it is not known;
+    ``pair_inliers`` are of the verified pairs. Raises WorkspaceError when it cannot be written.
     """
     model = report.models[0] if report.models else ModelSummary((), 0, 0.0, 0.0)
     cards = [_fate(number, name, report, model) for number, name in enumerate(names, 1)]
@@ -169,7 +155,7 @@ def _why_no_model(report: ReconstructionReport) -> list[str]:
     why = report.why_no_model
     return [
         f"{why[0].upper()}{why[1:]}.",
-        *(f"{reason}: {_some_of(alike)}" for reason, alike in names.items()),
+        *(f"{reason}: {such_as(alike)}" for reason, alike in names.items()),
     ]
 
 
@@ -187,15 +173,16 @@ def _tiles(report: ReconstructionReport, model: ModelSummary) -> dict[str, str]:
         }
     if len(report.models) > 1:
         tiles["models"] = str(len(report.models))
-    return tiles | {"seconds": number_text(sum(stage.wall_s for stage in report.stages))}
+    seconds = sum(stage.wall_s for stage in report.stages)
+    return tiles | {"seconds": f"{seconds:,.1f}".removesuffix(".0")}
 
 
 def _guided(report: ReconstructionReport) -> str:
     if not report.guided:
         return ""
     pairs, before, after = (report.guided[k] for k in ("pairs", "matches_before", "matches_after"))
-    plural = "s" if pairs != 1 else ""
-    return f"Guided matching took {pairs} pair{plural} from {before:,} to {after:,} inliers."
+    taken = f"{pairs} pair{'s' if pairs != 1 else ''}"
+    return f"Guided matching took {taken} from {before:,} to {after:,} inliers."
 
 
 def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str, Any]:
@@ -221,12 +208,11 @@ def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str
                 "at": round(((refined or camera["focal_px"]) - low) * scale, 1),
             }
         )
-    counts = Counter(camera["source"] for camera in report.cameras)
+    counts, total = Counter(camera["source"] for camera in report.cameras), len(report.cameras)
     sources = ", ".join(f"{count} by {SOURCES[key]}" for key, count in counts.most_common())
-    more = len(report.cameras) - len(rows)
-    total = len(report.cameras)
     note = f"{total} camera{'s' if total != 1 else ''}, focal lengths: {sources}."
-    note += f" The first {len(rows)} are listed, report.json has all." if more else ""
+    if total > len(rows):
+        note += f" The first {len(rows)} are listed, report.json has all."
     has_range = any(row["spread"] != "-" for row in rows)
     return {"cameras": rows, "camera_note": note, "has_range": has_range}
 
@@ -237,13 +223,7 @@ def _focals(camera: Mapping[str, Any]) -> list[float]:
 
 
 def _photographs(names: Sequence[str], index: Mapping[str, int]) -> str:
-    return _some_of([f"{index[name] + 1} {name}" for name in names if name in index])
-
-
-def _some_of(texts: Sequence[str]) -> str:
-    """Return the first few, and how many more there are."""
-    more = len(texts) - MAX_NAMES
-    return ", ".join(texts[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
+    return such_as(f"{index[name] + 1} {name}" for name in names if name in index)
 
 
 def _stages(report: ReconstructionReport) -> list[dict[str, Any]]:

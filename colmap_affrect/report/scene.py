@@ -39,7 +39,6 @@ class View3D:
     """A model ready for the page; lengths in units of the view's radius.
 
     Attributes:
-        num_points: points in ``points``.
         points: (N, 3) uint16 positions from -1 to 1 and then (N, 3) uint8 colours, as base64.
         cameras: name and (5, 3) centre and corners of the pyramid of each camera.
         note: what is special about it; empty if nothing is.
@@ -53,9 +52,8 @@ class View3D:
     def script_data(self, index: Mapping[str, int], kinds: Mapping[str, str]) -> dict[str, Any]:
         """Return what the script of the page reads.
 
-        Args:
-            index: of the photographs on the page, by name.
-            kinds: name of the colour that the style has for each camera.
+        ``index`` is that of the photographs on the page, ``kinds`` the names of the colours that
+        the style has for their cameras.
         """
         cameras = [
             {
@@ -113,14 +111,12 @@ def read_models(paths: Mapping[str, Path | None]) -> tuple[dict[str, Model], dic
     Returns the models, and what is special about them or why they are missing, by name.
     """
     models: dict[str, Model] = {}
-    notes: dict[str, str] = {}
+    notes = {name: "There is no model." for name, path in paths.items() if path is None}
     max_num_points = min(MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE // max(1, len(paths)))
     for name, path in paths.items():
-        if path is None:
-            notes[name] = "There is no model."
-            continue
         try:
-            models[name] = _read(path, max_num_points)
+            if path is not None:
+                models[name] = _read(path, max_num_points)
         except AffrectError as error:
             notes[name] = f"The model cannot be shown: {error}"
     return (_in_one_frame(models, notes) if models else {}), notes
@@ -130,11 +126,7 @@ def _read(path: Path, max_num_points: int) -> Model:
     registered_names(path)
     model = pycolmap.Reconstruction(path)
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
-    sizes = []
-    for image in images:
-        camera = model.cameras[image.camera_id]
-        focal_px = camera.mean_focal_length()
-        sizes.append([camera.width / focal_px / 2, camera.height / focal_px / 2])
+    cameras = [model.cameras[image.camera_id] for image in images]
     ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
     if len(ids) > max_num_points:
         ids = np.random.default_rng(0).choice(ids, max_num_points, replace=False)
@@ -143,7 +135,7 @@ def _read(path: Path, max_num_points: int) -> Model:
         tuple(image.name for image in images),
         np.array([image.projection_center() for image in images]).reshape(-1, 3),
         np.array([image.cam_from_world().rotation.matrix().T for image in images]),
-        np.array(sizes),
+        np.array([np.array([c.width, c.height]) / c.mean_focal_length() / 2 for c in cameras]),
         np.array([point.xyz for point in points]).reshape(-1, 3),
         np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
     )
@@ -155,17 +147,16 @@ def _in_one_frame(models: Mapping[str, Model], notes: dict[str, str]) -> dict[st
     upright = _upright(models[reference])
     framed = {}
     for name, model in models.items():
-        similarity = similarity_of(model, upright)
         if name == reference:
             framed[name] = upright
-        elif similarity is None:
+        elif similarity := similarity_of(model, upright):
+            framed[name] = model.transformed(*similarity)
+        else:
             framed[name] = _upright(model)
             notes[name] = (
                 f"Shares fewer than two photographs at different places with the model of "
                 f"{reference}: drawn in a frame of its own."
             )
-        else:
-            framed[name] = model.transformed(*similarity)
     return framed
 
 

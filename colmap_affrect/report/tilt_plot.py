@@ -43,12 +43,7 @@ MAX_NUM_SHAPES = 6000
 
 @dataclass(frozen=True)
 class TiltClass:
-    """A class of maps to mark.
-
-    Attributes:
-        tilt, angle_rad: its coordinates.
-        label: text beside the mark; may be empty.
-    """
+    """A class of maps to mark, with a label that may be empty."""
 
     tilt: float
     angle_rad: float
@@ -116,10 +111,10 @@ def draw_tilt_space(
         )
         shown.set_clip_path(disc)
     if cover:
-        _draw_half_circle(axes, np.log(cover.tilt_radius), "-")
+        _draw_half_circle(axes, np.log(cover.tilt_radius))
         for item in classes:
             _draw_ball(axes, item, cover.tilt_radius, disc)
-        _draw_half_circle(axes, np.log(cover.max_tilt), "--")
+        _draw_half_circle(axes, np.log(cover.max_tilt), linestyle="--")
     for item in classes:
         _draw_mark(axes, item)
 
@@ -141,22 +136,19 @@ def shape_colors(
 
 def _draw_grid(axes: Axes, edge: float) -> None:
     for degrees in range(0, 181, 30):
-        direction = np.array([np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))])
-        axes.plot(*np.stack([np.zeros(2), edge * direction], axis=1), color=GRID, linewidth=0.7)
+        x, y = edge * np.cos(np.deg2rad(degrees)), edge * np.sin(np.deg2rad(degrees))
+        axes.plot([0.0, x], [0.0, y], color=GRID, linewidth=0.7)
         align = "center" if degrees == 90 else "left" if degrees < 90 else "right"
-        x, y = (1.02 * edge * direction).tolist()
-        axes.text(x, y, f"{degrees}°", ha=align, va="bottom", color=DARK)
+        axes.text(1.02 * x, 1.02 * y, f"{degrees}°", ha=align, va="bottom", color=DARK)
     for tick in (1, *(tick for tick in TICKS if np.log(tick) < edge)):
         place = float(np.log(tick))
-        _draw_half_circle(axes, place, "-", color=GRID, linewidth=0.7)
+        _draw_half_circle(axes, place, color=GRID, linewidth=0.7)
         for side in {place, -place}:
             axes.text(side, -0.015 * edge, f"{tick}", ha="center", va="top", color=DARK)
 
 
-def _draw_half_circle(
-    axes: Axes, radius: float, linestyle: str, color: str = DARK, linewidth: float = 1.4
-) -> None:
-    style: dict[str, Any] = {"linestyle": linestyle, "color": color, "linewidth": linewidth}
+def _draw_half_circle(axes: Axes, radius: float, **style: Any) -> None:
+    style = {"color": DARK, "linewidth": 1.4, **style}
     axes.add_patch(Arc((0.0, 0.0), 2 * radius, 2 * radius, theta2=180.0, **style))
 
 
@@ -173,11 +165,6 @@ def _draw_ball(axes: Axes, item: TiltClass, radius: float, disc: Wedge) -> None:
 def _draw_mark(axes: Axes, item: TiltClass) -> None:
     ((x, y),) = plane_points(np.array([[item.tilt, item.angle_rad]]))
     axes.plot(x, y, "o", color=item.color, markeredgecolor=DARK, markersize=6, clip_on=False)
-    axes.annotate(
-        item.label,
-        (x, y),
-        (0, 5),
-        textcoords="offset points",
-        ha="center",
-        path_effects=[withStroke(linewidth=2.5, foreground="white")],
-    )
+    effects = [withStroke(linewidth=2.5, foreground="white")]
+    place: dict[str, Any] = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center"}
+    axes.annotate(item.label, (x, y), path_effects=effects, **place)

@@ -65,13 +65,11 @@ def class_labels() -> list[str]:
 
 @dataclass(frozen=True)
 class Node:
-    """A photograph in a view graph.
+    """A photograph in a view graph; it has the same number, from 1, everywhere on the page.
 
     Attributes:
-        number: from 1, the same everywhere on the page.
         state: ``always``, ``sometimes`` or ``never`` registered, over the seeds.
         is_wrong: registered, but at a wrong place with some seed.
-        text: the same in words.
     """
 
     number: int
@@ -83,12 +81,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the photographs are in all view graphs of a page.
-
-    Attributes:
-        centers: (N, 2) in ``GRAPH_SIZE``.
-        node_size: side of a node.
-    """
+    """Where photographs are in all view graphs of a page, (N, 2) in ``GRAPH_SIZE``, and a side."""
 
     centers: NDArray[np.float64]
     node_size: float

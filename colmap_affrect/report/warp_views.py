@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.colors import to_hex
 
 from colmap_affrect.data import ColorImage, Photograph, RectificationPlan
 from colmap_affrect.images.reading import shrink_to
@@ -25,13 +26,7 @@ TINT = 0.45
 
 @dataclass(frozen=True)
 class WarpView:
-    """One warp.
-
-    Attributes:
-        color: of its region, as #rrggbb.
-        tilt: that it undoes.
-        angle_deg: direction in which it stretches.
-    """
+    """One warp; the colour of its region is #rrggbb, the angle where it stretches."""
 
     picture: Picture
     color: str
@@ -41,14 +36,10 @@ class WarpView:
 
 @dataclass(frozen=True)
 class WarpedPhotograph:
-    """What one level of a recipe does with a photograph.
+    """What one level of a recipe does with a photograph, and the largest of its warps.
 
-    Attributes:
-        level: of escalation; 0 is what every photograph gets.
-        num_warps: all that were planned.
-        regions: the photograph with the regions of the warps in colour.
-        warps: the largest.
-        has_regions: whether warps are meant for parts of the photograph.
+    ``regions`` is the photograph with their regions in colour; ``has_regions`` says whether they
+    are meant for parts of it.
     """
 
     name: str
@@ -73,15 +64,10 @@ def warped_photographs(
     inputs = Inputs.recorded(workspace)
     found = []
     for task in image_tasks(workspace, inputs, extractor.options, [(name, 0) for name in names]):
-        photographs = task.photographs
+        path, mask = task.photographs.folder / task.name, task.photographs.mask(task.name)
         for level, chosen in enumerate(extractor.options.levels):
-            photograph, _ = extractor.photograph(
-                photographs.folder / task.name,
-                task.name,
-                task.intrinsics,
-                photographs.mask(task.name),
-                level,
-            )
+            given = path, task.name, task.intrinsics, mask, level
+            photograph, _ = extractor.photograph(*given)
             plan, _ = extractor.plan_or_warn(photograph, level)
             if plan.items:
                 found.append(_view(photograph, plan, level, chosen.rectifier.name))
@@ -97,15 +83,9 @@ def _view(
     views = []
     for index in by_area[:MAX_NUM_WARPS]:
         item = plan.items[index]
-        red, green, blue = (round(255 * share) for share in colors[index])
-        views.append(
-            WarpView(
-                Picture.jpeg(shrink_to(warp(photograph.gray, item), WARP_SIZE_PX)),
-                f"#{red:02x}{green:02x}{blue:02x}",
-                item.tilt,
-                float(np.rad2deg(item.tilt_angle_rad)),
-            )
-        )
+        picture = Picture.jpeg(shrink_to(warp(photograph.gray, item), WARP_SIZE_PX))
+        angle_deg = float(np.rad2deg(item.tilt_angle_rad))
+        views.append(WarpView(picture, to_hex(colors[index]), item.tilt, angle_deg))
     return WarpedPhotograph(
         photograph.name,
         level,

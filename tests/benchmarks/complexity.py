@@ -21,7 +21,7 @@ from statistics import median
 from machine import describe_machine, table
 
 from colmap_affrect.comparison.methods import parse_method
-from colmap_affrect.evaluation.costs import ImageCost, extract_measured
+from colmap_affrect.evaluation.recipe_features import ImageCost, extract_measured
 from colmap_affrect.images.photographs import list_images
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.whole_image import IdentityOptions

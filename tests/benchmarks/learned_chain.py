@@ -25,7 +25,7 @@ from machine import describe_machine
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import GrayImage, LocalFeatures, View
-from colmap_affrect.evaluation.costs import ImageCost, extract_measured
+from colmap_affrect.evaluation.recipe_features import ImageCost, extract_measured
 from colmap_affrect.features.affnet_hardnet import AffNetHardNet
 from colmap_affrect.features.networks import DESCRIPTOR_NETWORKS
 from colmap_affrect.features.weights import load_state_dict

@@ -15,8 +15,7 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.comparison.differing_pairs import choose_pairs, plot_pairs
-from colmap_affrect.comparison.page import write_page
+from colmap_affrect.comparison.page import choose_pairs, plot_pairs, write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.verdict import verdict
 from colmap_affrect.report.match_plots import PLOT_HEIGHT
@@ -210,6 +209,15 @@ def test_matrices_of_the_script_have_the_inliers(page: Page, comparison: Compari
             row, column = names.index(name1), names.index(name2)
             expected[row, column] = expected[column, row] = count
         np.testing.assert_array_equal(counts, expected)
+
+
+def test_more_photographs_than_fit_into_a_matrix_have_the_table_only(
+    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("colmap_affrect.report.view_graph.MAX_NUM_IN_MATRIX", len(NAMES) - 1)
+    html = write_page(comparison, tmp_path).read_text(encoding="utf-8")
+    assert "data-matrix=" not in html
+    assert "Table of verified pairs" in html
 
 
 def test_models_are_drawn_in_one_frame(page: Page) -> None:

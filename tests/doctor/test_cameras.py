@@ -13,8 +13,8 @@ from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.camera_vote import apply_records
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import VerificationOptions, verify
-from colmap_affrect.doctor import cameras as module
-from colmap_affrect.doctor.cameras import examine_cameras
+from colmap_affrect.doctor import database as module
+from colmap_affrect.doctor.database import examine_cameras
 from colmap_affrect.doctor.findings import Finding, Findings
 from colmap_affrect.progress import SILENT
 

@@ -17,14 +17,12 @@ from planar_pairs import TRUTH, write_extreme_views
 
 from colmap_affrect.errors import EvaluationError, OptionError, StaleStoreError
 from colmap_affrect.evaluation import evaluate as module
-from colmap_affrect.evaluation.costs import IMAGE_STEPS
 from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate
 from colmap_affrect.evaluation.evd import Evd
-from colmap_affrect.evaluation.imc import Imc
 from colmap_affrect.evaluation.pair_matches import MatchedPair
+from colmap_affrect.evaluation.posed_scenes import Imc
 from colmap_affrect.evaluation.protocol import PairResult
-from colmap_affrect.evaluation.recipe_features import RecipeFeatures
-from colmap_affrect.evaluation.records import RecordFile
+from colmap_affrect.evaluation.recipe_features import IMAGE_STEPS, RecipeFeatures, RecordFile
 from colmap_affrect.evaluation.results import Evaluation, RecipeResult, Solved
 from colmap_affrect.matchers import nearest
 from colmap_affrect.stages.context import Resources

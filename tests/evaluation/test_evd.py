@@ -9,9 +9,9 @@ import pytest
 from planar_pairs import TRUTH, write_extreme_views, write_pair
 
 from colmap_affrect.errors import EvaluationError, OptionError
+from colmap_affrect.evaluation.evaluate import PROTOCOLS, make_protocol
 from colmap_affrect.evaluation.evd import Evd
 from colmap_affrect.evaluation.protocol import PairScore
-from colmap_affrect.evaluation.registry import PROTOCOLS, make_protocol
 
 UNCHECKED = Evd(check_truth=False)
 
@@ -95,6 +95,7 @@ def test_settings_of_a_protocol_are_read_by_their_type() -> None:
         ("threshold_px=wide", "expected float"),
         ("threshold_px=-1", "is outside"),
         ("check_truth=perhaps", "expected bool"),
+        ("threshold_px=" + 20_000 * "[", "expected float"),
     ):
         with pytest.raises(OptionError, match=message):
             make_protocol("evd", [setting])

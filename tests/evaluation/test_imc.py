@@ -14,7 +14,7 @@ from posed_photographs import NAMES, pose, write_calibration, write_imc, write_l
 from small_scene import FOCAL_PX
 
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.imc import Imc
+from colmap_affrect.evaluation.posed_scenes import Imc
 from colmap_affrect.evaluation.relative_pose import true_pose
 
 SCRIPT = Path(__file__).parents[2] / "recipes" / "own-evaluation-set" / "imc_from_model.py"

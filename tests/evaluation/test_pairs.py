@@ -14,8 +14,7 @@ from small_scene import FOCAL_PX, IMAGE_SIZE, photograph
 from synthetic import write_image
 
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.correspondences import recalls
-from colmap_affrect.evaluation.pairs import Pairs
+from colmap_affrect.evaluation.pairs import Pairs, recalls
 from colmap_affrect.evaluation.protocol import Dataset, EvaluationPair, PairResult
 from colmap_affrect.evaluation.truth_checks import correspondence_doubts
 from colmap_affrect.evaluation.two_views import symmetric_epipolar_distances

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from colmap_affrect.evaluation.published import COMPLEXITY, DATA, published
+from colmap_affrect.evaluation.results import COMPLEXITY, DATA, published
 
 PAPER = Path(__file__).parents[3] / "shared" / "paper" / "matching_with_affnet_rectifications.tex"
 

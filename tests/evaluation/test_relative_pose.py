@@ -11,7 +11,7 @@ import pytest
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.conventions import pixel_from_colmap
-from colmap_affrect.evaluation.imc import Imc
+from colmap_affrect.evaluation.posed_scenes import Imc
 from colmap_affrect.evaluation.protocol import EvaluationPair, PairResult
 from colmap_affrect.evaluation.relative_pose import (
     posed_image,

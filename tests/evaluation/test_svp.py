@@ -11,8 +11,13 @@ from posed_photographs import image_line, pose, write_svp
 from small_scene import FOCAL_PX
 
 from colmap_affrect.errors import EvaluationError
+from colmap_affrect.evaluation.posed_scenes import (
+    Svp,
+    difficulty,
+    read_camera_poses,
+    read_pair_list,
+)
 from colmap_affrect.evaluation.relative_pose import true_pose
-from colmap_affrect.evaluation.svp import Svp, difficulty, read_camera_poses, read_pair_list
 
 UNCHECKED = Svp(check_truth=False)
 SAMPLE = Path(__file__).parents[3] / "shared" / "pairs" / "svp_sample"

@@ -14,8 +14,13 @@ from colmap_affrect.data import RectificationPlan
 from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.canvas import rectifying_affine
 from colmap_affrect.rectifiers.base import RectifierInputs
-from colmap_affrect.rectifiers.depth_affnet import DepthAffNet, DepthAffNetOptions
-from colmap_affrect.rectifiers.depth_planes import PlanarSegment, PlaneOptions, planar_segments
+from colmap_affrect.rectifiers.depth_planes import (
+    DepthAffNet,
+    DepthAffNetOptions,
+    PlanarSegment,
+    PlaneOptions,
+    planar_segments,
+)
 
 
 def shapes_at(points: Array, tilt: float, angle_rad: float) -> Array:

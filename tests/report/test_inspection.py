@@ -46,20 +46,22 @@ from colmap_affrect.rectifiers.whole_image import (
     plan_whole_image,
 )
 from colmap_affrect.report import sheet
-from colmap_affrect.report.figure_page import (
-    HEAD_PX,
-    INNER_PX,
-    MARGIN_PX,
-    TILE_TITLE_PX,
-    WIDTH_PX,
-    fitted,
-    printable,
-    tiles,
-)
 from colmap_affrect.report.inspection import inspect_image
 from colmap_affrect.report.levels import InspectedLevel, inspect_level
 from colmap_affrect.report.regions import PALETTE, circle_origin, region_middle, warp_colors
-from colmap_affrect.report.sheet import LINE_PX, NAME_PX, normal_colors
+from colmap_affrect.report.sheet import (
+    HEAD_PX,
+    INNER_PX,
+    LINE_PX,
+    MARGIN_PX,
+    NAME_PX,
+    TILE_TITLE_PX,
+    WIDTH_PX,
+    fitted,
+    normal_colors,
+    printable,
+    tiles,
+)
 from colmap_affrect.report.tilt_plot import ball_outline, plane_points, shape_colors
 from colmap_affrect.stages.one_image import ImageExtractor
 
@@ -112,10 +114,8 @@ class SlantedDepth:
 class Planned:
     """A rectifier with a plan made beforehand; without one its depth map is missing."""
 
-    def __init__(
-        self, plan: RectificationPlan | None = None, source: SlantedDepth | None = None
-    ) -> None:
-        self._plan, self.source = plan, source
+    def __init__(self, plan: RectificationPlan | None = None) -> None:
+        self._plan = plan
 
     def plan(self, photograph: Photograph) -> RectificationPlan:
         if self._plan is None:
@@ -318,8 +318,10 @@ def test_sheet_of_a_rectifier_that_reads_shapes(
 
 
 def test_sheet_of_a_rectifier_that_reads_depth(tmp_path: Path, photo: Path) -> None:
-    rectifier = Planned(RectificationPlan(SIZE), SlantedDepth())
-    extractor = extractor_with(DepthPlanesOptions(), rectifier)
+    options = DepthPlanesOptions()
+    rectifier = RECTIFIERS.make(options, RectifierInputs(depth=SlantedDepth()))
+    extractor = extractor_with(options, rectifier)
+    assert_array_equal(inspected(extractor, photo).depth, SlantedDepth().depth(photo))
     _, with_depth = inspect(extractor, photo, tmp_path / "with")
     _, without = inspect(extractor_of(PLANS["no warps"]), photo, tmp_path / "without")
     assert len(with_depth) > len(without) + HEAD_PX
