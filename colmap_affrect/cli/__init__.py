@@ -23,8 +23,7 @@ from colmap_affrect.shown import one_line
 
 logger = logging.getLogger("colmap_affrect")
 
-REPEAT_S = 0.01
-"""After which a Ctrl-C is repeated."""
+REPEAT_S = 0.01  # after which a Ctrl-C is repeated
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

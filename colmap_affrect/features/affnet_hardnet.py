@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS
 from colmap_affrect.data import GrayImage, LocalFeatures, View, in_mask, union
 from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.features.sift import DogOptions, detect_dog, is_searchable
 from colmap_affrect.geometry.affine import determinants, lafs_from_keypoints, rotation
+from colmap_affrect.geometry.arrays import Array, Bools, Floats, Singles
 from colmap_affrect.options import within
 
 if TYPE_CHECKING:
@@ -37,8 +37,7 @@ MIN_RESPONSE = 1e-10
 """kornia fills up to the number asked for with frames of response 0 at the origin. Its Hessian
 finds rounding errors of 1e-13 in flat images; a blob of one gray level has 1e-6."""
 
-MAX_TILT = 20.0
-"""More is degenerate. AffNet's shapes on photographs stay under 6 (Graffiti)."""
+MAX_TILT = 20.0  # more is degenerate; AffNet's shapes on photographs stay under 6 (Graffiti).
 
 BATCH_MULTIPLE = 64
 """Batches are filled up to multiples of this many patches: other sizes change the last bits of the
@@ -160,9 +159,7 @@ class AffNetHardNet:
             described.append(LocalFeatures(lafs, found.responses[kept], rows, ids))
         return described
 
-    def _describe(
-        self, patches: _Patches, found: LocalFeatures
-    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    def _describe(self, patches: _Patches, found: LocalFeatures) -> tuple[Array, Singles]:
         """Return (N, 2, 2) shapes of determinant 1, and (N, 128) descriptors of any length."""
         half_widths_px = self.options.patch_sigmas / MEASUREMENT_SIGMAS * found.scales
         shapes = np.tile(np.eye(2), (len(found), 1, 1))
@@ -176,7 +173,7 @@ class AffNetHardNet:
         descriptors = self._run(self.descriptor, turned)
         return shapes, descriptors
 
-    def _run(self, network: nn.Module, patches: Tensor) -> NDArray[np.float32]:
+    def _run(self, network: nn.Module, patches: Tensor) -> Singles:
         """Run a network on (N, 1, 32, 32) patches, in batches."""
         import torch
         from torch.nn.functional import pad
@@ -206,7 +203,7 @@ class _Patches:
         self.samplers = [PatchSampler(_unit_range(image), device) for image, _ in pairs]
         self.ends = np.cumsum([count for _, count in pairs])
 
-    def sample(self, lafs: NDArray[np.float64]) -> Tensor:
+    def sample(self, lafs: Array) -> Tensor:
         """Return (N, 1, 32, 32) float32 patches of the (N, 2, 3) frames of all images in turn."""
         import torch
 
@@ -214,7 +211,7 @@ class _Patches:
         return torch.cat([s.sample(part) for s, part in zip(self.samplers, parts, strict=True)])
 
 
-def shapes_from_outputs(outputs: NDArray[np.floating]) -> NDArray[np.float64]:
+def shapes_from_outputs(outputs: Floats) -> Array:
     """Return (N, 2, 2) shapes of determinant 1 of (N, 3) outputs o of AffNet, lower triangular.
 
     They are [[1 + o0, 0], [o1, 1 + o2]] up to scale; not a number where that has no area.
@@ -231,7 +228,7 @@ def shapes_from_outputs(outputs: NDArray[np.floating]) -> NDArray[np.float64]:
     return shapes / np.sqrt(np.where(areas > 0.0, areas, np.nan))[:, None, None]
 
 
-def _is_sound(shapes: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _is_sound(shapes: Array) -> Bools:
     """Tell which of (N, 2, 2) shapes of determinant 1 are finite and of a tilt up to MAX_TILT.
 
     The squared Frobenius norm of a shape of tilt t is t + 1 / t.
@@ -239,14 +236,12 @@ def _is_sound(shapes: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray((shapes**2).sum(axis=(1, 2)) <= MAX_TILT + 1.0 / MAX_TILT)
 
 
-def _frames(
-    shapes: NDArray[np.float64], radii_px: NDArray[np.float64], centers: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _frames(shapes: Array, radii_px: Array, centers: Array) -> Array:
     """Return (N, 2, 3) frames of shapes of determinant 1, geometric mean radii and centres."""
     return np.concatenate([radii_px[:, None, None] * shapes, centers[:, :, None]], axis=2)
 
 
-def _unit_range(image: GrayImage) -> NDArray[np.float32]:
+def _unit_range(image: GrayImage) -> Singles:
     """Return an (H, W) image as float32 in [0, 1]."""
     return image.astype(np.float32) / np.float32(255)
 
@@ -267,9 +262,7 @@ def _detector(
     return ScaleSpaceDetector(count, MEASUREMENT_SIGMAS).to(resolve_device(device))
 
 
-def _centers_from_keynet(
-    centers: NDArray[np.float64], radii_px: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _centers_from_keynet(centers: Array, radii_px: Array) -> Array:
     """Correct the centres that kornia's multi-resolution detector reports.
 
     A pixel of a level f times coarser than the image is reported at f times its coordinates,

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import HALF_PIXEL
 from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, Mask, View, in_mask
 from colmap_affrect.features.base import FeatureOptions, NetworkContext
 from colmap_affrect.features.sift import is_searchable
 from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.options import within
 
 if TYPE_CHECKING:
@@ -239,5 +239,5 @@ def _pixels(image: GrayImage | ColorImage) -> Tensor:
     return torch.from_numpy(channels)[None] / 255
 
 
-def _array(values: Tensor) -> NDArray[np.float32]:
+def _array(values: Tensor) -> Singles:
     return np.asarray(values.float().cpu().numpy())

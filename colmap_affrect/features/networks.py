@@ -26,8 +26,7 @@ from colmap_affrect.shown import such_as
 
 Network = TypeVar("Network", bound=nn.Module)
 
-DESCRIPTOR_SIZE = 128
-"""Width of all descriptors."""
+DESCRIPTOR_SIZE = 128  # width of all descriptors
 
 
 def resolve_device(name: str) -> torch.device:
@@ -151,11 +150,7 @@ class HardTFeat(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.features = nn.Sequential(
-            nn.Conv2d(1, 32, 7),
-            nn.MaxPool2d(2),
-            nn.Tanh(),
-            nn.Conv2d(32, 64, 6),
-            nn.Tanh(),
+            nn.Conv2d(1, 32, 7), nn.MaxPool2d(2), nn.Tanh(), nn.Conv2d(32, 64, 6), nn.Tanh()
         )
         self.classifier = nn.Sequential(
             nn.Dropout(0.1), nn.Conv2d(64, DESCRIPTOR_SIZE, 8), nn.Tanh()

@@ -7,12 +7,12 @@ from typing import Annotated, ClassVar, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, View
 from colmap_affrect.features.base import FeatureOptions, NetworkContext
 from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Indices, Singles
 from colmap_affrect.options import within
 
 
@@ -79,14 +79,13 @@ class RootSift:
         return list(detected)
 
 
-def root_normalized(descriptors: NDArray[np.floating]) -> NDArray[np.float32]:
+def root_normalized(descriptors: Floats) -> Singles:
     """Divide non-negative rows by their sum and take square roots: rows of unit length."""
     sums = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)
     return np.asarray(np.sqrt(descriptors / sums), dtype=np.float32)
 
 
-MIN_IMAGE_SIZE_PX = 8
-"""OpenCV's scale space needs this much of the shorter side."""
+MIN_IMAGE_SIZE_PX = 8  # OpenCV's scale space needs this much of the shorter side
 
 
 def make_sift(options: DogOptions) -> cv2.SIFT:
@@ -104,15 +103,13 @@ def make_sift(options: DogOptions) -> cv2.SIFT:
     )
 
 
-def is_searchable(image: GrayImage | ColorImage, mask: NDArray[np.uint8] | None) -> bool:
+def is_searchable(image: GrayImage | ColorImage, mask: Bytes | None) -> bool:
     """Tell whether an image is large enough for OpenCV, not flat, and its mask not empty."""
     large = min(image.shape[:2]) >= MIN_IMAGE_SIZE_PX
     return large and bool(image.min() < image.max()) and (mask is None or bool(mask.any()))
 
 
-def by_falling_response(
-    keypoints: Sequence[cv2.KeyPoint],
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
+def by_falling_response(keypoints: Sequence[cv2.KeyPoint]) -> tuple[Indices, Array, Singles]:
     """Sort keypoints by falling response; those of equal response keep their order.
 
     Returns the (N,) index of the sorted keypoints in the given ones; their (N, 4) x, y in
@@ -125,9 +122,7 @@ def by_falling_response(
     return order, rows, responses[order]
 
 
-def detect_dog(
-    image: GrayImage, options: DogOptions, mask: NDArray[np.uint8] | None = None
-) -> LocalFeatures:
+def detect_dog(image: GrayImage, options: DogOptions, mask: Bytes | None = None) -> LocalFeatures:
     """Detect DoG keypoints for descriptors that assign orientations themselves.
 
     OpenCV returns a location once for each of its dominant orientations, 15 to 18 % of them more

@@ -34,35 +34,25 @@ ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
 WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")
 """Recipes that need no weights: the way out when there is no network."""
 
-TIMEOUT_S = 30.0
-"""Longest wait for a server, to connect and for each read."""
+TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read
 
 CHUNK_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
 class WeightFile:
-    """A published file.
+    """A published file."""
 
-    Attributes:
-        file_name: upstream's.
-        used_for: the option that needs it, for people.
-        kornia: where kornia has its address: a module of ``kornia.feature``, a name in it, and
-            perhaps a key; empty if kornia has no list with it.
-        licence: of the repository that publishes it; empty if it states none.
-        sha256: of the file, where it could be computed; else empty.
-        urls: its addresses, best first, where kornia has no list with it.
-        other_names: that kornia's cache and distributions have it under.
-        distribution: a requirement of a package index that carries the file; empty if none does.
-    """
-
-    file_name: str
-    used_for: str
+    file_name: str  # upstream's
+    used_for: str  # the option that needs it, for people
+    # where kornia has its address: a module of ``kornia.feature``, a name in it, and perhaps a key;
+    # empty if kornia has no list with it
     kornia: tuple[str, ...] = ()
-    licence: str = ""
-    sha256: str = ""
-    urls: tuple[str, ...] = ()
-    other_names: tuple[str, ...] = ()
+    licence: str = ""  # of the repository that publishes it; empty if it states none
+    sha256: str = ""  # of the file, where it could be computed; else empty
+    urls: tuple[str, ...] = ()  # its addresses, best first, where kornia has no list with it
+    other_names: tuple[str, ...] = ()  # that kornia's cache and distributions have it under
+    # a requirement of a package index that carries the file; empty if none does
     distribution: str = ""
 
     @property
@@ -221,17 +211,13 @@ def install_hint(files: Iterable[WeightFile]) -> str:
 
 @dataclass(frozen=True)
 class WeightStatus:
-    """What is known of one file of weights.
-
-    Attributes:
-        path: where it was found; None if nowhere.
-        verified: whether its sha256 is that of the published file; None if there is no file
-            or no sha256 to compare with.
-    """
+    """What is known of one file of weights."""
 
     key: str
     published: WeightFile
-    path: Path | None
+    path: Path | None  # where it was found; None if nowhere
+    # whether its sha256 is that of the published file; None if there is no file or no sha256 to
+    # compare with
     verified: bool | None
 
 

@@ -16,11 +16,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_affrect.geometry.arrays import Array, Bools
 from colmap_affrect.geometry.epipolar import sampson_errors
-
-Array = NDArray[np.float64]
 
 PRINCIPAL_POINT_SIGMA, DISTORTION_SIGMA = 0.02, 0.05
 """How far both are from 0 in photographs that nobody cropped, longer sides."""
@@ -50,19 +48,12 @@ NUM_PARAMETERS = 12
 
 @dataclass(frozen=True, eq=False)
 class MatchedPair:
-    """Inliers of a pair with a fundamental matrix.
+    """Inliers of a pair with a fundamental matrix."""
 
-    Attributes:
-        points1: (N, 2) in image 1.
-        points2: (N, 2) their matches.
-        fundamental: (3, 3) in the units of the points.
-        error: of a match, to be expected, longer sides.
-    """
-
-    points1: Array
-    points2: Array
-    fundamental: Array
-    error: float
+    points1: Array  # (N, 2) in image 1
+    points2: Array  # (N, 2) their matches
+    fundamental: Array  # (3, 3) in the units of the points
+    error: float  # of a match, to be expected, longer sides
 
     @classmethod
     def of(cls, points1: Array, points2: Array, fundamental: Array, least_error: float) -> Self:
@@ -76,16 +67,9 @@ class MatchedPair:
 def log_evidence(
     pair: MatchedPair, focals1: Array, focals2: Array, *, max_misfit: float = MAX_MISFIT
 ) -> Array:
-    """Return the logarithm of the evidence for pairs of focal lengths, up to a constant.
+    """Return the (N,) logarithms of the evidence for (N,) pairs of focal lengths, up to a constant.
 
-    Args:
-        pair: what is known.
-        focals1: (N,) of image 1.
-        focals2: (N,) of image 2.
-        max_misfit: see :data:`MAX_MISFIT`.
-
-    Returns:
-        (N,), all 0 where the pair fits no camera, or its matches leave parameters undetermined.
+    All are 0 where the pair fits no camera, or its matches leave parameters undetermined.
     """
     essential = _Fit(pair, focals1, focals2, is_essential=True)
     fundamental = _Fit(pair, np.ones(1), np.ones(1), is_essential=False)
@@ -122,8 +106,7 @@ class _Fit:
         self._precision = np.zeros(NUM_PARAMETERS)
         self._precision[CENTERS] = PRINCIPAL_POINT_SIGMA**-2
         self._precision[DISTORTIONS] = DISTORTION_SIGMA**-2
-        self._free = np.arange(NUM_PARAMETERS) != SCALE if is_essential else np.arange(6) >= 0
-        self._free = np.flatnonzero(self._free)
+        self._free = np.delete(np.arange(NUM_PARAMETERS), SCALE) if is_essential else np.arange(6)
         self._squares = [(points**2).sum(axis=1) for points in (pair.points1, pair.points2)]
         self.costs = np.zeros(0)
         self.hessians = np.zeros(0)
@@ -163,8 +146,7 @@ class _Fit:
                 zip((pair.points1, pair.points2), self._squares, strict=True)
             )
         )
-        values = np.ones((len(state), 1, 3))
-        values[:, 0, 1], values[:, 0, 2] = state[:, SCALE], 0.0
+        values = _singular_values(state)
         # rays in the frames of both factors, where E is diagonal
         rays1, rays2 = _rays(moved1, self._inverse1), _rays(moved2, self._inverse2)
         sides1, sides2 = rays1 @ right, rays2 @ left
@@ -175,15 +157,13 @@ class _Fit:
         errors = (sides1 * values * sides2).sum(axis=2) / lengths
         priors = 0.5 * (self._precision * state**2).sum(axis=1)
         costs = np.log1p(errors**2).sum(axis=1) + priors  # matches have Cauchy's distribution
-        return _Residuals(
-            costs, errors, lengths, sides1, sides2, lines1, lines2, state[:, SCALE], state
-        )
+        return _Residuals(costs, errors, lengths, sides1, sides2, lines1, lines2, state)
 
     def _derivatives(self, at: _Residuals) -> tuple[Array, Array]:
         """Return (G, P, P) second derivatives, to first order of the errors, and gradients."""
         pair = self._pair
-        values = np.stack([np.ones_like(at.scales), at.scales, np.zeros_like(at.scales)], axis=1)
-        flat1, flat2 = at.sides1 * values[:, None, :], at.sides2 * values[:, None, :]
+        values = _singular_values(at.state)
+        flat1, flat2 = at.sides1 * values, at.sides2 * values
         jacobians = np.empty((*at.errors.shape, NUM_PARAMETERS))
         jacobians[..., BASELINE] = np.cross(flat1, at.sides2)
         jacobians[..., TILT] = np.cross(flat2, at.sides1)[..., :2]
@@ -211,16 +191,22 @@ class _Residuals:
     sides2: Array
     lines1: Array
     lines2: Array
-    scales: Array
     state: Array
 
-    def replaced(self, where: NDArray[np.bool_], other: _Residuals) -> _Residuals:
+    def replaced(self, where: Bools, other: _Residuals) -> _Residuals:
         """Return a copy with some focals as in another one."""
         values = {
             name: np.where(where.reshape(-1, *[1] * (old.ndim - 1)), vars(other)[name], old)
             for name, old in vars(self).items()
         }
         return _Residuals(**values)
+
+
+def _singular_values(state: Array) -> Array:
+    """Return (G, 1, 3) singular values 1, s, 0 of the matrices."""
+    values = np.tile([1.0, 0.0, 0.0], (len(state), 1, 1))
+    values[:, 0, 1] = state[:, SCALE]
+    return values
 
 
 def _rays(points: Array, inverse: Array) -> Array:

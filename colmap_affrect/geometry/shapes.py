@@ -8,16 +8,13 @@ entries (l11, l12); its eigenvalues are +-log t. Means of shapes are means of lo
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.geometry.tilts import unit_metrics
 
-STEP_PX = 4
-"""Dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet."""
-
-MAX_TANH = 0.999
-"""Where logarithms end: of a metric, tilt 45."""
+STEP_PX = 4  # dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet
+MAX_TANH = 0.999  # where logarithms end: of a metric, tilt 45
 
 
 MIN_DISTINCT_SHARE = 0.5
@@ -28,13 +25,13 @@ SHAPE_STEP = 1e-4
 the orientations of all features of an image hardly coincide."""
 
 
-def of_unit_area(shapes: NDArray[np.floating]) -> NDArray[np.float64]:
+def of_unit_area(shapes: Floats) -> Array:
     """Divide (N, 2, 2) shapes by the roots of their areas."""
     areas = np.maximum(np.abs(determinants(shapes)), np.finfo(float).tiny)
     return np.asarray(shapes / np.sqrt(areas)[:, None, None], np.float64)
 
 
-def vary_singly(shapes: NDArray[np.floating]) -> bool:
+def vary_singly(shapes: Floats) -> bool:
     """Whether (N, 2, 2) shapes of features were measured one by one.
 
     Those of features without a shape are circles, which a warp turns into one ellipse for all of
@@ -44,7 +41,7 @@ def vary_singly(shapes: NDArray[np.floating]) -> bool:
     return len(np.unique(cells, axis=0)) > max(1.0, MIN_DISTINCT_SHARE * len(shapes))
 
 
-def rectifying_metrics(shapes: NDArray[np.floating]) -> NDArray[np.float64]:
+def rectifying_metrics(shapes: Floats) -> Array:
     """Return (..., 3) unit metrics of L^-1, the rectifying maps of (..., 2, 2) frames L.
 
     The metric of L^-1 is the inverse of L L^T, which of unit determinant is its adjugate.
@@ -53,7 +50,7 @@ def rectifying_metrics(shapes: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.stack([ellipses[..., 1], ellipses[..., 0], -ellipses[..., 2]], -1)
 
 
-def log_metrics(metrics: NDArray[np.floating]) -> NDArray[np.float32]:
+def log_metrics(metrics: Floats) -> Singles:
     """Return (..., 2) entries (l11, l12) of log(S / sqrt det S) for (..., 3) metrics of any scale.
 
     For S = m I + D with trace-free D the logarithm is atanh(|D| / m) D / |D|.
@@ -65,7 +62,7 @@ def log_metrics(metrics: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.asarray((np.arctanh(ratio) / norm)[..., None] * deviator, dtype=np.float32)
 
 
-def metrics_from_log(logs: NDArray[np.floating]) -> NDArray[np.float64]:
+def metrics_from_log(logs: Floats) -> Array:
     """Invert :func:`log_metrics`: (..., 3) unit metrics by the exponential."""
     logs = logs.astype(np.float64)
     norm = np.linalg.norm(logs, axis=-1)

@@ -13,17 +13,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+
+from colmap_affrect.geometry.arrays import Indices
 
 NUM_SHUFFLED = 4000
 """About how many random matches tell a chance: 1 % is then known within a sixth of itself."""
-MIN_AGREEING = 0.5
-"""Right pairs have at least this share of inliers with agreeing frames."""
+MIN_AGREEING = 0.5  # right pairs have at least this share of inliers with agreeing frames
 AGREEING_SHARES = np.linspace(0.0, 1.0, 51)[:-1]
 """Where the Bayes factor averages over shares, from ``MIN_AGREEING`` (0) to all (1)."""
 
 
-def shuffled(num: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def shuffled(num: int) -> tuple[Indices, Indices]:
     """Return two lists of indices below ``num`` that never agree: matches paired anew.
 
     By cyclic shifts spread over all there are, so that it is the same every time.
@@ -45,11 +45,8 @@ def log10_false_alarms(
 ) -> float:
     """Return how many geometries with so many inliers random matches are expected to have.
 
-    Args:
-        num_matches: raw matches.
-        num_inliers: of the geometry.
-        sample_size: matches that determine a geometry; they are inliers in any case.
-        chance: that a random match is an inlier.
+    ``sample_size`` matches determine a geometry and are inliers in any case; another random one is
+    with a probability of ``chance``.
     """
     if num_inliers <= sample_size:
         return math.inf

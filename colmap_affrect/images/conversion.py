@@ -23,18 +23,14 @@ AS_STORED = ("1", "L", "I;16", "RGB")
 
 @dataclass
 class ConversionReport:
-    """What became of the files of a folder.
+    """What became of the files of a folder."""
 
-    Attributes:
-        written: names of the files that were converted, with those that were made of them.
-        copied: names of the files that COLMAP can read as they are.
-        kept: names of the files that had been there before.
-        failures: names of the files that cannot be read, with the reason.
-    """
-
+    # names of the files that were converted, with those that were made of them
     written: dict[str, list[str]] = field(default_factory=dict)
+    # names of the files that COLMAP can read as they are
     copied: list[str] = field(default_factory=list)
-    kept: list[str] = field(default_factory=list)
+    kept: list[str] = field(default_factory=list)  # names of the files that had been there before
+    # names of the files that cannot be read, with the reason
     failures: dict[str, str] = field(default_factory=dict)
 
     def summary(self) -> str:
@@ -51,10 +47,8 @@ def convert_images(
     """Fill a folder with the photographs of another one, all in formats that COLMAP reads.
 
     Pages of a file become a file each, ``scan.tif-page2.png``. EXIF, its orientation too, stays.
-    What is there already is not made again.
-
-    Raises:
-        ImageError: when there are no photographs, or the new folder is inside the old one.
+    What is there already is not made again. Raises ImageError when there are no photographs, or
+    the new folder is inside the old one.
     """
     if image_path.is_file():
         raise ImageError(f"{image_path}: is a file; give the folder that it is in")
@@ -80,25 +74,21 @@ def convert_images(
 def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> None:
     """Convert or copy one file."""
     suffix = PurePosixPath(name).suffix.lower()
-    is_read = suffix in IMAGE_SUFFIXES and not foreign_format(path)
     numbers = pages(path) if suffix in TIFF_SUFFIXES else [0]
+    as_it_is = suffix in IMAGE_SUFFIXES and not foreign_format(path) and numbers == [0]
+    made = [_page_name(name, k, len(numbers)) for k in range(1, len(numbers) + 1)]
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    if is_read and numbers == [0]:
-        if (folder / name).exists():
-            report.kept.append(name)
-            return
+    if all((folder / target).exists() for target in ([name] if as_it_is else made)):
+        report.kept.append(name)
+    elif as_it_is:
         shutil.copy2(path, folder / name)
         report.copied.append(name)
-        return
-    made = [_page_name(name, k, len(numbers)) for k in range(1, len(numbers) + 1)]
-    if all((folder / target).exists() for target in made):
-        report.kept.append(name)
-        return
-    with _opened(path) as image:
-        for target, page in zip(made, numbers, strict=True):
-            image.seek(page)
-            replace_bytes(folder / target, _png(image, path))
-    report.written[name] = made
+    else:
+        with _opened(path) as image:
+            for target, page in zip(made, numbers, strict=True):
+                image.seek(page)
+                replace_bytes(folder / target, _png(image, path))
+        report.written[name] = made
 
 
 def _page_name(name: str, page: int, num_pages: int) -> str:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.data import Mask
+from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.images.reading import decode
 
 
@@ -23,7 +23,7 @@ def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:
     return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0)
 
 
-def mask_values(mask: Mask) -> NDArray[np.uint8]:
+def mask_values(mask: Mask) -> Bytes:
     """Return an (H, W) mask as uint8, 255 inside and 0 outside."""
     return mask.astype(np.uint8) * 255
 

@@ -14,10 +14,10 @@ from functools import cache
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.features.base import NetworkContext, NetworkOptions
+from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.options import Registry
 from colmap_affrect.parallel.executor import unless_gpu_is_full
 
@@ -45,50 +45,35 @@ class MatcherOptions(NetworkOptions):
 
 @dataclass(frozen=True)
 class MatcherContext(NetworkContext):
-    """What a matcher works with.
+    """What a matcher works with."""
 
-    Attributes:
-        device: as given, also ``auto``.
-        num_similarities: about how many pairs of features there will be to compare in all.
-    """
-
-    device: str = "auto"
-    num_similarities: float = 0
+    device: str = "auto"  # as given, also ``auto``
+    num_similarities: float = 0  # about how many pairs of features there will be to compare in all
 
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """What a matcher is given of an image.
+    """What a matcher is given of an image."""
 
-    Attributes:
-        features: frames, scores (``responses``), descriptors and the warps they come from.
-        image_size: (width, height) of the stored image in px.
-        extractor: name of the feature extractor.
-    """
-
+    # frames, scores (``responses``), descriptors and the warps they come from
     features: LocalFeatures
-    image_size: tuple[int, int]
-    extractor: str
+    image_size: tuple[int, int]  # (width, height) of the stored image in px
+    extractor: str  # name of the feature extractor
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Matches of two images before geometric verification.
+    """Matches of two images before geometric verification."""
 
-    Attributes:
-        indices: (M, 2) int64 features of image 1 and 2, strictly rising in column 0.
-        scores: (M,) float32 in [0, 1], larger is better.
-    """
-
-    indices: NDArray[np.int64]
-    scores: NDArray[np.float32]
+    indices: Indices  # (M, 2) int64 features of image 1 and 2, strictly rising in column 0
+    scores: Singles  # (M,) float32 in [0, 1], larger is better
 
 
 ROUNDING = np.float32(1e-6)
 """Similarities closer to 1 than this are equal: two copies of a descriptor have ratio 1."""
 
 
-def distance_ratios(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+def distance_ratios(first: Singles, second: Singles) -> Singles:
     """Return the ratios of distances of unit vectors with these similarities."""
     distances = (np.maximum(1.0 - similarity, ROUNDING) for similarity in (first, second))
     return np.asarray(np.sqrt(np.divide(*distances)))

@@ -17,17 +17,14 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles
 from colmap_affrect.geometry.epipolar import common_sign, epipolar_lines
 from colmap_affrect.geometry.pair_models import EpipolarModel, HomographyModel, PairModel
 from colmap_affrect.geometry.shapes import vary_singly
 from colmap_affrect.matchers.base import distance_ratios
 from colmap_affrect.options import Options, within
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 GROUP_ROWS = 48
 """Features of image 1 that are compared at once: more take longer in products, fewer in Python."""
@@ -68,16 +65,11 @@ class GuidedOptions(Options):
 
 @dataclass(frozen=True)
 class GuidableImage:
-    """The features of an image.
+    """The features of an image."""
 
-    Attributes:
-        descriptors: (N, D) float32 rows of unit length.
-        points: (N, 2) px in which the geometry of the pair holds; rows with NaN match nothing.
-        shapes: (N, 2, 2) linear parts of the frames, up to a factor; None without frames.
-    """
-
-    descriptors: NDArray[np.float32]
-    points: Array
+    descriptors: Singles  # (N, D) float32 rows of unit length
+    points: Array  # (N, 2) px in which the geometry of the pair holds; rows with NaN match nothing
+    # (N, 2, 2) linear parts of the frames, up to a factor; None without frames
     shapes: Array | None = None
 
     @property
@@ -102,7 +94,7 @@ class Guide(Protocol):
     def groups(self) -> Iterator[tuple[Indices, Indices]]:
         """Yield features of image 1, each once, and all of image 2 that any of these may match."""
 
-    def allowed(self, rows: Indices, columns: Indices) -> NDArray[np.bool_]:
+    def allowed(self, rows: Indices, columns: Indices) -> Bools:
         """Tell which of (R,) and (C,) features may match, (R, C)."""
 
 
@@ -161,7 +153,7 @@ class EpipolarGuide:
             near = [pencil.near(span, reach, self._band) for pencil in classes]
             yield rows, np.concatenate([np.zeros(0, np.int64), *near])
 
-    def allowed(self, rows: Indices, columns: Indices) -> NDArray[np.bool_]:
+    def allowed(self, rows: Indices, columns: Indices) -> Bools:
         """See :class:`Guide`."""
         residuals = self._lines2[rows] @ self._homogeneous2[columns].T
         squares = self._squares2[rows, None] + self._squares1[columns]
@@ -196,24 +188,18 @@ class HomographyGuide:
             part = slice(*np.searchsorted(y, [lowest[1], np.nextafter(highest[1], np.inf)]))
             yield rows, order2[part][(x[part] >= lowest[0]) & (x[part] <= highest[0])]
 
-    def allowed(self, rows: Indices, columns: Indices) -> NDArray[np.bool_]:
+    def allowed(self, rows: Indices, columns: Indices) -> Bools:
         """See :class:`Guide`."""
         return _within(self._places[rows], self._points2[columns], self._radius)
 
 
 @dataclass(frozen=True)
 class _Pencil:
-    """Features of image 2 of similar reach, by rising angles of their epipolar lines.
+    """Features of image 2 of similar reach, by rising angles of their epipolar lines."""
 
-    Attributes:
-        angles: (3 N,), those of a turn before and of one after included.
-        indices: (N,) features.
-        reach: the largest of both reaches.
-    """
-
-    angles: Array
-    indices: Indices
-    reach: tuple[float, float]
+    angles: Array  # (3 N,), those of a turn before and of one after included
+    indices: Indices  # (N,) features
+    reach: tuple[float, float]  # the largest of both reaches
 
     @classmethod
     def of(cls, indices: Indices, guide: EpipolarGuide) -> _Pencil:
@@ -247,14 +233,14 @@ def _sorted_within(sizes: Array, values: Array) -> tuple[Indices, Indices]:
     return usable[order], np.flatnonzero(np.diff(classes[order])) + 1
 
 
-def _chunks(order: Indices, edges: NDArray[np.int64]) -> Iterator[Indices]:
+def _chunks(order: Indices, edges: Indices) -> Iterator[Indices]:
     """Cut a sequence into groups that do not reach over the edges."""
     for part in np.split(order, edges):
         for begin in range(0, len(part), GROUP_ROWS):
             yield part[begin : begin + GROUP_ROWS]
 
 
-def _within(points1: Array, points2: Array, radius: float) -> NDArray[np.bool_]:
+def _within(points1: Array, points2: Array, radius: float) -> Bools:
     """Tell which of (R, 2) and (C, 2) points are at most ``radius`` apart, (R, C)."""
     x, y = (points1[:, axis, None] - points2[:, axis] for axis in (0, 1))
     return np.asarray(x**2 + y**2 <= radius**2)

@@ -25,6 +25,7 @@ from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import OptionError, WeightsError
 from colmap_affrect.features.weights import load_state_dict
 from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.geometry.arrays import Array, Indices, Singles
 from colmap_affrect.geometry.neighbors import without_duplicates
 from colmap_affrect.matchers.base import (
     ImageFeatures,
@@ -46,8 +47,7 @@ MIN_VIEW_FEATURES = 8
 TRAINING_SIZE_PX = 1024
 """Longer side of the images of training, whose pixels scales of features are in."""
 
-KORNIA_SIGMAS = 12.0
-"""Radius of kornia's frames of DoG features, in units of sigma."""
+KORNIA_SIGMAS = 12.0  # radius of kornia's frames of DoG features, in units of sigma
 
 CHUNK_ROWS = 1 << 10
 """Features of an image whose similarities are held at once, which bounds memory."""
@@ -62,19 +62,12 @@ TrainedFor = Literal[
 
 @dataclass(frozen=True)
 class Training:
-    """What weights were trained for.
+    """What weights were trained for."""
 
-    Attributes:
-        weights: key of the file.
-        kornia: name of the configuration in kornia.
-        extractor: whose features they take.
-        has_circles: whether frames are circles of one radius in the view, upright.
-    """
-
-    weights: str
-    kornia: str
-    extractor: str
-    has_circles: bool = True
+    weights: str  # key of the file
+    kornia: str  # name of the configuration in kornia
+    extractor: str  # whose features they take
+    has_circles: bool = True  # whether frames are circles of one radius in the view, upright
 
 
 TRAININGS: dict[str, Training] = {
@@ -128,15 +121,10 @@ class LightGlueOptions(MatcherOptions):
 
 @dataclass(frozen=True)
 class PreparedView:
-    """One view of an image as the network takes it.
+    """One view of an image as the network takes it."""
 
-    Attributes:
-        rows: (N,) of the image's features.
-        inputs: the network's, a batch of one, on its device.
-    """
-
-    rows: NDArray[np.int64]
-    inputs: dict[str, Tensor]
+    rows: Indices  # (N,) of the image's features
+    inputs: dict[str, Tensor]  # the network's, a batch of one, on its device
 
 
 @dataclass(frozen=True)
@@ -144,7 +132,7 @@ class PreparedViews:
     """All views of an image that have features enough, and (N, 2) centres of all features, px."""
 
     views: tuple[PreparedView, ...]
-    keypoints: NDArray[np.float64]
+    keypoints: Array
 
     @property
     def nbytes(self) -> int:
@@ -193,7 +181,7 @@ class LightGlue:
         return PreparedViews(tuple(views), features.keypoints)
 
     def _view(
-        self, features: LocalFeatures, rows: NDArray[np.int64], image_size: tuple[int, int]
+        self, features: LocalFeatures, rows: Indices, image_size: tuple[int, int]
     ) -> PreparedView:
         import torch
 
@@ -237,7 +225,7 @@ class LightGlue:
 
     def _run(
         self, network: torch.nn.Module, pair: dict[str, dict[str, Tensor]], device: torch.device
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    ) -> tuple[Indices, Indices, Singles]:
         import torch
 
         on_gpu = device.type != "cpu"
@@ -305,9 +293,7 @@ def renamed(name: str) -> str:
     return re.sub(r"^(self_attn|cross_attn)\.(\d+)\.", r"transformers.\2.\1.", name)
 
 
-def frames_of_view(
-    lafs: NDArray[np.float64], *, has_circles: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def frames_of_view(lafs: Array, *, has_circles: bool) -> tuple[Array, Array]:
     """Undo the warp of a view, whose frames were carried back into the image.
 
     Circles became the map of the warp. Other frames have a common shape, which tells the map up to
@@ -330,7 +316,7 @@ def frames_of_view(
 
 
 def network_inputs(
-    lafs: NDArray[np.float64], size: NDArray[np.float64], longer_side_px: int, kornia: str
+    lafs: Array, size: Array, longer_side_px: int, kornia: str
 ) -> dict[str, NDArray[np.floating[Any]]]:
     """Return what the network reads of (N, 2, 3) frames in a view of (width, height).
 
@@ -381,9 +367,7 @@ def promising(
     return [(first[i], second[j]) for i, j in zip(*np.divmod(chosen, len(second)), strict=True)]
 
 
-def united(
-    parts: list[Matches], keypoints1: NDArray[np.float64], keypoints2: NDArray[np.float64]
-) -> Matches:
+def united(parts: list[Matches], keypoints1: Array, keypoints2: Array) -> Matches:
     """Unite matches of several pairs of views: one-to-one, and each place once, the best first."""
     if not sum(len(part.scores) for part in parts):
         return NO_MATCHES

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.errors import PairListError
+from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.project.atomic_files import replace_lines
 
@@ -77,8 +78,8 @@ def most_similar_pairs(
 
 
 def _candidates(
-    index: int, row: NDArray[np.float32], max_num: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:
+    index: int, row: Singles, max_num: int
+) -> tuple[Indices, Indices, Singles, Indices]:
     """Return the smaller and larger indices, similarities and ranks of an image's best pairs."""
     order = np.argsort(-row, kind="stable")
     others = order[order != index][:max_num]

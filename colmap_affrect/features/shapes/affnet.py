@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, grid_origin, resized_from_original
@@ -25,6 +24,7 @@ from colmap_affrect.data import GrayImage, Mask, ShapeGrid, ShapeSamples
 from colmap_affrect.features.base import PATCH_SIZE_PX, FeatureOptions, NetworkContext, ShapeOptions
 from colmap_affrect.features.sift import DogOptions, detect_dog
 from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.geometry.shapes import (
     STEP_PX,
     log_metrics,
@@ -52,11 +52,8 @@ PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX
 CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9
 """Cell i depends on the rows 4 i - 11...4 i + 39: on those of the cells i - 3...i + 9."""
 
-STRIP_CELLS = 64
-"""Rows of cells that are computed at once, to bound the memory."""
-
-WINDOW_PX = 33
-"""Surroundings whose mean and deviation normalise a pixel."""
+STRIP_CELLS = 64  # rows of cells that are computed at once, to bound the memory
+WINDOW_PX = 33  # surroundings whose mean and deviation normalise a pixel
 
 DEVIATION_FLOOR = 0.01 * 255
 """Added to the deviation of the surroundings, gray values: blank ones stay blank."""
@@ -67,8 +64,7 @@ MAX_NORMALISED = 6.0
 PATCH_SIGMAS = 12.0
 """Half width of the patch of a keypoint in units of its sigma (kornia-moons, the paper)."""
 
-BATCH_SIZE = 256
-"""Patches that go through the network at once."""
+BATCH_SIZE = 256  # patches that go through the network at once
 
 
 class AffNetOptions(ShapeOptions):
@@ -152,7 +148,7 @@ class AffNet:
         valid = np.isfinite(shapes).all(axis=(1, 2)) & (determinants(shapes) > 0)
         return ShapeSamples(keypoints.keypoints[valid], rectifying_metrics(shapes[valid]))
 
-    def _mean_logs(self, image: GrayImage) -> NDArray[np.float32]:
+    def _mean_logs(self, image: GrayImage) -> Singles:
         """Return (R, C, 2) logarithms of metrics, the mean over all sizes of the image."""
         size = image.shape[::-1]
         resized = [shrink_to(image, round(max(size) * scale)) for scale in self.options.scales]
@@ -166,7 +162,7 @@ class AffNet:
             mean += _read_grid(logs, level_from_image, mean.shape[:2]) / len(levels)
         return mean
 
-    def _paper_logs(self, image: GrayImage) -> NDArray[np.float32]:
+    def _paper_logs(self, image: GrayImage) -> Singles:
         """Return (R, C, 2) logarithms of metrics as in the paper, border cells replicated."""
         values = image.astype(np.float32)
         normalised = (values - values.mean()) / (values.std() + 1e-6)
@@ -178,7 +174,7 @@ class AffNet:
         widths = ((PAPER_LEAD_CELLS, below), (PAPER_LEAD_CELLS, right), (0, 0))
         return np.pad(logs, widths, mode="edge")
 
-    def _dense_logs(self, normalised: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _dense_logs(self, normalised: Singles) -> Singles:
         """Return (R, C, 2) logarithms of the metrics that the network sees in a float image.
 
         Computed in strips of ``STRIP_CELLS`` rows of cells, with as many rows around as
@@ -199,7 +195,7 @@ class AffNet:
             strips.append(log_metrics(metrics))
         return np.concatenate(strips)
 
-    def _patch_outputs(self, image: GrayImage, lafs: NDArray[np.float64]) -> torch.Tensor:
+    def _patch_outputs(self, image: GrayImage, lafs: Array) -> torch.Tensor:
         """Return the (N, 3) outputs of the network on the patches of (N, 2, 3) frames."""
         import torch
 
@@ -235,7 +231,7 @@ def fully_convolutional(network: LAFAffNetShapeEstimator) -> nn.Sequential:
     return convert_conv2d_weight_memory_format(sequence, torch.channels_last)
 
 
-def _frames(outputs: torch.Tensor) -> NDArray[np.float64]:
+def _frames(outputs: torch.Tensor) -> Array:
     """Return (..., 2, 2) frames L = [[1 + o0, 0], [o1, 1 + o2]] of (..., 3) outputs."""
     values = outputs.cpu().numpy().astype(np.float64)
     frames = np.zeros((*values.shape[:-1], 2, 2))
@@ -245,7 +241,7 @@ def _frames(outputs: torch.Tensor) -> NDArray[np.float64]:
     return frames
 
 
-def _mean_and_deviation(image: GrayImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _mean_and_deviation(image: GrayImage) -> tuple[Array, Array]:
     """Return (H, W) mean and standard deviation of the window round each pixel."""
     window, border = (WINDOW_PX, WINDOW_PX), cv2.BORDER_REFLECT_101
     mean = np.asarray(cv2.boxFilter(image, cv2.CV_64F, window, borderType=border), np.float64)
@@ -253,13 +249,13 @@ def _mean_and_deviation(image: GrayImage) -> tuple[NDArray[np.float64], NDArray[
     return mean, np.sqrt(np.maximum(mean_square - mean**2, 0.0))
 
 
-def _locally_normalised(image: GrayImage) -> NDArray[np.float32]:
+def _locally_normalised(image: GrayImage) -> Singles:
     mean, deviation = _mean_and_deviation(image)
     normalised = (image - mean) / (deviation + DEVIATION_FLOOR)
     return np.clip(normalised, -MAX_NORMALISED, MAX_NORMALISED).astype(np.float32)
 
 
-def _with_reflected_border(values: NDArray[np.floating]) -> NDArray[np.floating]:
+def _with_reflected_border(values: Floats) -> Floats:
     """Add a border so that the cells of the network are the 4 x 4 blocks of the image."""
     bottom, right = (LEAD_PX + -length % STEP_PX for length in values.shape)
     return np.asarray(
@@ -274,9 +270,7 @@ def _textured(image: GrayImage, min_deviation: float) -> Mask:
     return np.asarray(deviation[middle:-LEAD_PX:STEP_PX, middle:-LEAD_PX:STEP_PX] > min_deviation)
 
 
-def _read_grid(
-    values: NDArray[np.float32], level_from_image: NDArray[np.float64], cells: tuple[int, int]
-) -> NDArray[np.float32]:
+def _read_grid(values: Singles, level_from_image: Array, cells: tuple[int, int]) -> Singles:
     """Interpolate a grid of a resized image bilinearly at the (R, C) cells of the image's own.
 
     ``values`` are (r, c, D) at the blocks of the resized image, the map (3, 3) of pixel-centre

@@ -10,12 +10,12 @@ from typing import Annotated, ClassVar, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from colmap_affrect.conventions import grid_origin
 from colmap_affrect.data import GrayImage, ShapeGrid, ShapeSamples
 from colmap_affrect.features.base import FeatureOptions, NetworkContext, ShapeOptions
+from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.geometry.shapes import STEP_PX, log_metrics, metrics_from_log
 from colmap_affrect.options import within
 
@@ -72,11 +72,11 @@ class SecondMoment:
         return self.grid(image).samples()
 
 
-def _smooth(tensor: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+def _smooth(tensor: Singles, sigma_px: float) -> Singles:
     return np.asarray(cv2.GaussianBlur(tensor, (0, 0), sigma_px / STEP_PX), dtype=np.float32)
 
 
-def _block_tensor(image: GrayImage, derivative_sigma_px: float) -> NDArray[np.float32]:
+def _block_tensor(image: GrayImage, derivative_sigma_px: float) -> Singles:
     """Return (R, C, 3) block means of (Ix^2, Iy^2, Ix Iy); gradients in gray values per px."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), derivative_sigma_px)
     right = cv2.copyMakeBorder(smooth, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)
