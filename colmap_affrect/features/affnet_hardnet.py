@@ -21,6 +21,7 @@ from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.features.sift import DogOptions, detect_dog, is_searchable
 from colmap_affrect.geometry.affine import determinants, lafs_from_keypoints, rotation
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Singles
+from colmap_affrect.geometry.shapes import frames_from_affnet
 from colmap_affrect.options import within
 
 if TYPE_CHECKING:
@@ -92,8 +93,7 @@ class AffNetHardNet:
         )
 
         weights, device = network.weights, network.device
-        self.options = options
-        self.device = resolve_device(device)
+        self.options, self.device = options, resolve_device(device)
         self.affine_shapes = None
         if options.affine_shape:
             self.affine_shapes = AffineShapes(load_affnet(weights["affnet"], device))
@@ -212,18 +212,15 @@ class _Patches:
 
 
 def shapes_from_outputs(outputs: Floats) -> Array:
-    """Return (N, 2, 2) shapes of determinant 1 of (N, 3) outputs o of AffNet, lower triangular.
+    """Return (N, 2, 2) shapes of determinant 1 of (N, 3) outputs of AffNet, lower triangular.
 
-    They are [[1 + o0, 0], [o1, 1 + o2]] up to scale; not a number where that has no area.
+    They are not a number where the frame has no area.
 
     >>> shapes_from_outputs(np.array([[0.0, 3.0, 3.0]]))[0]
     array([[0.5, 0. ],
            [1.5, 2. ]])
     """
-    shapes = np.zeros((len(outputs), 2, 2))
-    shapes[:, 0, 0] = 1.0 + outputs[:, 0]
-    shapes[:, 1, 0] = outputs[:, 1]
-    shapes[:, 1, 1] = 1.0 + outputs[:, 2]
+    shapes = frames_from_affnet(outputs)
     areas = shapes[:, 0, 0] * shapes[:, 1, 1]
     return shapes / np.sqrt(np.where(areas > 0.0, areas, np.nan))[:, None, None]
 
@@ -266,8 +263,7 @@ def _centers_from_keynet(centers: Array, radii_px: Array) -> Array:
     """Correct the centres that kornia's multi-resolution detector reports.
 
     A pixel of a level f times coarser than the image is reported at f times its coordinates,
-    which holds for corner coordinates only: in pixel-centre ones (f - 1) / 2 is missing, up to
-    1.5 px on the coarsest level.
+    which holds for corner coordinates only: in pixel-centre ones (f - 1) / 2 is missing.
     """
     factors = radii_px / KEYNET_RADIUS_PX
     return centers + HALF_PIXEL * (factors - 1.0)[:, None]

@@ -39,16 +39,18 @@ def resolve_device(name: str) -> torch.device:
     if not re.fullmatch(r"cpu|cuda(:\d+)?|mps", name):
         raise DeviceError(f"--device {name}: not one of auto, cpu, cuda, cuda:0, mps")
     device = torch.device(name)
+    count = 1
     if device.type == "cuda":
         count = torch.cuda.device_count()
-        if not count:
-            raise DeviceError(
-                f"--device {name}: torch finds no CUDA device; use --device cpu or auto"
-            )
-        if (device.index or 0) >= count:
-            raise DeviceError(f"--device {name}: the last one is cuda:{count - 1}; use that")
-    if device.type == "mps" and not torch.backends.mps.is_available():
-        raise DeviceError(f"--device {name}: torch finds no MPS device; use --device cpu or auto")
+    elif device.type == "mps":
+        count = int(torch.backends.mps.is_available())
+    if not count:
+        kind = device.type.upper()
+        raise DeviceError(
+            f"--device {name}: torch finds no {kind} device; use --device cpu or auto"
+        )
+    if (device.index or 0) >= count:
+        raise DeviceError(f"--device {name}: the last one is cuda:{count - 1}; use that")
     return device
 
 
@@ -75,10 +77,7 @@ class AffineShapes(nn.Module):
         self.features = folded(affnet.features)
 
     def forward(self, patches: Tensor) -> Tensor:
-        """Return (B, 3) outputs o of (B, 1, 32, 32) patches.
-
-        The shape is [[1 + o0, 0], [o1, 1 + o2]] up to scale, image from patch.
-        """
+        """Return (B, 3) outputs of (B, 1, 32, 32) patches."""
         return cast(Tensor, self.features(standardized(patches))).flatten(1)
 
 
@@ -224,29 +223,25 @@ def _load(network: nn.Module, path: Path, name: str) -> None:
     _load_state(network, state, path, name)
 
 
-def _load_state(network: nn.Module, state: Mapping[str, Any], path: Path, name: str) -> None:
-    _require_same(state, network.state_dict(), path, name)
-    network.load_state_dict(state, strict=False)
-
-
 COUNTER = "num_batches_tracked"
 """Entry of batch normalisations that older files do not have and inference does not read."""
 
 
-def _require_same(
-    state: Mapping[str, Any], expected: Mapping[str, Tensor], path: Path, name: str
-) -> None:
-    given = {key: value for key, value in state.items() if not key.endswith(COUNTER)}
-    wanted = {key: value for key, value in expected.items() if not key.endswith(COUNTER)}
+def _load_state(network: nn.Module, state: Mapping[str, Any], path: Path, name: str) -> None:
+    given, wanted = (
+        {key: _kind(value) for key, value in values.items() if not key.endswith(COUNTER)}
+        for values in (state, network.state_dict())
+    )
     problems = [f"no {key}" for key in wanted if key not in given]
     problems += [f"unknown {key}" for key in given if key not in wanted]
     problems += [
-        f"{key} is {_kind(given[key])} instead of {_kind(value)}"
-        for key, value in wanted.items()
-        if key in given and _kind(given[key]) != _kind(value)
+        f"{key} is {given[key]} instead of {kind}"
+        for key, kind in wanted.items()
+        if given.get(key, kind) != kind
     ]
     if problems:
         raise WeightsError(f"{path}: not the weights of {name} ({such_as(problems, 1)})")
+    network.load_state_dict(state, strict=False)
 
 
 def _kind(value: Any) -> str:

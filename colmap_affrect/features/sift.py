@@ -10,7 +10,7 @@ import numpy as np
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, View
-from colmap_affrect.features.base import FeatureOptions, NetworkContext
+from colmap_affrect.features.base import FeatureExtractor, FeatureOptions, NetworkContext
 from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Indices, Singles
 from colmap_affrect.options import within
@@ -38,7 +38,7 @@ class SiftOptions(DogOptions):
     of a large photograph, which counts 8192 before."""
 
 
-class RootSift:
+class RootSift(FeatureExtractor):
     """DoG keypoints with RootSIFT descriptors (Arandjelovic & Zisserman 2012)."""
 
     Options = SiftOptions
@@ -70,13 +70,6 @@ class RootSift:
         lafs = lafs_from_keypoints(rows[:, :2], MEASUREMENT_SIGMAS * rows[:, 2], rows[:, 3])
         described = root_normalized(descriptors[order[best]].astype(np.float32))
         return LocalFeatures(lafs, responses[best], described)
-
-    def describe(
-        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
-    ) -> list[LocalFeatures]:
-        """Return the features as they are: :meth:`detect` has described them."""
-        del images
-        return list(detected)
 
 
 def root_normalized(descriptors: Floats) -> Singles:
@@ -112,8 +105,8 @@ def is_searchable(image: GrayImage | ColorImage, mask: Bytes | None) -> bool:
 def by_falling_response(keypoints: Sequence[cv2.KeyPoint]) -> tuple[Indices, Array, Singles]:
     """Sort keypoints by falling response; those of equal response keep their order.
 
-    Returns the (N,) index of the sorted keypoints in the given ones; their (N, 4) x, y in
-    pixel-centre px, sigma in px and angle in radians (from x towards y); their (N,) responses.
+    Returns their (N,) indices, (N, 4) x, y in pixel-centre px, sigma in px and angle in radians
+    (from x towards y), and (N,) responses.
     """
     responses = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
     order = np.argsort(-responses, kind="stable")
@@ -125,9 +118,9 @@ def by_falling_response(keypoints: Sequence[cv2.KeyPoint]) -> tuple[Indices, Arr
 def detect_dog(image: GrayImage, options: DogOptions, mask: Bytes | None = None) -> LocalFeatures:
     """Detect DoG keypoints for descriptors that assign orientations themselves.
 
-    OpenCV returns a location once for each of its dominant orientations, 15 to 18 % of them more
-    than once. With another orientation put in their place these would be equal features, which no
-    ratio test tells apart; so there is one keypoint per centre and scale.
+    OpenCV returns a location once for each of its dominant orientations. With another one put in
+    their place these would be equal features, which no ratio test tells apart; so there is one per
+    centre and scale.
 
     The (H, W) uint8 mask is 0 where none are wanted. Returns features by falling response, frames
     upright circles of 6 sigma, descriptors (N, 0); none for images under 8 px.

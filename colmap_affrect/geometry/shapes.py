@@ -25,6 +25,18 @@ SHAPE_STEP = 1e-4
 the orientations of all features of an image hardly coincide."""
 
 
+def frames_from_affnet(outputs: Floats) -> Array:
+    """Return (..., 2, 2) frames L = [[1 + o0, 0], [o1, 1 + o2]], up to scale, of (..., 3) outputs.
+
+    They map the patch that AffNet saw to the image.
+    """
+    frames = np.zeros((*outputs.shape[:-1], 2, 2))
+    frames[..., 0, 0] = 1.0 + outputs[..., 0]
+    frames[..., 1, 0] = outputs[..., 1]
+    frames[..., 1, 1] = 1.0 + outputs[..., 2]
+    return frames
+
+
 def of_unit_area(shapes: Floats) -> Array:
     """Divide (N, 2, 2) shapes by the roots of their areas."""
     areas = np.maximum(np.abs(determinants(shapes)), np.finfo(float).tiny)

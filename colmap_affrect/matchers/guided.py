@@ -23,6 +23,7 @@ from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles
 from colmap_affrect.geometry.epipolar import common_sign, epipolar_lines
 from colmap_affrect.geometry.pair_models import EpipolarModel, HomographyModel, PairModel
 from colmap_affrect.geometry.shapes import vary_singly
+from colmap_affrect.geometry.two_views import homogeneous
 from colmap_affrect.matchers.base import distance_ratios
 from colmap_affrect.options import Options, within
 
@@ -76,14 +77,10 @@ class GuidableImage:
     def has_directions(self) -> bool:
         """Whether frames can tell a direction.
 
-        Circles without orientation cannot, nor what warps made of them.
-
-        Similarities (COLMAP's SIFT) do: they turn directions as they turn themselves, which is
-        right up to what the change of viewpoint adds.
+        Circles without orientation cannot, nor what warps made of them. Similarities (COLMAP's
+        SIFT) do, up to what the change of viewpoint adds.
         """
-        if self.shapes is None or not len(self.shapes):
-            return False
-        return vary_singly(self.shapes)
+        return self.shapes is not None and len(self.shapes) > 0 and vary_singly(self.shapes)
 
 
 class Guide(Protocol):
@@ -113,7 +110,7 @@ class EpipolarGuide:
             unit.append((points - center) / size)
         matrix = to_pixels[1].T @ fundamental @ to_pixels[0]
         self._band = band_px / size
-        self._homogeneous2 = np.hstack([unit[1], np.ones((len(points2), 1))])
+        self._homogeneous2 = homogeneous(unit[1])
         lines1, self._lines2 = epipolar_lines(matrix, *unit)
         self._squares1 = (lines1[:, :2] ** 2).sum(axis=1)
         self._squares2 = (self._lines2[:, :2] ** 2).sum(axis=1)
@@ -127,8 +124,7 @@ class EpipolarGuide:
         (u1'x2, u2'x2).
         """
         u, s, vt = np.linalg.svd(matrix)
-        homogeneous1 = np.hstack([unit[0], np.ones((len(unit[0]), 1))])
-        along1 = homogeneous1 @ vt[:2].T * s[:2]
+        along1 = homogeneous(unit[0]) @ vt[:2].T * s[:2]
         along2 = self._homogeneous2 @ u[:, :2]
         tiny = np.finfo(float).tiny
         inverse1, inverse2 = (
@@ -267,21 +263,13 @@ def guided_matches(
     options: GuidedOptions,
     inliers: Indices,
 ) -> Indices:
-    """Return the inliers of a pair together with its guided matches, one to one.
+    """Return the (M, 2) inliers of a pair and its guided matches, one to one, as (K, 2).
 
-    Args:
-        first: image 1.
-        second: image 2.
-        guide: the geometry of the pair.
-        options: what counts as a match.
-        inliers: (M, 2) matches that the geometry was estimated from; they stay. Guided matches
-            that disagree with one of them are left out.
-
-    Returns:
-        (K, 2), by rising features of image 1; the inliers alone where their frames do not agree
-        with the geometry (:data:`MIN_AGREEING`); without inliers those of the guided matches must.
-        Frames are not asked where an image has none that could tell
-        (:attr:`GuidableImage.has_directions`); there nothing is found without inliers.
+    They rise by features of image 1. The inliers, which the geometry was estimated from, stay;
+    guided matches that disagree with one of them are left out, and all where the frames of the
+    inliers, or else of the guided matches, do not agree with the geometry (:data:`MIN_AGREEING`).
+    Frames are not asked where an image has none that could tell
+    (:attr:`GuidableImage.has_directions`); there nothing is found without inliers.
     """
     found = nearest_allowed(first, second, guide, options)
     if not (first.has_directions and second.has_directions):

@@ -27,6 +27,7 @@ from colmap_affrect.features.weights import load_state_dict
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Indices, Singles
 from colmap_affrect.geometry.neighbors import without_duplicates
+from colmap_affrect.geometry.shapes import of_unit_area
 from colmap_affrect.matchers.base import (
     ImageFeatures,
     MatcherContext,
@@ -65,22 +66,17 @@ class Training:
     """What weights were trained for."""
 
     weights: str  # key of the file
-    kornia: str  # name of the configuration in kornia
     extractor: str  # whose features they take
     has_circles: bool = True  # whether frames are circles of one radius in the view, upright
 
 
 TRAININGS: dict[str, Training] = {
-    "aliked": Training("lightglue-aliked", "aliked", "aliked"),
-    "disk": Training("lightglue-disk", "disk", "disk"),
-    "xfeat": Training("lighterglue-xfeat", "xfeat", "xfeat"),
-    "sift": Training("lightglue-sift", "sift", "rootsift", False),
-    "dog-affnet-hardnet": Training(
-        "lightglue-dog-affnet-hardnet", "dog_affnet_hardnet", "affnet-hardnet", False
-    ),
-    "keynet-affnet-hardnet": Training(
-        "lightglue-keynet-affnet-hardnet", "keynet_affnet_hardnet", "affnet-hardnet", False
-    ),
+    "aliked": Training("lightglue-aliked", "aliked"),
+    "disk": Training("lightglue-disk", "disk"),
+    "xfeat": Training("lighterglue-xfeat", "xfeat"),
+    "sift": Training("lightglue-sift", "rootsift", False),
+    "dog-affnet-hardnet": Training("lightglue-dog-affnet-hardnet", "affnet-hardnet", False),
+    "keynet-affnet-hardnet": Training("lightglue-keynet-affnet-hardnet", "affnet-hardnet", False),
 }
 
 
@@ -108,6 +104,11 @@ class LightGlueOptions(MatcherOptions):
     def weights(self) -> tuple[str, ...]:
         """Key of the file of weights."""
         return (TRAININGS[self.trained_for].weights,)
+
+    @property
+    def kornia(self) -> str:
+        """Name of the configuration in kornia."""
+        return self.trained_for.replace("-", "_")
 
     def require_extractor(self, extractor: str) -> None:
         """Refuse features that the weights were not trained for."""
@@ -188,7 +189,7 @@ class LightGlue:
         lafs, size = features.lafs, np.asarray(image_size, np.float64)
         if features.rectification_ids[0]:
             lafs, size = frames_of_view(lafs, has_circles=self.training.has_circles)
-        values = network_inputs(lafs, size, max(image_size), self.training.kornia)
+        values = network_inputs(lafs, size, max(image_size), self.options.kornia)
         values["descriptors"] = features.descriptors
         inputs = {
             name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
@@ -259,7 +260,7 @@ def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) 
     from kornia.feature import LightGlue as Network
 
     configuration = {
-        **Network.features[TRAININGS[options.trained_for].kornia],
+        **Network.features[options.kornia],
         "weights": None,
         "depth_confidence": options.depth_confidence,
         "width_confidence": options.width_confidence,
@@ -275,8 +276,7 @@ def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) 
             f"{path}: not the weights of LightGlue for {options.trained_for} (of another size)"
         ) from error
     parameters = dict(network.named_parameters())
-    missing = [name for name in found.missing_keys if name in parameters]
-    if missing:
+    if missing := [name for name in found.missing_keys if name in parameters]:
         raise WeightsError(
             f"{path}: not the weights of LightGlue for {options.trained_for} (no {missing[0]})"
         )
@@ -297,12 +297,10 @@ def frames_of_view(lafs: Array, *, has_circles: bool) -> tuple[Array, Array]:
     """Undo the warp of a view, whose frames were carried back into the image.
 
     Circles became the map of the warp. Other frames have a common shape, which tells the map up to
-    a rotation; the one without is taken. The view is as large as its features reach.
-
-    Returns:
-        (N, 2, 3) frames in px of the view, and its (width, height).
+    a rotation; the one without is taken. The view is as large as its features reach. Returns the
+    (N, 2, 3) frames in px of the view, and its (width, height).
     """
-    shapes = lafs[:, :, :2] / np.sqrt(determinants(lafs[:, :, :2]))[:, None, None]
+    shapes = of_unit_area(lafs[:, :, :2])
     if has_circles:
         linear = shapes.mean(axis=0)
     else:

@@ -238,13 +238,7 @@ def _is_hidden(
 
     That is where a rival of the best may be nearer than it, and has the runner-up for a rival, of
     which the best is none. What takes the place of the runner-up then may be far less similar.
-
-    Args:
-        best: (R,) nearest by coarse similarities.
-        runners_up: (R,) second neighbours by coarse similarities.
-        of_best: (E,) rows and columns of the rivals of the best, itself included.
-        is_close: (E,) those that may be nearer than the best.
-        rivals: of each column.
+    Rows and columns of the rivals of the best, itself included, are ``of_best``, (E,) each.
     """
     rows, columns = (indices[is_close] for indices in of_best)
     is_other = columns != best[rows]

@@ -4,8 +4,7 @@ AffNet (Mishkin, Radenovic, Matas 2018) reads the shape of a feature off a 32 x 
 the final pooling it is fully convolutional and gives a shape every 4 px: the paper's
 DenseAffNet (Sec. 3).
 
-The three outputs o of the network make the frame L = [[1 + o0, 0], [o1, 1 + o2]], image from
-patch, up to scale; shapes are the unit metrics of L^-1.
+The three outputs o of the network make a frame L; shapes are the unit metrics of L^-1.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.geometry.shapes import (
     STEP_PX,
+    frames_from_affnet,
     log_metrics,
     metrics_from_log,
     rectifying_metrics,
@@ -118,14 +118,10 @@ class AffNet:
     def grid(self, image: GrayImage) -> ShapeGrid:
         """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
 
-        By default pixels are normalised by mean and deviation of the 33 x 33 px around them,
-        the border is reflected, and the shapes of several sizes of the image are combined by
-        their log-Euclidean mean. Blocks whose surroundings deviate by less than
-        ``min_deviation`` are not textured and get the identity.
-
-        With ``paper``, the image is normalised as a whole, the network sees the full size
-        without padding (the shorter side must have 32 px), and blocks near the border get the
-        shape of the nearest one that has a patch inside. All blocks are textured.
+        By default the border is reflected, and blocks whose surroundings deviate by less than
+        ``min_deviation`` are not textured and get the identity. With ``paper`` the network sees
+        the image without padding (the shorter side must have 32 px), and blocks near the border
+        get the shape of the nearest one that has a patch inside. All blocks are textured.
         """
         if self.options.paper:
             logs = self._paper_logs(image)
@@ -175,11 +171,7 @@ class AffNet:
         return np.pad(logs, widths, mode="edge")
 
     def _dense_logs(self, normalised: Singles) -> Singles:
-        """Return (R, C, 2) logarithms of the metrics that the network sees in a float image.
-
-        Computed in strips of ``STRIP_CELLS`` rows of cells, with as many rows around as
-        these depend on.
-        """
+        """Return (R, C, 2) logarithms of the metrics that the network sees in a float image."""
         import torch
 
         image = torch.from_numpy(normalised)[None, None]
@@ -232,13 +224,8 @@ def fully_convolutional(network: LAFAffNetShapeEstimator) -> nn.Sequential:
 
 
 def _frames(outputs: torch.Tensor) -> Array:
-    """Return (..., 2, 2) frames L = [[1 + o0, 0], [o1, 1 + o2]] of (..., 3) outputs."""
-    values = outputs.cpu().numpy().astype(np.float64)
-    frames = np.zeros((*values.shape[:-1], 2, 2))
-    frames[..., 0, 0] = 1.0 + values[..., 0]
-    frames[..., 1, 0] = values[..., 1]
-    frames[..., 1, 1] = 1.0 + values[..., 2]
-    return frames
+    """Return (..., 2, 2) frames L of (..., 3) outputs."""
+    return frames_from_affnet(outputs.cpu().numpy().astype(np.float64))
 
 
 def _mean_and_deviation(image: GrayImage) -> tuple[Array, Array]:

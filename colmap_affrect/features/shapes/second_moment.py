@@ -53,9 +53,7 @@ class SecondMoment:
     def grid(self, image: GrayImage) -> ShapeGrid:
         """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
 
-        The tensor is averaged over blocks, then over each integration scale; the scales are
-        combined by the log-Euclidean mean of the unit metrics. Blocks whose gradients stay
-        under ``min_gradient`` are not textured and get the identity.
+        Blocks whose gradients stay under ``min_gradient`` are not textured and get the identity.
         """
         tensor = _block_tensor(image, self.options.derivative_sigma_px)
         sigmas_px = self.options.integration_sigmas_px
@@ -79,9 +77,9 @@ def _smooth(tensor: Singles, sigma_px: float) -> Singles:
 def _block_tensor(image: GrayImage, derivative_sigma_px: float) -> Singles:
     """Return (R, C, 3) block means of (Ix^2, Iy^2, Ix Iy); gradients in gray values per px."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), derivative_sigma_px)
-    right = cv2.copyMakeBorder(smooth, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)
-    gradient_x = (right[1:-1, 2:] - right[1:-1, :-2]) / 2
-    gradient_y = (right[2:, 1:-1] - right[:-2, 1:-1]) / 2
+    gradient_x, gradient_y = (  # central differences
+        cv2.Sobel(smooth, cv2.CV_32F, dx, dy, ksize=1, scale=0.5) for dx, dy in ((1, 0), (0, 1))
+    )
     products = np.dstack([gradient_x**2, gradient_y**2, gradient_x * gradient_y])
     height, width = image.shape
     bottom, side = -height % STEP_PX, -width % STEP_PX
