@@ -281,7 +281,6 @@ def export_h5(options: argparse.Namespace) -> int:
 
 def export_database(options: argparse.Namespace) -> int:
     from colmap_affrect.colmap.old_databases import MAPPER_OPTIONS, export_database
-    from colmap_affrect.project.workspace import Workspace
 
     path = Workspace(options.path).database if options.path.is_dir() else options.path
     notes = export_database(path, options.database_path)

@@ -79,11 +79,7 @@ class AffNetHardNet:
     descriptor_size = 128
 
     def __init__(self, options: AffNetHardNetOptions, network: NetworkContext) -> None:
-        """Load the networks.
-
-        Raises WeightsError when a file is damaged or belongs to another network, DeviceError when
-        the device is not there.
-        """
+        """Load the networks; WeightsError and DeviceError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import (
             AffineShapes,
             load_affnet,
@@ -226,10 +222,8 @@ def shapes_from_outputs(outputs: Floats) -> Array:
 
 
 def _is_sound(shapes: Array) -> Bools:
-    """Tell which of (N, 2, 2) shapes of determinant 1 are finite and of a tilt up to MAX_TILT.
-
-    The squared Frobenius norm of a shape of tilt t is t + 1 / t.
-    """
+    """Tell which (N, 2, 2) shapes of determinant 1 are finite and of a tilt up to MAX_TILT."""
+    # The squared Frobenius norm of a shape of tilt t is t + 1 / t.
     return np.asarray((shapes**2).sum(axis=(1, 2)) <= MAX_TILT + 1.0 / MAX_TILT)
 
 

@@ -101,10 +101,7 @@ def load_keynet(path: Path, device: str) -> feature.KeyNet:
 
 
 def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
-    """Build a descriptor by its name in the options.
-
-    From (B, 1, 32, 32) patches in [0, 1] to (B, 128) rows, not of all networks of unit length.
-    """
+    """Build what makes (B, 128) rows of any length of (B, 1, 32, 32) patches in [0, 1]."""
     if name == "mkd":
         return _ready(_load_mkd(path), device)
     network: nn.Module = DESCRIPTOR_NETWORKS[name]()
@@ -172,19 +169,13 @@ DESCRIPTOR_NETWORKS: dict[str, Any] = {
 
 
 def standardized(patches: Tensor) -> Tensor:
-    """Subtract the mean of each of (B, 1, H, W) patches and divide by its standard deviation.
-
-    Flat patches become zero. (1e-6 is what AffNet and OriNet in kornia add to the deviation.)
-    """
+    """Subtract the mean of each of (B, 1, H, W) patches and divide by its deviation, if any."""
     deviations, means = torch.std_mean(patches, dim=(1, 2, 3), keepdim=True)
-    return (patches - means) / (deviations + 1e-6)
+    return (patches - means) / (deviations + 1e-6)  # as AffNet and OriNet in kornia
 
 
 def folded(layers: nn.Sequential) -> nn.Sequential:
-    """Return layers for inference only: batch normalisations become part of the convolutions.
-
-    Twice as fast on a CPU (0.25 instead of 0.5 ms for AffNet and a patch, 1 thread).
-    """
+    """Fold batch normalisations into convolutions, for inference; twice as fast on a CPU."""
     kept: list[nn.Module] = []
     for layer in layers.eval():
         if isinstance(layer, nn.BatchNorm2d):
@@ -197,10 +188,7 @@ def folded(layers: nn.Sequential) -> nn.Sequential:
 
 
 def _load_mkd(path: Path) -> nn.Module:
-    """Build MKD (Mukundan et al. 2019): kernels and the whitening learned on Liberty.
-
-    Whitening by attenuated PCA (``pcawt``), kornia's default.
-    """
+    """Build MKD (Mukundan et al. 2019) with its whitening by attenuated PCA, learned on Liberty."""
     kernels = feature.MKDDescriptor(PATCH_SIZE_PX, whitening=None)  # type: ignore[arg-type]
     width = kernels.odims
     try:

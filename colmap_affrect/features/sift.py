@@ -82,10 +82,7 @@ MIN_IMAGE_SIZE_PX = 8  # OpenCV's scale space needs this much of the shorter sid
 
 
 def make_sift(options: DogOptions) -> cv2.SIFT:
-    """Build OpenCV's detector and descriptor.
-
-    ``enable_precise_upscale`` removes OpenCV's bias of +0.25 px in x and y.
-    """
+    """Build OpenCV's SIFT; ``enable_precise_upscale`` removes its bias of +0.25 px in x and y."""
     return cv2.SIFT.create(
         nfeatures=0,
         nOctaveLayers=options.num_octave_layers,

@@ -280,10 +280,7 @@ UNREADABLE = (
 
 
 def cache_folder() -> Path:
-    """Return the folder where torch keeps downloaded weights, without loading torch for that.
-
-    As ``torch.hub.get_dir`` says, but for a folder set within the process.
-    """
+    """Return torch's folder of weights (``torch.hub.get_dir``) without loading torch."""
     home = os.environ.get("TORCH_HOME")
     if home is None:
         home = str(Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch")

@@ -119,10 +119,7 @@ def _softened(table: Array) -> Array:
 
 
 def evidence_for_one(ballots: Sequence[Ballot]) -> float:
-    """Return the logarithm of the evidence if all cameras of the ballots are one.
-
-    To be compared with that of :func:`count`.
-    """
+    """Return the log-evidence, as of :func:`count`, if all cameras of the ballots are one."""
     focals = _candidates(ballots)
     same = [
         Ballot((0, 0), item.evidence if item.evidence.ndim == 1 else np.diagonal(item.evidence))

@@ -207,10 +207,7 @@ def fronto_parallel_homography(normal: Floats, camera_matrix: Floats) -> Array:
 
 
 def viewing_cosines(normal: Floats, camera_matrix: Floats, size: tuple[int, int]) -> Array:
-    """Return the cosines (h, w) between a plane's normal and the rays of an image of (w, h) px.
-
-    They are 1 where the plane is seen from the front, 0 along it, negative from behind.
-    """
+    """Return (h, w) cosines of rays against a plane's normal: 1 from the front, < 0 from behind."""
     width, height = size
     ray_from_pixel = np.linalg.inv(camera_matrix)
     columns, rows = np.arange(width), np.arange(height)[:, None]

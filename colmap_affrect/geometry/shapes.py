@@ -26,10 +26,7 @@ the orientations of all features of an image hardly coincide."""
 
 
 def frames_from_affnet(outputs: Floats) -> Array:
-    """Return (..., 2, 2) frames L = [[1 + o0, 0], [o1, 1 + o2]], up to scale, of (..., 3) outputs.
-
-    They map the patch that AffNet saw to the image.
-    """
+    """Return (..., 2, 2) frames, image from patch up to scale, of (..., 3) outputs of AffNet."""
     frames = np.zeros((*outputs.shape[:-1], 2, 2))
     frames[..., 0, 0] = 1.0 + outputs[..., 0]
     frames[..., 1, 0] = outputs[..., 1]

@@ -24,10 +24,7 @@ AGREEING_SHARES = np.linspace(0.0, 1.0, 51)[:-1]
 
 
 def shuffled(num: int) -> tuple[Indices, Indices]:
-    """Return two lists of indices below ``num`` that never agree: matches paired anew.
-
-    By cyclic shifts spread over all there are, so that it is the same every time.
-    """
+    """Pair matches anew: two lists of indices below ``num`` that never agree, by cyclic shifts."""
     num_shifts = min(num - 1, max(1, NUM_SHUFFLED // max(num, 1)))
     shifts = np.linspace(1, num - 1, num_shifts).astype(np.int64)
     first = np.tile(np.arange(num), len(shifts))

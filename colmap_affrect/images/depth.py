@@ -166,10 +166,7 @@ class DepthFiles:
             )
 
     def depth(self, photograph: Photograph) -> Singles:
-        """Read the (h, w) float32 z-depth of a photograph, NaN where it is unknown.
-
-        Raises DepthError if there is none, or it is damaged or not of this photograph.
-        """
+        """Read the (h, w) z-depth of a photograph, NaN where unknown; DepthError without."""
         path = self._options.file(photograph.name)
         if path is None:
             raise DepthError(
@@ -224,21 +221,14 @@ class MonocularDepth:
         self._lock = threading.Lock()
 
     def require_some(self, names: Sequence[str]) -> None:
-        """Load the network now, before any image is processed, unless all predictions are kept.
-
-        Raises DepthError if transformers is not installed or the model cannot be loaded.
-        """
+        """Load the network now unless all predictions are kept; DepthError if it cannot be."""
         files = [self._cache_file(name) for name in names]
         if not all(file is not None and file.exists() for file in files):
             with self._lock:
                 self._load()
 
     def depth(self, photograph: Photograph) -> Singles:
-        """Predict the (h, w) float32 z-depth of a photograph, NaN where it is unknown.
-
-        Raises DepthError if the network cannot be loaded or predicts no depth, ImageError if the
-        photograph cannot be read.
-        """
+        """Predict (h, w) z-depth of a photograph, NaN where unknown; DepthError if that fails."""
         prediction = self._prediction(photograph)
         kind = "inverse" if self._kind == "z" and prediction.inverse else self._kind
         values = prediction.values

@@ -40,10 +40,7 @@ class UnusableMap(Exception):
 
 
 def read_map(path: Path, num_px: int) -> Array:
-    """Read the (h, w) values of a file with one of ``SUFFIXES``.
-
-    UnusableMap when it holds no map, or one too large for a photograph of so many pixels.
-    """
+    """Read the (h, w) values of a photograph's map; UnusableMap if there are none, or too many."""
     max_num = max(MIN_LARGEST_MAP, MAX_NUM_VALUES_PER_PX * num_px)
 
     def require(shape: Sequence[int], dtype: np.dtype[Any] | None = None) -> None:

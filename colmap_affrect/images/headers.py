@@ -36,11 +36,8 @@ Found = TypeVar("Found")
 
 
 def read_header(path: Path, read: Callable[[BinaryIO], Found]) -> Found | None:
-    """Return what a function reads of an image file, None if that fails in any way.
-
-    Nothing is opened that is not a file: a pipe would wait for ever.
-    """
-    if not path.is_file():
+    """Return what a function reads of a file, None if that fails in any way, or for a pipe."""
+    if not path.is_file():  # a pipe would wait for ever
         return None
     try:
         with warnings.catch_warnings(), path.open("rb") as file:

@@ -29,10 +29,7 @@ def mask_values(mask: Mask) -> Bytes:
 
 
 def connected_regions(mask: Mask, min_area_px: float) -> list[tuple[Mask, tuple[int, int]]]:
-    """Find the 4-connected regions of an (H, W) mask that have enough pixels.
-
-    Each is an (h, w) mask, cropped to it, and the (x, y) of the mask's first pixel.
-    """
+    """Crop the 4-connected regions that have enough pixels; return each with its first (x, y)."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     regions = []
     for label, (left, top, width, height, area) in enumerate(stats.tolist()):

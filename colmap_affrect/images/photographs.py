@@ -69,10 +69,7 @@ class Photographs:
             raise OptionError(f"--camera-mask-path {self.masks.camera_path}: no such file")
 
     def mask(self, name: str) -> Mask | None:
-        """Return the (H, W) mask of an image, None where it has none.
-
-        ImageError when a mask cannot be read or has another size.
-        """
+        """Return an image's (H, W) mask, if any; ImageError if it is unreadable or does not fit."""
         paths = [path for path in self._mask_paths(name) if path.is_file()][:1]
         paths += [Path(self.masks.camera_path)] if self.masks.camera_path else []
         size, masks = header_size(self.folder / name), list[Mask]()
@@ -191,10 +188,7 @@ def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:
 
 
 def _visible_files(folder: Path) -> list[str]:
-    """Return the sorted names, relative to a folder, of all files that are not hidden.
-
-    Output folders of this program are passed over with all that is in them.
-    """
+    """Return the sorted names of all files below a folder, but for hidden ones and our output."""
     found: list[str] = []
     for path, inner, files in os.walk(folder):
         inner[:] = [n for n in inner if n[0] != "." and not is_output_folder(Path(path, n))]
@@ -237,10 +231,7 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
 
 
 def checked_names(image_path: Path, names: Sequence[str], where: str) -> list[str]:
-    """Return the sorted names of images below a folder, each once.
-
-    ImageError for a name that is not there, or that leads out of the folder.
-    """
+    """Return the sorted names of images, each once; ImageError for one not below the folder."""
     found = sorted({PurePosixPath(name).as_posix() for name in names})
     missing = [name for name in found if not _is_below(image_path, name)]
     for name in found:

@@ -120,11 +120,8 @@ def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
 
 
 def require_png() -> None:
-    """Check that this process can write PNG, before work that ends with pictures.
-
-    ImageError when it imported pycolmap before this package: compressing would kill it.
-    """
-    if PYCOLMAP_CAME_FIRST:
+    """Raise ImageError, before work that ends with pictures, where writing PNG would crash."""
+    if PYCOLMAP_CAME_FIRST:  # compressing would kill the process
         raise ImageError(
             "pictures cannot be written in a script that imports pycolmap first; put "
             '"import colmap_affrect" before "import pycolmap"'

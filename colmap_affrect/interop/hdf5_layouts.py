@@ -74,11 +74,7 @@ class Source:
     shapes: dict[str, tuple[int, ...]]
 
     def read(self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu") -> NDArray[Any]:
-        """Read a dataset of finite numbers once its shape has been checked.
-
-        None in the shape stands for any size; ``kinds`` are numpy's kinds of types that are
-        accepted.
-        """
+        """Read finite numbers of some of numpy's kinds, of a shape in which None is any size."""
         found = self.shapes[key]
         same = [size in (expected, None) for size, expected in zip(shape, found, strict=False)]
         if len(found) != len(shape) or not all(same):

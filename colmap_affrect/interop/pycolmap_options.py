@@ -67,10 +67,7 @@ SET_OTHERWISE = ("random_seed", "image_path", "fix_existing_frames")
 
 
 def native(given: object, kind: type[Native], argument: str) -> Native:
-    """Return pycolmap's options: as they are, or from a nested dictionary; None for the defaults.
-
-    OptionError names the argument and the field.
-    """
+    """Return pycolmap's options, of a nested dictionary too; OptionError names the field."""
     if isinstance(given, kind):
         return given
     if given is not None and not isinstance(given, Mapping):
@@ -89,10 +86,7 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
 
 
 def changes(given: object, kind: type, argument: str) -> dict[str, Any]:
-    """Return the fields that differ from pycolmap's defaults, by dotted key.
-
-    OptionError names one that has no counterpart here.
-    """
+    """Return fields that differ from pycolmap's defaults; OptionError for one we do not have."""
     usual, values = flat_values(kind()), flat_values(native(given, kind, argument))
     found = {key: value for key, value in values.items() if value != usual[key]}
     for key, value in found.items():

@@ -37,10 +37,7 @@ class MatcherOptions(NetworkOptions):
     frames of scans, watermarks."""
 
     def require_extractor(self, extractor: str) -> None:
-        """Raise OptionError for a feature extractor whose features cannot be matched.
-
-        An empty name is that of another program, and passes.
-        """
+        """Raise OptionError for an extractor whose features cannot be matched; none for no name."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +80,7 @@ class Matcher(Protocol):
     """Matches pairs of images; called with its ``Options`` and a :class:`MatcherContext`."""
 
     def prepare(self, image: ImageFeatures) -> Any:
-        """Return what :meth:`match` needs of an image, made once for all of its pairs.
-
-        It has an attribute ``nbytes``, the memory that it takes.
-        """
+        """Return what :meth:`match` needs of an image, made once, with its memory as ``nbytes``."""
 
     def match(self, first: Any, second: Any) -> Matches:
         """Match two prepared images. Either may have no features."""

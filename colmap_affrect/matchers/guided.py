@@ -136,10 +136,7 @@ class EpipolarGuide:
         self._reach2 = inverse2, np.sqrt(self._squares1) * inverse2
 
     def groups(self) -> Iterator[tuple[Indices, Indices]]:
-        """See :class:`Guide`.
-
-        Near the epipole lines fan out: features are sorted by reach, then by angle.
-        """
+        """Sort by reach, then by angle: near the epipole lines fan out."""
         order, edges = _sorted_within(np.log2(self._reach1[0]), self._angles1)
         order2, edges2 = _sorted_within(2.0 * np.log2(self._reach2[0]), self._angles2)
         classes = [_Pencil.of(part, self) for part in np.split(order2, edges2) if len(part)]
@@ -219,10 +216,7 @@ class _Pencil:
 
 
 def _sorted_within(sizes: Array, values: Array) -> tuple[Indices, Indices]:
-    """Sort by whole ``sizes``, then by ``values``; return the order and where sizes change.
-
-    What has no finite size and value is left out.
-    """
+    """Sort what is finite by whole sizes, then values; return the order and where sizes change."""
     usable = np.flatnonzero(np.isfinite(sizes) & np.isfinite(values))
     classes = np.floor(sizes[usable])
     order = np.lexsort((values[usable], classes))

@@ -152,11 +152,7 @@ class LightGlue:
     Options = LightGlueOptions
 
     def __init__(self, options: LightGlueOptions, context: MatcherContext) -> None:
-        """Load the network.
-
-        Raises WeightsError when the file is damaged or of another network, DeviceError when the
-        device is not there.
-        """
+        """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import resolve_device
 
         self.options, self.training = options, TRAININGS[options.trained_for]

@@ -53,10 +53,7 @@ class NearestOptions(MatcherOptions):
 
 
 class NearestNeighbors:
-    """Every descriptor of one image is compared with every one of the other.
-
-    Where the memory of a GPU is full the CPU matches, with the same result.
-    """
+    """Compares all descriptors; where the memory of a GPU is full, a CPU does, just the same."""
 
     Options = NearestOptions
 
@@ -105,10 +102,7 @@ def matchable(
     options: NearestOptions,
     make_coarse: MakeCoarse | None = None,
 ) -> MatchableImage:
-    """Prepare (N, D) descriptors of unit length and (N, 2) keypoints, px, for matching.
-
-    ``make_coarse`` is the same for all images that are matched with each other.
-    """
+    """Prepare (N, D) unit descriptors at (N, 2) px; ``make_coarse`` is the same for all images."""
     descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
     return MatchableImage(
         descriptors,
@@ -121,10 +115,7 @@ def matchable(
 def match_features(
     image1: MatchableImage, image2: MatchableImage, options: NearestOptions
 ) -> Matches:
-    """Match two images; see the module docstring. Either may have no features.
-
-    The score is 1 minus the larger of the ratios of distances.
-    """
+    """Match two images, with or without features; scores are 1 - the larger ratio of distances."""
     if not len(image1.descriptors) or not len(image2.descriptors):
         return Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
     everything = np.arange(len(image1.descriptors))
@@ -148,7 +139,7 @@ def match_features(
 def _nearest(
     image1: MatchableImage, rows: Indices, image2: MatchableImage, max_ratio: float
 ) -> tuple[Indices, Singles]:
-    """Return the nearest feature of each of some features, and the ratio to the nearest non-rival.
+    """Return nearest features, and the ratios to the nearest non-rivals.
 
     They may be -1 and infinite where the ratio is ``max_ratio`` or larger.
     """

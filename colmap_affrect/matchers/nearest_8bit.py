@@ -315,10 +315,7 @@ def _similarity_codes(codes: NDArray[np.int8], packed: Any, unit: float) -> Byte
 
 @cache
 def has_fast_8_bit_products() -> bool:
-    """Tell whether torch and the processor multiply 8-bit numbers, and without saturation.
-
-    Older processors do it more slowly than floating point, or lose bits on the way.
-    """
+    """Tell whether 8-bit products are fast here and right: old processors lose bits."""
     import torch
 
     if not torch.backends.cpu.get_cpu_capability().startswith("AVX512"):

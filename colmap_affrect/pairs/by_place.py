@@ -11,10 +11,7 @@ from colmap_affrect.pairs.lists import sequence_pairs
 
 
 def pairs_by_place(names: Sequence[str], database_path: Path, options: PairOptions) -> set[Pair]:
-    """Return the pairs of the methods ``gps`` and ``sequence``, where they are asked for.
-
-    Raises DatabaseError when gps is asked for and there are no positions.
-    """
+    """Return pairs by ``gps`` (DatabaseError without positions) and ``sequence``, as asked for."""
     pairs: set[Pair] = set()
     if "sequence" in options.methods:
         pairs |= set(sequence_pairs(names, options.num_neighbors))

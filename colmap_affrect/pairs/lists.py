@@ -28,10 +28,7 @@ def exhaustive_pairs(names: Sequence[str]) -> list[Pair]:
 
 
 def sequence_pairs(names: Sequence[str], num_neighbors: int) -> list[Pair]:
-    """Return the pairs of each name and the ``num_neighbors`` after it, sorted.
-
-    Numbers in names count by value: frame 9 comes before frame 10.
-    """
+    """Return the sorted pairs of each name and the next ones; frame 9 comes before frame 10."""
     ordered = sorted(names, key=_by_numbers)
     return sorted(
         (min(first, second), max(first, second))

@@ -47,10 +47,7 @@ def nearest_words(descriptors: Singles, vocabulary: Singles) -> Indices:
 
 
 def image_vector(descriptors: Singles, vocabulary: Singles) -> NDArray[np.float16]:
-    """Describe an image by one (K * D,) vector of unit length; zeros without descriptors.
-
-    From its (N, D) descriptors and (K, D) words.
-    """
+    """Describe (N, D) descriptors by (K, D) words: (K * D,) of unit length, or zeros."""
     words = nearest_words(descriptors, vocabulary)
     sums = _unit_rows(_sums(descriptors - vocabulary[words], words, len(vocabulary)))
     damped = np.sign(sums) * np.sqrt(np.abs(sums))
@@ -68,10 +65,7 @@ def _sums(rows: Singles, words: Indices, num_words: int) -> Singles:
 
 
 def similarities(vectors: NDArray[np.float16]) -> Iterator[Singles]:
-    """Yield for each of (N, V) image vectors its (N,) similarities with all of them.
-
-    They are the cosines after the mean of all vectors has been subtracted.
-    """
+    """Yield the (N,) cosines of each of (N, V) image vectors with all, the mean subtracted."""
     mean = vectors.mean(axis=0, dtype=np.float32)
     begins = range(0, len(vectors), VECTORS_AT_ONCE)
 

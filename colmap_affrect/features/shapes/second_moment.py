@@ -51,10 +51,7 @@ class SecondMoment:
         self.options = options
 
     def grid(self, image: GrayImage) -> ShapeGrid:
-        """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
-
-        Blocks whose gradients stay under ``min_gradient`` are not textured and get the identity.
-        """
+        """Estimate a shape per 4 x 4 block of (H, W) uint8; identity under ``min_gradient``."""
         tensor = _block_tensor(image, self.options.derivative_sigma_px)
         sigmas_px = self.options.integration_sigmas_px
         mean_log = np.zeros((*tensor.shape[:2], 2), dtype=np.float32)
