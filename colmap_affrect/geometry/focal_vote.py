@@ -171,11 +171,6 @@ def _peaks(marginals: Array, focals: Array) -> Array:
     return np.asarray(focals[best] * (focals[1] / focals[0]) ** shift)
 
 
-def _votes(evidence: Array) -> Array:
-    """Return the likelihoods of one ballot, between exp(-MAX_VOTE) and 1."""
-    return np.asarray(np.exp(np.logaddexp(evidence, -MAX_VOTE) - np.logaddexp(0.0, -MAX_VOTE)))
-
-
 def _propagate(
     ballots: Sequence[Ballot], cameras: Sequence[int], focals: Array
 ) -> tuple[Array, float]:
@@ -189,7 +184,7 @@ def _propagate(
         evidence = item.evidence
         if evidence.ndim == 1 and len(evidence) != len(focals):
             evidence = evidence[::STEP]
-        votes = np.log(_votes(evidence))
+        votes = np.logaddexp(evidence, -MAX_VOTE) - np.logaddexp(0.0, -MAX_VOTE)
         if evidence.ndim == 1:
             own[first] += votes
         elif first < second:
@@ -210,14 +205,12 @@ def _propagate(
         new -= new.max(axis=1, keepdims=True)
         messages = DAMPING * messages + (1.0 - DAMPING) * new
     beliefs = _beliefs(own, targets, messages)
-    total = float(_log_sums(beliefs).sum())
+    sums = np.logaddexp.reduce(beliefs, axis=1)
+    total = float(sums.sum())
     cavities = beliefs[sources] - messages[opposite]
     for edge, (first, second) in enumerate(edges.tolist()):
-        joint = (
-            cavities[edge][:, None] + np.log(forward[edge]) + cavities[edge + len(edges)][None, :]
-        )
-        total += float(_log_sums(joint.reshape(1, -1))[0])
-        total -= float(_log_sums(beliefs[[first, second]]).sum())
+        joint = cavities[edge][:, None] + tables[first, second] + cavities[edge + len(edges)]
+        total += float(np.logaddexp.reduce(joint, axis=None) - sums[first] - sums[second])
     shares = np.exp(beliefs - beliefs.max(axis=1, keepdims=True))
     return shares / shares.sum(axis=1, keepdims=True), total
 
@@ -226,8 +219,3 @@ def _beliefs(own: Array, targets: Indices, messages: Array) -> Array:
     found = own.copy()
     np.add.at(found, targets, messages)
     return found
-
-
-def _log_sums(values: Array) -> Array:
-    top = values.max(axis=1)
-    return np.asarray(top + np.log(np.exp(values - top[:, None]).sum(axis=1)))

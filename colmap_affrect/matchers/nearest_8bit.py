@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, Protocol, Self
 
@@ -270,16 +270,10 @@ def _part(
 def _joined(parts: list[ShortList]) -> ShortList:
     """Put the lists of consecutive rows together."""
     begins = np.cumsum([0, *(len(part.rows) for part in parts)])
-    nothing = np.zeros(0, np.int64)
-    return ShortList(
-        np.concatenate([nothing, *(part.rows for part in parts)]),
-        np.concatenate([nothing, *(part.runners_up for part in parts)]),
-        np.concatenate([np.zeros(0, bool), *(part.doubtful for part in parts)]),
-        np.concatenate(
-            [nothing, *(p.entry_rows + b for p, b in zip(parts, begins[:-1], strict=True))]
-        ),
-        np.concatenate([nothing, *(part.entry_columns for part in parts)]),
-    )
+    moved = (replace(p, entry_rows=p.entry_rows + b) for p, b in zip(parts, begins, strict=False))
+    none = np.zeros(0, np.int64)
+    every = [vars(ShortList(none, none, none.astype(bool), none, none)), *map(vars, moved)]
+    return ShortList(**{name: np.concatenate([part[name] for part in every]) for name in every[0]})
 
 
 def _packed(codes: NDArray[np.int8]) -> Any:
