@@ -28,11 +28,8 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
-MIN_DETECTABLE_PX = 32
-"""kornia's detectors look for nothing within 15 px of a border, and Key.Net fails on less."""
-
-KEYNET_RADIUS_PX = 22.0
-"""Radius of kornia's frames of Key.Net on the image itself, its measurement region."""
+MIN_DETECTABLE_PX = 32  # kornia finds nothing within 15 px of a border; Key.Net fails on less
+KEYNET_RADIUS_PX = 22.0  # of kornia's frames of Key.Net on the image itself
 
 MIN_RESPONSE = 1e-10
 """kornia fills up to the number asked for with frames of response 0 at the origin. Its Hessian

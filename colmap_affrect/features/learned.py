@@ -29,8 +29,7 @@ RADIUS_PX = 12.0
 """Radius of all frames: a sigma of 2 px, within which all three networks find a point again, so
 that a point that warps show again is known as the same."""
 
-MIN_NETWORK_PX = 32
-"""Views are filled up to this side: DISK normalises over what is a sixteenth of it."""
+MIN_NETWORK_PX = 32  # views are filled up to it: DISK normalises over a sixteenth of it
 
 Found = tuple["Tensor", "Tensor", "Tensor"]
 """(N, 2) points in pixel-centre px, (N,) responses, (N, D) descriptors of unit length."""

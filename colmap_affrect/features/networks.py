@@ -211,8 +211,7 @@ def _load(network: nn.Module, path: Path, name: str) -> None:
     _load_state(network, state, path, name)
 
 
-COUNTER = "num_batches_tracked"
-"""Entry of batch normalisations that older files do not have and inference does not read."""
+COUNTER = "num_batches_tracked"  # of batch normalisations; older files have none
 
 
 def _load_state(network: nn.Module, state: Mapping[str, Any], path: Path, name: str) -> None:

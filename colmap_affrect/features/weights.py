@@ -31,9 +31,7 @@ from colmap_affrect.project.contents import sha256_of
 
 ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
 
-WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")
-"""Recipes that need no weights: the way out when there is no network."""
-
+WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")  # need no network
 TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read
 
 CHUNK_BYTES = 1 << 16

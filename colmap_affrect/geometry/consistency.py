@@ -13,17 +13,13 @@ import numpy as np
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
 
 NUM_NEIGHBORS = 8  # matches nearest to one in image 1, and in image 2, that may confirm it
-
-NUM_CONFIRMING = 2
-"""So many of them must, in both images: one does for some wrong matches, two hardly ever."""
+NUM_CONFIRMING = 2  # must do so, in both images: one does for some wrong matches, two hardly
 
 MAX_RELATIVE_ERROR = 0.5
 """A neighbour may be so far from where the map puts it, in distances between the two matches:
 similarities stand for affine maps, and planes for surfaces."""
 
-MIN_DISTANCE_PX = 4.0
-"""Nearer matches are those of one place, found in several orientations, scales or warps."""
-
+MIN_DISTANCE_PX = 4.0  # nearer matches are those of one place, in several orientations or warps
 ROWS_AT_ONCE = 512  # matches that are compared with all others at a time, which bounds memory
 
 

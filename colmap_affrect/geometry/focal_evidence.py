@@ -20,24 +20,16 @@ import numpy as np
 from colmap_affrect.geometry.arrays import Array, Bools
 from colmap_affrect.geometry.epipolar import sampson_errors
 
-PRINCIPAL_POINT_SIGMA, DISTORTION_SIGMA = 0.02, 0.05
-"""How far both are from 0 in photographs that nobody cropped, longer sides."""
-
-MAX_NUM_MATCHES = 100
-"""Matches of a pair that are looked at; beyond, errors of the model weigh more than noise."""
+PRINCIPAL_POINT_SIGMA, DISTORTION_SIGMA = 0.02, 0.05  # longer sides; of what nobody cropped
+MAX_NUM_MATCHES = 100  # of a pair; beyond, errors of the model weigh more than noise
 
 MAX_MISFIT = 5.0
 """By how much the log-likelihood of the best essential matrix may fall short of that of the best
 fundamental matrix; a pair beyond says nothing about cameras: its geometry is wrong."""
 
-MAX_MISFIT_OF_CANDIDATES = 100.0
-"""Like :data:`MAX_MISFIT` of candidates that are far apart, before those beside are looked at."""
-
-BESIDE = np.geomspace(1 / 1.2, 1.2, 11)
-"""Factors from a candidate to focal lengths beside it, halfway to the next one or nearer."""
-
-MAX_NUM_STEPS, MIN_GAIN = 15, 1e-3
-"""Of Levenberg and Marquardt; the least gain of log-likelihood that is worth another step."""
+MAX_MISFIT_OF_CANDIDATES = 100.0  # the same of candidates far apart
+BESIDE = np.geomspace(1 / 1.2, 1.2, 11)  # from a candidate at most halfway to the next
+MAX_NUM_STEPS, MIN_GAIN = 15, 1e-3  # of Levenberg and Marquardt, and of log-likelihood
 
 BASELINE, TILT, SCALE = slice(0, 3), slice(3, 5), 5
 CENTERS, DISTORTIONS = slice(6, 10), slice(10, 12)

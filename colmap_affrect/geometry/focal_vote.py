@@ -32,10 +32,7 @@ MIN_PROMISE = -30.0
 at beside those that fall short of the best one by less."""
 
 MAX_LOSS = 2.0  # of log-evidence, at most, between two candidates of such a table
-
-PRIOR_FOCAL, PRIOR_SIGMA = 1.1, 0.6
-"""Lenses of photographs: most between .6 and 2 longer sides (logarithmic)."""
-
+PRIOR_FOCAL, PRIOR_SIGMA = 1.1, 0.6  # most lenses: .6 to 2 longer sides (logarithmic)
 MAX_VOTE = 3.0  # largest difference of log-evidence that one pair makes
 NUM_ITERATIONS, DAMPING = 30, 0.3  # of belief propagation
 NUM_RESAMPLES = 50  # votes among pairs drawn with replacement: do the pairs agree?

@@ -17,13 +17,8 @@ FOCAL_LENGTHS = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.5, 5.0, 10.0)
 rotation is a shift, as between two crops of one photograph."""
 
 MAX_NUM_POINTS = 500  # enough to measure a share to two per cent
-
-MIN_DEPTH = 1e-3
-"""Of a turned ray of length 1; what is behind the camera lands far outside of the image."""
-
-DISPLACEMENT_PX = np.array([13.0, 7.0])
-"""Keypoints that are moved by it meet others by chance only, and lie as dense as before."""
-
+MIN_DEPTH = 1e-3  # of a turned ray of length 1; what is behind lands far outside of the image
+DISPLACEMENT_PX = np.array([13.0, 7.0])  # so moved, keypoints meet others by chance only
 MIN_FREE_SHARE = 0.1  # where keypoints are so dense that chance leaves less, nothing can be told
 MAX_ITERATIONS = 3  # least squares are repeated without outliers; a verified pair has few of them
 

@@ -16,18 +16,14 @@ from colmap_affrect.conventions import grid_origin
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
 
 WINDOW_RADIUS = 2
-WINDOW_SIGMA_PX = 0.8
-"""Gaussian weights of the 5 x 5 window to which a plane is fitted (the authors' values)."""
+WINDOW_SIGMA_PX = 0.8  # Gaussian weights of the 5 x 5 window of a plane (the authors' values)
 
 MIN_WEIGHT_FRAC = 0.5
 """Share of the window's weight that known neighbours need. A line of pixels holds 0.499 and
 cannot carry a plane, a corner of the map 0.562."""
 
-MAX_SLANT_COS = np.cos(np.deg2rad(85.0))
-"""Neighbours that no plane seen at less than 85 degrees could hold are on another surface."""
-
-SAME_AXIS_COS = np.cos(np.deg2rad(45.0))
-"""Normals at most this far from the same line belong to one axis of an orthogonal frame."""
+MAX_SLANT_COS = np.cos(np.deg2rad(85.0))  # steeper neighbours are on another surface
+SAME_AXIS_COS = np.cos(np.deg2rad(45.0))  # normals so near to a line have one axis
 
 SPIRAL_STEP = 3.6
 

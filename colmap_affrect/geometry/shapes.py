@@ -15,10 +15,7 @@ from colmap_affrect.geometry.tilts import unit_metrics
 
 STEP_PX = 4  # dense sources give one shape per block of 4 x 4 px, as the paper's dense AffNet
 MAX_TANH = 0.999  # where logarithms end: of a metric, tilt 45
-
-
-MIN_DISTINCT_SHARE = 0.5
-"""Of frames that were measured one by one nearly all have a shape of their own."""
+MIN_DISTINCT_SHARE = 0.5  # of frames that were measured one by one nearly all differ
 
 SHAPE_STEP = 1e-4
 """Shapes of unit area that are this close are one: above the rounding of 32 bits, and so fine that

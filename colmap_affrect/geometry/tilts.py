@@ -19,8 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from colmap_affrect.geometry.arrays import Array, Floats
 
-GRID_TILTS = np.geomspace(2.0, 6.21970, 6)
-"""Tilts of the candidate centres for balls of radius 1.7 up to tilt 5.8 (the paper's cover)."""
+GRID_TILTS = np.geomspace(2.0, 6.21970, 6)  # of candidates for 1.7-balls up to tilt 5.8 (paper)
 
 GRID_NUM_ANGLES = 32
 IDENTITY_LABEL = -1

@@ -70,20 +70,11 @@ class ScaleEstimate:
         return self.num_agreeing / max(self.num_ratios, 1)
 
 
-TOLERANCE = 0.08
-"""Largest difference of the logarithm of ratios that agree: neighbours are not at one depth."""
-
+TOLERANCE = 0.08  # of logarithms of ratios that agree: neighbours are not at one depth
 NUM_NEIGHBORS = 5  # known places looked at beside each place of a pair
-
-NUM_INDEPENDENT = 10
-"""Ratios that count for the standard error at most: all share the errors of the same poses."""
-
+NUM_INDEPENDENT = 10  # ratios that count at most: all share the errors of the same poses
 NUM_ON_PLANE = 12  # known places to which a plane is fitted
-
-MAX_PLANE_ERROR = 0.04
-"""Largest error of an inverse depth that a plane predicts, and spread of those it is fitted to."""
-
-
+MAX_PLANE_ERROR = 0.04  # relative, of a predicted inverse depth and of those it is fitted to
 MIN_KNOWN = 20  # known depths that a depth map is fitted to
 MAX_FITTED = 500  # known depths of which pairs are tried and counted; more are thinned
 

@@ -17,8 +17,7 @@ from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_bytes
 
-AS_STORED = ("1", "L", "I;16", "RGB")
-"""Pillow's modes that PNG holds and COLMAP reads; others become RGB."""
+AS_STORED = ("1", "L", "I;16", "RGB")  # Pillow's modes that PNG holds and COLMAP reads
 
 
 @dataclass

@@ -31,16 +31,10 @@ from colmap_affrect.images.reading import read_color, shrink_to
 from colmap_affrect.options import PartOptions, Registry, within
 from colmap_affrect.project.atomic_files import replace_bytes
 
-MAX_ASPECT_RATIO = 1.05
-"""Aspects of map and photograph may differ by this factor: networks round sizes to 32 px."""
-
+MAX_ASPECT_RATIO = 1.05  # of aspects of map and photograph: networks round sizes to 32 px
 MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
-
-MIN_DISPARITY_FRAC = 0.01
-"""Relative inverse depth below this share of the image's largest counts as sky, i.e. unknown."""
-
-NETWORK_IMAGE_SIZE_PX = 1024
-"""Longer side of what a network is given; most of them work at about 384 to 784 px."""
+MIN_DISPARITY_FRAC = 0.01  # inverse depth below this share of the largest is sky, i.e. unknown
+NETWORK_IMAGE_SIZE_PX = 1024  # longer side; most networks work at about 384 to 784 px
 
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, zlib.error)
 """What numpy raises on a prediction that was kept and is missing or damaged."""

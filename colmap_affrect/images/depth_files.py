@@ -26,13 +26,8 @@ from colmap_affrect.geometry.arrays import Array
 
 MAX_NUM_VALUES_PER_PX = 4  # of a map, for each pixel of its photograph; more is taken for damage
 MIN_LARGEST_MAP = 1 << 22  # a map of so many values is read whatever the size of the photograph
-
-
-EXR_WINDOW = b"dataWindow\0box2i\0\x10\0\0\0"
-"""What stands before the first and last column and row in a header of OpenEXR."""
-
-Require = Callable[..., None]
-"""Takes the shape of a map, and its type if it may be one that holds no numbers."""
+EXR_WINDOW = b"dataWindow\0box2i\0\x10\0\0\0"  # before first and last column and row
+Require = Callable[..., None]  # takes the shape of a map, and its type if that may be no number
 
 
 class UnusableMap(Exception):

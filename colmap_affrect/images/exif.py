@@ -17,20 +17,15 @@ from PIL import ExifTags
 
 from colmap_affrect.images.headers import opened, read_header, stored_size
 
-FILM_DIAGONAL_MM = 43.27
-"""Of 35 mm film, to which equivalent focal lengths refer (by COLMAP's rounding)."""
+FILM_DIAGONAL_MM = 43.27  # of 35 mm film, to which equivalents refer (by COLMAP's rounding)
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """By EXIF's number of the unit of focal-plane resolutions: inches, cm, and, as COLMAP reads them,
 mm and micrometres."""
-PLAUSIBLE_FOCALS = (0.3, 6.0)
-"""In longer sides: fields of view of 118 to 10 degrees, which hold nearly all lenses."""
-MAX_CONTRADICTION = 1.15
-"""Ratio of two focal lengths that still agree: equivalents and widths of sensors are rounded."""
+PLAUSIBLE_FOCALS = (0.3, 6.0)  # in longer sides: 118 to 10 degrees, which hold nearly all lenses
+MAX_CONTRADICTION = 1.15  # ratio of focal lengths that still agree: equivalents are rounded
 MAX_ASPECT_ERROR = 0.01  # lossless rotation cuts off up to 15 px, shrinking rounds
-SENSOR_ASPECTS = (3 / 2, 4 / 3, 16 / 9)
-"""Photographs of another shape have been cropped, or may have been."""
-MAX_THUMBNAIL_PX = 160
-"""Longer side of the thumbnails that cameras put into their files, often with black bars."""
+SENSOR_ASPECTS = (3 / 2, 4 / 3, 16 / 9)  # photographs of another shape may have been cropped
+MAX_THUMBNAIL_PX = 160  # longer side of the thumbnails of cameras, often with black bars
 
 RESOLUTION, EQUIVALENT, SENSOR = "focal-plane resolution", "35 mm equivalent", "known sensor"
 

@@ -43,15 +43,11 @@ FOREIGN_FORMATS = {
 wheel does not."""
 
 
-TONE_PERCENTILES = (0.5, 99.5)
-"""What is black and white of a stretched photograph: dust and glints are a few pixels."""
+TONE_PERCENTILES = (0.5, 99.5)  # black and white of a stretched photograph but for dust and glints
 MIN_TONE_RANGE = 0.5  # a photograph whose tones fill less of the range of its file is stretched
 MAX_TONE_STEP = 16  # neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
 NUM_TONES = 250_000  # about so many pixels are looked at
-FRAME_FRAC = 0.1
-"""So much along each border says nothing about tones: scans have frames and captions there."""
-
-
+FRAME_FRAC = 0.1  # along each border is passed over: scans have frames and captions there
 BIG_TIFF = 43  # what files of more than 4 GiB have in the place of 42, with offsets of 64 bits
 
 

@@ -15,8 +15,7 @@ from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_frames
 from colmap_affrect.geometry.arrays import Array, Bytes, Singles
 from colmap_affrect.images.masks import mask_values
 
-ANTI_ALIASING_SIGMA = 0.8
-"""Blur before a compression by c: sigma = 0.8 sqrt(c^2 - 1) source px (Morel & Yu, ASIFT)."""
+ANTI_ALIASING_SIGMA = 0.8  # px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)
 
 TILE_PX = 64
 """Homographies are executed in square tiles, each with the blur that its strongest compression

@@ -22,19 +22,15 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import csv_text
 from colmap_affrect.project.workspace import Workspace
 
-DENSE = "dense"
-"""Folder of undistorted photographs with their model, as COLMAP's dense reconstruction has it."""
-
-NO_EXTRA = dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0.0)
-"""Distortion of undistorted photographs, by nerfstudio's names."""
+DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
+NO_EXTRA = dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0.0)  # nerfstudio's distortion
 
 RADIAL_MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2}
 """Camera models that Bundler's and NVM's radial terms can tell, and how many terms they have."""
 
 NVM_TERMS, BUNDLER_TERMS = 1, 2
 
-FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])
-"""From COLMAP's camera (y down, looks along z) to that of OpenGL, Bundler and nerfstudio."""
+FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL, Bundler, nerfstudio
 
 
 @dataclass(frozen=True)

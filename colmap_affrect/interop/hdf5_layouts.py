@@ -46,8 +46,7 @@ MAX_VALUES = 1 << 28  # an array of more values is taken for damage, and not rea
 
 MAX_NAMES_IN_MESSAGE = 10
 
-SPARE_BYTES = 8 << 20
-"""What HDF5 may need beside the data themselves: its index, and what it has not written yet."""
+SPARE_BYTES = 8 << 20  # for HDF5's index, and for what it has not written yet
 
 KEYPOINTS, HLOC_MATCHES = "/keypoints", "/matches0"
 

@@ -23,8 +23,7 @@ from colmap_affrect.parallel.executor import unless_gpu_is_full
 
 logger = logging.getLogger(__name__)
 
-_WARNING = threading.Lock()
-"""Held by the thread that warns: ``cache`` alone lets two threads through."""
+_WARNING = threading.Lock()  # ``cache`` alone lets two threads through
 
 Found = TypeVar("Found")
 
@@ -66,8 +65,7 @@ class Matches:
     scores: Singles  # (M,) float32 in [0, 1], larger is better
 
 
-ROUNDING = np.float32(1e-6)
-"""Similarities closer to 1 than this are equal: two copies of a descriptor have ratio 1."""
+ROUNDING = np.float32(1e-6)  # similarities that near to 1 are equal: two copies have ratio 1
 
 
 def distance_ratios(first: Singles, second: Singles) -> Singles:

@@ -27,18 +27,14 @@ from colmap_affrect.geometry.two_views import homogeneous
 from colmap_affrect.matchers.base import distance_ratios
 from colmap_affrect.options import Options, within
 
-GROUP_ROWS = 48
-"""Features of image 1 that are compared at once: more take longer in products, fewer in Python."""
+GROUP_ROWS = 48  # compared at once: more take longer in products, fewer in Python
 
 MIN_AGREEING = 0.5
 """Of a right pair at least this share of the inliers has frames that agree with the geometry, and
 of a wrong one whose inliers are accidental far less; guiding would make such a pair look proven."""
 
-ANGLE_ROUNDING = 1e-9
-"""Of angles in a pencil of lines, far below any band, far above that of their computation."""
-
-BANDS_OF_HOMOGRAPHY = 2.0
-"""Radius around the place that a homography gives, in bands: planes are never quite plane."""
+ANGLE_ROUNDING = 1e-9  # far below any band, far above the error of angles in a pencil of lines
+BANDS_OF_HOMOGRAPHY = 2.0  # radius round the place of a homography: planes are never quite plane
 
 
 class GuidedOptions(Options):

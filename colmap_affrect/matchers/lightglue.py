@@ -42,19 +42,11 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-MIN_VIEW_FEATURES = 8
-"""Views with fewer features are left out: no geometry could be verified by what they add."""
-
-TRAINING_SIZE_PX = 1024
-"""Longer side of the images of training, whose pixels scales of features are in."""
-
+MIN_VIEW_FEATURES = 8  # of a view: no geometry could be verified by what fewer add
+TRAINING_SIZE_PX = 1024  # longer side in training, whose pixels scales of features are in
 KORNIA_SIGMAS = 12.0  # radius of kornia's frames of DoG features, in units of sigma
-
-CHUNK_ROWS = 1 << 10
-"""Features of an image whose similarities are held at once, which bounds memory."""
-
-DUPLICATE_RADIUS_PX = 2.0
-"""Of matches of several views that are closer than this at both ends the best one stays."""
+CHUNK_ROWS = 1 << 10  # features whose similarities are held at once, which bounds memory
+DUPLICATE_RADIUS_PX = 2.0  # of nearer matches of several views, at both ends, the best stays
 
 TrainedFor = Literal[
     "aliked", "disk", "xfeat", "sift", "dog-affnet-hardnet", "keynet-affnet-hardnet"

@@ -28,8 +28,7 @@ MIN_SIMILARITIES_PER_CORE = 6e8  # with fewer than this, loading torch takes lon
 
 ERROR_SIGMAS = 6.0
 MAX_CODE, ZERO_CODE = 127, 128
-CODE_STEP = 1.0 / 250
-"""Step of similarities in 8 bits; negative ones are 0, and errors may make them more than 1."""
+CODE_STEP = 1.0 / 250  # of similarities in 8 bits; negative ones are 0, few more than 1
 NUM_ROWS_8_BIT = 512  # rows of similarities computed at once, a multiple of ``SIZE_MULTIPLE``
 SIZE_MULTIPLE = 256
 """Both factors of a product are filled up to a multiple of it: oneDNN prepares and keeps a program
@@ -37,8 +36,7 @@ for every size, and many sizes take memory and time."""
 FOLD = 8  # similarities that share a maximum
 NO_HALF_SIMILARITY = -4.0
 NUM_ROWS_16_BIT = 4096
-HALF_ERROR = 2.0**-11
-"""Standard deviation, rounded up, of the similarity of unit vectors in 16 bits."""
+HALF_ERROR = 2.0**-11  # standard deviation, rounded up, of similarities in 16 bits
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from colmap_affrect.pairs.base import Pair, PairList, PairOptions
 from colmap_affrect.project.atomic_files import replace_lines
 
 MAX_NAMES_IN_MESSAGE = 5
-CANDIDATES_PER_NEIGHBOR = 5
-"""An image may have that many times as many neighbours as images have on average."""
+CANDIDATES_PER_NEIGHBOR = 5  # times as many may an image have as images have on average
 
 
 def exhaustive_pairs(names: Sequence[str]) -> list[Pair]:

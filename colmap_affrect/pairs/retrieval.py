@@ -25,8 +25,7 @@ NUM_WORDS = 256
 NUM_SAMPLED_IMAGES = 512  # the vocabulary of larger sets is built from that many of their images
 NUM_SAMPLES = 1 << 15  # descriptors that the vocabulary is built from
 NUM_ITERATIONS = 10
-VECTORS_AT_ONCE = 512
-"""Image vectors that are compared with as many others at a time, which bounds memory."""
+VECTORS_AT_ONCE = 512  # compared with as many others at a time, which bounds memory
 
 
 def build_vocabulary(samples: Singles, random: np.random.Generator) -> Singles:

@@ -43,27 +43,14 @@ LEAD_PX = (PATCH_SIZE_PX - STEP_PX) // 2
 """Cell (0, 0) of the network has the patch of the rows and columns 0...31. With 14 px more in
 front, that patch has the block of rows and columns 0...3 in its middle."""
 
-PAPER_CROP_PX = (-LEAD_PX) % STEP_PX
-"""Without padding, 2 px fewer in front put the patches of all cells round whole blocks."""
-
-PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX
-"""Blocks before the first one that then has a patch."""
-
-CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9
-"""Cell i depends on the rows 4 i - 11...4 i + 39: on those of the cells i - 3...i + 9."""
-
+PAPER_CROP_PX = (-LEAD_PX) % STEP_PX  # puts the patches of all cells round whole blocks
+PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX  # blocks before the first with a patch
+CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9  # cell i depends on rows 4 i - 11...4 i + 39
 STRIP_CELLS = 64  # rows of cells that are computed at once, to bound the memory
 WINDOW_PX = 33  # surroundings whose mean and deviation normalise a pixel
-
-DEVIATION_FLOOR = 0.01 * 255
-"""Added to the deviation of the surroundings, gray values: blank ones stay blank."""
-
-MAX_NORMALISED = 6.0
-"""Largest normalised value (as in the AffNet authors' own fully convolutional network)."""
-
-PATCH_SIGMAS = 12.0
-"""Half width of the patch of a keypoint in units of its sigma (kornia-moons, the paper)."""
-
+DEVIATION_FLOOR = 0.01 * 255  # added to deviations, gray values: blank surroundings stay blank
+MAX_NORMALISED = 6.0  # as in the AffNet authors' own fully convolutional network
+PATCH_SIGMAS = 12.0  # half width of a keypoint's patch in its sigmas (kornia-moons, the paper)
 BATCH_SIZE = 256  # patches that go through the network at once
 
 
