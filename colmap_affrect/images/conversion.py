@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import shutil
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -83,10 +84,8 @@ def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> N
         shutil.copy2(path, folder / name)
         report.copied.append(name)
     else:
-        with _opened(path) as image:
-            for target, page in zip(made, numbers, strict=True):
-                image.seek(page)
-                replace_bytes(folder / target, _png(image, path))
+        for target, content in zip(made, _as_png(path, numbers), strict=True):
+            replace_bytes(folder / target, content)
         report.written[name] = made
 
 
@@ -99,22 +98,19 @@ def _page_name(name: str, page: int, num_pages: int) -> str:
     return f"{name}-page{page}.png" if num_pages > 1 else f"{name}.png"
 
 
-def _opened(path: Path) -> Image.Image:
+def _as_png(path: Path, numbers: Sequence[int]) -> Iterator[bytes]:
+    """Yield pages of a file as PNG; ImageError if it is damaged, or of no format that is known."""
     try:
-        return Image.open(path)
+        with Image.open(path) as image:
+            for number in numbers:
+                image.seek(number)
+                page = image if image.mode in AS_STORED else image.convert("RGB")
+                file = io.BytesIO()
+                page.save(file, "PNG", exif=image.getexif())
+                yield file.getvalue()
     except UnidentifiedImageError as error:
         heic = path.suffix.lower() in (".heic", ".heif")
         hint = "; HEIC needs: pip install pillow-heif" if heic else ""
         raise ImageError(f"{path}: is of a format that cannot be converted{hint}") from error
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
+    except Exception as error:  # damaged files raise nearly anything in Pillow
         raise ImageError(f"{path}: cannot be read ({error})") from error
-
-
-def _png(page: Image.Image, path: Path) -> bytes:
-    try:
-        image = page if page.mode in AS_STORED else page.convert("RGB")
-        file = io.BytesIO()
-        image.save(file, "PNG", exif=page.getexif())
-    except (OSError, ValueError, SyntaxError) as error:
-        raise ImageError(f"{path}: cannot be read ({error})") from error
-    return file.getvalue()

@@ -65,8 +65,7 @@ class Alignment:
 def align(model_path: Path, output_path: Path, reference: Reference) -> Alignment:
     """Write a model of COLMAP in metres, to a new folder; the old one stays as it is.
 
-    Positions and control points give scale, rotation and place, distances the scale alone. Raises
-    AffrectError when the reference is unreadable, or leaves open how the model lies.
+    Positions and control points give scale, rotation and place, distances the scale alone.
     """
     if output_path.exists():
         raise OptionError(f"{output_path}: exists, and is left as it is; use another folder")
@@ -153,7 +152,7 @@ def _scale(
                     f"--distance: {name} is no photograph of the model, nor a point of --points"
                 )
         own = float(np.linalg.norm(places[first] - places[second]))
-        if own <= 0.0 or length <= 0.0:
+        if own <= 0.0 or not 0.0 < length < np.inf:
             raise OptionError(f"--distance {first},{second}: must be of two places, and positive")
         lengths[f"{first},{second}"] = own, length
     scale = float(np.exp(np.mean([np.log(true / own) for own, true in lengths.values()])))
