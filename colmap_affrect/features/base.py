@@ -66,8 +66,7 @@ class FeatureExtractor(Protocol):
     ) -> list[LocalFeatures]:
         """Describe features that :meth:`detect` found, a list element for each image.
 
-        The result is the same for images that are given together or one by one; here for those that
-        :meth:`detect` has described.
+        The result is the same for images together or one by one. Here they are described already.
         """
         del images
         return list(detected)

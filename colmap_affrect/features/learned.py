@@ -101,8 +101,7 @@ class LearnedFeatures(FeatureExtractor):
     def detect(self, view: View) -> LocalFeatures:
         """Detect and describe, by falling response; none for views under 8 px.
 
-        A gray view is taken as one whose colours are equal. The mask chooses among what was
-        found, so that its edge is no feature.
+        The mask chooses among what was found, so that its edge is no feature.
         """
         image, mask = view
         if not is_searchable(image, mask):

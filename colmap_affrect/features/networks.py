@@ -139,8 +139,7 @@ def load_xfeat(score_threshold: float, path: Path, device: str) -> feature.XFeat
 class HardTFeat(nn.Module):
     """Two convolutions and a fully connected layer, with tanh, as in TFeat (Balntas et al. 2016).
 
-    The AffNet authors trained it with HardNet's loss. As they publish it, tanh comes before the
-    maximum of 2 x 2; here after it, which is the same and a quarter of the work.
+    As it is published, tanh comes before the maximum; here after it, a quarter of the work.
     """
 
     def __init__(self) -> None:

@@ -102,8 +102,7 @@ def is_searchable(image: GrayImage | ColorImage, mask: Bytes | None) -> bool:
 def by_falling_response(keypoints: Sequence[cv2.KeyPoint]) -> tuple[Indices, Array, Singles]:
     """Sort keypoints by falling response; those of equal response keep their order.
 
-    Returns their (N,) indices, (N, 4) x, y in pixel-centre px, sigma in px and angle in radians
-    (from x towards y), and (N,) responses.
+    Returns (N,) indices, (N, 4) x, y, sigma in px and angle in radians, and (N,) responses.
     """
     responses = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
     order = np.argsort(-responses, kind="stable")

@@ -141,11 +141,9 @@ WEIGHT_FILES: dict[str, WeightFile] = {
 def resolve(
     keys: Iterable[str], weights_path: Path | None = None, *, progress: Progress = SILENT
 ) -> dict[str, Path]:
-    """Find files of weights, or download them into torch's cache; return their paths by key.
+    """Find files of weights, in this folder first, or download them into torch's cache, by key.
 
-    They are looked for in ``weights_path`` first. Raises one WeightsError for all files that are
-    missing and cannot be downloaded, or for one of an installed distribution that is not the
-    published one.
+    One WeightsError for all that are nowhere, or if an installed file is not the published one.
     """
     if weights_path is not None and not weights_path.is_dir():
         raise WeightsError(f"--weights {weights_path}: not a folder")
@@ -175,8 +173,7 @@ def fetch(
 ) -> dict[str, Path]:
     """Get files into a folder, torch's cache by default; those already there stay.
 
-    What an installed distribution carries is copied, and left there where no folder is given.
-    Raises WeightsError for an unknown key, or when a download fails.
+    Installed files are copied where a folder is given. WeightsError for what cannot be had.
     """
     keys, target = list(keys), folder or cache_folder()
     for key in keys:
@@ -246,10 +243,9 @@ def _sha256(path: Path, _modified_ns: int, _size: int) -> str:
 
 
 def load_state_dict(path: Path) -> dict[str, Any]:
-    """Read the parameters of a network by name; objects that would run code are not loaded.
+    """Read the parameters of a network, or those in an entry ``state_dict``, by name.
 
-    Of a checkpoint with an entry ``state_dict`` only that. Raises WeightsError when the file cannot
-    be read or holds other things.
+    Objects that would run code are not loaded; WeightsError for what cannot be read.
     """
     import torch
 

@@ -11,10 +11,9 @@ from colmap_affrect.geometry.arrays import Array, Floats
 
 
 def rectifying_affine(tilt: float, angle_rad: float, *, area_preserving: bool = True) -> Array:
-    """Return the (2, 2) rectifying map of the class (tilt, angle).
+    """Return the (2, 2) rectifying map diag(sqrt t, 1 / sqrt t) R(phi) of a class (tilt, angle).
 
-    It is diag(sqrt t, 1 / sqrt t) R(phi), or diag(1, 1 / t) R(phi), which magnifies in no
-    direction (ASIFT, the paper).
+    Where areas may change, diag(1, 1 / t) R(phi), which magnifies in no direction (ASIFT).
     """
     zoom = sqrt(tilt) if area_preserving else 1.0
     return np.asarray(np.array([[zoom], [zoom / tilt]]) * rotation(angle_rad))

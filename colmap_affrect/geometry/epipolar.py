@@ -35,8 +35,7 @@ def direction_cosines(
 ) -> Array:
     """Return (N,) cosines between epipolar directions of image 2 and those that frames carry over.
 
-    Lines have no direction, so that all signs may be turned; they are the same for all right
-    matches of a pair (see :func:`common_sign`).
+    Up to one sign for all right matches of a pair (:func:`common_sign`): lines have no direction.
     """
     lines1, lines2 = epipolar_lines(fundamental, points1, points2)
     along1 = np.stack([-lines1[:, 1], lines1[:, 0]], axis=1)

@@ -78,10 +78,9 @@ def log_evidence(
 
 
 class _Fit:
-    """Epipolar matrices ``E = U diag(1, s, 0) V^T`` in camera coordinates, one for each focals.
+    """Matrices ``E = U diag(1, s, 0) V^T`` in camera coordinates, one for each focals.
 
-    An essential matrix has s = 1, and its fit also moves the nuisances; a fundamental one has them
-    all at 0.
+    An essential one has s = 1 and moves the nuisances; a fundamental one has them all at 0.
     """
 
     def __init__(

@@ -103,8 +103,8 @@ def _table(pair: MatchedPair) -> Array:
 def _softened(table: Array) -> Array:
     """Widen a table so that no peak is lost between candidates.
 
-    Evidence is a parabola about its best candidate: halfway to the next one it falls by a quarter
-    of the second difference.
+    Evidence is a parabola: halfway to the next candidate it falls by a quarter of the second
+    difference.
     """
     row, column = np.unravel_index(table.argmax(), table.shape)
     lines = (np.pad(table[row], 1, "edge"), np.pad(table[:, column], 1, "edge"))
@@ -132,8 +132,7 @@ def _candidates(ballots: Sequence[Ballot]) -> Array:
 def count(ballots: Sequence[Ballot], cameras: Sequence[int], *, resample: bool = True) -> Outcome:
     """Count the votes on all these cameras; ``resample`` widens intervals where pairs disagree.
 
-    One without ballots, or whose best candidate is the first or the last, has the prior's focal
-    length.
+    One whose best candidate is the first or the last has the prior's focal length.
     """
     focals = _candidates(ballots)
     marginals, total = _propagate(ballots, cameras, focals)

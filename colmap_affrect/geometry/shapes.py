@@ -40,8 +40,7 @@ def of_unit_area(shapes: Floats) -> Array:
 def vary_singly(shapes: Floats) -> bool:
     """Whether (N, 2, 2) shapes of features were measured one by one.
 
-    Those of features without a shape are circles, which a warp turns into one ellipse for all of
-    its features: they repeat what view it was, as often as there are features.
+    Those without a shape are circles, which a warp turns into one ellipse for all its features.
     """
     cells = np.rint(of_unit_area(shapes) / SHAPE_STEP).reshape(-1, 4)
     return len(np.unique(cells, axis=0)) > max(1.0, MIN_DISTINCT_SHARE * len(shapes))

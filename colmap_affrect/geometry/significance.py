@@ -40,8 +40,7 @@ def log10_false_alarms(
 ) -> float:
     """Return how many geometries with so many inliers random matches are expected to have.
 
-    ``sample_size`` matches determine a geometry and are inliers in any case; another random one is
-    with a probability of ``chance``.
+    ``sample_size`` matches are inliers in any case; ``chance`` is the probability of another.
     """
     if num_inliers <= sample_size:
         return math.inf
@@ -54,10 +53,10 @@ def log10_false_alarms(
 
 
 def log10_bayes_factor(num: int, num_agreeing: int, chance: float) -> float:
-    """Return how much more probable it is in a right pair that so many of some frames agree.
+    """Return how much more probable in a right pair so many agreeing frames are than by chance.
 
-    In a wrong pair each agrees by chance; in a right one with a share that is unknown and at
-    least ``MIN_AGREEING``. When chance reaches as much, frames say nothing.
+    It is an unknown share in a right pair, at least ``MIN_AGREEING``; where chance reaches as much,
+    frames say nothing.
     """
     lowest = max(MIN_AGREEING, chance)
     shares = lowest + (1.0 - lowest) * AGREEING_SHARES

@@ -196,8 +196,8 @@ def _reconciled(
 ) -> ExifFocal:
     """Choose among plausible focal lengths, of which some may contradict each other.
 
-    Equivalents and sensors count for the whole frame, resolutions for pixels: against a resolution
-    of more pixels the others are right if the photograph was shrunk, wrong if it was cropped.
+    Against a resolution of more pixels, which alone counts for pixels and not for the whole frame,
+    the others are right if the photograph was shrunk, wrong if it was cropped.
     """
     colmaps, pixels = next(iter(stated)), plausible.get(RESOLUTION)
     key, focal = next(iter(plausible.items()))

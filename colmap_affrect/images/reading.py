@@ -59,8 +59,7 @@ EIGHTH_OF_COLOR = cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
 def read_gray(path: Path, *, stretch: bool = False) -> GrayImage:
     """Read an image as gray, as stored: EXIF orientation is not applied, 16 bit becomes 8.
 
-    With ``stretch`` the tones of a photograph of low contrast fill the range (:func:`tones`).
-    Raises ImageError when the file is missing, empty, or not an image.
+    With ``stretch`` low contrast fills the range (:func:`tones`). ImageError if it is no image.
     """
     image = decode(path)
     return in_eight_bits(image, tones(image) if stretch else None)
@@ -80,8 +79,7 @@ def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorIm
 def tones(image: NDArray[Any]) -> tuple[float, float] | None:
     """Return what is to be black and white of an (H, W[, 3]) image, None to leave it as it is.
 
-    Scans of faded prints and 12 bits in a file of 16 fill a small part of the range, and detectors
-    with a fixed threshold see next to nothing in them.
+    Detectors with a fixed threshold see next to nothing in scans of faded prints.
     """
     height, width = image.shape[:2]
     y, x = int(FRAME_FRAC * height), int(FRAME_FRAC * width)

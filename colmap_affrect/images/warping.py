@@ -140,10 +140,9 @@ def _source_points(
 
 
 def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> Bytes:
-    """Carry the region of a rectification into its warp (nearest; 255 inside, 0 outside).
+    """Carry the region of a rectification of an image of (width, height) px into its warp.
 
-    Of an image of (width, height) px, all of it where the region is None, to (height, width) uint8
-    of the canvas; what lies behind the camera is outside.
+    To (height, width) uint8 of the canvas, nearest: 255 inside, 0 outside and behind the camera.
     """
     region = rectification.region
     if region is None:

@@ -73,8 +73,7 @@ class GuidableImage:
     def has_directions(self) -> bool:
         """Whether frames can tell a direction.
 
-        Circles without orientation cannot, nor what warps made of them. Similarities (COLMAP's
-        SIFT) do, up to what the change of viewpoint adds.
+        Similarities (COLMAP's SIFT) do, circles do not, nor what warps made of them.
         """
         return self.shapes is not None and len(self.shapes) > 0 and vary_singly(self.shapes)
 

@@ -161,8 +161,7 @@ def _nearest_of_listed(
 ) -> tuple[Indices, Singles, Bools]:
     """Return nearest and ratio among the features listed for each row, and where they are doubtful.
 
-    That is where the list says so, and where the second neighbour by coarse similarities is a rival
-    of the nearest by exact ones: what takes its place may not be listed.
+    So they are, too, where the second neighbour by coarse similarities is a rival of the nearest.
     """
     similarity = np.empty(len(short.entry_rows), np.float32)
     for begin in range(0, len(similarity), CHUNK_ROWS):

@@ -236,7 +236,6 @@ def _is_hidden(
 
     That is where a rival of the best may be nearer than it, and has the runner-up for a rival, of
     which the best is none. What takes the place of the runner-up then may be far less similar.
-    Rows and columns of the rivals of the best, itself included, are ``of_best``, (E,) each.
     """
     rows, columns = (indices[is_close] for indices in of_best)
     is_other = columns != best[rows]
@@ -289,9 +288,8 @@ def _filled_up(codes: NDArray[np.int8]) -> NDArray[np.int8]:
 def _similarity_codes(codes: NDArray[np.int8], packed: Any, unit: float) -> Bytes:
     """Return similarities over ``CODE_STEP`` of (R, D) and (N, D) codes, rounded: 0...255.
 
-    The columns that ``packed`` has been filled up with are 0. They stay: without them rows would
-    not follow each other in memory, and numpy would make a copy before it looks for maxima.
-    ``unit`` is the similarity of the codes 1 and 1.
+    Columns that ``packed`` was filled up with stay, as 0: numpy would copy before it looks for
+    maxima. ``unit`` is the similarity of the codes 1 and 1.
     """
     import torch
 

@@ -103,8 +103,7 @@ def _candidates(
 def ordered_for_reuse(pairs: Iterable[Pair], num_images: int) -> PairList:
     """Order pairs so that those of the same images come close together.
 
-    Images are numbered by walking breadth first through the graph of pairs. Then come, block by
-    block, the pairs of ``num_images`` with as many others: memory must hold twice as many.
+    Images are numbered breadth first; then come blocks of ``num_images`` with as many others.
     """
     listed = PairList.of(pairs)
     low, high = np.sort(_breadth_first(listed)[listed.numbers], axis=1).T

@@ -21,8 +21,7 @@ def low_resolution_pairs(
 ) -> list[Pair]:
     """Return the pairs of images of which the strongest features have the most matches.
 
-    ``match`` matches the strongest features of two images, best if it keeps ``2 * IMAGES_AT_ONCE``
-    images in memory; ``num_neighbors`` is that of an image on average.
+    ``match`` should keep ``2 * IMAGES_AT_ONCE`` images; neighbours are counted on average.
     """
     counts = np.zeros((len(names), len(names)), np.uint16)
 

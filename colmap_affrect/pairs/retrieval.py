@@ -88,10 +88,9 @@ def retrieved_pairs(
     num_neighbors: int,
     progress: Progress,
 ) -> list[Pair]:
-    """Return the pairs of images whose descriptors are alike as a whole.
+    """Return pairs of images that are alike as a whole, of so many neighbours on average.
 
-    None if all features are those of warps, which are not looked at. ``num_neighbors`` is that of
-    an image on average.
+    None if all features are those of warps, which are not looked at.
     """
     random = np.random.default_rng(0)
     sampled = random.permutation(len(names))[:NUM_SAMPLED_IMAGES]

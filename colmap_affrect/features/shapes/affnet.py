@@ -80,8 +80,7 @@ class AffNetOptions(ShapeOptions):
 class AffNet:
     """Shapes of all 4 x 4 blocks of an image, or of its keypoints.
 
-    Sparse shapes are those of DoG keypoints; where the recipe's features are found by DoG, with
-    their thresholds.
+    Keypoints are by DoG, with the thresholds of the recipe's features where those are.
     """
 
     Options = AffNetOptions
@@ -119,10 +118,9 @@ class AffNet:
         return ShapeGrid(metrics_from_log(logs), textured, grid_origin(STEP_PX), STEP_PX)
 
     def samples(self, image: GrayImage) -> ShapeSamples:
-        """Estimate the affine shapes of the strongest keypoints of a (H, W) uint8 image.
+        """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image.
 
-        Each shape is read off the 32 x 32 patch of half width 12 sigma. Keypoints whose shape
-        is not finite or turns the patch over are left out.
+        Keypoints whose shape is not finite or turns the patch over are left out.
         """
         keypoints = self.detect(image)
         order = np.argsort(-keypoints.responses, kind="stable")
@@ -193,10 +191,10 @@ class AffNet:
 
 
 def fully_convolutional(network: LAFAffNetShapeEstimator) -> nn.Sequential:
-    """Return the layers of AffNet without the final pooling, for inference.
+    """Return the layers of AffNet without the final pooling, batch normalisation folded in.
 
-    Batch normalisation is folded into the convolutions. An image of H x W px gives (ceil(H / 4) -
-    7) x (ceil(W / 4) - 7) cells; cell (i, j) has the patch whose first pixel is (4 j, 4 i).
+    An image of H x W px gives (ceil(H / 4) - 7) x (ceil(W / 4) - 7) cells; cell (i, j) has the
+    patch whose first pixel is (4 j, 4 i).
     """
     import torch
     from torch import nn
@@ -245,10 +243,9 @@ def _textured(image: GrayImage, min_deviation: float) -> Mask:
 
 
 def _read_grid(values: Singles, level_from_image: Array, cells: tuple[int, int]) -> Singles:
-    """Interpolate a grid of a resized image bilinearly at the (R, C) cells of the image's own.
+    """Interpolate (r, c, D) values at the blocks of a resized image at (R, C) cells of the image.
 
-    ``values`` are (r, c, D) at the blocks of the resized image, the map (3, 3) of pixel-centre
-    coordinates. Beyond the outermost centres their values count.
+    The map (3, 3) is of pixel-centre px; beyond the outermost centres their values count.
     """
     weights = []
     for axis, (count, length) in enumerate(zip(cells, values.shape[:2], strict=True)):
