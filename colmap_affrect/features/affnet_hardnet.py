@@ -9,7 +9,7 @@ Patches are sampled from a pyramid whose level has steps of 1 to 2 px.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -139,7 +139,7 @@ class AffNetHardNet:
 
         found = union(list(detected))
         with torch.inference_mode():
-            shapes, descriptors = self._describe(_Patches(images, counts, self.device), found)
+            shapes, descriptors = self._describe(_sampler(images, counts, self.device), found)
         lengths = np.linalg.norm(descriptors, axis=1)
         valid = _is_sound(shapes) & np.isfinite(lengths) & (lengths > 0.0)
         radii_px = found.scales
@@ -152,17 +152,19 @@ class AffNetHardNet:
             described.append(LocalFeatures(lafs, found.responses[kept], rows, ids))
         return described
 
-    def _describe(self, patches: _Patches, found: LocalFeatures) -> tuple[Array, Singles]:
+    def _describe(
+        self, sample: Callable[[Array], Tensor], found: LocalFeatures
+    ) -> tuple[Array, Singles]:
         """Return (N, 2, 2) shapes of determinant 1, and (N, 128) descriptors of any length."""
         half_widths_px = self.options.patch_sigmas / MEASUREMENT_SIGMAS * found.scales
         shapes = np.tile(np.eye(2), (len(found), 1, 1))
         if self.affine_shapes is not None:
-            upright = patches.sample(_frames(shapes, half_widths_px, found.keypoints))
+            upright = sample(_frames(shapes, half_widths_px, found.keypoints))
             shapes = shapes_from_outputs(self._run(self.affine_shapes, upright))
-        unturned = patches.sample(_frames(shapes, half_widths_px, found.keypoints))
+        unturned = sample(_frames(shapes, half_widths_px, found.keypoints))
         # kornia's angles are of the opposite sense to those of our rotation().
         shapes = shapes @ rotation(-self._run(self.orinet, unturned).astype(np.float64))
-        turned = patches.sample(_frames(shapes, half_widths_px, found.keypoints))
+        turned = sample(_frames(shapes, half_widths_px, found.keypoints))
         descriptors = self._run(self.descriptor, turned)
         return shapes, descriptors
 
@@ -183,25 +185,23 @@ class AffNetHardNet:
         return np.asarray(torch.cat(outputs).cpu().numpy())
 
 
-class _Patches:
-    """Patches of the features of several images."""
+def _sampler(
+    images: Sequence[GrayImage], counts: Sequence[int], device: torch.device
+) -> Callable[[Array], Tensor]:
+    """Return what samples (N, 1, 32, 32) patches of (N, 2, 3) frames, so many of each image."""
+    import torch
 
-    def __init__(
-        self, images: Sequence[GrayImage], counts: Sequence[int], device: torch.device
-    ) -> None:
-        """Take the images, and how many features each has."""
-        from colmap_affrect.features.patches import PatchSampler
+    from colmap_affrect.features.patches import PatchSampler
 
-        pairs = [pair for pair in zip(images, counts, strict=True) if pair[1]]
-        self.samplers = [PatchSampler(_unit_range(image), device) for image, _ in pairs]
-        self.ends = np.cumsum([count for _, count in pairs])
+    pairs = [pair for pair in zip(images, counts, strict=True) if pair[1]]
+    samplers = [PatchSampler(_unit_range(image), device) for image, _ in pairs]
+    ends = np.cumsum([count for _, count in pairs])
 
-    def sample(self, lafs: Array) -> Tensor:
-        """Return (N, 1, 32, 32) float32 patches of the (N, 2, 3) frames of all images in turn."""
-        import torch
+    def sample(lafs: Array) -> Tensor:
+        parts = np.split(lafs, ends[:-1])
+        return torch.cat([s.sample(part) for s, part in zip(samplers, parts, strict=True)])
 
-        parts = np.split(lafs, self.ends[:-1])
-        return torch.cat([s.sample(part) for s, part in zip(self.samplers, parts, strict=True)])
+    return sample
 
 
 def shapes_from_outputs(outputs: Floats) -> Array:

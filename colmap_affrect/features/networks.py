@@ -72,7 +72,6 @@ class AffineShapes(nn.Module):
     """AffNet on patches (Mishkin, Radenovic, Matas 2018)."""
 
     def __init__(self, affnet: feature.LAFAffNetShapeEstimator) -> None:
-        """Take the layers of kornia's AffNet, batch normalisation folded in."""
         super().__init__()
         self.features = folded(affnet.features)
 

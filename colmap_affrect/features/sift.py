@@ -45,7 +45,6 @@ class RootSift(FeatureExtractor):
     descriptor_size = 128
 
     def __init__(self, options: SiftOptions, network: NetworkContext | None = None) -> None:
-        """Keep the options; there is no network."""
         del network
         self.options = options
 

@@ -144,7 +144,6 @@ class DepthFiles:
     Options = DepthFilesOptions
 
     def __init__(self, options: DepthFilesOptions, context: DepthContext | None = None) -> None:
-        """Keep the options; nothing else is needed."""
         del context
         self._options = options
         self._path = Path(options.path)

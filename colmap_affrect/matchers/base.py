@@ -10,7 +10,6 @@ import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -23,7 +22,7 @@ from colmap_affrect.parallel.executor import unless_gpu_is_full
 
 logger = logging.getLogger(__name__)
 
-_WARNING = threading.Lock()  # ``cache`` alone lets two threads through
+_SAID = threading.Lock()  # taken, and never given back, by the thread that says so
 
 Found = TypeVar("Found")
 
@@ -99,13 +98,8 @@ def unless_gpu_is_full_or_say(with_gpu: Callable[[], Found], without: Callable[[
     """Return what is done on a GPU, or without it where its memory is full; say so once."""
 
     def say_once_and_go_on() -> Found:
-        with _WARNING:
-            _warn_that_gpu_is_full()
+        if _SAID.acquire(blocking=False):
+            logger.warning("the memory of the GPU is full; the CPU matches the rest")
         return without()
 
     return unless_gpu_is_full(with_gpu, say_once_and_go_on)
-
-
-@cache
-def _warn_that_gpu_is_full() -> None:
-    logger.warning("the memory of the GPU is full; the CPU matches the rest")

@@ -152,7 +152,6 @@ class HomographyGuide:
     """Matches lie near the places that a homography gives: of planes, and without a baseline."""
 
     def __init__(self, homography: Array, points1: Array, points2: Array, band_px: float) -> None:
-        """Carry the points of image 1 over."""
         self._points2 = points2
         self.model: PairModel = HomographyModel(homography, (points1, points2))
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -58,7 +58,6 @@ class NearestNeighbors:
     Options = NearestOptions
 
     def __init__(self, options: NearestOptions, context: MatcherContext) -> None:
-        """Choose how similarities are computed."""
         self.options = options
         self._make_coarse = coarse_descriptors(context.num_similarities, context.device)
 

@@ -28,7 +28,6 @@ class PairList(Sequence[Pair]):
     """
 
     def __init__(self, names: Sequence[str], numbers: NDArray[np.integer]) -> None:
-        """Keep them as they are."""
         self.names, self.numbers = names, numbers.astype(np.int32, copy=False).reshape(-1, 2)
 
     @classmethod

@@ -46,7 +46,6 @@ class SecondMoment:
         network: NetworkContext | None = None,
         features: FeatureOptions | None = None,
     ) -> None:
-        """Keep the options; there is no network, and there are no keypoints."""
         del network, features
         self.options = options
 
