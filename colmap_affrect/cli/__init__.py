@@ -23,8 +23,7 @@ from colmap_affrect.shown import one_line
 
 logger = logging.getLogger("colmap_affrect")
 
-REPEAT_S = 0.01
-"""After which a Ctrl-C is repeated."""
+REPEAT_S = 0.01  # after which a Ctrl-C is repeated
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,9 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = build_parser().parse_args(arguments)
         if not hasattr(options, "verbose"):  # a command that only prints
-            return int(options.function(options))
+            return options.function(options) or EXIT_OK
         with _no_empty_folder(options.output_path), _logging(options):
-            return int(options.function(options))
+            return options.function(options) or EXIT_OK
     except OptionError as error:
         return _fail(str(error), EXIT_USAGE)
     except AffrectError as error:

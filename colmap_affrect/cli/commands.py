@@ -1,7 +1,7 @@
 """What each command does with its options: one library function and its result printed.
 
-Every command takes the parsed options and returns the exit code. Modules are imported when a
-command needs them: ``--help`` loads no heavy package.
+Every command takes the parsed options and returns an exit code, or nothing when all is well.
+Modules are imported when a command needs them: ``--help`` loads no heavy package.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_affrect.comparison.results import Comparison
-    from colmap_affrect.interop.hdf5 import InterchangeReport
-    from colmap_affrect.project.report import ReconstructionReport, StageReport
+    from colmap_affrect.project.report import ReconstructionReport
 
 
 def run(options: argparse.Namespace) -> int:
@@ -68,16 +67,16 @@ def extract(options: argparse.Namespace) -> int:
     return _exit_code(report.failures, options)
 
 
-def pairs(options: argparse.Namespace) -> int:
+def pairs(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.pairs import choose_pairs
 
     with given.context(options) as context:
         chosen = given.pair_options(options, context.workspace.planned("pairs"))
         report = choose_pairs(context, chosen, overwrite=options.overwrite)
-    return _printed(report)
+    show(report.summary())
 
 
-def match(options: argparse.Namespace) -> int:
+def match(options: argparse.Namespace) -> None:
     from colmap_affrect.matchers.base import MATCHERS
     from colmap_affrect.stages.match import match
 
@@ -89,19 +88,19 @@ def match(options: argparse.Namespace) -> int:
             values = given.changed(context, "match", "matching", [*chosen, *options.set])
             matching = MATCHERS.options(values, where="matching")
         report = match(context, matching, overwrite=options.overwrite)
-    return _printed(report)
+    show(report.summary())
 
 
-def verify(options: argparse.Namespace) -> int:
+def verify(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.verify import verify_matches
 
     with given.context(options) as context:
         chosen = given.verification(options, context.workspace.planned("verify"))
         report = verify_matches(context, chosen, overwrite=options.overwrite)
-    return _printed(report)
+    show(report.summary())
 
 
-def escalate(options: argparse.Namespace) -> int:
+def escalate(options: argparse.Namespace) -> None:
     from colmap_affrect.recipes import EscalateOptions
     from colmap_affrect.stages.escalate import escalate, pair_levels
 
@@ -112,10 +111,9 @@ def escalate(options: argparse.Namespace) -> int:
         levels = pair_levels(context)
     show(report.summary())
     show(", ".join(by_level(*item) for item in levels.items()))
-    return EXIT_OK
 
 
-def guide(options: argparse.Namespace) -> int:
+def guide(options: argparse.Namespace) -> None:
     from colmap_affrect.colmap.model_files import read_model
     from colmap_affrect.matchers.guided import GuidedOptions
     from colmap_affrect.stages.guide import guide, guided_counts
@@ -134,7 +132,6 @@ def guide(options: argparse.Namespace) -> int:
     show(report.summary())
     if counts:
         show("{pairs} pairs, {matches_before} to {matches_after} inliers".format(**counts))
-    return EXIT_OK
 
 
 def map(options: argparse.Namespace) -> int:
@@ -245,7 +242,7 @@ def _comparison_exit_code(comparison: Comparison, options: argparse.Namespace) -
     return _exit_code(failures, options)
 
 
-def import_h5(options: argparse.Namespace) -> int:
+def import_h5(options: argparse.Namespace) -> None:
     from colmap_affrect.interop.hdf5 import import_h5
 
     report = import_h5(
@@ -260,10 +257,10 @@ def import_h5(options: argparse.Namespace) -> int:
         random_seed=options.random_seed,
         progress=given.progress(options),
     )
-    return _printed(report)
+    show(report.summary())
 
 
-def export_h5(options: argparse.Namespace) -> int:
+def export_h5(options: argparse.Namespace) -> None:
     from colmap_affrect.interop.hdf5 import export_h5
 
     report = export_h5(
@@ -275,12 +272,11 @@ def export_h5(options: argparse.Namespace) -> int:
         half=options.half,
         progress=given.progress(options),
     )
-    return _printed(report)
+    show(report.summary())
 
 
-def export_database(options: argparse.Namespace) -> int:
+def export_database(options: argparse.Namespace) -> None:
     from colmap_affrect.colmap.old_databases import MAPPER_OPTIONS, export_database
-    from colmap_affrect.project.workspace import Workspace
 
     path = Workspace(options.path).database if options.path.is_dir() else options.path
     notes = export_database(path, options.database_path)
@@ -290,10 +286,9 @@ def export_database(options: argparse.Namespace) -> int:
         f"{MAPPER_OPTIONS}"
     )
     show("\n".join([f"{options.database_path}: for COLMAP {options.colmap} to 3.13", *notes]))
-    return EXIT_OK
 
 
-def export(options: argparse.Namespace) -> int:
+def export(options: argparse.Namespace) -> None:
     from colmap_affrect.interop.export import export
 
     written = export(
@@ -301,10 +296,9 @@ def export(options: argparse.Namespace) -> int:
     )
     for name, path in written.items():
         show(f"{name:11s} {path}")
-    return EXIT_OK
 
 
-def align(options: argparse.Namespace) -> int:
+def align(options: argparse.Namespace) -> None:
     from colmap_affrect.interop.align import Reference, align
 
     reference = Reference(
@@ -315,7 +309,6 @@ def align(options: argparse.Namespace) -> int:
     )
     show(align(options.model_path, options.target_path, reference).summary())
     show(f"model       {options.target_path}")
-    return EXIT_OK
 
 
 def doctor(options: argparse.Namespace) -> int:
@@ -329,11 +322,6 @@ def doctor(options: argparse.Namespace) -> int:
     )
     show(diagnosis.to_json() if options.json else diagnosis.summary())
     return EXIT_FAILED if diagnosis.num_errors else EXIT_OK
-
-
-def _printed(report: StageReport | InterchangeReport) -> int:
-    show(report.summary())
-    return EXIT_OK
 
 
 def _print_reconstruction(report: ReconstructionReport, options: argparse.Namespace) -> int:
@@ -379,7 +367,7 @@ def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
     return EXIT_FAILED
 
 
-def inspect(options: argparse.Namespace) -> int:
+def inspect(options: argparse.Namespace) -> None:
     from colmap_affrect.images.photographs import Photographs
     from colmap_affrect.report.inspection import inspect_image
     from colmap_affrect.stages.one_image import prepare
@@ -395,7 +383,6 @@ def inspect(options: argparse.Namespace) -> int:
     mask = photographs.mask(options.image.name)
     extractor = prepare(recipe.extraction, given.resources(options), [options.image.name])
     show(inspect_image(extractor, options.image, options.output_path, mask))
-    return EXIT_OK
 
 
 def convert(options: argparse.Namespace) -> int:
@@ -406,7 +393,7 @@ def convert(options: argparse.Namespace) -> int:
     return EXIT_FAILED if report.failures else EXIT_OK
 
 
-def recipes(options: argparse.Namespace) -> int:
+def recipes(options: argparse.Namespace) -> None:
     from colmap_affrect.options import described_toml
     from colmap_affrect.recipes import RecipeOptions, load_recipe, recipe_names
 
@@ -414,24 +401,23 @@ def recipes(options: argparse.Namespace) -> int:
         recipe = load_recipe(options.name)
         values = {"summary": recipe.summary, **recipe.to_mapping()}
         show(described_toml(RecipeOptions.from_mapping(values, options.name)), end="")
-        return EXIT_OK
+        return
     for name in recipe_names():
         recipe = load_recipe(name)
         needs = list(recipe.weights)
         needs += ["depth"] if recipe.extraction.uses_depth else []
         show(f"{name:28s} {recipe.summary}")
         show(f"{'':28s} needs {', '.join(needs) or 'nothing'}")
-    return EXIT_OK
 
 
-def weights(options: argparse.Namespace) -> int:
+def weights(options: argparse.Namespace) -> None:
     from colmap_affrect.features.weights import describe_weights, fetch, install_hint
 
     if options.action == "fetch":
         keys = options.keys or ["affnet", "orinet", "hardnet"]
         for path in fetch(keys, options.weights, progress=Progress(sys.stderr)).values():
             show(path)
-        return EXIT_OK
+        return
     checks = {None: "", True: ", verified", False: ", NOT the published file"}
     for row in describe_weights(options.weights):
         file = row.published
@@ -442,4 +428,3 @@ def weights(options: argparse.Namespace) -> int:
         show(f"{'':4s}{where}")
         sha256, licence = file.sha256 or "not known", file.licence or "not stated"
         show(f"{'':4s}sha256 {sha256}; licence {licence}")
-    return EXIT_OK

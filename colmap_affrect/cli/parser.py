@@ -127,7 +127,7 @@ ABSENT: dict[str, Any] = {
 """What commands read that not all of them have as options."""
 
 
-def _add(container: Container, options: tuple[args.Option | args.OneOf, ...]) -> None:
+def _add(container: Container, options: Options) -> None:
     for option in options:
         if isinstance(option, args.OneOf):
             group = container.add_mutually_exclusive_group(required=option.required)
@@ -136,7 +136,8 @@ def _add(container: Container, options: tuple[args.Option | args.OneOf, ...]) ->
             container.add_argument(*option.flags, **option.settings)
 
 
-Command = tuple[Callable[[argparse.Namespace], int], str, tuple[args.Option | args.OneOf, ...]]
+Options = tuple[args.Option | args.OneOf, ...]
+Command = tuple[Callable[[argparse.Namespace], int | None], str, Options]
 """What is called with the options, what it does in one line, and the options."""
 
 COMMANDS: dict[str, Command] = {

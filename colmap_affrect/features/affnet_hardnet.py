@@ -9,36 +9,33 @@ Patches are sampled from a pyramid whose level has steps of 1 to 2 px.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS
 from colmap_affrect.data import GrayImage, LocalFeatures, View, in_mask, union
 from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.features.sift import DogOptions, detect_dog, is_searchable
 from colmap_affrect.geometry.affine import determinants, lafs_from_keypoints, rotation
+from colmap_affrect.geometry.arrays import Array, Bools, Floats, Singles
+from colmap_affrect.geometry.shapes import frames_from_affnet
 from colmap_affrect.options import within
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor, nn
 
-MIN_DETECTABLE_PX = 32
-"""kornia's detectors look for nothing within 15 px of a border, and Key.Net fails on less."""
-
-KEYNET_RADIUS_PX = 22.0
-"""Radius of kornia's frames of Key.Net on the image itself, its measurement region."""
+MIN_DETECTABLE_PX = 32  # kornia finds nothing within 15 px of a border; Key.Net fails on less
+KEYNET_RADIUS_PX = 22.0  # of kornia's frames of Key.Net on the image itself
 
 MIN_RESPONSE = 1e-10
 """kornia fills up to the number asked for with frames of response 0 at the origin. Its Hessian
 finds rounding errors of 1e-13 in flat images; a blob of one gray level has 1e-6."""
 
-MAX_TILT = 20.0
-"""More is degenerate. AffNet's shapes on photographs stay under 6 (Graffiti)."""
+MAX_TILT = 20.0  # more is degenerate; AffNet's shapes on photographs stay under 6 (Graffiti).
 
 BATCH_MULTIPLE = 64
 """Batches are filled up to multiples of this many patches: other sizes change the last bits of the
@@ -79,11 +76,7 @@ class AffNetHardNet:
     descriptor_size = 128
 
     def __init__(self, options: AffNetHardNetOptions, network: NetworkContext) -> None:
-        """Load the networks.
-
-        Raises WeightsError when a file is damaged or belongs to another network, DeviceError when
-        the device is not there.
-        """
+        """Load the networks; WeightsError and DeviceError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import (
             AffineShapes,
             load_affnet,
@@ -93,8 +86,7 @@ class AffNetHardNet:
         )
 
         weights, device = network.weights, network.device
-        self.options = options
-        self.device = resolve_device(device)
+        self.options, self.device = options, resolve_device(device)
         self.affine_shapes = None
         if options.affine_shape:
             self.affine_shapes = AffineShapes(load_affnet(weights["affnet"], device))
@@ -147,7 +139,7 @@ class AffNetHardNet:
 
         found = union(list(detected))
         with torch.inference_mode():
-            shapes, descriptors = self._describe(_Patches(images, counts, self.device), found)
+            shapes, descriptors = self._describe(_sampler(images, counts, self.device), found)
         lengths = np.linalg.norm(descriptors, axis=1)
         valid = _is_sound(shapes) & np.isfinite(lengths) & (lengths > 0.0)
         radii_px = found.scales
@@ -161,22 +153,22 @@ class AffNetHardNet:
         return described
 
     def _describe(
-        self, patches: _Patches, found: LocalFeatures
-    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        self, sample: Callable[[Array], Tensor], found: LocalFeatures
+    ) -> tuple[Array, Singles]:
         """Return (N, 2, 2) shapes of determinant 1, and (N, 128) descriptors of any length."""
         half_widths_px = self.options.patch_sigmas / MEASUREMENT_SIGMAS * found.scales
         shapes = np.tile(np.eye(2), (len(found), 1, 1))
         if self.affine_shapes is not None:
-            upright = patches.sample(_frames(shapes, half_widths_px, found.keypoints))
+            upright = sample(_frames(shapes, half_widths_px, found.keypoints))
             shapes = shapes_from_outputs(self._run(self.affine_shapes, upright))
-        unturned = patches.sample(_frames(shapes, half_widths_px, found.keypoints))
+        unturned = sample(_frames(shapes, half_widths_px, found.keypoints))
         # kornia's angles are of the opposite sense to those of our rotation().
         shapes = shapes @ rotation(-self._run(self.orinet, unturned).astype(np.float64))
-        turned = patches.sample(_frames(shapes, half_widths_px, found.keypoints))
+        turned = sample(_frames(shapes, half_widths_px, found.keypoints))
         descriptors = self._run(self.descriptor, turned)
         return shapes, descriptors
 
-    def _run(self, network: nn.Module, patches: Tensor) -> NDArray[np.float32]:
+    def _run(self, network: nn.Module, patches: Tensor) -> Singles:
         """Run a network on (N, 1, 32, 32) patches, in batches."""
         import torch
         from torch.nn.functional import pad
@@ -193,60 +185,51 @@ class AffNetHardNet:
         return np.asarray(torch.cat(outputs).cpu().numpy())
 
 
-class _Patches:
-    """Patches of the features of several images."""
+def _sampler(
+    images: Sequence[GrayImage], counts: Sequence[int], device: torch.device
+) -> Callable[[Array], Tensor]:
+    """Return what samples (N, 1, 32, 32) patches of (N, 2, 3) frames, so many of each image."""
+    import torch
 
-    def __init__(
-        self, images: Sequence[GrayImage], counts: Sequence[int], device: torch.device
-    ) -> None:
-        """Take the images, and how many features each has."""
-        from colmap_affrect.features.patches import PatchSampler
+    from colmap_affrect.features.patches import PatchSampler
 
-        pairs = [pair for pair in zip(images, counts, strict=True) if pair[1]]
-        self.samplers = [PatchSampler(_unit_range(image), device) for image, _ in pairs]
-        self.ends = np.cumsum([count for _, count in pairs])
+    pairs = [pair for pair in zip(images, counts, strict=True) if pair[1]]
+    samplers = [PatchSampler(_unit_range(image), device) for image, _ in pairs]
+    ends = np.cumsum([count for _, count in pairs])
 
-    def sample(self, lafs: NDArray[np.float64]) -> Tensor:
-        """Return (N, 1, 32, 32) float32 patches of the (N, 2, 3) frames of all images in turn."""
-        import torch
+    def sample(lafs: Array) -> Tensor:
+        parts = np.split(lafs, ends[:-1])
+        return torch.cat([s.sample(part) for s, part in zip(samplers, parts, strict=True)])
 
-        parts = np.split(lafs, self.ends[:-1])
-        return torch.cat([s.sample(part) for s, part in zip(self.samplers, parts, strict=True)])
+    return sample
 
 
-def shapes_from_outputs(outputs: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return (N, 2, 2) shapes of determinant 1 of (N, 3) outputs o of AffNet, lower triangular.
+def shapes_from_outputs(outputs: Floats) -> Array:
+    """Return (N, 2, 2) shapes of determinant 1 of (N, 3) outputs of AffNet, lower triangular.
 
-    They are [[1 + o0, 0], [o1, 1 + o2]] up to scale; not a number where that has no area.
+    They are not a number where the frame has no area.
 
     >>> shapes_from_outputs(np.array([[0.0, 3.0, 3.0]]))[0]
     array([[0.5, 0. ],
            [1.5, 2. ]])
     """
-    shapes = np.zeros((len(outputs), 2, 2))
-    shapes[:, 0, 0] = 1.0 + outputs[:, 0]
-    shapes[:, 1, 0] = outputs[:, 1]
-    shapes[:, 1, 1] = 1.0 + outputs[:, 2]
+    shapes = frames_from_affnet(outputs)
     areas = shapes[:, 0, 0] * shapes[:, 1, 1]
     return shapes / np.sqrt(np.where(areas > 0.0, areas, np.nan))[:, None, None]
 
 
-def _is_sound(shapes: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which of (N, 2, 2) shapes of determinant 1 are finite and of a tilt up to MAX_TILT.
-
-    The squared Frobenius norm of a shape of tilt t is t + 1 / t.
-    """
+def _is_sound(shapes: Array) -> Bools:
+    """Tell which (N, 2, 2) shapes of determinant 1 are finite and of a tilt up to MAX_TILT."""
+    # The squared Frobenius norm of a shape of tilt t is t + 1 / t.
     return np.asarray((shapes**2).sum(axis=(1, 2)) <= MAX_TILT + 1.0 / MAX_TILT)
 
 
-def _frames(
-    shapes: NDArray[np.float64], radii_px: NDArray[np.float64], centers: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _frames(shapes: Array, radii_px: Array, centers: Array) -> Array:
     """Return (N, 2, 3) frames of shapes of determinant 1, geometric mean radii and centres."""
     return np.concatenate([radii_px[:, None, None] * shapes, centers[:, :, None]], axis=2)
 
 
-def _unit_range(image: GrayImage) -> NDArray[np.float32]:
+def _unit_range(image: GrayImage) -> Singles:
     """Return an (H, W) image as float32 in [0, 1]."""
     return image.astype(np.float32) / np.float32(255)
 
@@ -267,14 +250,11 @@ def _detector(
     return ScaleSpaceDetector(count, MEASUREMENT_SIGMAS).to(resolve_device(device))
 
 
-def _centers_from_keynet(
-    centers: NDArray[np.float64], radii_px: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _centers_from_keynet(centers: Array, radii_px: Array) -> Array:
     """Correct the centres that kornia's multi-resolution detector reports.
 
     A pixel of a level f times coarser than the image is reported at f times its coordinates,
-    which holds for corner coordinates only: in pixel-centre ones (f - 1) / 2 is missing, up to
-    1.5 px on the coarsest level.
+    which holds for corner coordinates only: in pixel-centre ones (f - 1) / 2 is missing.
     """
     factors = radii_px / KEYNET_RADIUS_PX
     return centers + HALF_PIXEL * (factors - 1.0)[:, None]

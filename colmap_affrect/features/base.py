@@ -14,21 +14,16 @@ from typing import Annotated, ClassVar, Protocol
 from colmap_affrect.data import GrayImage, LocalFeatures, ShapeGrid, ShapeSamples, View
 from colmap_affrect.options import PartOptions, Registry, within
 
-PATCH_SIZE_PX = 32
-"""Side of the patches that all networks take."""
+PATCH_SIZE_PX = 32  # side of the patches that all networks take
 
 
 @dataclass(frozen=True)
 class NetworkContext:
-    """What networks run with.
+    """What networks run with."""
 
-    Attributes:
-        weights: files by key, found beforehand (:mod:`colmap_affrect.features.weights`).
-        device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``.
-    """
-
+    # files by key, found beforehand (:mod:`colmap_affrect.features.weights`)
     weights: Mapping[str, Path] = field(default_factory=dict)
-    device: str = "cpu"
+    device: str = "cpu"  # ``cpu``, ``cuda``, ``cuda:1``, ``mps``
 
 
 class NetworkOptions(PartOptions):
@@ -59,13 +54,9 @@ class FeatureOptions(NetworkOptions):
 
 
 class FeatureExtractor(Protocol):
-    """Detection and description; called with its ``Options`` and a :class:`NetworkContext`.
+    """Detection and description; called with its ``Options`` and a :class:`NetworkContext`."""
 
-    Attributes:
-        descriptor_size: D, also of an image without features.
-    """
-
-    descriptor_size: int
+    descriptor_size: int  # D, also of an image without features
 
     def detect(self, view: View) -> LocalFeatures:
         """Return features of one view, frames in its px; descriptors may be (N, 0) still."""
@@ -75,8 +66,10 @@ class FeatureExtractor(Protocol):
     ) -> list[LocalFeatures]:
         """Describe features that :meth:`detect` found, a list element for each image.
 
-        The result is the same for images that are given together or one by one.
+        The result is the same for images together or one by one. Here they are described already.
         """
+        del images
+        return list(detected)
 
 
 EXTRACTORS: Registry[FeatureExtractor] = Registry(

@@ -6,19 +6,20 @@ a warp makes ellipses in the image.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import HALF_PIXEL
 from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, Mask, View, in_mask
-from colmap_affrect.features.base import FeatureOptions, NetworkContext
+from colmap_affrect.features.base import FeatureExtractor, FeatureOptions, NetworkContext
 from colmap_affrect.features.sift import is_searchable
 from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.options import within
 
 if TYPE_CHECKING:
@@ -28,11 +29,13 @@ RADIUS_PX = 12.0
 """Radius of all frames: a sigma of 2 px, within which all three networks find a point again, so
 that a point that warps show again is known as the same."""
 
-MIN_NETWORK_PX = 32
-"""Views are filled up to this side: DISK normalises over what is a sixteenth of it."""
+MIN_NETWORK_PX = 32  # views are filled up to it: DISK normalises over a sixteenth of it
 
 Found = tuple["Tensor", "Tensor", "Tensor"]
 """(N, 2) points in pixel-centre px, (N,) responses, (N, D) descriptors of unit length."""
+
+Best = Callable[["Tensor", "Tensor"], "Tensor"]
+"""Chooses the strongest of (N, 2) points with (N,) responses where they are allowed."""
 
 
 class LearnedOptions(FeatureOptions):
@@ -83,10 +86,8 @@ class XFeatOptions(LearnedOptions):
     """Scores are above it, before they are weighted by reliability."""
 
 
-class LearnedFeatures(ABC):
+class LearnedFeatures(FeatureExtractor):
     """A network on one view after another; its class says how it is called."""
-
-    descriptor_size: int
 
     def __init__(self, options: LearnedOptions, context: NetworkContext) -> None:
         """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
@@ -100,8 +101,7 @@ class LearnedFeatures(ABC):
     def detect(self, view: View) -> LocalFeatures:
         """Detect and describe, by falling response; none for views under 8 px.
 
-        A gray view is taken as one whose colours are equal. The mask chooses among what was
-        found, so that its edge is no feature.
+        The mask chooses among what was found, so that its edge is no feature.
         """
         image, mask = view
         if not is_searchable(image, mask):
@@ -111,26 +111,19 @@ class LearnedFeatures(ABC):
         from colmap_affrect.features.networks import arithmetic
 
         allowed = np.ones(image.shape[:2], dtype=bool) if mask is None else mask > 0
-        best = _Best(allowed, self.limit)
+        best = partial(_best, allowed, self.limit)
         with torch.inference_mode(), arithmetic(self.dtype, self.device):
             found = self._run(_pixels(image).to(self.device), best)
         points, responses, descriptors = (_array(values) for values in found)
         lafs = lafs_from_keypoints(points, np.full(len(points), RADIUS_PX), np.zeros(len(points)))
         return LocalFeatures(lafs, responses, descriptors)
 
-    def describe(
-        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
-    ) -> list[LocalFeatures]:
-        """Return the features as they are: :meth:`detect` has described them."""
-        del images
-        return list(detected)
-
     @abstractmethod
     def _load(self, options: Any, path: Path, device: str) -> Any:
         """Return the network with the weights in a file."""
 
     @abstractmethod
-    def _run(self, pixels: Tensor, best: _Best) -> Found:
+    def _run(self, pixels: Tensor, best: Best) -> Found:
         """Return the best features of a (1, 3, H, W) view in [0, 1]."""
 
 
@@ -148,7 +141,7 @@ class Aliked(LearnedFeatures):
 
         return load_aliked(options.weights[0], options.score_threshold, path, device)
 
-    def _run(self, pixels: Tensor, best: _Best) -> Found:
+    def _run(self, pixels: Tensor, best: Best) -> Found:
         features, scores = self.network.extract_dense_map(pixels)
         (places,), (responses,), _ = self.network.dkd(scores)
         size = places.new_tensor([pixels.shape[3] - 1, pixels.shape[2] - 1])
@@ -174,7 +167,7 @@ class Disk(LearnedFeatures):
         self.score_threshold = options.score_threshold
         return load_disk(path, device)
 
-    def _run(self, pixels: Tensor, best: _Best) -> Found:
+    def _run(self, pixels: Tensor, best: Best) -> Found:
         from torch.nn.functional import pad
 
         height, width = pixels.shape[2:]
@@ -204,7 +197,7 @@ class XFeat(LearnedFeatures):
 
         return load_xfeat(options.score_threshold, path, device)
 
-    def _run(self, pixels: Tensor, best: _Best) -> Found:
+    def _run(self, pixels: Tensor, best: Best) -> Found:
         height, width = pixels.shape[2:]
         (found,) = self.network.detectAndCompute(pixels, top_k=height * width)
         # kornia multiplies whole pixels of the shrunk view by these; of corner coordinates, which
@@ -215,19 +208,13 @@ class XFeat(LearnedFeatures):
         return points[chosen], found["scores"][chosen], found["descriptors"][chosen]
 
 
-class _Best:
-    """Chooses the strongest features where they are allowed."""
+def _best(allowed: Mask, limit: int, points: Tensor, responses: Tensor) -> Tensor:
+    """Return the indices of the strongest features where they are allowed, by falling response."""
+    import torch
 
-    def __init__(self, allowed: Mask, limit: int) -> None:
-        self.allowed, self.limit = allowed, limit
-
-    def __call__(self, points: Tensor, responses: Tensor) -> Tensor:
-        """Return the indices of those that stay, by falling response."""
-        import torch
-
-        kept = np.flatnonzero(in_mask(self.allowed, _array(points)))
-        order = np.argsort(-_array(responses)[kept], kind="stable")[: self.limit]
-        return torch.from_numpy(kept[order]).to(points.device)
+    kept = np.flatnonzero(in_mask(allowed, _array(points)))
+    order = np.argsort(-_array(responses)[kept], kind="stable")[:limit]
+    return torch.from_numpy(kept[order]).to(points.device)
 
 
 def _pixels(image: GrayImage | ColorImage) -> Tensor:
@@ -239,5 +226,5 @@ def _pixels(image: GrayImage | ColorImage) -> Tensor:
     return torch.from_numpy(channels)[None] / 255
 
 
-def _array(values: Tensor) -> NDArray[np.float32]:
+def _array(values: Tensor) -> Singles:
     return np.asarray(values.float().cpu().numpy())

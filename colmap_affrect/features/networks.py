@@ -26,8 +26,7 @@ from colmap_affrect.shown import such_as
 
 Network = TypeVar("Network", bound=nn.Module)
 
-DESCRIPTOR_SIZE = 128
-"""Width of all descriptors."""
+DESCRIPTOR_SIZE = 128  # width of all descriptors
 
 
 def resolve_device(name: str) -> torch.device:
@@ -40,16 +39,18 @@ def resolve_device(name: str) -> torch.device:
     if not re.fullmatch(r"cpu|cuda(:\d+)?|mps", name):
         raise DeviceError(f"--device {name}: not one of auto, cpu, cuda, cuda:0, mps")
     device = torch.device(name)
+    count = 1
     if device.type == "cuda":
         count = torch.cuda.device_count()
-        if not count:
-            raise DeviceError(
-                f"--device {name}: torch finds no CUDA device; use --device cpu or auto"
-            )
-        if (device.index or 0) >= count:
-            raise DeviceError(f"--device {name}: the last one is cuda:{count - 1}; use that")
-    if device.type == "mps" and not torch.backends.mps.is_available():
-        raise DeviceError(f"--device {name}: torch finds no MPS device; use --device cpu or auto")
+    elif device.type == "mps":
+        count = int(torch.backends.mps.is_available())
+    if not count:
+        kind = device.type.upper()
+        raise DeviceError(
+            f"--device {name}: torch finds no {kind} device; use --device cpu or auto"
+        )
+    if (device.index or 0) >= count:
+        raise DeviceError(f"--device {name}: the last one is cuda:{count - 1}; use that")
     return device
 
 
@@ -71,15 +72,11 @@ class AffineShapes(nn.Module):
     """AffNet on patches (Mishkin, Radenovic, Matas 2018)."""
 
     def __init__(self, affnet: feature.LAFAffNetShapeEstimator) -> None:
-        """Take the layers of kornia's AffNet, batch normalisation folded in."""
         super().__init__()
         self.features = folded(affnet.features)
 
     def forward(self, patches: Tensor) -> Tensor:
-        """Return (B, 3) outputs o of (B, 1, 32, 32) patches.
-
-        The shape is [[1 + o0, 0], [o1, 1 + o2]] up to scale, image from patch.
-        """
+        """Return (B, 3) outputs of (B, 1, 32, 32) patches."""
         return cast(Tensor, self.features(standardized(patches))).flatten(1)
 
 
@@ -103,10 +100,7 @@ def load_keynet(path: Path, device: str) -> feature.KeyNet:
 
 
 def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
-    """Build a descriptor by its name in the options.
-
-    From (B, 1, 32, 32) patches in [0, 1] to (B, 128) rows, not of all networks of unit length.
-    """
+    """Build what makes (B, 128) rows of any length of (B, 1, 32, 32) patches in [0, 1]."""
     if name == "mkd":
         return _ready(_load_mkd(path), device)
     network: nn.Module = DESCRIPTOR_NETWORKS[name]()
@@ -144,18 +138,13 @@ def load_xfeat(score_threshold: float, path: Path, device: str) -> feature.XFeat
 class HardTFeat(nn.Module):
     """Two convolutions and a fully connected layer, with tanh, as in TFeat (Balntas et al. 2016).
 
-    The AffNet authors trained it with HardNet's loss. As they publish it, tanh comes before the
-    maximum of 2 x 2; here after it, which is the same and a quarter of the work.
+    As it is published, tanh comes before the maximum; here after it, a quarter of the work.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.features = nn.Sequential(
-            nn.Conv2d(1, 32, 7),
-            nn.MaxPool2d(2),
-            nn.Tanh(),
-            nn.Conv2d(32, 64, 6),
-            nn.Tanh(),
+            nn.Conv2d(1, 32, 7), nn.MaxPool2d(2), nn.Tanh(), nn.Conv2d(32, 64, 6), nn.Tanh()
         )
         self.classifier = nn.Sequential(
             nn.Dropout(0.1), nn.Conv2d(64, DESCRIPTOR_SIZE, 8), nn.Tanh()
@@ -178,19 +167,13 @@ DESCRIPTOR_NETWORKS: dict[str, Any] = {
 
 
 def standardized(patches: Tensor) -> Tensor:
-    """Subtract the mean of each of (B, 1, H, W) patches and divide by its standard deviation.
-
-    Flat patches become zero. (1e-6 is what AffNet and OriNet in kornia add to the deviation.)
-    """
+    """Subtract the mean of each of (B, 1, H, W) patches and divide by its deviation, if any."""
     deviations, means = torch.std_mean(patches, dim=(1, 2, 3), keepdim=True)
-    return (patches - means) / (deviations + 1e-6)
+    return (patches - means) / (deviations + 1e-6)  # as AffNet and OriNet in kornia
 
 
 def folded(layers: nn.Sequential) -> nn.Sequential:
-    """Return layers for inference only: batch normalisations become part of the convolutions.
-
-    Twice as fast on a CPU (0.25 instead of 0.5 ms for AffNet and a patch, 1 thread).
-    """
+    """Fold batch normalisations into convolutions, for inference; twice as fast on a CPU."""
     kept: list[nn.Module] = []
     for layer in layers.eval():
         if isinstance(layer, nn.BatchNorm2d):
@@ -203,10 +186,7 @@ def folded(layers: nn.Sequential) -> nn.Sequential:
 
 
 def _load_mkd(path: Path) -> nn.Module:
-    """Build MKD (Mukundan et al. 2019): kernels and the whitening learned on Liberty.
-
-    Whitening by attenuated PCA (``pcawt``), kornia's default.
-    """
+    """Build MKD (Mukundan et al. 2019) with its whitening by attenuated PCA, learned on Liberty."""
     kernels = feature.MKDDescriptor(PATCH_SIZE_PX, whitening=None)  # type: ignore[arg-type]
     width = kernels.odims
     try:
@@ -229,29 +209,24 @@ def _load(network: nn.Module, path: Path, name: str) -> None:
     _load_state(network, state, path, name)
 
 
+COUNTER = "num_batches_tracked"  # of batch normalisations; older files have none
+
+
 def _load_state(network: nn.Module, state: Mapping[str, Any], path: Path, name: str) -> None:
-    _require_same(state, network.state_dict(), path, name)
-    network.load_state_dict(state, strict=False)
-
-
-COUNTER = "num_batches_tracked"
-"""Entry of batch normalisations that older files do not have and inference does not read."""
-
-
-def _require_same(
-    state: Mapping[str, Any], expected: Mapping[str, Tensor], path: Path, name: str
-) -> None:
-    given = {key: value for key, value in state.items() if not key.endswith(COUNTER)}
-    wanted = {key: value for key, value in expected.items() if not key.endswith(COUNTER)}
+    given, wanted = (
+        {key: _kind(value) for key, value in values.items() if not key.endswith(COUNTER)}
+        for values in (state, network.state_dict())
+    )
     problems = [f"no {key}" for key in wanted if key not in given]
     problems += [f"unknown {key}" for key in given if key not in wanted]
     problems += [
-        f"{key} is {_kind(given[key])} instead of {_kind(value)}"
-        for key, value in wanted.items()
-        if key in given and _kind(given[key]) != _kind(value)
+        f"{key} is {given[key]} instead of {kind}"
+        for key, kind in wanted.items()
+        if given.get(key, kind) != kind
     ]
     if problems:
         raise WeightsError(f"{path}: not the weights of {name} ({such_as(problems, 1)})")
+    network.load_state_dict(state, strict=False)
 
 
 def _kind(value: Any) -> str:

@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 from kornia.feature import extract_patches_from_pyramid
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
 from colmap_affrect.conventions import HALF_PIXEL
 from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.images.warping import halved
 
 PATCHES_AT_ONCE = 512
@@ -25,14 +25,14 @@ PATCHES_AT_ONCE = 512
 class PatchSampler:
     """An image and its halved versions, down to the size of a patch."""
 
-    def __init__(self, image: NDArray[np.float32], device: torch.device) -> None:
+    def __init__(self, image: Singles, device: torch.device) -> None:
         """Build the pyramid of an (H, W) image, for sampling on a device."""
         levels = [image]
         while min(levels[-1].shape) >= 2 * PATCH_SIZE_PX:
             levels.append(halved(levels[-1]))
         self.levels = [torch.from_numpy(level)[None, None].to(device) for level in levels]
 
-    def sample(self, lafs: NDArray[np.floating]) -> Tensor:
+    def sample(self, lafs: Floats) -> Tensor:
         """Return (N, 1, 32, 32) patches of (N, 2, 3) frames in px.
 
         Pixel (i, j) of a patch is the image at c + A u, u = ((2 j + 1) / 32 - 1, (2 i + 1) / 32 -
@@ -58,7 +58,7 @@ class PatchSampler:
                 patches[part] = _sampled(level, normalized[part])
         return patches
 
-    def _level_numbers(self, matrices: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _level_numbers(self, matrices: Array) -> Indices:
         """Return the (N,) levels to sample frames of (N, 2, 2) matrices from."""
         steps_px = 2.0 * np.sqrt(np.abs(determinants(matrices))) / PATCH_SIZE_PX
         numbers = np.floor(np.log2(np.maximum(steps_px, 1.0))).astype(np.int64)

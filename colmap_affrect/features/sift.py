@@ -7,12 +7,12 @@ from typing import Annotated, ClassVar, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, View
-from colmap_affrect.features.base import FeatureOptions, NetworkContext
+from colmap_affrect.features.base import FeatureExtractor, FeatureOptions, NetworkContext
 from colmap_affrect.geometry.affine import lafs_from_keypoints
+from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Indices, Singles
 from colmap_affrect.options import within
 
 
@@ -38,14 +38,13 @@ class SiftOptions(DogOptions):
     of a large photograph, which counts 8192 before."""
 
 
-class RootSift:
+class RootSift(FeatureExtractor):
     """DoG keypoints with RootSIFT descriptors (Arandjelovic & Zisserman 2012)."""
 
     Options = SiftOptions
     descriptor_size = 128
 
     def __init__(self, options: SiftOptions, network: NetworkContext | None = None) -> None:
-        """Keep the options; there is no network."""
         del network
         self.options = options
 
@@ -71,29 +70,18 @@ class RootSift:
         described = root_normalized(descriptors[order[best]].astype(np.float32))
         return LocalFeatures(lafs, responses[best], described)
 
-    def describe(
-        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
-    ) -> list[LocalFeatures]:
-        """Return the features as they are: :meth:`detect` has described them."""
-        del images
-        return list(detected)
 
-
-def root_normalized(descriptors: NDArray[np.floating]) -> NDArray[np.float32]:
+def root_normalized(descriptors: Floats) -> Singles:
     """Divide non-negative rows by their sum and take square roots: rows of unit length."""
     sums = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)
     return np.asarray(np.sqrt(descriptors / sums), dtype=np.float32)
 
 
-MIN_IMAGE_SIZE_PX = 8
-"""OpenCV's scale space needs this much of the shorter side."""
+MIN_IMAGE_SIZE_PX = 8  # OpenCV's scale space needs this much of the shorter side
 
 
 def make_sift(options: DogOptions) -> cv2.SIFT:
-    """Build OpenCV's detector and descriptor.
-
-    ``enable_precise_upscale`` removes OpenCV's bias of +0.25 px in x and y.
-    """
+    """Build OpenCV's SIFT; ``enable_precise_upscale`` removes its bias of +0.25 px in x and y."""
     return cv2.SIFT.create(
         nfeatures=0,
         nOctaveLayers=options.num_octave_layers,
@@ -104,19 +92,16 @@ def make_sift(options: DogOptions) -> cv2.SIFT:
     )
 
 
-def is_searchable(image: GrayImage | ColorImage, mask: NDArray[np.uint8] | None) -> bool:
+def is_searchable(image: GrayImage | ColorImage, mask: Bytes | None) -> bool:
     """Tell whether an image is large enough for OpenCV, not flat, and its mask not empty."""
     large = min(image.shape[:2]) >= MIN_IMAGE_SIZE_PX
     return large and bool(image.min() < image.max()) and (mask is None or bool(mask.any()))
 
 
-def by_falling_response(
-    keypoints: Sequence[cv2.KeyPoint],
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:
+def by_falling_response(keypoints: Sequence[cv2.KeyPoint]) -> tuple[Indices, Array, Singles]:
     """Sort keypoints by falling response; those of equal response keep their order.
 
-    Returns the (N,) index of the sorted keypoints in the given ones; their (N, 4) x, y in
-    pixel-centre px, sigma in px and angle in radians (from x towards y); their (N,) responses.
+    Returns (N,) indices, (N, 4) x, y, sigma in px and angle in radians, and (N,) responses.
     """
     responses = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
     order = np.argsort(-responses, kind="stable")
@@ -125,14 +110,12 @@ def by_falling_response(
     return order, rows, responses[order]
 
 
-def detect_dog(
-    image: GrayImage, options: DogOptions, mask: NDArray[np.uint8] | None = None
-) -> LocalFeatures:
+def detect_dog(image: GrayImage, options: DogOptions, mask: Bytes | None = None) -> LocalFeatures:
     """Detect DoG keypoints for descriptors that assign orientations themselves.
 
-    OpenCV returns a location once for each of its dominant orientations, 15 to 18 % of them more
-    than once. With another orientation put in their place these would be equal features, which no
-    ratio test tells apart; so there is one keypoint per centre and scale.
+    OpenCV returns a location once for each of its dominant orientations. With another one put in
+    their place these would be equal features, which no ratio test tells apart; so there is one per
+    centre and scale.
 
     The (H, W) uint8 mask is 0 where none are wanted. Returns features by falling response, frames
     upright circles of 6 sigma, descriptors (N, 0); none for images under 8 px.

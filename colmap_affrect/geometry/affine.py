@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from colmap_affrect.geometry.arrays import Array, Floats
 
 
-def rotation(angle_rad: ArrayLike) -> NDArray[np.float64]:
+def rotation(angle_rad: ArrayLike) -> Array:
     """Return R(a) = [[cos a, -sin a], [sin a, cos a]] of shape (..., 2, 2)."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
 
 
-def determinants(matrices: NDArray[np.floating]) -> NDArray[np.floating]:
+def determinants(matrices: Floats) -> Floats:
     """Return the (...) determinants of (..., 2, 2) matrices, faster than numpy for few of them."""
     return np.asarray(
         matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0]
     )
 
 
+def adjugates(matrices: Floats) -> Floats:
+    """Return the (N, 2, 2) inverses of matrices, times their determinants."""
+    a, b, c, d = (matrices[:, i, j] for i in (0, 1) for j in (0, 1))
+    return np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
+
+
 def compose_affine(
     scale: ArrayLike, psi_rad: ArrayLike, tilt: ArrayLike, phi_rad: ArrayLike
-) -> NDArray[np.float64]:
+) -> Array:
     """Return A = scale R(psi) diag(tilt, 1) R(phi) of shape (..., 2, 2)."""
     tilt = np.asarray(tilt, dtype=np.float64)
     stretch = np.stack([tilt, np.ones_like(tilt)], -1)[..., :, None]
@@ -29,25 +37,17 @@ def compose_affine(
     return np.asarray(np.asarray(scale, dtype=np.float64)[..., None, None] * matrix)
 
 
-def project(homography: NDArray[np.floating], points: NDArray[np.floating]) -> NDArray[np.float64]:
+def project(homography: Floats, points: Floats) -> Array:
     """Map (N, 2) points by a (3, 3) homography or affine map."""
     mapped = points @ homography[:, :2].T + homography[:, 2]
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
-def transform_frames(
-    homography: NDArray[np.floating], lafs: NDArray[np.floating]
-) -> NDArray[np.float64]:
-    """Carry local affine frames through a map: centres exactly, shapes by its Jacobian.
+def transform_frames(homography: Floats, lafs: Floats) -> Array:
+    """Carry (N, 2, 3) frames through a map: centres exactly, shapes by its Jacobian.
 
-    Args:
-        homography: (3, 3), target_from_source, finite and non-zero third coordinate at
-            every centre. An affine map is the special case with last row (0, 0, 1).
-        lafs: (N, 2, 3) frames in source px.
-
-    Returns:
-        (N, 2, 3) float64 frames in target px. For an affine map M with linear part B
-        the shapes become B A (the map stands on the left).
+    The (3, 3) map is target_from_source, with a finite and non-zero third coordinate at every
+    centre. For an affine one, of last row (0, 0, 1) and linear part B, shapes A become B A.
     """
     centers = lafs[:, :, 2]
     mapped = centers @ homography[:, :2].T + homography[:, 2]
@@ -57,11 +57,7 @@ def transform_frames(
     return np.concatenate([jacobians @ lafs[:, :, :2], target[:, :, None]], axis=2)
 
 
-def homography_errors(
-    homography: NDArray[np.floating],
-    points1: NDArray[np.floating],
-    points2: NDArray[np.floating],
-) -> NDArray[np.float64]:
+def homography_errors(homography: Floats, points1: Floats, points2: Floats) -> Array:
     """Return (N,) distances of matches from a homography, px, to first order (Sampson).
 
     Both points may be off: where image 2 is stretched, so is the error of the point in image 1.
@@ -77,19 +73,16 @@ def homography_errors(
     return np.asarray(np.sqrt((d * x**2 - 2.0 * b * x * y + a * y**2) / (a * d - b**2)))
 
 
-def lafs_from_keypoints(
-    points: NDArray[np.floating], radii_px: NDArray[np.floating], angles_rad: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def lafs_from_keypoints(points: Floats, radii_px: Floats, angles_rad: Floats) -> Array:
     """Build frames r R(a) from centres (N, 2), radii (N,) and orientations (N,).
 
-    Convention:
-        The first column of the shape points along the orientation; angles run from x
-        towards y (clockwise on the screen), as OpenCV's ``KeyPoint.angle`` does.
+    The first column of the shape points along the orientation; angles run from x towards y
+    (clockwise on the screen), as OpenCV's ``KeyPoint.angle`` does.
     """
     shapes = radii_px[:, None, None] * rotation(angles_rad)
     return np.concatenate([shapes, points[:, :, None]], axis=2)
 
 
-def ellipse_extents(shapes: NDArray[np.floating]) -> NDArray[np.float64]:
+def ellipse_extents(shapes: Floats) -> Array:
     """Half width and height (N, 2) of the ellipses that (N, 2, 2) shapes make of a unit circle."""
     return np.asarray(np.linalg.norm(shapes, axis=2))

@@ -9,26 +9,21 @@ far too few for an epipolar geometry.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-NUM_NEIGHBORS = 8
-"""Matches nearest to one in image 1, and in image 2, that may confirm it."""
+from colmap_affrect.geometry.arrays import Array, Floats, Indices
 
-NUM_CONFIRMING = 2
-"""So many of them must, in both images: one does for some wrong matches, two hardly ever."""
+NUM_NEIGHBORS = 8  # matches nearest to one in image 1, and in image 2, that may confirm it
+NUM_CONFIRMING = 2  # must do so, in both images: one does for some wrong matches, two hardly
 
 MAX_RELATIVE_ERROR = 0.5
 """A neighbour may be so far from where the map puts it, in distances between the two matches:
 similarities stand for affine maps, and planes for surfaces."""
 
-MIN_DISTANCE_PX = 4.0
-"""Nearer matches are those of one place, found in several orientations, scales or warps."""
-
-ROWS_AT_ONCE = 512
-"""Matches that are compared with all others at a time, which bounds memory."""
+MIN_DISTANCE_PX = 4.0  # nearer matches are those of one place, in several orientations or warps
+ROWS_AT_ONCE = 512  # matches that are compared with all others at a time, which bounds memory
 
 
-def num_consistent_matches(frames1: NDArray[np.floating], frames2: NDArray[np.floating]) -> int:
+def num_consistent_matches(frames1: Floats, frames2: Floats) -> int:
     """Return how many of (M, 2, 3) matched frames their neighbours in both images confirm."""
     if len(frames1) <= NUM_CONFIRMING:
         return 0
@@ -39,9 +34,7 @@ def num_consistent_matches(frames1: NDArray[np.floating], frames2: NDArray[np.fl
     return int(np.count_nonzero(np.minimum(forth, back) >= NUM_CONFIRMING))
 
 
-def _num_confirming(
-    points1: NDArray[np.float64], points2: NDArray[np.float64], maps: NDArray[np.float64]
-) -> NDArray[np.int64]:
+def _num_confirming(points1: Array, points2: Array, maps: Array) -> Indices:
     """Count, for each match, the neighbours in image 1 that its (2, 2) map carries near enough."""
     count = min(NUM_NEIGHBORS, len(points1) - 1)
     confirming = np.zeros(len(points1), np.int64)
@@ -61,5 +54,5 @@ def _num_confirming(
     return confirming
 
 
-def _distances(points: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
+def _distances(points: Array, rows: Indices) -> Array:
     return np.asarray(np.linalg.norm(points[rows, None] - points, axis=2))

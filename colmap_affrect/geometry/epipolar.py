@@ -11,23 +11,18 @@ All points are (N, 2) px of any one convention, the one of the fundamental matri
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_affrect.geometry.affine import adjugates
+from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.two_views import homogeneous
 
-Array = NDArray[np.float64]
 
-
-def epipolar_lines(
-    fundamental: NDArray[np.floating], points1: NDArray[np.floating], points2: NDArray[np.floating]
-) -> tuple[Array, Array]:
+def epipolar_lines(fundamental: Floats, points1: Floats, points2: Floats) -> tuple[Array, Array]:
     """Return (N, 3) lines in image 1 of ``points2``, and in image 2 of ``points1``."""
     return homogeneous(points2) @ fundamental, homogeneous(points1) @ fundamental.T
 
 
-def sampson_errors(
-    fundamental: NDArray[np.floating], points1: NDArray[np.floating], points2: NDArray[np.floating]
-) -> Array:
+def sampson_errors(fundamental: Floats, points1: Floats, points2: Floats) -> Array:
     """Return (N,) distances of matches from an epipolar geometry, px, to first order."""
     lines1, lines2 = epipolar_lines(fundamental, points1, points2)
     products = (lines2[:, :2] * points2).sum(axis=1) + lines2[:, 2]
@@ -36,30 +31,20 @@ def sampson_errors(
 
 
 def direction_cosines(
-    fundamental: NDArray[np.floating],
-    points1: NDArray[np.floating],
-    points2: NDArray[np.floating],
-    shapes1: NDArray[np.floating],
-    shapes2: NDArray[np.floating],
+    fundamental: Floats, points1: Floats, points2: Floats, shapes1: Floats, shapes2: Floats
 ) -> Array:
-    """Compare the epipolar direction of image 2 with that of image 1, carried over by the frames.
+    """Return (N,) cosines between epipolar directions of image 2 and those that frames carry over.
 
-    Returns:
-        (N,) cosines of the angle between both. Lines have no direction, so that all signs may be
-        turned; they are the same for all right matches of a pair (see :func:`common_sign`).
+    Up to one sign for all right matches of a pair (:func:`common_sign`): lines have no direction.
     """
     lines1, lines2 = epipolar_lines(fundamental, points1, points2)
     along1 = np.stack([-lines1[:, 1], lines1[:, 0]], axis=1)
     along2 = np.stack([-lines2[:, 1], lines2[:, 0]], axis=1)
-    # the inverse of a matrix with positive determinant, up to a factor: its adjugate
-    adjugates = np.empty(shapes1.shape)
-    adjugates[:, 0, 0], adjugates[:, 1, 1] = shapes1[:, 1, 1], shapes1[:, 0, 0]
-    adjugates[:, 0, 1], adjugates[:, 1, 0] = -shapes1[:, 0, 1], -shapes1[:, 1, 0]
-    carried = np.einsum("nij,njk,nk->ni", shapes2, adjugates, along1)
+    carried = np.einsum("nij,njk,nk->ni", shapes2, adjugates(shapes1), along1)
     lengths = np.linalg.norm(carried, axis=1) * np.linalg.norm(along2, axis=1)
     return np.asarray((carried * along2).sum(axis=1) / np.maximum(lengths, np.finfo(float).tiny))
 
 
-def common_sign(cosines: NDArray[np.floating]) -> float:
+def common_sign(cosines: Floats) -> float:
     """Return the sign, 1 or -1, that most of the :func:`direction_cosines` of a pair have."""
     return -1.0 if np.sign(cosines).sum() < 0 else 1.0

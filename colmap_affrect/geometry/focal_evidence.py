@@ -16,30 +16,20 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_affrect.geometry.arrays import Array, Bools
 from colmap_affrect.geometry.epipolar import sampson_errors
 
-Array = NDArray[np.float64]
-
-PRINCIPAL_POINT_SIGMA, DISTORTION_SIGMA = 0.02, 0.05
-"""How far both are from 0 in photographs that nobody cropped, longer sides."""
-
-MAX_NUM_MATCHES = 100
-"""Matches of a pair that are looked at; beyond, errors of the model weigh more than noise."""
+PRINCIPAL_POINT_SIGMA, DISTORTION_SIGMA = 0.02, 0.05  # longer sides; of what nobody cropped
+MAX_NUM_MATCHES = 100  # of a pair; beyond, errors of the model weigh more than noise
 
 MAX_MISFIT = 5.0
 """By how much the log-likelihood of the best essential matrix may fall short of that of the best
 fundamental matrix; a pair beyond says nothing about cameras: its geometry is wrong."""
 
-MAX_MISFIT_OF_CANDIDATES = 100.0
-"""Like :data:`MAX_MISFIT` of candidates that are far apart, before those beside are looked at."""
-
-BESIDE = np.geomspace(1 / 1.2, 1.2, 11)
-"""Factors from a candidate to focal lengths beside it, halfway to the next one or nearer."""
-
-MAX_NUM_STEPS, MIN_GAIN = 15, 1e-3
-"""Of Levenberg and Marquardt; the least gain of log-likelihood that is worth another step."""
+MAX_MISFIT_OF_CANDIDATES = 100.0  # the same of candidates far apart
+BESIDE = np.geomspace(1 / 1.2, 1.2, 11)  # from a candidate at most halfway to the next
+MAX_NUM_STEPS, MIN_GAIN = 15, 1e-3  # of Levenberg and Marquardt, and of log-likelihood
 
 BASELINE, TILT, SCALE = slice(0, 3), slice(3, 5), 5
 CENTERS, DISTORTIONS = slice(6, 10), slice(10, 12)
@@ -50,19 +40,12 @@ NUM_PARAMETERS = 12
 
 @dataclass(frozen=True, eq=False)
 class MatchedPair:
-    """Inliers of a pair with a fundamental matrix.
+    """Inliers of a pair with a fundamental matrix."""
 
-    Attributes:
-        points1: (N, 2) in image 1.
-        points2: (N, 2) their matches.
-        fundamental: (3, 3) in the units of the points.
-        error: of a match, to be expected, longer sides.
-    """
-
-    points1: Array
-    points2: Array
-    fundamental: Array
-    error: float
+    points1: Array  # (N, 2) in image 1
+    points2: Array  # (N, 2) their matches
+    fundamental: Array  # (3, 3) in the units of the points
+    error: float  # of a match, to be expected, longer sides
 
     @classmethod
     def of(cls, points1: Array, points2: Array, fundamental: Array, least_error: float) -> Self:
@@ -76,16 +59,9 @@ class MatchedPair:
 def log_evidence(
     pair: MatchedPair, focals1: Array, focals2: Array, *, max_misfit: float = MAX_MISFIT
 ) -> Array:
-    """Return the logarithm of the evidence for pairs of focal lengths, up to a constant.
+    """Return the (N,) logarithms of the evidence for (N,) pairs of focal lengths, up to a constant.
 
-    Args:
-        pair: what is known.
-        focals1: (N,) of image 1.
-        focals2: (N,) of image 2.
-        max_misfit: see :data:`MAX_MISFIT`.
-
-    Returns:
-        (N,), all 0 where the pair fits no camera, or its matches leave parameters undetermined.
+    All are 0 where the pair fits no camera, or its matches leave parameters undetermined.
     """
     essential = _Fit(pair, focals1, focals2, is_essential=True)
     fundamental = _Fit(pair, np.ones(1), np.ones(1), is_essential=False)
@@ -102,10 +78,9 @@ def log_evidence(
 
 
 class _Fit:
-    """Epipolar matrices ``E = U diag(1, s, 0) V^T`` in camera coordinates, one for each focals.
+    """Matrices ``E = U diag(1, s, 0) V^T`` in camera coordinates, one for each focals.
 
-    An essential matrix has s = 1, and its fit also moves the nuisances; a fundamental one has them
-    all at 0.
+    An essential one has s = 1 and moves the nuisances; a fundamental one has them all at 0.
     """
 
     def __init__(
@@ -122,8 +97,7 @@ class _Fit:
         self._precision = np.zeros(NUM_PARAMETERS)
         self._precision[CENTERS] = PRINCIPAL_POINT_SIGMA**-2
         self._precision[DISTORTIONS] = DISTORTION_SIGMA**-2
-        self._free = np.arange(NUM_PARAMETERS) != SCALE if is_essential else np.arange(6) >= 0
-        self._free = np.flatnonzero(self._free)
+        self._free = np.delete(np.arange(NUM_PARAMETERS), SCALE) if is_essential else np.arange(6)
         self._squares = [(points**2).sum(axis=1) for points in (pair.points1, pair.points2)]
         self.costs = np.zeros(0)
         self.hessians = np.zeros(0)
@@ -163,8 +137,7 @@ class _Fit:
                 zip((pair.points1, pair.points2), self._squares, strict=True)
             )
         )
-        values = np.ones((len(state), 1, 3))
-        values[:, 0, 1], values[:, 0, 2] = state[:, SCALE], 0.0
+        values = _singular_values(state)
         # rays in the frames of both factors, where E is diagonal
         rays1, rays2 = _rays(moved1, self._inverse1), _rays(moved2, self._inverse2)
         sides1, sides2 = rays1 @ right, rays2 @ left
@@ -175,15 +148,13 @@ class _Fit:
         errors = (sides1 * values * sides2).sum(axis=2) / lengths
         priors = 0.5 * (self._precision * state**2).sum(axis=1)
         costs = np.log1p(errors**2).sum(axis=1) + priors  # matches have Cauchy's distribution
-        return _Residuals(
-            costs, errors, lengths, sides1, sides2, lines1, lines2, state[:, SCALE], state
-        )
+        return _Residuals(costs, errors, lengths, sides1, sides2, lines1, lines2, state)
 
     def _derivatives(self, at: _Residuals) -> tuple[Array, Array]:
         """Return (G, P, P) second derivatives, to first order of the errors, and gradients."""
         pair = self._pair
-        values = np.stack([np.ones_like(at.scales), at.scales, np.zeros_like(at.scales)], axis=1)
-        flat1, flat2 = at.sides1 * values[:, None, :], at.sides2 * values[:, None, :]
+        values = _singular_values(at.state)
+        flat1, flat2 = at.sides1 * values, at.sides2 * values
         jacobians = np.empty((*at.errors.shape, NUM_PARAMETERS))
         jacobians[..., BASELINE] = np.cross(flat1, at.sides2)
         jacobians[..., TILT] = np.cross(flat2, at.sides1)[..., :2]
@@ -211,16 +182,22 @@ class _Residuals:
     sides2: Array
     lines1: Array
     lines2: Array
-    scales: Array
     state: Array
 
-    def replaced(self, where: NDArray[np.bool_], other: _Residuals) -> _Residuals:
+    def replaced(self, where: Bools, other: _Residuals) -> _Residuals:
         """Return a copy with some focals as in another one."""
         values = {
             name: np.where(where.reshape(-1, *[1] * (old.ndim - 1)), vars(other)[name], old)
             for name, old in vars(self).items()
         }
         return _Residuals(**values)
+
+
+def _singular_values(state: Array) -> Array:
+    """Return (G, 1, 3) singular values 1, s, 0 of the matrices."""
+    values = np.tile([1.0, 0.0, 0.0], (len(state), 1, 1))
+    values[:, 0, 1] = state[:, SCALE]
+    return values
 
 
 def _rays(points: Array, inverse: Array) -> Array:

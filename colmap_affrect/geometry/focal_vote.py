@@ -16,72 +16,45 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.geometry.focal_evidence import (
     MAX_MISFIT_OF_CANDIDATES,
     MatchedPair,
     log_evidence,
 )
 
-Array = NDArray[np.float64]
-
-FOCALS = np.geomspace(0.3, 10.0, 41)
-"""Candidates, 9 per cent apart: 120 to 6 degrees."""
-
-STEP = 2
-"""Where two cameras are asked for at once every second candidate will do."""
+FOCALS = np.geomspace(0.3, 10.0, 41)  # candidates, 9 per cent apart: 120 to 6 degrees
+STEP = 2  # where two cameras are asked for at once every second candidate will do
 
 MIN_PROMISE = -30.0
 """Tables of two cameras are made at every second of these candidates first; the others are looked
 at beside those that fall short of the best one by less."""
 
-MAX_LOSS = 2.0
-"""Of log-evidence, at most, between two candidates of such a table."""
-
-PRIOR_FOCAL, PRIOR_SIGMA = 1.1, 0.6
-"""Lenses of photographs: most between .6 and 2 longer sides (logarithmic)."""
-
-MAX_VOTE = 3.0
-"""Largest difference of log-evidence that one pair makes."""
-
-NUM_ITERATIONS, DAMPING = 30, 0.3
-"""Of belief propagation."""
-
-NUM_RESAMPLES = 50
-"""Votes among pairs drawn with replacement: do the pairs agree?"""
-
-LOW, HIGH = 0.05, 0.95
-"""Quantiles of an interval."""
+MAX_LOSS = 2.0  # of log-evidence, at most, between two candidates of such a table
+PRIOR_FOCAL, PRIOR_SIGMA = 1.1, 0.6  # most lenses: .6 to 2 longer sides (logarithmic)
+MAX_VOTE = 3.0  # largest difference of log-evidence that one pair makes
+NUM_ITERATIONS, DAMPING = 30, 0.3  # of belief propagation
+NUM_RESAMPLES = 50  # votes among pairs drawn with replacement: do the pairs agree?
+LOW, HIGH = 0.05, 0.95  # quantiles of an interval
 
 
 @dataclass(frozen=True)
 class Ballot:
-    """The votes of one pair.
+    """The votes of one pair."""
 
-    Attributes:
-        cameras: of both images, twice the same where they share it.
-        evidence: (F,) for one camera, also where the other one is known, else (C, C) for every
-            second candidate.
-    """
-
-    cameras: tuple[int, int]
+    cameras: tuple[int, int]  # of both images, twice the same where they share it
+    # (F,) for one camera, also where the other one is known, else (C, C) for every second candidate
     evidence: Array
 
 
 @dataclass(frozen=True)
 class FocalEstimate:
-    """What a vote says of one camera, longer sides.
+    """What a vote says of one camera, longer sides."""
 
-    Attributes:
-        focal: most likely one.
-        low: lower end of the interval that holds it with 90 per cent.
-        high: upper end.
-    """
-
-    focal: float
-    low: float
-    high: float
+    focal: float  # most likely one
+    low: float  # lower end of the interval that holds it with 90 per cent
+    high: float  # upper end
 
     @property
     def spread(self) -> float:
@@ -100,25 +73,14 @@ class Outcome:
 def ballot(
     pair: MatchedPair, cameras: tuple[int, int], known: Mapping[int, float]
 ) -> Ballot | None:
-    """Ask one pair; None where both focal lengths are known.
-
-    Args:
-        pair: its matches.
-        cameras: of both images.
-        known: focal lengths of cameras that need no vote.
-    """
-    first, second = (known.get(camera) for camera in cameras)
-    if first is not None and second is not None:
+    """Ask a pair about the cameras of its images; None where both focal lengths are known."""
+    open_ones = sorted({camera for camera in cameras if camera not in known})
+    if not open_ones:
         return None
-    if cameras[0] == cameras[1]:
-        return Ballot(cameras, log_evidence(pair, FOCALS, FOCALS))
-    if first is not None:
-        evidence = log_evidence(pair, np.full_like(FOCALS, first), FOCALS)
-        return Ballot((cameras[1], cameras[1]), evidence)
-    if second is not None:
-        evidence = log_evidence(pair, FOCALS, np.full_like(FOCALS, second))
-        return Ballot((cameras[0], cameras[0]), evidence)
-    return Ballot(cameras, _table(pair))
+    if len(open_ones) == 2:
+        return Ballot(cameras, _table(pair))
+    first, second = (np.full_like(FOCALS, known[c]) if c in known else FOCALS for c in cameras)
+    return Ballot((open_ones[0], open_ones[0]), log_evidence(pair, first, second))
 
 
 @lru_cache(maxsize=256)  # who shares a camera is asked first
@@ -141,8 +103,8 @@ def _table(pair: MatchedPair) -> Array:
 def _softened(table: Array) -> Array:
     """Widen a table so that no peak is lost between candidates.
 
-    Evidence is a parabola about its best candidate: halfway to the next one it falls by a quarter
-    of the second difference.
+    Evidence is a parabola: halfway to the next candidate it falls by a quarter of the second
+    difference.
     """
     row, column = np.unravel_index(table.argmax(), table.shape)
     lines = (np.pad(table[row], 1, "edge"), np.pad(table[:, column], 1, "edge"))
@@ -154,10 +116,7 @@ def _softened(table: Array) -> Array:
 
 
 def evidence_for_one(ballots: Sequence[Ballot]) -> float:
-    """Return the logarithm of the evidence if all cameras of the ballots are one.
-
-    To be compared with that of :func:`count`.
-    """
+    """Return the log-evidence, as of :func:`count`, if all cameras of the ballots are one."""
     focals = _candidates(ballots)
     same = [
         Ballot((0, 0), item.evidence if item.evidence.ndim == 1 else np.diagonal(item.evidence))
@@ -171,13 +130,9 @@ def _candidates(ballots: Sequence[Ballot]) -> Array:
 
 
 def count(ballots: Sequence[Ballot], cameras: Sequence[int], *, resample: bool = True) -> Outcome:
-    """Count the votes.
+    """Count the votes on all these cameras; ``resample`` widens intervals where pairs disagree.
 
-    Args:
-        ballots: of all pairs.
-        cameras: all that are asked for; one without ballots, or whose best candidate is the first
-            or the last, has the prior's focal length.
-        resample: widen intervals where the pairs do not agree.
+    One whose best candidate is the first or the last has the prior's focal length.
     """
     focals = _candidates(ballots)
     marginals, total = _propagate(ballots, cameras, focals)
@@ -212,11 +167,6 @@ def _peaks(marginals: Array, focals: Array) -> Array:
     return np.asarray(focals[best] * (focals[1] / focals[0]) ** shift)
 
 
-def _votes(evidence: Array) -> Array:
-    """Return the likelihoods of one ballot, between exp(-MAX_VOTE) and 1."""
-    return np.asarray(np.exp(np.logaddexp(evidence, -MAX_VOTE) - np.logaddexp(0.0, -MAX_VOTE)))
-
-
 def _propagate(
     ballots: Sequence[Ballot], cameras: Sequence[int], focals: Array
 ) -> tuple[Array, float]:
@@ -230,7 +180,7 @@ def _propagate(
         evidence = item.evidence
         if evidence.ndim == 1 and len(evidence) != len(focals):
             evidence = evidence[::STEP]
-        votes = np.log(_votes(evidence))
+        votes = np.logaddexp(evidence, -MAX_VOTE) - np.logaddexp(0.0, -MAX_VOTE)
         if evidence.ndim == 1:
             own[first] += votes
         elif first < second:
@@ -251,24 +201,17 @@ def _propagate(
         new -= new.max(axis=1, keepdims=True)
         messages = DAMPING * messages + (1.0 - DAMPING) * new
     beliefs = _beliefs(own, targets, messages)
-    total = float(_log_sums(beliefs).sum())
+    sums = np.logaddexp.reduce(beliefs, axis=1)
+    total = float(sums.sum())
     cavities = beliefs[sources] - messages[opposite]
     for edge, (first, second) in enumerate(edges.tolist()):
-        joint = (
-            cavities[edge][:, None] + np.log(forward[edge]) + cavities[edge + len(edges)][None, :]
-        )
-        total += float(_log_sums(joint.reshape(1, -1))[0])
-        total -= float(_log_sums(beliefs[[first, second]]).sum())
+        joint = cavities[edge][:, None] + tables[first, second] + cavities[edge + len(edges)]
+        total += float(np.logaddexp.reduce(joint, axis=None) - sums[first] - sums[second])
     shares = np.exp(beliefs - beliefs.max(axis=1, keepdims=True))
     return shares / shares.sum(axis=1, keepdims=True), total
 
 
-def _beliefs(own: Array, targets: NDArray[np.int64], messages: Array) -> Array:
+def _beliefs(own: Array, targets: Indices, messages: Array) -> Array:
     found = own.copy()
     np.add.at(found, targets, messages)
     return found
-
-
-def _log_sums(values: Array) -> Array:
-    top = values.max(axis=1)
-    return np.asarray(top + np.log(np.exp(values - top[:, None]).sum(axis=1)))

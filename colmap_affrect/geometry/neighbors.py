@@ -7,26 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.geometry.arrays import Bools, Floats, Indices
+
 
 @dataclass(frozen=True)
 class NeighborLists:
-    """Neighbours of each point, itself included, as compressed rows.
+    """Neighbours of each point, itself included, as compressed rows."""
 
-    Attributes:
-        starts: (N + 1,) int64; the neighbours of i are ``indices[starts[i]:starts[i + 1]]``.
-        indices: int64 indices of points.
-    """
+    starts: Indices  # (N + 1,) int64; the neighbours of i are ``indices[starts[i]:starts[i + 1]]``
+    indices: Indices  # int64 indices of points
 
-    starts: NDArray[np.int64]
-    indices: NDArray[np.int64]
-
-    def of(self, points: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def of(self, points: NDArray[np.integer]) -> tuple[Indices, Indices]:
         """Return (rows, neighbours): for each k in order, all neighbours of ``points[k]``."""
         rows, positions = _expand(self.starts[points], self.starts[points + 1])
         return rows, self.indices[positions]
 
 
-def neighbors_within(points: NDArray[np.floating], radius: float) -> NeighborLists:
+def neighbors_within(points: Floats, radius: float) -> NeighborLists:
     """List, for each of (N, 2) finite points, the points at most ``radius`` away."""
     if not len(points):
         return NeighborLists(np.zeros(1, np.int64), np.zeros(0, np.int64))
@@ -49,13 +46,8 @@ def neighbors_within(points: NDArray[np.floating], radius: float) -> NeighborLis
     return NeighborLists(starts, candidate[np.argsort(row, kind="stable")])
 
 
-def without_duplicates(
-    points1: NDArray[np.floating], points2: NDArray[np.floating], radius_px: float
-) -> NDArray[np.bool_]:
-    """Tell which of (M, 2) matching points, the best first, to keep.
-
-    Those within ``radius_px`` of a better one that is kept, at both ends, go.
-    """
+def without_duplicates(points1: Floats, points2: Floats, radius_px: float) -> Bools:
+    """Tell which of (M, 2) matches, best first, are not near a better one, kept, at both ends."""
     rows, others = neighbors_within(points1, radius_px).of(np.arange(len(points1)))
     near = ((points2[rows] - points2[others]) ** 2).sum(axis=1) <= radius_px**2
     near &= others < rows
@@ -66,9 +58,7 @@ def without_duplicates(
     return keep
 
 
-def _expand(
-    begin: NDArray[np.integer], end: NDArray[np.integer]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _expand(begin: NDArray[np.integer], end: NDArray[np.integer]) -> tuple[Indices, Indices]:
     """Return for ranges [begin_k, end_k) the k of each element and the elements."""
     lengths = end - begin
     rows = np.repeat(np.arange(len(begin)), lengths)

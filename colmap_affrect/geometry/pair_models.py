@@ -12,10 +12,16 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.geometry.affine import determinants, homography_errors, transform_frames
+from colmap_affrect.geometry.affine import (
+    adjugates,
+    determinants,
+    homography_errors,
+    transform_frames,
+)
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.epipolar import direction_cosines, sampson_errors
 
-Points = NDArray[np.float64]
+Points = Array
 Rows = NDArray[np.integer]
 
 
@@ -63,9 +69,7 @@ PairModel = EpipolarModel | HomographyModel
 
 def turn_cosines(shapes1: Points, shapes2: Points) -> Points:
     """Return (N,) cosines of the angles by which frames are turned against others; -1 mirrored."""
-    a, b, c, d = (shapes1[:, i, j] for i in (0, 1) for j in (0, 1))
-    inverses = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)  # up to the determinants
-    turns = shapes2 @ inverses * np.sign(determinants(shapes1))[:, None, None]
+    turns = shapes2 @ adjugates(shapes1) * np.sign(determinants(shapes1))[:, None, None]
     along, across = turns[:, 0, 0] + turns[:, 1, 1], turns[:, 1, 0] - turns[:, 0, 1]
     cosines = along / np.maximum(np.hypot(along, across), np.finfo(float).tiny)
     return np.where(determinants(turns) > 0.0, cosines, -1.0)

@@ -6,40 +6,25 @@ All points are (N, 2) px with the corner of the image at (0, 0); sizes are (widt
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from colmap_affrect.geometry.arrays import Array, Floats, Indices
+from colmap_affrect.geometry.two_views import homogeneous
+
 Size = tuple[int, int]
 
 FOCAL_LENGTHS = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.5, 5.0, 10.0)
 """Tried for a turned camera, in longer sides: fine where a rotation bends lines most. From ten on a
 rotation is a shift, as between two crops of one photograph."""
 
-MAX_NUM_POINTS = 500
-"""Enough to measure a share to two per cent."""
-
-MIN_DEPTH = 1e-3
-"""Of a turned ray of length 1; what is behind the camera lands far outside of the image."""
-
-DISPLACEMENT_PX = np.array([13.0, 7.0])
-"""Keypoints that are moved by it meet others by chance only, and lie as dense as before."""
-
-MIN_FREE_SHARE = 0.1
-"""Where keypoints are so dense that chance leaves less, nothing can be told."""
-
-MAX_ITERATIONS = 3
-"""Least squares are repeated without outliers; a verified pair has few of them."""
+MAX_NUM_POINTS = 500  # enough to measure a share to two per cent
+MIN_DEPTH = 1e-3  # of a turned ray of length 1; what is behind lands far outside of the image
+DISPLACEMENT_PX = np.array([13.0, 7.0])  # so moved, keypoints meet others by chance only
+MIN_FREE_SHARE = 0.1  # where keypoints are so dense that chance leaves less, nothing can be told
+MAX_ITERATIONS = 3  # least squares are repeated without outliers; a verified pair has few of them
 
 
 def rotation_share(points1: Array, points2: Array, sizes: tuple[Size, Size], error: float) -> float:
-    """Return the share of matches that one turned, and zoomed, camera explains.
-
-    Args:
-        points1: in image 1.
-        points2: their matches in image 2.
-        sizes: of both images.
-        error: explained are matches at most so far off in image 2, px.
-    """
+    """Return the share of matches that a turned, and zoomed, camera explains to ``error`` px."""
     points1, points2 = _some(points1), _some(points2)
     spreads = [  # which outliers do not change
         float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
@@ -70,7 +55,7 @@ def _share_of(points1: Array, points2: Array, focal: float, zoom: float, error: 
 
 
 def _rays(points: Array) -> Array:
-    rays = np.hstack([points, np.ones((len(points), 1))])
+    rays = homogeneous(points)
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
@@ -79,17 +64,10 @@ def _some(points: Array) -> Array:
     return points[:: -(-len(points) // MAX_NUM_POINTS)] if len(points) else points
 
 
-def mirrored_share(
-    points1: NDArray[np.floating], points2: NDArray[np.floating], size: Size
-) -> float:
-    """Return the share of all keypoints of image 1 that a mirrored copy of it has too.
+def mirrored_share(points1: Floats, points2: Floats, size: Size) -> float:
+    """Return the share of all keypoints of image 1 that a mirrored copy of it, image 2, has too.
 
     Beyond what chance brings, which of dense keypoints is most: as a share of what it leaves.
-
-    Args:
-        points1: all keypoints of image 1.
-        points2: all keypoints of image 2, of the same size.
-        size: of both images.
     """
     row = size[0] + 4
     taken = np.unique(_cells(points2, row))
@@ -106,7 +84,7 @@ def mirrored_share(
     return max(shares)
 
 
-def _cells(points: NDArray[np.floating], row: int) -> NDArray[np.int64]:
+def _cells(points: Floats, row: int) -> Indices:
     """Number the pixels that points lie in."""
     columns, rows = np.floor(points).astype(np.int64).T
     return np.asarray(rows * row + columns)

@@ -13,38 +13,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.conventions import grid_origin
+from colmap_affrect.geometry.arrays import Array, Floats, Indices
 
 WINDOW_RADIUS = 2
-WINDOW_SIGMA_PX = 0.8
-"""Gaussian weights of the 5 x 5 window to which a plane is fitted (the authors' values)."""
+WINDOW_SIGMA_PX = 0.8  # Gaussian weights of the 5 x 5 window of a plane (the authors' values)
 
 MIN_WEIGHT_FRAC = 0.5
 """Share of the window's weight that known neighbours need. A line of pixels holds 0.499 and
 cannot carry a plane, a corner of the map 0.562."""
 
-MAX_SLANT_COS = np.cos(np.deg2rad(85.0))
-"""Neighbours that no plane seen at less than 85 degrees could hold are on another surface."""
-
-SAME_AXIS_COS = np.cos(np.deg2rad(45.0))
-"""Normals at most this far from the same line belong to one axis of an orthogonal frame."""
+MAX_SLANT_COS = np.cos(np.deg2rad(85.0))  # steeper neighbours are on another surface
+SAME_AXIS_COS = np.cos(np.deg2rad(45.0))  # normals so near to a line have one axis
 
 SPIRAL_STEP = 3.6
 
 
-def shrink_depth(
-    depth: NDArray[np.floating], max_size_px: int
-) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
+def shrink_depth(depth: Floats, max_size_px: int) -> tuple[Floats, Array]:
     """Average 1/z over square blocks until the longer side is at most ``max_size_px``.
 
     Inverse depth of a plane is affine in the pixel, so planes stay exact. A block with an
-    unknown pixel is unknown; incomplete blocks at the right and lower side are dropped.
-
-    Args:
-        depth: (h, w) z-depth > 0, NaN where unknown.
-        max_size_px: bound on the longer side of the result.
-
-    Returns:
-        The depth map and the (3, 3) map to its pixel-centre px from those of the given one.
+    unknown pixel is unknown; incomplete blocks at the right and lower side are dropped. Returns
+    the depth map and the (3, 3) map to its pixel-centre px from those of the given one.
     """
     step = -(-max(depth.shape) // max_size_px)
     step_y, step_x = np.minimum(step, depth.shape).tolist()
@@ -55,9 +44,7 @@ def shrink_depth(
     return 1.0 / np.mean(1.0 / blocks, axis=(1, 3)), np.linalg.inv(given_from_shrunk)
 
 
-def normals_from_depth(
-    depth: NDArray[np.floating], camera_matrix: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def normals_from_depth(depth: Floats, camera_matrix: Floats) -> Array:
     """Fit a plane to the 5 x 5 window of each pixel of a depth map and return its normal.
 
     Along a plane 1/z is an affine function of the pixel. It is fitted to the window by least
@@ -66,12 +53,8 @@ def normals_from_depth(
     0: those whose 1/z differs from the centre's by more than a plane seen at 85 degrees would
     make it, which is |dr| / cos 85 deg times the centre's for rays that differ by dr.
 
-    Args:
-        depth: (h, w) z-depth > 0, NaN where unknown.
-        camera_matrix: (3, 3) intrinsics in pixel-centre px of the depth map.
-
-    Returns:
-        (h, w, 3) unit normals, NaN where the pixel or too much of its window is unknown.
+    From (h, w) depth and (3, 3) intrinsics in pixel-centre px of the depth map to (h, w, 3) unit
+    normals, NaN where the pixel or too much of its window is unknown.
     """
     height, width = depth.shape
     inverse = 1.0 / np.asarray(depth, dtype=np.float64)
@@ -101,9 +84,7 @@ def normals_from_depth(
     return np.asarray(-forms / np.linalg.norm(forms, axis=-1, keepdims=True))
 
 
-def _weighted_line(
-    moments: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _weighted_line(moments: Array) -> tuple[Array, Array, Array]:
     """Return slopes in x and y and the value at 0 from sums of w, wx, wy, wxx ... and q, qx, qy."""
     x, y, xx, xy, yy, q, qx, qy = moments[1:] / moments[0]
     xx, xy, yy, qx, qy = xx - x * x, xy - x * y, yy - y * y, qx - q * x, qy - q * y
@@ -113,7 +94,7 @@ def _weighted_line(
     return slope_x, slope_y, q - slope_x * x - slope_y * y
 
 
-def spiral_points(num_points: int) -> NDArray[np.float64]:
+def spiral_points(num_points: int) -> Array:
     """Return (N, 3) points spread evenly over the unit sphere, along a spiral about z.
 
     Heights are equidistant, neighbours on the spiral 3.6 / sqrt(N) apart (Saff & Kuijlaars,
@@ -127,19 +108,15 @@ def spiral_points(num_points: int) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class PlaneClusters:
-    """Directions that many normals share.
+    """Directions that many normals share."""
 
-    Attributes:
-        normals: (K, 3) unit normals in order of choice; K may be 0.
-        labels: (h, w) int32, the nearest of them for each pixel, -1 where none is near.
-    """
-
-    normals: NDArray[np.float64]
+    normals: Array  # (K, 3) unit normals in order of choice; K may be 0
+    # (h, w) int32, the nearest of them for each pixel, -1 where none is near
     labels: NDArray[np.int32]
 
 
 def cluster_normals(
-    normals: NDArray[np.floating],
+    normals: Floats,
     *,
     num_candidates: int,
     bin_angle_rad: float,
@@ -149,23 +126,16 @@ def cluster_normals(
     orthogonal: bool = False,
     antipodal: bool = False,
 ) -> PlaneClusters:
-    """Choose the directions with most normals greedily, then give each normal to the nearest.
+    """Choose directions that most (h, w, 3) normals share, then give each normal to the nearest.
 
     Candidates are the :func:`spiral_points` of the whole sphere: normals that face a camera of
     wide angle fill more than half of it, and candidates without normals get no votes. After
     each choice the direction moves to the mean of its normals, those then within the bin are
     taken away, and the others vote again (the authors counted once).
 
-    Args:
-        normals: (h, w, 3) unit normals, NaN where unknown.
-        num_candidates: directions to choose from.
-        bin_angle_rad: normals at most this far from a direction belong to it.
-        min_separation_rad: candidates nearer to a chosen direction are left out.
-        max_num_planes: upper bound of K.
-        min_votes_frac: share of all h w pixels that a direction needs.
-        orthogonal: make the chosen directions orthogonal, see :func:`orthogonalized`.
-        antipodal: count opposite normals as one direction; the sign of the result then is
-            that of the most of them.
+    Normals (unit, NaN where unknown) at most ``bin_angle_rad`` from a direction belong to it, which
+    needs ``min_votes_frac`` of all h w pixels; ``orthogonal`` ones are :func:`orthogonalized`.
+    ``antipodal`` counts opposite normals as one direction, with the sign of the most of them.
     """
     known = ~np.isnan(normals).any(axis=-1)
     waiting = np.asarray(normals[known], dtype=np.float32)
@@ -190,18 +160,12 @@ def cluster_normals(
     return PlaneClusters(centers, labels)
 
 
-def orthogonalized(normals: NDArray[np.floating]) -> NDArray[np.float64]:
+def orthogonalized(normals: Floats) -> Array:
     """Return the nearest set of unit normals that are pairwise orthogonal or opposite.
 
-    Nearest in the sum of squared differences: the polar factor of the matrix of axes. Normals
-    within 45 degrees of one line share its axis, as the two sides of a street do. In three
+    Nearest in the sum of squared differences: the polar factor of the matrix of axes. Normals, all
+    (K, 3), within 45 degrees of one line share its axis, as the two sides of a street do. In three
     dimensions there are three axes: later normals that fit to none are returned as they are.
-
-    Args:
-        normals: (K, 3) unit normals.
-
-    Returns:
-        (K, 3) unit normals.
     """
     result = np.array(normals, dtype=np.float64)
     axes = np.zeros((0, 3))
@@ -224,18 +188,13 @@ def orthogonalized(normals: NDArray[np.floating]) -> NDArray[np.float64]:
     return result
 
 
-def fronto_parallel_homography(
-    normal: NDArray[np.floating], camera_matrix: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def fronto_parallel_homography(normal: Floats, camera_matrix: Floats) -> Array:
     """Return the (3, 3) map to the view that a camera turned towards a plane would have.
 
-    It is K R K^-1 with R the smallest rotation that turns -n, which points into the plane, onto
-    the optical axis. Its third coordinate at a pixel (x, y, 1) is -n . r with the pixel's ray
-    r = K^-1 (x, y, 1): positive where the pixel can see the front of the plane.
-
-    Args:
-        normal: (3,) unit normal that faces the camera; (0, 0, -1) gives the identity.
-        camera_matrix: (3, 3) intrinsics in pixel-centre px.
+    It is K R K^-1, with intrinsics K in pixel-centre px and R the smallest rotation that turns -n,
+    which points into the plane, onto the optical axis; n = (0, 0, -1) gives the identity. Its third
+    coordinate at a pixel (x, y, 1) is -n . r with the pixel's ray r = K^-1 (x, y, 1): positive
+    where the pixel can see the front of the plane.
     """
     x, y, z = -np.asarray(normal, dtype=np.float64)
     turn = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
@@ -243,19 +202,8 @@ def fronto_parallel_homography(
     return np.asarray(camera_matrix @ rotation @ np.linalg.inv(camera_matrix))
 
 
-def viewing_cosines(
-    normal: NDArray[np.floating], camera_matrix: NDArray[np.floating], size: tuple[int, int]
-) -> NDArray[np.float64]:
-    """Return the cosine of the angle between a plane's normal and the ray of each pixel.
-
-    Args:
-        normal: (3,) unit normal that faces the camera.
-        camera_matrix: (3, 3) intrinsics in pixel-centre px.
-        size: (width, height) in px.
-
-    Returns:
-        (h, w): 1 where the plane is seen from the front, 0 along it, negative from behind.
-    """
+def viewing_cosines(normal: Floats, camera_matrix: Floats, size: tuple[int, int]) -> Array:
+    """Return (h, w) cosines of rays against a plane's normal: 1 from the front, < 0 from behind."""
     width, height = size
     ray_from_pixel = np.linalg.inv(camera_matrix)
     columns, rows = np.arange(width), np.arange(height)[:, None]
@@ -264,17 +212,13 @@ def viewing_cosines(
     return np.asarray(towards / np.sqrt(x * x + y * y + z * z))
 
 
-def _cosines(
-    directions: NDArray[np.floating], centers: NDArray[np.floating], antipodal: bool
-) -> NDArray[np.floating]:
+def _cosines(directions: Floats, centers: Floats, antipodal: bool) -> Floats:
     """Return (N, K) cosines of the angles between directions, or between lines."""
     cosines = directions @ centers.T.astype(directions.dtype)
     return np.asarray(np.abs(cosines) if antipodal else cosines)
 
 
-def _votes(
-    candidates: NDArray[np.float64], normals: NDArray[np.floating], bin_cos: float, antipodal: bool
-) -> NDArray[np.int64]:
+def _votes(candidates: Array, normals: Floats, bin_cos: float, antipodal: bool) -> Indices:
     """Count the normals near each candidate."""
     by_axis = np.asfortranarray(normals)  # several times faster than rows of three
     return np.array(
@@ -285,9 +229,7 @@ def _votes(
     )
 
 
-def _mean_near(
-    center: NDArray[np.float64], normals: NDArray[np.floating], bin_cos: float, antipodal: bool
-) -> NDArray[np.float64]:
+def _mean_near(center: Array, normals: Floats, bin_cos: float, antipodal: bool) -> Array:
     """Return the unit mean of the normals near a direction, with the sign of the most of them."""
     cosines = normals @ center.astype(normals.dtype)
     near = (np.abs(cosines) if antipodal else cosines) >= bin_cos
@@ -296,12 +238,7 @@ def _mean_near(
     return np.asarray(mean / np.linalg.norm(mean))
 
 
-def _nearest(
-    normals: NDArray[np.floating],
-    centers: NDArray[np.float64],
-    bin_cos: float,
-    antipodal: bool,
-) -> NDArray[np.int32]:
+def _nearest(normals: Floats, centers: Array, bin_cos: float, antipodal: bool) -> NDArray[np.int32]:
     if not len(centers):
         return np.full(len(normals), -1, dtype=np.int32)
     cosines = _cosines(normals, centers, antipodal)

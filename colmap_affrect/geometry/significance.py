@@ -13,21 +13,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-NUM_SHUFFLED = 4000
-"""About how many random matches tell a chance: 1 % is then known within a sixth of itself."""
-MIN_AGREEING = 0.5
-"""Right pairs have at least this share of inliers with agreeing frames."""
-AGREEING_SHARES = np.linspace(0.0, 1.0, 51)[:-1]
-"""Where the Bayes factor averages over shares, from ``MIN_AGREEING`` (0) to all (1)."""
+from colmap_affrect.geometry.arrays import Indices
+
+NUM_SHUFFLED = 4000  # about so many random matches tell 1 % within a sixth of itself
+MIN_AGREEING = 0.5  # right pairs have at least this share of inliers with agreeing frames
+AGREEING_SHARES = np.linspace(0.0, 1.0, 51)[:-1]  # from ``MIN_AGREEING`` (0) to all (1)
 
 
-def shuffled(num: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return two lists of indices below ``num`` that never agree: matches paired anew.
-
-    By cyclic shifts spread over all there are, so that it is the same every time.
-    """
+def shuffled(num: int) -> tuple[Indices, Indices]:
+    """Pair matches anew: two lists of indices below ``num`` that never agree, by cyclic shifts."""
     num_shifts = min(num - 1, max(1, NUM_SHUFFLED // max(num, 1)))
     shifts = np.linspace(1, num - 1, num_shifts).astype(np.int64)
     first = np.tile(np.arange(num), len(shifts))
@@ -45,11 +40,7 @@ def log10_false_alarms(
 ) -> float:
     """Return how many geometries with so many inliers random matches are expected to have.
 
-    Args:
-        num_matches: raw matches.
-        num_inliers: of the geometry.
-        sample_size: matches that determine a geometry; they are inliers in any case.
-        chance: that a random match is an inlier.
+    ``sample_size`` matches are inliers in any case; ``chance`` is the probability of another.
     """
     if num_inliers <= sample_size:
         return math.inf
@@ -62,10 +53,10 @@ def log10_false_alarms(
 
 
 def log10_bayes_factor(num: int, num_agreeing: int, chance: float) -> float:
-    """Return how much more probable it is in a right pair that so many of some frames agree.
+    """Return how much more probable in a right pair so many agreeing frames are than by chance.
 
-    In a wrong pair each agrees by chance; in a right one with a share that is unknown and at
-    least ``MIN_AGREEING``. When chance reaches as much, frames say nothing.
+    It is an unknown share in a right pair, at least ``MIN_AGREEING``; where chance reaches as much,
+    frames say nothing.
     """
     lowest = max(MIN_AGREEING, chance)
     shares = lowest + (1.0 - lowest) * AGREEING_SHARES

@@ -17,15 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-GRID_TILTS = np.geomspace(2.0, 6.21970, 6)
-"""Tilts of the candidate centres for balls of radius 1.7 up to tilt 5.8 (the paper's cover)."""
+from colmap_affrect.geometry.arrays import Array, Floats
+
+GRID_TILTS = np.geomspace(2.0, 6.21970, 6)  # of candidates for 1.7-balls up to tilt 5.8 (paper)
 
 GRID_NUM_ANGLES = 32
 IDENTITY_LABEL = -1
 UNCOVERED_LABEL = -2
 
 
-def unit_metrics(matrices: NDArray[np.floating]) -> NDArray[np.float64]:
+def unit_metrics(matrices: Floats) -> Array:
     """Return (..., 3) metrics (S11, S22, S12) of S = M^T M / |det M| for (..., 2, 2) maps."""
     gram = np.swapaxes(matrices, -1, -2) @ matrices
     determinant = np.abs(np.linalg.det(matrices))
@@ -33,7 +34,7 @@ def unit_metrics(matrices: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(parts / determinant[..., None], dtype=np.float64)
 
 
-def metrics_from_tilts(tilts: ArrayLike, angles_rad: ArrayLike) -> NDArray[np.float64]:
+def metrics_from_tilts(tilts: ArrayLike, angles_rad: ArrayLike) -> Array:
     """Return (..., 3) unit metrics of the classes (tilt, angle) of diag(t, 1) R(phi)."""
     tilts, angles = np.broadcast_arrays(
         np.asarray(tilts, dtype=np.float64), np.asarray(angles_rad, dtype=np.float64)
@@ -49,9 +50,7 @@ def metrics_from_tilts(tilts: ArrayLike, angles_rad: ArrayLike) -> NDArray[np.fl
     )
 
 
-def tilts_from_metrics(
-    metrics: NDArray[np.floating],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def tilts_from_metrics(metrics: Floats) -> tuple[Array, Array]:
     """Return tilts >= 1 and angles in [0, pi) of (..., 3) unit metrics.
 
     >>> t, phi = tilts_from_metrics(metrics_from_tilts(3.0, 0.4))
@@ -65,9 +64,7 @@ def tilts_from_metrics(
     return tilts, np.where(angles >= np.pi, 0.0, angles)
 
 
-def cosh_distances(
-    metrics1: NDArray[np.floating], metrics2: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def cosh_distances(metrics1: Floats, metrics2: Floats) -> Array:
     """Return the (N, M) matrix of cosh(log transition tilt) between (N, 3) and (M, 3) metrics."""
     swapped = np.stack([metrics2[:, 1], metrics2[:, 0], -2.0 * metrics2[:, 2]], -1)
     return np.asarray(metrics1 @ swapped.T) / 2.0
@@ -82,28 +79,28 @@ def ball_threshold(radius: float) -> float:
     return (radius**2 + 1.0) / (2.0 * radius)
 
 
-def covering_grid() -> NDArray[np.float64]:
+def covering_grid() -> Array:
     """Return the paper's 192 candidate centres as (192, 2) rows (tilt, angle_rad)."""
     angles = np.arange(GRID_NUM_ANGLES) * np.pi / GRID_NUM_ANGLES
     tilts, angles = np.meshgrid(GRID_TILTS, angles, indexing="ij")
     return np.stack([tilts.ravel(), angles.ravel()], axis=1)
 
 
-def asift_covering() -> NDArray[np.float64]:
+def asift_covering() -> Array:
     """Return the 60 maps of ASIFT beside the identity as (60, 2) rows (tilt, angle_rad).
 
     Tilts 2^(k/2), k = 1...6; 4, 5, 7, 10, 14, 20 angles (Morel & Yu 2009, whose program rounds
     5 t to an even number and halves it; Sec. 2.3 of the paper counts 61 with the identity).
     """
-    rows = []
-    for level in range(1, 7):
-        tilt = 2.0 ** (level / 2.0)
-        count = (round(5.0 * tilt) + 1) // 2
-        rows += [(tilt, index * np.pi / count) for index in range(count)]
-    return np.array(rows)
+    tilts = [2.0 ** (level / 2.0) for level in range(1, 7)]
+    counts = [(round(5.0 * tilt) + 1) // 2 for tilt in tilts]
+    rings = zip(tilts, counts, strict=True)
+    return np.array(
+        [(tilt, index * np.pi / count) for tilt, count in rings for index in range(count)]
+    )
 
 
-def near_optimal_covering() -> NDArray[np.float64]:
+def near_optimal_covering() -> Array:
     """Return the 24 maps that, with the identity, cover all tilts to 5.8 by 1.7-balls.
 
     As (24, 2) rows (tilt, angle_rad). Source: Rodriguez, Delon, Morel 2018, constants for
@@ -115,42 +112,31 @@ def near_optimal_covering() -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Cover:
-    """Covering centres of a set of shapes and the centre nearest to each shape.
+    """Covering centres of a set of shapes and the centre nearest to each shape."""
 
-    Attributes:
-        centers: (K, 2) float64 rows (tilt, angle_rad) in order of choice; K may be 0.
-        labels: (N,) int32 index of the nearest centre, ``IDENTITY_LABEL`` where the
-            identity is nearest, ``UNCOVERED_LABEL`` outside every ball.
-    """
-
-    centers: NDArray[np.float64]
+    centers: Array  # (K, 2) float64 rows (tilt, angle_rad) in order of choice; K may be 0
+    # (N,) int32 index of the nearest centre, ``IDENTITY_LABEL`` where the identity is nearest,
+    # ``UNCOVERED_LABEL`` outside every ball
     labels: NDArray[np.int32]
 
 
 def cover_shapes(
-    metrics: NDArray[np.floating],
-    weights: NDArray[np.floating],
+    metrics: Floats,
+    weights: Floats,
     *,
     radius: float,
     max_tilt: float,
     covered_frac: float,
     max_num_centers: int,
-    candidates: NDArray[np.floating] | None = None,
+    candidates: Floats | None = None,
 ) -> Cover:
     """Choose centres greedily until their r-balls hold enough shapes, then partition.
 
-    Shapes in the r-ball of the identity count as covered from the start; shapes of a
-    tilt above ``max_tilt`` neither vote nor count. Every shape then goes to the nearest
-    of the centres and the identity if it lies in that r-ball (Sec. 2.4 of the paper).
-
-    Args:
-        metrics: (N, 3) unit metrics of the rectifying maps.
-        weights: (N,) non-negative votes.
-        radius: r of the balls as a tilt ratio, > 1.
-        max_tilt: largest tilt that votes.
-        covered_frac: share of the votes to cover, in [0, 1].
-        max_num_centers: upper bound of K.
-        candidates: (C, 2) rows (tilt, angle_rad), the paper's 192 by default.
+    Shapes, (N, 3) metrics of rectifying maps with (N,) votes >= 0, count as covered from the start
+    in the r-ball of the identity, r > 1 being a tilt ratio; those of a tilt above ``max_tilt``
+    neither vote nor count. Every shape then goes to the nearest of the centres and the identity if
+    it lies in that r-ball (Sec. 2.4 of the paper). Candidates are (C, 2) rows (tilt, angle_rad),
+    the paper's 192 by default; ``covered_frac`` of the votes are to be covered.
     """
     candidates = covering_grid() if candidates is None else candidates
     threshold = ball_threshold(radius)
@@ -175,9 +161,7 @@ def cover_shapes(
     return Cover(centers, nearest_centers(metrics, centers, radius))
 
 
-def nearest_centers(
-    metrics: NDArray[np.floating], centers: NDArray[np.floating], radius: float
-) -> NDArray[np.int32]:
+def nearest_centers(metrics: Floats, centers: Floats, radius: float) -> NDArray[np.int32]:
     """Label (N, 3) metrics with the nearest of the identity and (K, 2) centres, within r."""
     references = np.concatenate([[[1.0, 0.0]], centers])
     distances = cosh_distances(

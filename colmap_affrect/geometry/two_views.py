@@ -10,27 +10,20 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices
 
 
 @dataclass(frozen=True)
 class Depths:
-    """What a relative pose makes of matches.
+    """What a relative pose makes of matches."""
 
-    Attributes:
-        first: (N,) depths in camera 1, in units of the length of the translation.
-        second: (N,) depths in camera 2.
-        angles_deg: (N,) angles between both rays.
-    """
-
-    first: Array
-    second: Array
-    angles_deg: Array
+    first: Array  # (N,) depths in camera 1, in units of the length of the translation
+    second: Array  # (N,) depths in camera 2
+    angles_deg: Array  # (N,) angles between both rays
 
     @property
-    def in_front(self) -> NDArray[np.bool_]:
+    def in_front(self) -> Bools:
         """(N,) whether a point is before both cameras."""
         return (self.first > 0) & (self.second > 0)
 
@@ -51,7 +44,7 @@ def triangulated_depths(rotation: Array, translation: Array, rays1: Array, rays2
     )
 
 
-def homogeneous(points: NDArray[np.floating]) -> Array:
+def homogeneous(points: Floats) -> Array:
     """Append a column of ones to (N, 2) points."""
     return np.hstack([points, np.ones((len(points), 1))])
 
@@ -64,19 +57,12 @@ def essential_matrix(rotation: Array, translation: Array) -> Array:
 
 @dataclass(frozen=True)
 class ScaleEstimate:
-    """Ratio of known depths to those of a pair, by places that lie beside each other.
+    """Ratio of known depths to those of a pair, by places that lie beside each other."""
 
-    Attributes:
-        scale: known depth divided by depth of the pair.
-        num_agreeing: places that agree on it.
-        num_ratios: places that have neighbours with known depth.
-        error_frac: standard error of the scale.
-    """
-
-    scale: float
-    num_agreeing: int
-    num_ratios: int
-    error_frac: float
+    scale: float  # known depth divided by depth of the pair
+    num_agreeing: int  # places that agree on it
+    num_ratios: int  # places that have neighbours with known depth
+    error_frac: float  # standard error of the scale
 
     @property
     def share(self) -> float:
@@ -84,27 +70,13 @@ class ScaleEstimate:
         return self.num_agreeing / max(self.num_ratios, 1)
 
 
-TOLERANCE = 0.08
-"""Largest difference of the logarithm of ratios that agree: neighbours are not at one depth."""
-
-NUM_NEIGHBORS = 5
-"""Known places looked at beside each place of a pair."""
-
-NUM_INDEPENDENT = 10
-"""Ratios that count for the standard error at most: all share the errors of the same poses."""
-
-NUM_ON_PLANE = 12
-"""Known places to which a plane is fitted."""
-
-MAX_PLANE_ERROR = 0.04
-"""Largest error of an inverse depth that a plane predicts, and spread of those it is fitted to."""
-
-
-MIN_KNOWN = 20
-"""Known depths that a depth map is fitted to."""
-
-MAX_FITTED = 500
-"""Known depths of which pairs are tried and counted; more are thinned."""
+TOLERANCE = 0.08  # of logarithms of ratios that agree: neighbours are not at one depth
+NUM_NEIGHBORS = 5  # known places looked at beside each place of a pair
+NUM_INDEPENDENT = 10  # ratios that count at most: all share the errors of the same poses
+NUM_ON_PLANE = 12  # known places to which a plane is fitted
+MAX_PLANE_ERROR = 0.04  # relative, of a predicted inverse depth and of those it is fitted to
+MIN_KNOWN = 20  # known depths that a depth map is fitted to
+MAX_FITTED = 500  # known depths of which pairs are tried and counted; more are thinned
 
 MAX_UNEXPLAINED = 0.5
 """A depth map must leave at most this part of the spread of known depths unexplained: where all
@@ -114,18 +86,11 @@ are nearly the same a wrong map fits, too."""
 def scale_between(
     known: tuple[Array, Array], places: tuple[Array, Array], radius_px: float
 ) -> ScaleEstimate | None:
-    """Estimate the scale between two sets of depths in the same image.
+    """Estimate the scale between depths in one image: (K, 2) px and (K,), and (N, 2) px and (N,).
 
-    The two have no feature in common, so each depth of the pair is compared with known ones
-    near it in the image; the scale is where most logarithms of ratios gather.
-
-    Args:
-        known: (K, 2) px and (K,) depths that are known.
-        places: (N, 2) px and (N,) depths, all positive, whose scale is wanted.
-        radius_px: how far apart two places may be.
-
-    Returns:
-        None without neighbours.
+    The ``known`` and the others, all positive, have no feature in common, so each is compared with
+    known ones within a radius; the scale is where most logarithms of ratios gather. None without
+    neighbours.
     """
     rows, columns, distances = _nearest_known(known[0], places[0], radius_px, NUM_NEIGHBORS)
     ratios = np.log(known[1][columns] / places[1][rows])
@@ -139,11 +104,6 @@ def scale_by_planes(
 
     The inverse depth of a plane is affine in the image: it is fitted to the known depths around
     each place and taken where they lie on a plane that is certain enough there.
-
-    Args:
-        known: (K, 2) px and (K,) depths that are known.
-        places: (N, 2) px and (N,) depths, all positive, whose scale is wanted.
-        radius_px: how far away known depths may be.
     """
     if not len(known[0]) or not len(places[0]):
         return None
@@ -172,12 +132,8 @@ def scale_by_depth_map(
 
     Inverse depths of the map are those of the model up to scale and shift, as networks predict
     them; metric depth is so, too. Both are fitted to the known depths, robustly, and hold between
-    the nearest and the farthest of these only.
-
-    Args:
-        known: (K,) depths of the map at places whose depth is known, and these depths.
-        places: (N,) depths of the map at the pair's places, and depths of the pair, all positive.
-            The map's are NaN where it has none.
+    the nearest and the farthest of these only. Both arguments have depths of the map, NaN where it
+    has none, (K,) and (N,), and then the known ones or, all positive, those of the pair.
     """
     known_map, known_inverse = (1.0 / part[np.isfinite(known[0])] for part in known)
     fitted = _fitted_to(known_map, known_inverse)
@@ -202,9 +158,7 @@ def scale_by_depth_map(
 def _fitted_to(values: Array, inverse_depths: Array) -> tuple[Array, Array] | None:
     """Fit ``slope * value + shift`` to inverse depths that may be wrong, up to half of them.
 
-    Returns:
-        Slope and shift, and (K,) errors of the logarithm; None where the values do not explain
-        the depths.
+    Returns both, and (K,) errors of the logarithm; None where values do not explain the depths.
     """
     if len(values) < MIN_KNOWN:
         return None
@@ -241,7 +195,7 @@ def _log_errors(lines: Array, values: Array, inverse_depths: Array) -> Array:
         return np.abs(np.log(ratios))
 
 
-def _densest(rows: NDArray[np.int64], ratios: Array, weights: Array) -> ScaleEstimate | None:
+def _densest(rows: Indices, ratios: Array, weights: Array) -> ScaleEstimate | None:
     """Return the scale where most weight of the logarithms of ratios is; None without any."""
     if not len(ratios):
         return None
@@ -262,7 +216,7 @@ def _densest(rows: NDArray[np.int64], ratios: Array, weights: Array) -> ScaleEst
 
 def _nearest_known(
     known: Array, places: Array, radius_px: float, count: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+) -> tuple[Indices, Indices, Array]:
     """Return (place, known point, distance) of the ``count`` nearest of each place."""
     if not len(known) or not len(places):
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import shutil
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -17,24 +18,19 @@ from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_bytes
 
-AS_STORED = ("1", "L", "I;16", "RGB")
-"""Pillow's modes that PNG holds and COLMAP reads; others become RGB."""
+AS_STORED = ("1", "L", "I;16", "RGB")  # Pillow's modes that PNG holds and COLMAP reads
 
 
 @dataclass
 class ConversionReport:
-    """What became of the files of a folder.
+    """What became of the files of a folder."""
 
-    Attributes:
-        written: names of the files that were converted, with those that were made of them.
-        copied: names of the files that COLMAP can read as they are.
-        kept: names of the files that had been there before.
-        failures: names of the files that cannot be read, with the reason.
-    """
-
+    # names of the files that were converted, with those that were made of them
     written: dict[str, list[str]] = field(default_factory=dict)
+    # names of the files that COLMAP can read as they are
     copied: list[str] = field(default_factory=list)
-    kept: list[str] = field(default_factory=list)
+    kept: list[str] = field(default_factory=list)  # names of the files that had been there before
+    # names of the files that cannot be read, with the reason
     failures: dict[str, str] = field(default_factory=dict)
 
     def summary(self) -> str:
@@ -51,10 +47,8 @@ def convert_images(
     """Fill a folder with the photographs of another one, all in formats that COLMAP reads.
 
     Pages of a file become a file each, ``scan.tif-page2.png``. EXIF, its orientation too, stays.
-    What is there already is not made again.
-
-    Raises:
-        ImageError: when there are no photographs, or the new folder is inside the old one.
+    What is there already is not made again. Raises ImageError when there are no photographs, or
+    the new folder is inside the old one.
     """
     if image_path.is_file():
         raise ImageError(f"{image_path}: is a file; give the folder that it is in")
@@ -80,25 +74,19 @@ def convert_images(
 def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> None:
     """Convert or copy one file."""
     suffix = PurePosixPath(name).suffix.lower()
-    is_read = suffix in IMAGE_SUFFIXES and not foreign_format(path)
     numbers = pages(path) if suffix in TIFF_SUFFIXES else [0]
+    as_it_is = suffix in IMAGE_SUFFIXES and not foreign_format(path) and numbers == [0]
+    made = [_page_name(name, k, len(numbers)) for k in range(1, len(numbers) + 1)]
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    if is_read and numbers == [0]:
-        if (folder / name).exists():
-            report.kept.append(name)
-            return
+    if all((folder / target).exists() for target in ([name] if as_it_is else made)):
+        report.kept.append(name)
+    elif as_it_is:
         shutil.copy2(path, folder / name)
         report.copied.append(name)
-        return
-    made = [_page_name(name, k, len(numbers)) for k in range(1, len(numbers) + 1)]
-    if all((folder / target).exists() for target in made):
-        report.kept.append(name)
-        return
-    with _opened(path) as image:
-        for target, page in zip(made, numbers, strict=True):
-            image.seek(page)
-            replace_bytes(folder / target, _png(image, path))
-    report.written[name] = made
+    else:
+        for target, content in zip(made, _as_png(path, numbers), strict=True):
+            replace_bytes(folder / target, content)
+        report.written[name] = made
 
 
 def _page_name(name: str, page: int, num_pages: int) -> str:
@@ -110,22 +98,19 @@ def _page_name(name: str, page: int, num_pages: int) -> str:
     return f"{name}-page{page}.png" if num_pages > 1 else f"{name}.png"
 
 
-def _opened(path: Path) -> Image.Image:
+def _as_png(path: Path, numbers: Sequence[int]) -> Iterator[bytes]:
+    """Yield pages of a file as PNG; ImageError if it is damaged, or of no format that is known."""
     try:
-        return Image.open(path)
+        with Image.open(path) as image:
+            for number in numbers:
+                image.seek(number)
+                page = image if image.mode in AS_STORED else image.convert("RGB")
+                file = io.BytesIO()
+                page.save(file, "PNG", exif=image.getexif())
+                yield file.getvalue()
     except UnidentifiedImageError as error:
         heic = path.suffix.lower() in (".heic", ".heif")
         hint = "; HEIC needs: pip install pillow-heif" if heic else ""
         raise ImageError(f"{path}: is of a format that cannot be converted{hint}") from error
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
+    except Exception as error:  # damaged files raise nearly anything in Pillow
         raise ImageError(f"{path}: cannot be read ({error})") from error
-
-
-def _png(page: Image.Image, path: Path) -> bytes:
-    try:
-        image = page if page.mode in AS_STORED else page.convert("RGB")
-        file = io.BytesIO()
-        image.save(file, "PNG", exif=page.getexif())
-    except (OSError, ValueError, SyntaxError) as error:
-        raise ImageError(f"{path}: cannot be read ({error})") from error
-    return file.getvalue()

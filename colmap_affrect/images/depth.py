@@ -20,28 +20,21 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError, WorkspaceError
+from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Singles
 from colmap_affrect.images.depth_files import SUFFIXES, UnusableMap, read_map
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.images.reading import read_color, shrink_to
 from colmap_affrect.options import PartOptions, Registry, within
 from colmap_affrect.project.atomic_files import replace_bytes
 
-MAX_ASPECT_RATIO = 1.05
-"""Aspects of map and photograph may differ by this factor: networks round sizes to 32 px."""
-
-MIN_VALID_FRAC = 0.01
-"""Share of the pixels of a map that must be known."""
-
-MIN_DISPARITY_FRAC = 0.01
-"""Relative inverse depth below this share of the image's largest counts as sky, i.e. unknown."""
-
-NETWORK_IMAGE_SIZE_PX = 1024
-"""Longer side of what a network is given; most of them work at about 384 to 784 px."""
+MAX_ASPECT_RATIO = 1.05  # of aspects of map and photograph: networks round sizes to 32 px
+MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
+MIN_DISPARITY_FRAC = 0.01  # inverse depth below this share of the largest is sky, i.e. unknown
+NETWORK_IMAGE_SIZE_PX = 1024  # longer side; most networks work at about 384 to 784 px
 
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, zlib.error)
 """What numpy raises on a prediction that was kept and is missing or damaged."""
@@ -50,7 +43,7 @@ _DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, z
 class DepthSource(Protocol):
     """Depth maps of photographs; called with its ``Options`` and a :class:`DepthContext`."""
 
-    def depth(self, photograph: Photograph) -> NDArray[np.float32]:
+    def depth(self, photograph: Photograph) -> Singles:
         """Return (h, w) z-depth > 0, NaN where unknown, of any resolution over the whole image.
 
         Raises DepthError when there is no usable map.
@@ -62,15 +55,11 @@ class DepthSource(Protocol):
 
 @dataclass(frozen=True)
 class DepthContext:
-    """What depth sources work with.
+    """What depth sources work with."""
 
-    Attributes:
-        cache_path: folder that keeps the predictions of a network; None keeps none.
-        device: where a network runs: ``cpu``, ``cuda``, ``cuda:1``, ``mps``.
-    """
-
+    # folder that keeps the predictions of a network; None keeps none
     cache_path: Path | None = None
-    device: str = "cpu"
+    device: str = "cpu"  # where a network runs: ``cpu``, ``cuda``, ``cuda:1``, ``mps``
 
 
 class DepthOptions(PartOptions):
@@ -148,15 +137,13 @@ class DepthFiles:
     """Depth maps in a folder, named as the images.
 
     The map of ``a/b.jpg`` is the first that exists of ``a/b.jpg.npy``, ``a/b.jpg.npz`` and so on
-    in the order of ``SUFFIXES``, then ``a/b.npy``, ``a/b.npz`` and so on. What files of each
-    suffix hold: :mod:`colmap_affrect.images.depth_files`; values of ``.png`` are multiplied by
-    ``DepthFilesOptions.png_scale``. Values that are not finite or not positive are unknown.
+    in the order of ``SUFFIXES`` (see :mod:`.depth_files`), then ``a/b.npy``, ``a/b.npz`` and so on.
+    Values that are not finite or not positive are unknown.
     """
 
     Options = DepthFilesOptions
 
     def __init__(self, options: DepthFilesOptions, context: DepthContext | None = None) -> None:
-        """Keep the options; nothing else is needed."""
         del context
         self._options = options
         self._path = Path(options.path)
@@ -171,11 +158,8 @@ class DepthFiles:
                 f"{self._places(names[0])}"
             )
 
-    def depth(self, photograph: Photograph) -> NDArray[np.float32]:
-        """Read the (h, w) float32 z-depth of a photograph, NaN where it is unknown.
-
-        Raises DepthError if there is none, or it is damaged or not of this photograph.
-        """
+    def depth(self, photograph: Photograph) -> Singles:
+        """Read the (h, w) z-depth of a photograph, NaN where unknown; DepthError without."""
         path = self._options.file(photograph.name)
         if path is None:
             raise DepthError(
@@ -198,23 +182,17 @@ class DepthFiles:
 
 @dataclass(frozen=True)
 class _Prediction:
-    """What a network predicts of an image.
+    """What a network predicts of an image."""
 
-    Attributes:
-        values: (h, w) float32, depth or inverse depth.
-        inverse: whether the network predicts relative inverse depth.
-    """
-
-    values: NDArray[np.float32]
-    inverse: bool
+    values: Singles  # (h, w) depth or inverse depth
+    inverse: bool  # whether the network predicts relative inverse depth
 
 
 class MonocularDepth:
     """Depth from one image by a network of Hugging Face transformers.
 
-    Any model of the ``depth-estimation`` pipeline will do. DPT (MiDaS) and the relative models of
-    Depth Anything predict inverse depth, all others depth; this is read from the model's
-    configuration (:func:`predicts_inverse_depth`) unless ``kind`` says ``inverse`` or ``ray``.
+    Any model of the ``depth-estimation`` pipeline will do; whether it predicts depth or inverse
+    depth (:func:`predicts_inverse_depth`) counts unless ``kind`` says ``inverse`` or ``ray``.
 
     Relative inverse depth is known up to scale and shift. Here 0 is taken for infinitely far,
     as the networks are trained to say of the sky, and less than ``MIN_DISPARITY_FRAC`` of the
@@ -236,21 +214,14 @@ class MonocularDepth:
         self._lock = threading.Lock()
 
     def require_some(self, names: Sequence[str]) -> None:
-        """Load the network now, before any image is processed, unless all predictions are kept.
-
-        Raises DepthError if transformers is not installed or the model cannot be loaded.
-        """
+        """Load the network now unless all predictions are kept; DepthError if it cannot be."""
         files = [self._cache_file(name) for name in names]
         if not all(file is not None and file.exists() for file in files):
             with self._lock:
                 self._load()
 
-    def depth(self, photograph: Photograph) -> NDArray[np.float32]:
-        """Predict the (h, w) float32 z-depth of a photograph, NaN where it is unknown.
-
-        Raises DepthError if the network cannot be loaded or predicts no depth, ImageError if the
-        photograph cannot be read.
-        """
+    def depth(self, photograph: Photograph) -> Singles:
+        """Predict (h, w) z-depth of a photograph, NaN where unknown; DepthError if that fails."""
         prediction = self._prediction(photograph)
         kind = "inverse" if self._kind == "z" and prediction.inverse else self._kind
         values = prediction.values
@@ -307,7 +278,7 @@ class MonocularDepth:
         network.model.float()  # weights that are stored as float16 would give coarse depth
         self._network, self._pillow_from_array = network, Image.fromarray
 
-    def _predict(self, image: NDArray[np.uint8]) -> _Prediction:
+    def _predict(self, image: Bytes) -> _Prediction:
         # The pipeline also makes a preview, for which it divides by a range that may be 0.
         with np.errstate(all="ignore"):
             output = self._network(self._pillow_from_array(image))["predicted_depth"]
@@ -319,10 +290,8 @@ class MonocularDepth:
 def predicts_inverse_depth(config: Any) -> bool:
     """Tell from the configuration of a model whether it predicts relative inverse depth.
 
-    Models of the type of Depth Anything name it (``depth_estimation_type``: ``relative`` or
-    ``metric``). DPT does, as MiDaS was trained to, but for DPT heads on DINOv2, which are metric
-    and are the ones with ``add_projection``. All other types (GLPN, ZoeDepth, Depth Pro, ...)
-    predict depth.
+    Models of the type of Depth Anything say so. DPT does, as MiDaS was trained to, but for metric
+    DPT heads on DINOv2, the ones with ``add_projection``. All others predict depth.
     """
     estimation_type = getattr(config, "depth_estimation_type", None)
     if estimation_type is not None:
@@ -330,9 +299,7 @@ def predicts_inverse_depth(config: Any) -> bool:
     return bool(config.model_type == "dpt" and not config.add_projection)
 
 
-def _z_depth(
-    values: NDArray[np.floating], kind: str, photograph: Photograph
-) -> NDArray[np.float32]:
+def _z_depth(values: Floats, kind: str, photograph: Photograph) -> Singles:
     """Turn (h, w) values of a kind of depth into float32 z-depth, NaN where it is unknown."""
     with np.errstate(all="ignore"):  # unknown values may be anything, and become NaN below
         if kind == "inverse":
@@ -349,7 +316,7 @@ def _z_depth(
     return np.where(known, depth, np.float32(np.nan))
 
 
-def _ray_lengths(size: tuple[int, int], photograph: Photograph) -> NDArray[np.float64]:
+def _ray_lengths(size: tuple[int, int], photograph: Photograph) -> Array:
     """Distance from the camera of the points of depth 1 that the (h, w) pixels of a map show."""
     camera = resized_from_original(photograph.size, size) @ photograph.camera_matrix
     pixels = np.stack([*np.meshgrid(np.arange(size[0]), np.arange(size[1])), np.ones(size[::-1])])
@@ -357,7 +324,7 @@ def _ray_lengths(size: tuple[int, int], photograph: Photograph) -> NDArray[np.fl
     return np.asarray(np.linalg.norm(rays, axis=0))
 
 
-def _require_same_aspect(values: NDArray[np.floating], photograph: Photograph) -> None:
+def _require_same_aspect(values: Floats, photograph: Photograph) -> None:
     height, width = values.shape
     image_width, image_height = photograph.size
     if abs(log(width / height) - log(image_width / image_height)) > log(MAX_ASPECT_RATIO):

@@ -22,31 +22,20 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_NUM_VALUES_PER_PX = 4
-"""Of a map, for each pixel of its photograph; more is taken for damage."""
+from colmap_affrect.geometry.arrays import Array
 
-MIN_LARGEST_MAP = 1 << 22
-"""A map of so many values is read whatever the size of the photograph."""
-
-
-EXR_WINDOW = b"dataWindow\0box2i\0\x10\0\0\0"
-"""What stands before the first and last column and row in a header of OpenEXR."""
-
-Require = Callable[..., None]
-"""Takes the shape of a map, and its type if it may be one that holds no numbers."""
+MAX_NUM_VALUES_PER_PX = 4  # of a map, for each pixel of its photograph; more is taken for damage
+MIN_LARGEST_MAP = 1 << 22  # a map of so many values is read whatever the size of the photograph
+EXR_WINDOW = b"dataWindow\0box2i\0\x10\0\0\0"  # before first and last column and row
+Require = Callable[..., None]  # takes the shape of a map, and its type if that may be no number
 
 
 class UnusableMap(Exception):
     """Reason why a map cannot be used; the caller adds the file and the photograph."""
 
 
-def read_map(path: Path, num_px: int) -> NDArray[np.float64]:
-    """Read the (h, w) values of a file with one of ``SUFFIXES``.
-
-    Raises:
-        UnusableMap: when it holds no map, or one that is too large for a photograph of so many
-            pixels.
-    """
+def read_map(path: Path, num_px: int) -> Array:
+    """Read the (h, w) values of a photograph's map; UnusableMap if there are none, or too many."""
     max_num = max(MIN_LARGEST_MAP, MAX_NUM_VALUES_PER_PX * num_px)
 
     def require(shape: Sequence[int], dtype: np.dtype[Any] | None = None) -> None:
@@ -90,12 +79,8 @@ def _read_numpy(path: Path, require: Require) -> NDArray[np.generic]:
 def _read_array(stream: IO[bytes], require: Require) -> NDArray[np.generic]:
     """Read an array in the format of ``.npy``, never a pickle, when its header is sensible."""
     stream.seek(0)
-    version = np.lib.format.read_magic(stream)
-    read_header = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }[version]
-    shape, _, dtype = read_header(stream)
+    major, minor = np.lib.format.read_magic(stream)
+    shape, _, dtype = getattr(np.lib.format, f"read_array_header_{major}_{minor}")(stream)
     require(shape, dtype)
     stream.seek(0)
     return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
@@ -115,7 +100,7 @@ def _read_hdf5(path: Path, require: Require) -> NDArray[np.generic]:
                 "expected one dataset of two dimensions, or one named 'depth', found "
                 f"{_listed(maps)}"
             )
-        chosen = maps["depth"] if "depth" in maps else next(iter(maps.values()))
+        chosen = maps.get("depth") or next(iter(maps.values()))
         require(chosen.shape, chosen.dtype)
         if chosen.external or chosen.is_virtual:
             raise UnusableMap("its values are in other files; save it as one file")
@@ -165,5 +150,4 @@ _READERS: dict[str, Callable[[Path, Require], NDArray[np.generic]]] = {
     ".hdf5": _read_hdf5,
 }
 
-SUFFIXES = tuple(_READERS)
-"""Of files of depth maps, in the order in which they are looked for."""
+SUFFIXES = tuple(_READERS)  # of files of depth maps, in the order in which they are looked for

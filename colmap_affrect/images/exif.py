@@ -17,50 +17,35 @@ from PIL import ExifTags
 
 from colmap_affrect.images.headers import opened, read_header, stored_size
 
-FILM_DIAGONAL_MM = 43.27
-"""Of 35 mm film, to which equivalent focal lengths refer (by COLMAP's rounding)."""
+FILM_DIAGONAL_MM = 43.27  # of 35 mm film, to which equivalents refer (by COLMAP's rounding)
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """By EXIF's number of the unit of focal-plane resolutions: inches, cm, and, as COLMAP reads them,
 mm and micrometres."""
-PLAUSIBLE_FOCALS = (0.3, 6.0)
-"""In longer sides: fields of view of 118 to 10 degrees, which hold nearly all lenses."""
-MAX_CONTRADICTION = 1.15
-"""Ratio of two focal lengths that still agree: equivalents and widths of sensors are rounded."""
-MAX_ASPECT_ERROR = 0.01
-"""Lossless rotation cuts off up to 15 px, shrinking rounds."""
-SENSOR_ASPECTS = (3 / 2, 4 / 3, 16 / 9)
-"""Photographs of another shape have been cropped, or may have been."""
-MAX_THUMBNAIL_PX = 160
-"""Longer side of the thumbnails that cameras put into their files, often with black bars."""
+PLAUSIBLE_FOCALS = (0.3, 6.0)  # in longer sides: 118 to 10 degrees, which hold nearly all lenses
+MAX_CONTRADICTION = 1.15  # ratio of focal lengths that still agree: equivalents are rounded
+MAX_ASPECT_ERROR = 0.01  # lossless rotation cuts off up to 15 px, shrinking rounds
+SENSOR_ASPECTS = (3 / 2, 4 / 3, 16 / 9)  # photographs of another shape may have been cropped
+MAX_THUMBNAIL_PX = 160  # longer side of the thumbnails of cameras, often with black bars
 
 RESOLUTION, EQUIVALENT, SENSOR = "focal-plane resolution", "35 mm equivalent", "known sensor"
 
 
 @dataclass(frozen=True)
 class CameraTags:
-    """What the file of a photograph says of its camera; missing and absurd values are None.
+    """What the file of a photograph says of its camera; missing and absurd values are None."""
 
-    Attributes:
-        size: (width, height) of the stored pixels.
-        body: make, model and serial number, as far as they are there.
-        lens: model of the lens.
-        focal_mm: focal length.
-        equivalent_mm: of a camera with 35 mm film and the same field of view.
-        px_per_mm: focal-plane resolution, horizontal and vertical, the second may be missing.
-        original_size: (width, height) of the pixels when EXIF was written.
-        zoom: of the part of the sensor that was enlarged; 1 without.
-        absurd: names of tags whose values cannot be true.
-    """
-
-    size: tuple[int, int]
+    size: tuple[int, int]  # (width, height) of the stored pixels
+    # make, model and serial number, as far as they are there
     body: tuple[str, str, str] = ("", "", "")
-    lens: str = ""
-    focal_mm: float | None = None
-    equivalent_mm: float | None = None
+    lens: str = ""  # model of the lens
+    focal_mm: float | None = None  # focal length
+    equivalent_mm: float | None = None  # of a camera with 35 mm film and the same field of view
+    # focal-plane resolution, horizontal and vertical, the second may be missing
     px_per_mm: tuple[float, float | None] | None = None
+    # (width, height) of the pixels when EXIF was written
     original_size: tuple[int, int] | None = None
-    zoom: float = 1.0
-    absurd: tuple[str, ...] = ()
+    zoom: float = 1.0  # of the part of the sensor that was enlarged; 1 without
+    absurd: tuple[str, ...] = ()  # names of tags whose values cannot be true
 
     @property
     def identity(self) -> tuple[object, ...] | None:
@@ -84,17 +69,13 @@ class CameraTags:
 
 @dataclass(frozen=True)
 class ExifFocal:
-    """A focal length, or why there is none.
+    """A focal length, or why there is none."""
 
-    Attributes:
-        focal_px: in px of the stored file; None where EXIF does not say or cannot be trusted.
-        is_rescaled: it had to be scaled to the photograph, COLMAP would take another one.
-        why: what was found wrong; empty if nothing.
-    """
-
+    # in px of the stored file; None where EXIF does not say or cannot be trusted
     focal_px: float | None
+    # it had to be scaled to the photograph, COLMAP would take another one
     is_rescaled: bool = False
-    why: str = ""
+    why: str = ""  # what was found wrong; empty if nothing
 
 
 def read_camera_tags(path: Path) -> CameraTags | None:
@@ -127,17 +108,17 @@ def _camera_tags(size: tuple[int, int], tags: Mapping[int, Any]) -> CameraTags:
             absurd.append(key.name)
         return value
 
+    def text(key: ExifTags.Base) -> str:
+        value = tags.get(key)
+        return value.strip(" \t\r\n\0") if isinstance(value, str) else ""
+
     unit = MM_PER_UNIT.get(int(_positive(tags.get(tag.FocalPlaneResolutionUnit)) or 0))
     across, down = number(tag.FocalPlaneXResolution), number(tag.FocalPlaneYResolution)
     width, height = number(tag.ExifImageWidth), number(tag.ExifImageHeight)
     return CameraTags(
         size,
-        (
-            _text(tags.get(tag.Make)),
-            _text(tags.get(tag.Model)),
-            _text(tags.get(tag.BodySerialNumber)),
-        ),
-        _text(tags.get(tag.LensModel)),
+        (text(tag.Make), text(tag.Model), text(tag.BodySerialNumber)),
+        text(tag.LensModel),
         number(tag.FocalLength),
         number(tag.FocalLengthIn35mmFilm),
         (across / unit, down / unit if down else None) if across and unit else None,
@@ -157,10 +138,6 @@ def _positive(value: object) -> float | None:
     return number if math.isfinite(number) and number > 0.0 else None
 
 
-def _text(value: object) -> str:
-    return value.strip(" \t\r\n\0") if isinstance(value, str) else ""
-
-
 def _aspect(size: tuple[int, int]) -> float:
     return max(size) / min(size)
 
@@ -173,11 +150,7 @@ def exif_focal(tags: CameraTags, sensor_width_mm: float | None = None) -> ExifFo
     """Decide on the focal length that EXIF gives a photograph.
 
     Of statements that agree the first counts, in COLMAP's order: 35 mm equivalent, focal-plane
-    resolution, width of the sensor of this model.
-
-    Args:
-        tags: of the photograph.
-        sensor_width_mm: of the longer side of the sensor of this model, where it is known.
+    resolution, width of the longer side of the sensor of this model, where it is known.
     """
     if tags.was_cropped:
         return ExifFocal(None, why=f"cropped or padded: {_sizes(tags)}")
@@ -223,8 +196,8 @@ def _reconciled(
 ) -> ExifFocal:
     """Choose among plausible focal lengths, of which some may contradict each other.
 
-    Equivalents and sensors count for the whole frame, resolutions for pixels: against a resolution
-    of more pixels the others are right if the photograph was shrunk, wrong if it was cropped.
+    Against a resolution of more pixels, which alone counts for pixels and not for the whole frame,
+    the others are right if the photograph was shrunk, wrong if it was cropped.
     """
     colmaps, pixels = next(iter(stated)), plausible.get(RESOLUTION)
     key, focal = next(iter(plausible.items()))

@@ -17,8 +17,7 @@ from PIL.TiffImagePlugin import TiffImageFile
 
 from colmap_affrect.errors import ImageError
 
-MAX_NUM_PX = 1 << 29
-"""Of a photograph; those of the largest cameras have 400 megapixels."""
+MAX_NUM_PX = 1 << 29  # of a photograph; those of the largest cameras have 400 megapixels
 
 PNG = b"\x89PNG\r\n\x1a\n"
 READERS = {
@@ -31,18 +30,14 @@ READERS = {
 }
 """Pillow's by the first bytes: ``Image.open`` has a limit of pixels that photographs exceed."""
 
-NEW_SUBFILE_TYPE, REDUCED = 254, 1
-"""TIFF's tag, and its bit of a smaller copy of another page."""
+NEW_SUBFILE_TYPE, REDUCED = 254, 1  # TIFF's tag, and its bit of a smaller copy of another page
 
 Found = TypeVar("Found")
 
 
 def read_header(path: Path, read: Callable[[BinaryIO], Found]) -> Found | None:
-    """Return what a function reads of an image file, None if that fails in any way.
-
-    Nothing is opened that is not a file: a pipe would wait for ever.
-    """
-    if not path.is_file():
+    """Return what a function reads of a file, None if that fails in any way, or for a pipe."""
+    if not path.is_file():  # a pipe would wait for ever
         return None
     try:
         with warnings.catch_warnings(), path.open("rb") as file:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.data import Mask
+from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.images.reading import decode
 
 
@@ -23,16 +23,13 @@ def shrink_mask(mask: Mask, size: tuple[int, int]) -> Mask:
     return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0)
 
 
-def mask_values(mask: Mask) -> NDArray[np.uint8]:
+def mask_values(mask: Mask) -> Bytes:
     """Return an (H, W) mask as uint8, 255 inside and 0 outside."""
     return mask.astype(np.uint8) * 255
 
 
 def connected_regions(mask: Mask, min_area_px: float) -> list[tuple[Mask, tuple[int, int]]]:
-    """Find the 4-connected regions of an (H, W) mask that have enough pixels.
-
-    Each is an (h, w) mask, cropped to it, and the (x, y) of the mask's first pixel.
-    """
+    """Crop the 4-connected regions that have enough pixels; return each with its first (x, y)."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     regions = []
     for label, (left, top, width, height, area) in enumerate(stats.tolist()):

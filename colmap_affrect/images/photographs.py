@@ -56,33 +56,20 @@ class MaskOptions(Options):
 
 @dataclass(frozen=True)
 class Photographs:
-    """Where the photographs of a run and their masks are.
+    """Where the photographs of a run and their masks are."""
 
-    Attributes:
-        folder: of the photographs.
-        masks: where features may be.
-    """
-
-    folder: Path
-    masks: MaskOptions = field(default_factory=MaskOptions)
+    folder: Path  # of the photographs
+    masks: MaskOptions = field(default_factory=MaskOptions)  # where features may be
 
     def check(self) -> None:
-        """Refuse masks that are not there at all.
-
-        Raises:
-            OptionError: naming the option.
-        """
+        """Refuse masks that are not there at all: OptionError names the option."""
         if self.masks.path and not Path(self.masks.path).is_dir():
             raise OptionError(f"--mask-path {self.masks.path}: no such folder")
         if self.masks.camera_path and not Path(self.masks.camera_path).is_file():
             raise OptionError(f"--camera-mask-path {self.masks.camera_path}: no such file")
 
     def mask(self, name: str) -> Mask | None:
-        """Return the (H, W) mask of an image, None where it has none.
-
-        Raises:
-            ImageError: when a mask cannot be read or has another size.
-        """
+        """Return an image's (H, W) mask, if any; ImageError if it is unreadable or does not fit."""
         paths = [path for path in self._mask_paths(name) if path.is_file()][:1]
         paths += [Path(self.masks.camera_path)] if self.masks.camera_path else []
         size, masks = header_size(self.folder / name), list[Mask]()
@@ -102,8 +89,7 @@ class Photographs:
     def without_mask(self, names: Sequence[str]) -> list[str]:
         """Return the images that have no mask in the folder of masks, if there is one.
 
-        Raises:
-            OptionError: when none has: it is another folder, or the names differ.
+        OptionError when none has: it is another folder, or the names differ.
         """
         paths = {name: self._mask_paths(name) for name in names if self.masks.path}
         found = [name for name in paths if not any(path.is_file() for path in paths[name])]
@@ -116,10 +102,10 @@ class Photographs:
 
     def _mask_paths(self, name: str) -> list[Path]:
         """Return where the mask of an image may be, the first that is there counts."""
-        folder = Path(self.masks.path)
         if not self.masks.path:
             return []
-        return [folder / f"{name}.png", (folder / name).with_suffix(".png")]
+        path = Path(self.masks.path) / name
+        return [path.with_name(f"{path.name}.png"), path.with_suffix(".png")]
 
     def files(self, name: str) -> list[Path]:
         """Return the files that the extraction of an image reads, as far as they are there."""
@@ -139,21 +125,15 @@ class Photographs:
 
     def moved(self, move: Callable[[Path], Path]) -> Self:
         """Return the same photographs with all files in other places."""
-        folders = (self.masks.path, self.masks.camera_path)
-        path, camera_path = (str(move(Path(folder))) if folder else "" for folder in folders)
-        return replace(
-            self, folder=move(self.folder), masks=MaskOptions(path=path, camera_path=camera_path)
-        )
+        masks = MaskOptions(**{name: str(move(Path(path))) for name, path in self.masks if path})
+        return replace(self, folder=move(self.folder), masks=masks)
 
 
 def list_images(image_path: Path, image_list_path: Path | None = None) -> list[str]:
     """Return the sorted names, relative to ``image_path``, of all images or of those listed.
 
     Folders are searched through; hidden ones and files of other formats are passed over (see
-    :func:`left_out`).
-
-    Raises:
-        ImageError: when there are none, or a listed one is missing.
+    :func:`left_out`). ImageError when there are none, or a listed one is missing.
     """
     if image_path.is_file():
         raise ImageError(f"{image_path}: is a file; give the folder that it is in")
@@ -172,26 +152,23 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
 def left_out(image_path: Path) -> dict[str, str]:
     """Tell which photographs in a folder are passed over: for their format, names, or as pages."""
     found: dict[str, list[str]] = {}
+    notes: dict[str, str] = {}
     for name in _visible_files(image_path):
         if _suffix(name) in OTHER_IMAGE_SUFFIXES:
             found.setdefault(f"*{_suffix(name)}", []).append(name)
         elif _suffix(name) in IMAGE_SUFFIXES and _odd(name):
             found.setdefault("names", []).append(name)
-    notes = {
-        name: f"has {count} pages, and only the first is used; colmap-affrect convert makes a file "
-        "of each"
-        for name in _visible_files(image_path)
-        if _suffix(name) in TIFF_SUFFIXES and (count := len(pages(image_path / name))) > 1
-    }
-    return notes | {
-        kind: f"{len(names)} left out, such as {one_line(names[0])}: "
-        + (
-            f"{_odd(names[0])}; rename it"
-            if kind == "names"
-            else "COLMAP or OpenCV cannot read this format; colmap-affrect convert makes PNG"
-        )
-        for kind, names in found.items()
-    }
+        if _suffix(name) in TIFF_SUFFIXES and (count := len(pages(image_path / name))) > 1:
+            notes[name] = (
+                f"has {count} pages, and only the first is used; colmap-affrect convert makes a "
+                "file of each"
+            )
+    for kind, names in found.items():
+        why = "COLMAP or OpenCV cannot read this format; colmap-affrect convert makes PNG"
+        if kind == "names":
+            why = f"{_odd(names[0])}; rename it"
+        notes[kind] = f"{len(names)} left out, such as {one_line(names[0])}: {why}"
+    return notes
 
 
 def photograph_files(folder: Path) -> list[str]:
@@ -202,8 +179,8 @@ def photograph_files(folder: Path) -> list[str]:
 
 def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:
     """Tell which photographs in a folder a database does not name."""
-    suffixes = IMAGE_SUFFIXES
-    found = [n for n in _visible_files(image_path) if _suffix(n) in suffixes and n not in names]
+    files = _visible_files(image_path)
+    found = [name for name in files if _suffix(name) in IMAGE_SUFFIXES and name not in names]
     if not found:
         return {}
     why = f"{len(found)} photographs are left out, such as {one_line(found[0])}"
@@ -211,10 +188,7 @@ def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:
 
 
 def _visible_files(folder: Path) -> list[str]:
-    """Return the sorted names, relative to a folder, of all files that are not hidden.
-
-    Output folders of this program are passed over with all that is in them.
-    """
+    """Return the sorted names of all files below a folder, but for hidden ones and our output."""
     found: list[str] = []
     for path, inner, files in os.walk(folder):
         inner[:] = [n for n in inner if n[0] != "." and not is_output_folder(Path(path, n))]
@@ -257,11 +231,7 @@ def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
 
 
 def checked_names(image_path: Path, names: Sequence[str], where: str) -> list[str]:
-    """Return the sorted names of images below a folder, each once.
-
-    Raises:
-        ImageError: for a name that is not there, or that leads out of the folder.
-    """
+    """Return the sorted names of images, each once; ImageError for one not below the folder."""
     found = sorted({PurePosixPath(name).as_posix() for name in names})
     missing = [name for name in found if not _is_below(image_path, name)]
     for name in found:

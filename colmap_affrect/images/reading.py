@@ -17,6 +17,7 @@ from PIL import ExifTags
 from colmap_affrect import PYCOLMAP_CAME_FIRST
 from colmap_affrect.data import ColorImage, GrayImage
 from colmap_affrect.errors import ImageError
+from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.images.headers import header_size, require_possible
 
 IMAGE_SUFFIXES = (
@@ -42,20 +43,12 @@ FOREIGN_FORMATS = {
 wheel does not."""
 
 
-TONE_PERCENTILES = (0.5, 99.5)
-"""What is black and white of a stretched photograph: dust and glints are a few pixels."""
-MIN_TONE_RANGE = 0.5
-"""A photograph whose tones fill less of the range of its file is stretched."""
-MAX_TONE_STEP = 16
-"""Neighbouring tones get no further apart, in steps of 8 bits: beyond is noise."""
-NUM_TONES = 250_000
-"""About so many pixels are looked at."""
-FRAME_FRAC = 0.1
-"""So much along each border says nothing about tones: scans have frames and captions there."""
-
-
-BIG_TIFF = 43
-"""What files of more than 4 GiB have in the place of 42, with offsets of 64 bits."""
+TONE_PERCENTILES = (0.5, 99.5)  # black and white of a stretched photograph but for dust and glints
+MIN_TONE_RANGE = 0.5  # a photograph whose tones fill less of the range of its file is stretched
+MAX_TONE_STEP = 16  # neighbouring tones get no further apart, in steps of 8 bits: beyond is noise
+NUM_TONES = 250_000  # about so many pixels are looked at
+FRAME_FRAC = 0.1  # along each border is passed over: scans have frames and captions there
+BIG_TIFF = 43  # what files of more than 4 GiB have in the place of 42, with offsets of 64 bits
 
 
 COLOR_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
@@ -66,8 +59,7 @@ EIGHTH_OF_COLOR = cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
 def read_gray(path: Path, *, stretch: bool = False) -> GrayImage:
     """Read an image as gray, as stored: EXIF orientation is not applied, 16 bit becomes 8.
 
-    With ``stretch`` the tones of a photograph of low contrast fill the range (:func:`tones`).
-    Raises ImageError when the file is missing, empty, or not an image.
+    With ``stretch`` low contrast fills the range (:func:`tones`). ImageError if it is no image.
     """
     image = decode(path)
     return in_eight_bits(image, tones(image) if stretch else None)
@@ -87,8 +79,7 @@ def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorIm
 def tones(image: NDArray[Any]) -> tuple[float, float] | None:
     """Return what is to be black and white of an (H, W[, 3]) image, None to leave it as it is.
 
-    Scans of faded prints and 12 bits in a file of 16 fill a small part of the range, and detectors
-    with a fixed threshold see next to nothing in them.
+    Detectors with a fixed threshold see next to nothing in scans of faded prints.
     """
     height, width = image.shape[:2]
     y, x = int(FRAME_FRAC * height), int(FRAME_FRAC * width)
@@ -103,9 +94,7 @@ def tones(image: NDArray[Any]) -> tuple[float, float] | None:
     return float(low), float(high)
 
 
-def in_eight_bits(
-    image: NDArray[Any], black_and_white: tuple[float, float] | None = None
-) -> NDArray[np.uint8]:
+def in_eight_bits(image: NDArray[Any], black_and_white: tuple[float, float] | None = None) -> Bytes:
     """Return an image of 8 or 16 bits or of floats from 0 to 1 in 8 bits."""
     if black_and_white:
         low, high = black_and_white
@@ -125,11 +114,8 @@ def encode_jpeg(image: GrayImage | ColorImage, quality: int) -> bytes:
 
 
 def require_png() -> None:
-    """Check that this process can write PNG, before work that ends with pictures.
-
-    ImageError when it imported pycolmap before this package: compressing would kill it.
-    """
-    if PYCOLMAP_CAME_FIRST:
+    """Raise ImageError, before work that ends with pictures, where writing PNG would crash."""
+    if PYCOLMAP_CAME_FIRST:  # compressing would kill the process
         raise ImageError(
             "pictures cannot be written in a script that imports pycolmap first; put "
             '"import colmap_affrect" before "import pycolmap"'
@@ -174,7 +160,7 @@ def _foreign(beginning: bytes) -> str:
     return next(found, "")
 
 
-def _forget_orientation_of_tiff(data: NDArray[np.uint8]) -> None:
+def _forget_orientation_of_tiff(data: Bytes) -> None:
     """Have the first picture of a TIFF stand upright: OpenCV turns it whatever the flags say."""
     order = {b"II": "<", b"MM": ">"}.get(data[:2].tobytes())
     if not order:
@@ -193,7 +179,7 @@ def _forget_orientation_of_tiff(data: NDArray[np.uint8]) -> None:
                 struct.pack_into(f"{order}H", content, entry + size - struct.calcsize(offset), 1)
 
 
-def shrink_to(image: NDArray[np.uint8], max_size_px: int) -> NDArray[np.uint8]:
+def shrink_to(image: Bytes, max_size_px: int) -> Bytes:
     """Shrink an (H, W) or (H, W, 3) image, by area averaging, until no side is longer."""
     height, width = image.shape[:2]
     scale = max_size_px / max(width, height)

@@ -12,23 +12,20 @@ from numpy.typing import NDArray
 from colmap_affrect.conventions import is_inside
 from colmap_affrect.data import ColorImage, GrayImage, Mask, Rectification
 from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_frames
+from colmap_affrect.geometry.arrays import Array, Bytes, Singles
 from colmap_affrect.images.masks import mask_values
 
-ANTI_ALIASING_SIGMA = 0.8
-"""Blur before a compression by c: sigma = 0.8 sqrt(c^2 - 1) source px (Morel & Yu, ASIFT)."""
+ANTI_ALIASING_SIGMA = 0.8  # px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)
 
 TILE_PX = 64
 """Homographies are executed in square tiles, each with the blur that its strongest compression
 needs; larger tiles would blur more of what is compressed less."""
 
-SAMPLES_PER_TILE = 5
-"""Points along a side of a tile at which its compression is measured."""
-
-MAX_DENSITY = 16
-"""Samples per px of a warp along an axis; beyond, memory counts more than aliasing."""
+SAMPLES_PER_TILE = 5  # points along a side of a tile at which its compression is measured
+MAX_DENSITY = 16  # samples per px of a warp along an axis; beyond, memory counts more than aliasing
 
 
-def halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def halved(image: Singles) -> Singles:
     """Return an (H, W) image blurred and resampled to half its size, as kornia's ``pyrdown``."""
     kernel = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
     smooth = cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
@@ -36,9 +33,7 @@ def halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
 
 
-def warp(
-    image: GrayImage | ColorImage | NDArray[np.float32], rectification: Rectification
-) -> NDArray[np.uint8]:
+def warp(image: GrayImage | ColorImage | Singles, rectification: Rectification) -> Bytes:
     """Render a rectification: one exact resampling, free of aliasing where it compresses.
 
     The image is resampled once, on a grid that is denser than the warp by integer factors, blurred,
@@ -60,17 +55,18 @@ def warp(
     return warped
 
 
-def _warp_affine(source: NDArray[np.float32], rectification: Rectification) -> GrayImage:
+def _warp_affine(source: Singles, rectification: Rectification) -> GrayImage:
     """Warp on rows that are ``ceil(1/sy)`` times denser, blurred along the compressed axis."""
     matrix = rectification.rectified_from_image
     width, height = rectification.canvas_size
     compression = 1.0 / float(np.hypot(*matrix[1, :2]))
     density = max(1, ceil(compression - 1e-9))
     dense_from_image = np.diag([1.0, density, 1.0]) @ matrix
+    size = (width, (height - 1) * density + 1)
     dense = cv2.warpAffine(
         source,
         dense_from_image[:2],
-        (width, (height - 1) * density + 1),
+        size,
         flags=cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REFLECT_101,
     )
@@ -85,9 +81,7 @@ def _anti_aliasing_sigma(compression: float, density: int) -> float:
     return ANTI_ALIASING_SIGMA * sqrt(max(compression**2 - 1.0, 0.0)) * density / compression
 
 
-def _tiles(
-    canvas: NDArray[np.uint8], rectification: Rectification
-) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float64]]]:
+def _tiles(canvas: Bytes, rectification: Rectification) -> Iterator[tuple[Bytes, Array]]:
     """Yield views of the tiles of a canvas and their (3, 3) maps image_from_tile."""
     image_from_canvas = rectification.image_from_rectified
     for top in range(0, canvas.shape[0], TILE_PX):
@@ -97,9 +91,7 @@ def _tiles(
             yield canvas[top : top + TILE_PX, left : left + TILE_PX], image_from_tile
 
 
-def _warp_tile(
-    source: NDArray[np.float32], image_from_tile: NDArray[np.float64], size: tuple[int, int]
-) -> NDArray[np.float32]:
+def _warp_tile(source: Singles, image_from_tile: Array, size: tuple[int, int]) -> Singles:
     """Render one tile of (width, height), with surroundings as far as the blur reaches."""
     compressions = _compressions(image_from_tile, size, source.shape[1::-1])
     density_x, density_y = np.minimum(np.ceil(compressions - 1e-9), MAX_DENSITY).astype(int)
@@ -115,8 +107,8 @@ def _warp_tile(
 
 
 def _compressions(
-    image_from_tile: NDArray[np.float64], size: tuple[int, int], image_size: tuple[int, int]
-) -> NDArray[np.float64]:
+    image_from_tile: Array, size: tuple[int, int], image_size: tuple[int, int]
+) -> Array:
     """Return how many image px a px of the tile spans at most, in x and in y, at least 1."""
     columns, rows = (np.linspace(0, extent - 1, SAMPLES_PER_TILE) for extent in size)
     points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
@@ -128,11 +120,11 @@ def _compressions(
 
 
 def _source_points(
-    image_from_tile: NDArray[np.float64],
+    image_from_tile: Array,
     columns: NDArray[np.number],
     rows: NDArray[np.number],
     image_size: tuple[int, int],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], Mask]:
+) -> tuple[Singles, Singles, Mask]:
     """Return x and y in the image of a grid of points of a tile, and what is before the camera.
 
     Points further than an image size away are moved there: a border is reflected once.
@@ -147,11 +139,10 @@ def _source_points(
     return x.astype(np.float32), y.astype(np.float32), ahead
 
 
-def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Carry the region of a rectification into its warp (nearest; 255 inside, 0 outside).
+def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> Bytes:
+    """Carry the region of a rectification of an image of (width, height) px into its warp.
 
-    Of an image of (width, height) px, all of it where the region is None, to (height, width) uint8
-    of the canvas; what lies behind the camera is outside.
+    To (height, width) uint8 of the canvas, nearest: 255 inside, 0 outside and behind the camera.
     """
     region = rectification.region
     if region is None:
@@ -160,18 +151,9 @@ def warp_mask(rectification: Rectification, image_size: tuple[int, int]) -> NDAr
     image_from_region = np.eye(3)
     image_from_region[:2, 2] = rectification.region_origin
     if rectification.is_affine:
-        rectified_from_region = rectification.rectified_from_image @ image_from_region
-        return np.asarray(
-            cv2.warpAffine(
-                values,
-                rectified_from_region[:2],
-                rectification.canvas_size,
-                flags=cv2.INTER_NEAREST,
-                borderMode=cv2.BORDER_CONSTANT,
-                borderValue=0,
-            ),
-            dtype=np.uint8,
-        )
+        matrix = (rectification.rectified_from_image @ image_from_region)[:2]
+        size = rectification.canvas_size
+        return np.asarray(cv2.warpAffine(values, matrix, size, flags=cv2.INTER_NEAREST), np.uint8)
     mask = np.empty(rectification.canvas_size[::-1], dtype=np.uint8)
     region_from_image = np.linalg.inv(image_from_region)
     for tile, image_from_tile in _tiles(mask, rectification):

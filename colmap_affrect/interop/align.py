@@ -9,58 +9,46 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.model_files import read_given_model, write_model
 from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.interop.georeference import Georeference
 from colmap_affrect.project.tables import read_table
-
-Array = NDArray[np.float64]
 
 MIN_WIDTH = 0.01
 """Of positions, across the line that fits them best, in units of the length along it: with less
 nothing tells how the model is turned about that line."""
 METRIC, ON_EARTH = ("x", "y", "z"), ("latitude", "longitude", "altitude")
-SHOWN = 12
-"""Residuals that the summary lists, the largest first."""
+SHOWN = 12  # residuals that the summary lists, the largest first
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """What a model is aligned to; exactly one of the first three, or distances.
+    """What a model is aligned to; exactly one of the first three, or distances."""
 
-    Attributes:
-        gps_database: COLMAP database that has positions of the photographs by GPS.
-        positions_path: CSV of where photographs were taken: name and x, y, z in metres, or
-            latitude, longitude, altitude.
-        points_path: CSV of points marked in photographs: point, image, px, py, and for control
-            points x, y, z in one row or more of each.
-        distances: two names, of photographs or of marked points, and their distance.
-    """
-
-    gps_database: Path | None = None
+    gps_database: Path | None = None  # COLMAP database that has positions of the photographs by GPS
+    # CSV of where photographs were taken: name and x, y, z in metres, or latitude, longitude,
+    # altitude
     positions_path: Path | None = None
+    # CSV of points marked in photographs: point, image, px, py, and for control points x, y, z in
+    # one row or more of each
     points_path: Path | None = None
+    # two names, of photographs or of marked points, and their distance
     distances: tuple[tuple[str, str, float], ...] = ()
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """What was done.
+    """What was done."""
 
-    Attributes:
-        scale: metres for a unit of the model as it was.
-        residuals: how far each position, point or distance is off after it, metres.
-        georeference: where the model is on earth, if that is known.
-    """
-
-    scale: float
+    scale: float  # metres for a unit of the model as it was
+    # how far each position, point or distance is off after it, metres
     residuals: Mapping[str, float]
-    georeference: Georeference | None = None
+    georeference: Georeference | None = None  # where the model is on earth, if that is known
 
     def summary(self) -> str:
         """Return a few lines."""
@@ -75,17 +63,9 @@ class Alignment:
 
 
 def align(model_path: Path, output_path: Path, reference: Reference) -> Alignment:
-    """Write a model in metres; the old one stays as it is.
+    """Write a model of COLMAP in metres, to a new folder; the old one stays as it is.
 
     Positions and control points give scale, rotation and place, distances the scale alone.
-
-    Args:
-        model_path: folder of a COLMAP model.
-        output_path: folder of the new model, which must not exist.
-        reference: what to align to.
-
-    Raises:
-        AffrectError: when the reference is unreadable, or leaves open how the model lies.
     """
     if output_path.exists():
         raise OptionError(f"{output_path}: exists, and is left as it is; use another folder")
@@ -105,26 +85,28 @@ def align(model_path: Path, output_path: Path, reference: Reference) -> Alignmen
     return Alignment(float(new_from_old.scale), residuals, place)
 
 
-def _centers(model: pycolmap.Reconstruction) -> dict[str, Array]:
+def _images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
     images = (model.image(image_id) for image_id in model.reg_image_ids())
-    return {image.name: image.projection_center() for image in images}
+    return {image.name: image for image in images}
+
+
+def _centers(model: pycolmap.Reconstruction) -> dict[str, Array]:
+    return {name: image.projection_center() for name, image in _images(model).items()}
 
 
 def _positions(
     model: pycolmap.Reconstruction, reference: Reference
 ) -> tuple[list[str], Array, Array, Georeference | None]:
     """Return names, places in the model and true places of what the reference knows."""
+    old, is_on_earth = _centers(model), False
     if reference.points_path:
         old, true = _marked_points(model, reference.points_path)
-        is_on_earth = False
+    elif reference.gps_database:
+        true, is_on_earth = _gps(reference.gps_database)
+    elif reference.positions_path:
+        true, is_on_earth = _table_of_positions(reference.positions_path)
     else:
-        old = _centers(model)
-        if reference.gps_database:
-            true, is_on_earth = _gps(reference.gps_database)
-        elif reference.positions_path:
-            true, is_on_earth = _table_of_positions(reference.positions_path)
-        else:
-            raise OptionError("give --gps, --positions, --points or --distance")
+        raise OptionError("give --gps, --positions, --points or --distance")
     names = sorted(old.keys() & true.keys())
     if len(names) < 3:
         raise OptionError(
@@ -170,7 +152,7 @@ def _scale(
                     f"--distance: {name} is no photograph of the model, nor a point of --points"
                 )
         own = float(np.linalg.norm(places[first] - places[second]))
-        if own <= 0.0 or length <= 0.0:
+        if own <= 0.0 or not 0.0 < length < np.inf:
             raise OptionError(f"--distance {first},{second}: must be of two places, and positive")
         lengths[f"{first},{second}"] = own, length
     scale = float(np.exp(np.mean([np.log(true / own) for own, true in lengths.values()])))
@@ -221,9 +203,7 @@ def _marked_points(
     model: pycolmap.Reconstruction, path: Path
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Return marked points by name, in the model and, of control points, where they are."""
-    where, images = f"--points {path}", {}
-    for image_id in model.reg_image_ids():
-        images[model.image(image_id).name] = model.image(image_id)
+    where, images = f"--points {path}", _images(model)
     seen: defaultdict[str, list[tuple[pycolmap.Image, Array]]] = defaultdict(list)
     true = {}
     for place, row in read_table(path, where, ("point", "image", "px", "py", *METRIC), "point"):
@@ -238,20 +218,20 @@ def _marked_points(
     found = {name: _triangulated(model, views) for name, views in seen.items() if len(views) > 1}
     if not found:
         raise OptionError(f"{where}: no point is marked in two registered photographs")
-    missing = [name for name, place in found.items() if place is None]
-    if missing:
-        raise OptionError(f"{where}: the rays of point {missing[0]} do not meet; look at its marks")
-    return {name: place for name, place in found.items() if place is not None}, true
+    for name, place_in_model in found.items():
+        if not len(place_in_model):
+            raise OptionError(f"{where}: the rays of point {name} do not meet; look at its marks")
+    return found, true
 
 
 def _triangulated(
     model: pycolmap.Reconstruction, views: Sequence[tuple[pycolmap.Image, Array]]
-) -> Array | None:
-    """Return where the rays through the marks of a point meet."""
+) -> Array:
+    """Return where the rays through the marks of a point meet, nothing if they do not."""
     cameras = [model.cameras[image.camera_id] for image, _ in views]
     flat = [camera.cam_from_img(mark) for camera, (_, mark) in zip(cameras, views, strict=True)]
     rays = np.column_stack([np.array(flat), np.ones(len(flat))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     poses = [image.cam_from_world().matrix() for image, _ in views]
     place = pycolmap.triangulate_multi_view_point(poses, rays)
-    return None if place is None else np.asarray(place).ravel()
+    return np.zeros(0) if place is None else np.asarray(place).ravel()

@@ -10,48 +10,36 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.poses import model_poses
 from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.interop.georeference import Georeference
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import csv_text
 from colmap_affrect.project.workspace import Workspace
 
-Array = NDArray[np.float64]
-
-DENSE = "dense"
-"""Folder of undistorted photographs with their model, as COLMAP's dense reconstruction has it."""
-
-NO_EXTRA: dict[str, float] = {"k1": 0.0, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0}
-"""Distortion of undistorted photographs, by nerfstudio's names."""
+DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
+NO_EXTRA = dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0.0)  # nerfstudio's distortion
 
 RADIAL_MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2}
 """Camera models that Bundler's and NVM's radial terms can tell, and how many terms they have."""
 
 NVM_TERMS, BUNDLER_TERMS = 1, 2
 
-FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])
-"""From COLMAP's camera (y down, looks along z) to that of OpenGL, Bundler and nerfstudio."""
+FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL, Bundler, nerfstudio
 
 
 @dataclass(frozen=True)
 class Source:
-    """What is exported.
+    """What is exported."""
 
-    Attributes:
-        path: folder of the model.
-        model: its content.
-        image_path: folder of the photographs; None if it is not known.
-    """
-
-    path: Path
-    model: pycolmap.Reconstruction
-    image_path: Path | None
+    path: Path  # folder of the model
+    model: pycolmap.Reconstruction  # its content
+    image_path: Path | None  # folder of the photographs; None if it is not known
 
     def images(self) -> list[pycolmap.Image]:
         """Return the registered images by name."""
@@ -72,26 +60,13 @@ class Source:
 
 
 def export(
-    model_path: Path,
-    output_path: Path,
-    formats: Sequence[str],
-    *,
-    image_path: Path | None = None,
+    model_path: Path, output_path: Path, formats: Sequence[str], *, image_path: Path | None = None
 ) -> dict[str, Path]:
-    """Write a model in some formats.
+    """Write a COLMAP model in some of ``FORMATS``; return what was written, by format.
 
-    Args:
-        model_path: folder of a COLMAP model.
-        output_path: folder for the files, made if missing; nothing in it is overwritten.
-        formats: keys of ``FORMATS``.
-        image_path: folder of the photographs, for undistorted ones; by default as the run
-            that made the model has it on record.
-
-    Returns:
-        What was written, by format.
-
-    Raises:
-        AffrectError: when a format cannot hold the model, or a file exists; nothing is written.
+    The folder for the files is made if it is missing; nothing in it is overwritten. Photographs,
+    to be undistorted, are by default where the run that made the model has them on record. Raises
+    AffrectError when a format cannot hold the model, or a file exists; nothing is written then.
     """
     for name in formats:
         if name not in FORMATS:
@@ -114,8 +89,7 @@ def export(
 
 def _recorded_images(model_path: Path) -> Path | None:
     """Return where the photographs of a run are, if the model is that of a run."""
-    folder = model_path.resolve().parent.parent
-    recorded = Workspace(folder).planned("extract") or {}
+    recorded = Workspace(model_path.resolve().parent.parent).planned("extract") or {}
     return Path(recorded["image_path"]) if "image_path" in recorded else None
 
 
@@ -138,8 +112,10 @@ def _text(source: Source, folder: Path) -> Path:
     return path
 
 
-def _radial(source: Source, image: pycolmap.Image, num_terms: int, name: str) -> tuple[Any, Array]:
-    """Return the camera of an image and its radial terms, with zeros for those it has not."""
+def _radial(
+    source: Source, image: pycolmap.Image, num_terms: int, name: str
+) -> tuple[float, Array, Array]:
+    """Return the focal length of an image, its radial terms, 0 if it lacks some, and its centre."""
     camera = source.model.cameras[image.camera_id]
     known = RADIAL_MODELS.get(camera.model.name)
     if known is None or known > num_terms:
@@ -149,7 +125,8 @@ def _radial(source: Source, image: pycolmap.Image, num_terms: int, name: str) ->
         )
     terms = np.zeros(num_terms)
     terms[:known] = camera.params[len(camera.params) - known :] if known else []
-    return camera, terms
+    center = np.array([camera.principal_point_x, camera.principal_point_y])
+    return camera.mean_focal_length(), terms, center
 
 
 def _nvm(source: Source, folder: Path) -> Path:
@@ -157,13 +134,12 @@ def _nvm(source: Source, folder: Path) -> Path:
     path, images = _new(folder / "model.nvm"), source.images()
     lines, centers = ["NVM_V3", "", str(len(images))], []
     for image in images:
-        camera, terms = _radial(source, image, NVM_TERMS, "NVM")
+        focal, terms, center = _radial(source, image, NVM_TERMS, "NVM")
         if any(character.isspace() for character in image.name):
             raise OptionError(f"NVM: cannot hold the name '{image.name}', which has a space")
-        centers.append(np.array([camera.principal_point_x, camera.principal_point_y]))
-        pose = image.cam_from_world()
-        x, y, z, w = pose.rotation.quat
-        values = [camera.mean_focal_length(), w, x, y, z, *image.projection_center(), -terms[0], 0]
+        centers.append(center)
+        x, y, z, w = image.cam_from_world().rotation.quat
+        values = [focal, w, x, y, z, *image.projection_center(), -terms[0], 0]
         lines.append(f"{image.name} {_numbers(values)}")
     lines += ["", str(source.model.num_points3D())]
     for point, views in source.tracks():
@@ -184,12 +160,11 @@ def _bundler(source: Source, folder: Path) -> Path:
     lines = ["# Bundle file v0.3", f"{len(images)} {source.model.num_points3D()}"]
     centers = []
     for image in images:
-        camera, terms = _radial(source, image, BUNDLER_TERMS, "Bundler")
-        centers.append(np.array([camera.principal_point_x, camera.principal_point_y]))
+        focal, terms, center = _radial(source, image, BUNDLER_TERMS, "Bundler")
+        centers.append(center)
         matrix = FLIP_Y_Z @ image.cam_from_world().matrix()
-        lines.append(_numbers([camera.mean_focal_length(), *terms]))
-        lines += [_numbers(row) for row in matrix[:, :3]]
-        lines.append(_numbers(matrix[:, 3]))
+        lines.append(_numbers([focal, *terms]))
+        lines += [_numbers(row) for row in (*matrix[:, :3], matrix[:, 3])]
     for point, seen in source.tracks():
         lines += [_numbers(point.xyz), " ".join(map(str, point.color))]
         views = [

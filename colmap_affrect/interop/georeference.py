@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import TypeAdapter, ValidationError
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import StoreError
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.project.atomic_files import replace_text
 
 FILE_NAME = "georeference.json"
@@ -19,17 +20,11 @@ FILE_NAME = "georeference.json"
 
 @dataclass(frozen=True)
 class Georeference:
-    """A model in metres whose x, y, z point east, north and up, and where its origin is (WGS 84).
+    """A model in metres, its x, y, z pointing east, north and up, and its origin (WGS 84)."""
 
-    Attributes:
-        latitude: of the origin, degrees.
-        longitude: of the origin, degrees.
-        altitude: of the origin, metres above the ellipsoid, or as GPS has it.
-    """
-
-    latitude: float
-    longitude: float
-    altitude: float
+    latitude: float  # of the origin, degrees
+    longitude: float  # of the origin, degrees
+    altitude: float  # of the origin, metres above the ellipsoid, or as GPS has it
 
     @classmethod
     def middle_of(cls, positions: ArrayLike) -> Self:
@@ -52,17 +47,14 @@ class Georeference:
         text = TypeAdapter(Georeference).dump_json(self, indent=1).decode()
         replace_text(model_path / FILE_NAME, text + "\n")
 
-    def in_metres(self, positions: ArrayLike) -> NDArray[np.float64]:
+    def in_metres(self, positions: ArrayLike) -> Array:
         """Return metres east, north and up of the origin for latitudes, longitudes, altitudes."""
-        origin = (self.latitude, self.longitude, self.altitude)
-        found: NDArray[np.float64] = _transform().ellipsoid_to_enu(positions, *origin)
-        return found
+        return np.asarray(_transform().ellipsoid_to_enu(positions, *astuple(self)))
 
     def on_earth(self, point: ArrayLike) -> tuple[float, float, float]:
         """Return latitude, longitude and altitude of a point of the model."""
-        origin = (self.latitude, self.longitude, self.altitude)
-        found = _transform().enu_to_ellipsoid(np.asarray(point, float)[None], *origin)
-        latitude, longitude, altitude = found[0].tolist()
+        places = _transform().enu_to_ellipsoid(np.asarray(point, float)[None], *astuple(self))
+        latitude, longitude, altitude = places[0].tolist()
         return latitude, longitude, altitude
 
 

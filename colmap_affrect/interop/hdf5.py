@@ -27,10 +27,8 @@ from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import DatabaseError, ImageError, OptionError, StoreError
-from colmap_affrect.images.photographs import (
-    CameraOptions,
-    list_images,
-)
+from colmap_affrect.geometry.arrays import Singles
+from colmap_affrect.images.photographs import CameraOptions, list_images
 from colmap_affrect.interop.hdf5_layouts import (
     LAYOUTS,
     Datasets,
@@ -42,6 +40,7 @@ from colmap_affrect.interop.hdf5_layouts import (
     keypoints_key,
     listed,
     match_datasets,
+    noted,
     one_match_per_keypoint,
     open_files,
 )
@@ -57,24 +56,17 @@ PIXEL_ORIGINS = ("center", "corner")
 
 @dataclass(frozen=True)
 class InterchangeReport:
-    """What was imported or exported.
+    """What was imported or exported."""
 
-    Attributes:
-        action: ``imported`` or ``exported``.
-        layout: of the files, ``hloc`` or ``dim``.
-        num_images: images in the database or the file, those without features included.
-        num_verified: pairs with a two-view geometry; None where no verification was asked for.
-        notes: what was left out, chosen or lost, one line each.
-    """
-
-    action: str
-    layout: str
-    num_images: int
+    action: str  # ``imported`` or ``exported``
+    layout: str  # of the files, ``hloc`` or ``dim``
+    num_images: int  # images in the database or the file, those without features included
     num_keypoints: int
     num_pairs: int
     num_matches: int
+    # pairs with a two-view geometry; None where no verification was asked for
     num_verified: int | None
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what was left out, chosen or lost, one line each
 
     def summary(self) -> str:
         """Return a line of numbers, and one for each note."""
@@ -135,8 +127,8 @@ def import_h5(
         notes = [
             *files.notes,
             *_rounded(files),
-            *_note("images without features are there without keypoints", without),
-            *_note("images that COLMAP does not take are left out", rejected),
+            *noted("images without features are there without keypoints", without),
+            *noted("images that COLMAP does not take are left out", rejected),
         ]
         num_verified = None
         if not skip_verification:
@@ -154,10 +146,6 @@ def _verify(path: Path, num_pairs: int, random_seed: int, progress: Progress) ->
     with progress.stage("verify", num_pairs, "pairs") as advance:
         verify(path, options, advance=advance)
     return len(verified_pairs(path, options.min_num_inliers))
-
-
-def _note(what: str, names: Sequence[str]) -> list[str]:
-    return [f"{what}: {listed(names)}"] if names else []
 
 
 def _rounded(files: ForeignFiles) -> list[str]:
@@ -279,7 +267,7 @@ def _check_range(
             )
 
 
-def _read_keypoints(source: Source, key: str, pixel_origin: str) -> NDArray[np.float32]:
+def _read_keypoints(source: Source, key: str, pixel_origin: str) -> Singles:
     """Return the (N, 2), (N, 4) or (N, 6) keypoints of an image as COLMAP stores them."""
     path = keypoints_key(source, key)
     lafs, scales, oris = (f"{key}/{name}" for name in ("lafs", "scales", "oris"))
@@ -303,11 +291,7 @@ def _read_keypoints(source: Source, key: str, pixel_origin: str) -> NDArray[np.f
 
 
 class _WorkspaceContent:
-    """Features and matches of an output folder, to be exported.
-
-    Attributes:
-        num_pairs: number of pairs that :meth:`matches` yields.
-    """
+    """Features and matches of an output folder, to be exported."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.where = str(workspace.path)
@@ -344,7 +328,7 @@ class _DatabaseContent:
         pair_ids, _ = database.read_num_matches()
         self._pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids]
         self.names, self.num_pairs = sorted(found), len(self._pairs)
-        self.notes = _note(
+        self.notes = noted(
             "images without keypoints are left out", sorted(set(self._images) - found)
         )
 
@@ -364,7 +348,7 @@ class _DatabaseContent:
             data["descriptors"] = self._descriptors(name, len(points)).T
         return (camera.width, camera.height), data
 
-    def _descriptors(self, name: str, count: int) -> NDArray[np.float32]:
+    def _descriptors(self, name: str, count: int) -> Singles:
         found = self._database.read_descriptors(self._images[name].image_id)
         if len(found.data) != count:
             raise DatabaseError(

@@ -19,7 +19,7 @@ These files are not trusted: links and data in other files are refused, and arra
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap.checks import is_unsafe
 from colmap_affrect.errors import StoreError
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.images.photographs import refuse_colliding_keys
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import require_space
@@ -41,13 +42,11 @@ Datasets = dict[str, NDArray[Any]]
 
 LAYOUTS = ("hloc", "dim")
 
-MAX_VALUES = 1 << 28
-"""An array of more values is taken for damage, and not read."""
+MAX_VALUES = 1 << 28  # an array of more values is taken for damage, and not read
 
 MAX_NAMES_IN_MESSAGE = 10
 
-SPARE_BYTES = 8 << 20
-"""What HDF5 may need beside the data themselves: its index, and what it has not written yet."""
+SPARE_BYTES = 8 << 20  # for HDF5's index, and for what it has not written yet
 
 KEYPOINTS, HLOC_MATCHES = "/keypoints", "/matches0"
 
@@ -60,6 +59,11 @@ def listed(names: Iterable[str]) -> str:
     return such_as(names, MAX_NAMES_IN_MESSAGE)
 
 
+def noted(what: str, names: Collection[str]) -> list[str]:
+    """Return a note about names, if there are any."""
+    return [f"{what}: {listed(names)}"] if names else []
+
+
 @dataclass(frozen=True)
 class Source:
     """An open HDF5 file of another program, and the shapes of its datasets by their paths."""
@@ -69,11 +73,7 @@ class Source:
     shapes: dict[str, tuple[int, ...]]
 
     def read(self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu") -> NDArray[Any]:
-        """Read a dataset of finite numbers once its shape has been checked.
-
-        None in the shape stands for any size; ``kinds`` are numpy's kinds of types that are
-        accepted.
-        """
+        """Read finite numbers of some of numpy's kinds, of a shape in which None is any size."""
         found = self.shapes[key]
         same = [size in (expected, None) for size, expected in zip(shape, found, strict=False)]
         if len(found) != len(shape) or not all(same):
@@ -193,21 +193,14 @@ def _writing(path: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class ForeignFiles:
-    """Features and matches of another program, by the names of photographs.
-
-    Attributes:
-        layout: of both files, ``hloc`` or ``dim``.
-        keys: of the features of each image that has some.
-        pairs: key of the matches of each pair.
-        notes: which pairs were passed over.
-    """
+    """Features and matches of another program, by the names of photographs."""
 
     features: Source
     matches: Source
-    layout: str
-    keys: dict[str, str]
-    pairs: dict[Pair, str]
-    notes: list[str]
+    layout: str  # of both files, ``hloc`` or ``dim``
+    keys: dict[str, str]  # of the features of each image that has some
+    pairs: dict[Pair, str]  # key of the matches of each pair
+    notes: list[str]  # which pairs were passed over
 
     def check_size(self, name: str, expected: tuple[int, int]) -> None:
         """Refuse features of an image of another (width, height) than the photograph has."""
@@ -226,7 +219,7 @@ class ForeignFiles:
                 "photographs"
             )
 
-    def read_indices(self, pair: Pair, num_keypoints1: int) -> NDArray[np.int64]:
+    def read_indices(self, pair: Pair, num_keypoints1: int) -> Indices:
         """Read the (M, 2) matches of a pair, the range of which is not checked here."""
         key = self.pairs[pair]
         if self.layout == "dim":
@@ -311,12 +304,8 @@ def _name_pairs(
         raise StoreError(
             f"{source.path}: has matches of images that have no features: {listed(unknown)}"
         )
-    notes = []
-    if again:
-        notes.append(f"pairs that are there twice, the second is left out: {listed(again)}")
-    if selves:
-        notes.append(f"images matched with themselves are left out: {listed(selves)}")
-    return pairs, notes
+    notes = noted("pairs that are there twice, the second is left out", again)
+    return pairs, notes + noted("images matched with themselves are left out", selves)
 
 
 def _split_key(key: str, names: Mapping[str, str]) -> list[Pair]:
@@ -356,10 +345,10 @@ def check_names(names: Sequence[str], layout: str) -> None:
 
 
 def _by_file_name(names: Iterable[str]) -> dict[str, list[str]]:
-    groups = defaultdict(list)
+    groups: defaultdict[str, list[str]] = defaultdict(list)
     for name in names:
-        groups[PurePosixPath(name).name].append(name)
-    return dict(groups)
+        groups[feature_key(name, "dim")].append(name)
+    return groups
 
 
 def feature_key(name: str, layout: str) -> str:

@@ -12,19 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.checks import refuse_unusable
-from colmap_affrect.colmap.database import (
-    generated_pairs,
-    image_ids,
-    open_database,
-    spatial_pairs,
-)
+from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
@@ -56,12 +50,10 @@ from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import add_pairs
 
-CANCELLED = "Operation cancelled"
-"""What pycolmap says."""
+CANCELLED = "Operation cancelled"  # what pycolmap says
 
 PathLike = Path | str
-Native = Mapping[str, Any] | None
-"""Nested dictionaries are taken for all options of pycolmap."""
+Native = Mapping[str, Any] | None  # nested dictionaries are taken for all options of pycolmap
 GivenMatching = pycolmap.FeatureMatchingOptions | MatcherOptions | Native
 GivenVerification = VerificationOptions | pycolmap.TwoViewGeometryOptions | Native
 Token = pycolmap.CancellationToken | None
@@ -158,12 +150,8 @@ def match_exhaustive(
         ours: see :class:`Ours`.
     """
     translate.changes(pairing_options, pycolmap.ExhaustivePairingOptions, "pairing_options")
-
-    def choose(context: Context) -> list[Pair]:
-        return exhaustive_pairs(context.features.names())
-
-    given = _Given(database_path, matching_options, verification_options, device, ours)
-    return _match(given, choose, cancellation_token)
+    given = (database_path, matching_options, verification_options, device, cancellation_token)
+    return _match(lambda context: exhaustive_pairs(context.features.names()), *given, **ours)
 
 
 def match_sequential(
@@ -194,8 +182,8 @@ def match_sequential(
             pairs += retrieved_pairs(names, context.features.read, num_alike, context.progress)
         return pairs
 
-    given = _Given(database_path, matching_options, verification_options, device, ours)
-    return _match(given, choose, cancellation_token)
+    given = (database_path, matching_options, verification_options, device, cancellation_token)
+    return _match(choose, *given, **ours)
 
 
 def match_spatial(
@@ -212,12 +200,8 @@ def match_spatial(
     Raises DatabaseError when fewer than two images have a position.
     """
     options = translate.native(pairing_options, pycolmap.SpatialPairingOptions, "pairing_options")
-
-    def choose(context: Context) -> list[Pair]:
-        return spatial_pairs(context.workspace.database, options)
-
-    given = _Given(database_path, matching_options, verification_options, device, ours)
-    return _match(given, choose, cancellation_token)
+    given = (database_path, matching_options, verification_options, device, cancellation_token)
+    return _match(lambda at: spatial_pairs(at.workspace.database, options), *given, **ours)
 
 
 def match_image_pairs(
@@ -237,12 +221,9 @@ def match_image_pairs(
     asked = translate.changes(pairing_options, pycolmap.ImportedPairingOptions, "pairing_options")
     if "match_list_path" not in asked:
         raise PairListError("pairing_options: give match_list_path, a file with two names per line")
-
-    def choose(context: Context) -> Iterable[Pair]:
-        return read_pairs(Path(asked["match_list_path"]), context.features.names())
-
-    given = _Given(database_path, matching_options, verification_options, device, ours)
-    return _match(given, choose, cancellation_token)
+    path = Path(asked["match_list_path"])
+    given = (database_path, matching_options, verification_options, device, cancellation_token)
+    return _match(lambda context: read_pairs(path, context.features.names()), *given, **ours)
 
 
 def verify_matches(
@@ -306,34 +287,29 @@ def _verify_pairs(
         verify_database(copy, verification, advance=advance)
         with open_database(copy) as verified, open_database(path) as database:
             for pair in sorted(wanted):
-                if database.exists_two_view_geometry(*pair):
-                    continue
-                if verified.exists_two_view_geometry(*pair):
+                known = database.exists_two_view_geometry(*pair)
+                if not known and verified.exists_two_view_geometry(*pair):
                     geometry = verified.read_two_view_geometry(*pair)
                     database.write_two_view_geometry(*pair, geometry)
 
 
-@dataclass(frozen=True)
-class _Given:
-    """What the functions that match are given, but for pairs."""
-
-    database_path: PathLike
-    matching: GivenMatching
-    verification: GivenVerification
-    device: pycolmap.Device | str
-    ours: Ours
-
-
-def _match(given: _Given, choose: Callable[[Context], Iterable[Pair]], token: Token) -> Reports:
+def _match(
+    choose: Callable[[Context], Iterable[Pair]],
+    database_path: PathLike,
+    matching_options: GivenMatching,
+    verification_options: GivenVerification,
+    device: pycolmap.Device | str,
+    token: Token,
+    *,
+    random_seed: int | None = None,
+    weights_path: PathLike | None = None,
+    progress: Progress = SILENT,
+) -> Reports:
     """Match pairs and do what pycolmap's options ask for besides."""
-    ours = given.ours
-    if unknown := ours.keys() - Ours.__annotations__.keys():
-        raise TypeError(f"unexpected keyword argument {min(unknown)!r}")
-    verification = translate.verification_options(given.verification, ours.get("random_seed"))
-    matching, asked = translate.matching_options(given.matching)
-    shown = _Cancellable(ours.get("progress", SILENT), token)
-    where = (given.database_path, given.device, asked, ours.get("weights_path"), shown)
-    with _context(*where) as context:
+    verification = translate.verification_options(verification_options, random_seed)
+    matching, asked = translate.matching_options(matching_options)
+    shown = _Cancellable(progress, token)
+    with _context(database_path, device, asked, weights_path, shown) as context:
         context.workspace.require("extract")
         write_images_and_keypoints(context)
         known = set(context.features.names())

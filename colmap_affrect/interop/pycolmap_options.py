@@ -67,11 +67,7 @@ SET_OTHERWISE = ("random_seed", "image_path", "fix_existing_frames")
 
 
 def native(given: object, kind: type[Native], argument: str) -> Native:
-    """Return pycolmap's options: as they are, or from a nested dictionary; None for the defaults.
-
-    Raises:
-        OptionError: naming the argument and the field.
-    """
+    """Return pycolmap's options, of a nested dictionary too; OptionError names the field."""
     if isinstance(given, kind):
         return given
     if given is not None and not isinstance(given, Mapping):
@@ -90,19 +86,11 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
 
 
 def changes(given: object, kind: type, argument: str) -> dict[str, Any]:
-    """Return the fields that differ from pycolmap's defaults, by dotted key.
-
-    Raises:
-        OptionError: naming one that has no counterpart here.
-    """
-    usual, honoured = flat_values(kind()), HONOURED[kind]
-    found = {
-        key: value
-        for key, value in flat_values(native(given, kind, argument)).items()
-        if value != usual[key]
-    }
+    """Return fields that differ from pycolmap's defaults; OptionError for one we do not have."""
+    usual, values = flat_values(kind()), flat_values(native(given, kind, argument))
+    found = {key: value for key, value in values.items() if value != usual[key]}
     for key, value in found.items():
-        if key not in honoured:
+        if key not in HONOURED[kind]:
             shown = getattr(value, "name", value)
             raise OptionError(f"{argument}: {key}={shown} cannot be carried over")
     return found
@@ -147,7 +135,7 @@ def matching_options(given: object) -> tuple[MatcherOptions | None, dict[str, An
 
 def verification_options(given: object, random_seed: int | None) -> VerificationOptions:
     """Return ours, with what pycolmap's options change; a seed that is given wins."""
-    argument, seed = "verification_options", {} if random_seed is None else {"seed": random_seed}
+    argument = "verification_options"
     if isinstance(given, VerificationOptions):
         options = given
     elif is_native(given, pycolmap.TwoViewGeometryOptions, VerificationOptions):
@@ -160,7 +148,7 @@ def verification_options(given: object, random_seed: int | None) -> Verification
         options = VerificationOptions.from_mapping(given or {}, argument)
     else:
         raise _not_ours(given, argument, "colmap_affrect.VerificationOptions")
-    return options.changed(random_seed=seed.get("seed", options.random_seed))
+    return options.changed(random_seed=options.random_seed if random_seed is None else random_seed)
 
 
 def reader_options(given: object, camera_mode: object) -> tuple[CameraOptions, MaskOptions]:

@@ -10,21 +10,19 @@ import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.features.base import NetworkContext, NetworkOptions
+from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.options import Registry
 from colmap_affrect.parallel.executor import unless_gpu_is_full
 
 logger = logging.getLogger(__name__)
 
-_WARNING = threading.Lock()
-"""Held by the thread that warns: ``cache`` alone lets two threads through."""
+_SAID = threading.Lock()  # taken, and never given back, by the thread that says so
 
 Found = TypeVar("Found")
 
@@ -37,58 +35,39 @@ class MatcherOptions(NetworkOptions):
     frames of scans, watermarks."""
 
     def require_extractor(self, extractor: str) -> None:
-        """Raise OptionError for a feature extractor whose features cannot be matched.
-
-        An empty name is that of another program, and passes.
-        """
+        """Raise OptionError for an extractor whose features cannot be matched; none for no name."""
 
 
 @dataclass(frozen=True)
 class MatcherContext(NetworkContext):
-    """What a matcher works with.
+    """What a matcher works with."""
 
-    Attributes:
-        device: as given, also ``auto``.
-        num_similarities: about how many pairs of features there will be to compare in all.
-    """
-
-    device: str = "auto"
-    num_similarities: float = 0
+    device: str = "auto"  # as given, also ``auto``
+    num_similarities: float = 0  # about how many pairs of features there will be to compare in all
 
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """What a matcher is given of an image.
+    """What a matcher is given of an image."""
 
-    Attributes:
-        features: frames, scores (``responses``), descriptors and the warps they come from.
-        image_size: (width, height) of the stored image in px.
-        extractor: name of the feature extractor.
-    """
-
+    # frames, scores (``responses``), descriptors and the warps they come from
     features: LocalFeatures
-    image_size: tuple[int, int]
-    extractor: str
+    image_size: tuple[int, int]  # (width, height) of the stored image in px
+    extractor: str  # name of the feature extractor
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Matches of two images before geometric verification.
+    """Matches of two images before geometric verification."""
 
-    Attributes:
-        indices: (M, 2) int64 features of image 1 and 2, strictly rising in column 0.
-        scores: (M,) float32 in [0, 1], larger is better.
-    """
-
-    indices: NDArray[np.int64]
-    scores: NDArray[np.float32]
+    indices: Indices  # (M, 2) int64 features of image 1 and 2, strictly rising in column 0
+    scores: Singles  # (M,) float32 in [0, 1], larger is better
 
 
-ROUNDING = np.float32(1e-6)
-"""Similarities closer to 1 than this are equal: two copies of a descriptor have ratio 1."""
+ROUNDING = np.float32(1e-6)  # similarities that near to 1 are equal: two copies have ratio 1
 
 
-def distance_ratios(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+def distance_ratios(first: Singles, second: Singles) -> Singles:
     """Return the ratios of distances of unit vectors with these similarities."""
     distances = (np.maximum(1.0 - similarity, ROUNDING) for similarity in (first, second))
     return np.asarray(np.sqrt(np.divide(*distances)))
@@ -98,10 +77,7 @@ class Matcher(Protocol):
     """Matches pairs of images; called with its ``Options`` and a :class:`MatcherContext`."""
 
     def prepare(self, image: ImageFeatures) -> Any:
-        """Return what :meth:`match` needs of an image, made once for all of its pairs.
-
-        It has an attribute ``nbytes``, the memory that it takes.
-        """
+        """Return what :meth:`match` needs of an image, made once, with its memory as ``nbytes``."""
 
     def match(self, first: Any, second: Any) -> Matches:
         """Match two prepared images. Either may have no features."""
@@ -122,13 +98,8 @@ def unless_gpu_is_full_or_say(with_gpu: Callable[[], Found], without: Callable[[
     """Return what is done on a GPU, or without it where its memory is full; say so once."""
 
     def say_once_and_go_on() -> Found:
-        with _WARNING:
-            _warn_that_gpu_is_full()
+        if _SAID.acquire(blocking=False):
+            logger.warning("the memory of the GPU is full; the CPU matches the rest")
         return without()
 
     return unless_gpu_is_full(with_gpu, say_once_and_go_on)
-
-
-@cache
-def _warn_that_gpu_is_full() -> None:
-    logger.warning("the memory of the GPU is full; the CPU matches the rest")

@@ -17,30 +17,24 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles
 from colmap_affrect.geometry.epipolar import common_sign, epipolar_lines
 from colmap_affrect.geometry.pair_models import EpipolarModel, HomographyModel, PairModel
 from colmap_affrect.geometry.shapes import vary_singly
+from colmap_affrect.geometry.two_views import homogeneous
 from colmap_affrect.matchers.base import distance_ratios
 from colmap_affrect.options import Options, within
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
-GROUP_ROWS = 48
-"""Features of image 1 that are compared at once: more take longer in products, fewer in Python."""
+GROUP_ROWS = 48  # compared at once: more take longer in products, fewer in Python
 
 MIN_AGREEING = 0.5
 """Of a right pair at least this share of the inliers has frames that agree with the geometry, and
 of a wrong one whose inliers are accidental far less; guiding would make such a pair look proven."""
 
-ANGLE_ROUNDING = 1e-9
-"""Of angles in a pencil of lines, far below any band, far above that of their computation."""
-
-BANDS_OF_HOMOGRAPHY = 2.0
-"""Radius around the place that a homography gives, in bands: planes are never quite plane."""
+ANGLE_ROUNDING = 1e-9  # far below any band, far above the error of angles in a pencil of lines
+BANDS_OF_HOMOGRAPHY = 2.0  # radius round the place of a homography: planes are never quite plane
 
 
 class GuidedOptions(Options):
@@ -68,30 +62,20 @@ class GuidedOptions(Options):
 
 @dataclass(frozen=True)
 class GuidableImage:
-    """The features of an image.
+    """The features of an image."""
 
-    Attributes:
-        descriptors: (N, D) float32 rows of unit length.
-        points: (N, 2) px in which the geometry of the pair holds; rows with NaN match nothing.
-        shapes: (N, 2, 2) linear parts of the frames, up to a factor; None without frames.
-    """
-
-    descriptors: NDArray[np.float32]
-    points: Array
+    descriptors: Singles  # (N, D) float32 rows of unit length
+    points: Array  # (N, 2) px in which the geometry of the pair holds; rows with NaN match nothing
+    # (N, 2, 2) linear parts of the frames, up to a factor; None without frames
     shapes: Array | None = None
 
     @property
     def has_directions(self) -> bool:
         """Whether frames can tell a direction.
 
-        Circles without orientation cannot, nor what warps made of them.
-
-        Similarities (COLMAP's SIFT) do: they turn directions as they turn themselves, which is
-        right up to what the change of viewpoint adds.
+        Similarities (COLMAP's SIFT) do, circles do not, nor what warps made of them.
         """
-        if self.shapes is None or not len(self.shapes):
-            return False
-        return vary_singly(self.shapes)
+        return self.shapes is not None and len(self.shapes) > 0 and vary_singly(self.shapes)
 
 
 class Guide(Protocol):
@@ -102,7 +86,7 @@ class Guide(Protocol):
     def groups(self) -> Iterator[tuple[Indices, Indices]]:
         """Yield features of image 1, each once, and all of image 2 that any of these may match."""
 
-    def allowed(self, rows: Indices, columns: Indices) -> NDArray[np.bool_]:
+    def allowed(self, rows: Indices, columns: Indices) -> Bools:
         """Tell which of (R,) and (C,) features may match, (R, C)."""
 
 
@@ -121,7 +105,7 @@ class EpipolarGuide:
             unit.append((points - center) / size)
         matrix = to_pixels[1].T @ fundamental @ to_pixels[0]
         self._band = band_px / size
-        self._homogeneous2 = np.hstack([unit[1], np.ones((len(points2), 1))])
+        self._homogeneous2 = homogeneous(unit[1])
         lines1, self._lines2 = epipolar_lines(matrix, *unit)
         self._squares1 = (lines1[:, :2] ** 2).sum(axis=1)
         self._squares2 = (self._lines2[:, :2] ** 2).sum(axis=1)
@@ -135,8 +119,7 @@ class EpipolarGuide:
         (u1'x2, u2'x2).
         """
         u, s, vt = np.linalg.svd(matrix)
-        homogeneous1 = np.hstack([unit[0], np.ones((len(unit[0]), 1))])
-        along1 = homogeneous1 @ vt[:2].T * s[:2]
+        along1 = homogeneous(unit[0]) @ vt[:2].T * s[:2]
         along2 = self._homogeneous2 @ u[:, :2]
         tiny = np.finfo(float).tiny
         inverse1, inverse2 = (
@@ -148,10 +131,7 @@ class EpipolarGuide:
         self._reach2 = inverse2, np.sqrt(self._squares1) * inverse2
 
     def groups(self) -> Iterator[tuple[Indices, Indices]]:
-        """See :class:`Guide`.
-
-        Near the epipole lines fan out: features are sorted by reach, then by angle.
-        """
+        """Sort by reach, then by angle: near the epipole lines fan out."""
         order, edges = _sorted_within(np.log2(self._reach1[0]), self._angles1)
         order2, edges2 = _sorted_within(2.0 * np.log2(self._reach2[0]), self._angles2)
         classes = [_Pencil.of(part, self) for part in np.split(order2, edges2) if len(part)]
@@ -161,7 +141,7 @@ class EpipolarGuide:
             near = [pencil.near(span, reach, self._band) for pencil in classes]
             yield rows, np.concatenate([np.zeros(0, np.int64), *near])
 
-    def allowed(self, rows: Indices, columns: Indices) -> NDArray[np.bool_]:
+    def allowed(self, rows: Indices, columns: Indices) -> Bools:
         """See :class:`Guide`."""
         residuals = self._lines2[rows] @ self._homogeneous2[columns].T
         squares = self._squares2[rows, None] + self._squares1[columns]
@@ -172,7 +152,6 @@ class HomographyGuide:
     """Matches lie near the places that a homography gives: of planes, and without a baseline."""
 
     def __init__(self, homography: Array, points1: Array, points2: Array, band_px: float) -> None:
-        """Carry the points of image 1 over."""
         self._points2 = points2
         self.model: PairModel = HomographyModel(homography, (points1, points2))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -196,24 +175,18 @@ class HomographyGuide:
             part = slice(*np.searchsorted(y, [lowest[1], np.nextafter(highest[1], np.inf)]))
             yield rows, order2[part][(x[part] >= lowest[0]) & (x[part] <= highest[0])]
 
-    def allowed(self, rows: Indices, columns: Indices) -> NDArray[np.bool_]:
+    def allowed(self, rows: Indices, columns: Indices) -> Bools:
         """See :class:`Guide`."""
         return _within(self._places[rows], self._points2[columns], self._radius)
 
 
 @dataclass(frozen=True)
 class _Pencil:
-    """Features of image 2 of similar reach, by rising angles of their epipolar lines.
+    """Features of image 2 of similar reach, by rising angles of their epipolar lines."""
 
-    Attributes:
-        angles: (3 N,), those of a turn before and of one after included.
-        indices: (N,) features.
-        reach: the largest of both reaches.
-    """
-
-    angles: Array
-    indices: Indices
-    reach: tuple[float, float]
+    angles: Array  # (3 N,), those of a turn before and of one after included
+    indices: Indices  # (N,) features
+    reach: tuple[float, float]  # the largest of both reaches
 
     @classmethod
     def of(cls, indices: Indices, guide: EpipolarGuide) -> _Pencil:
@@ -237,24 +210,21 @@ class _Pencil:
 
 
 def _sorted_within(sizes: Array, values: Array) -> tuple[Indices, Indices]:
-    """Sort by whole ``sizes``, then by ``values``; return the order and where sizes change.
-
-    What has no finite size and value is left out.
-    """
+    """Sort what is finite by whole sizes, then values; return the order and where sizes change."""
     usable = np.flatnonzero(np.isfinite(sizes) & np.isfinite(values))
     classes = np.floor(sizes[usable])
     order = np.lexsort((values[usable], classes))
     return usable[order], np.flatnonzero(np.diff(classes[order])) + 1
 
 
-def _chunks(order: Indices, edges: NDArray[np.int64]) -> Iterator[Indices]:
+def _chunks(order: Indices, edges: Indices) -> Iterator[Indices]:
     """Cut a sequence into groups that do not reach over the edges."""
     for part in np.split(order, edges):
         for begin in range(0, len(part), GROUP_ROWS):
             yield part[begin : begin + GROUP_ROWS]
 
 
-def _within(points1: Array, points2: Array, radius: float) -> NDArray[np.bool_]:
+def _within(points1: Array, points2: Array, radius: float) -> Bools:
     """Tell which of (R, 2) and (C, 2) points are at most ``radius`` apart, (R, C)."""
     x, y = (points1[:, axis, None] - points2[:, axis] for axis in (0, 1))
     return np.asarray(x**2 + y**2 <= radius**2)
@@ -281,21 +251,13 @@ def guided_matches(
     options: GuidedOptions,
     inliers: Indices,
 ) -> Indices:
-    """Return the inliers of a pair together with its guided matches, one to one.
+    """Return the (M, 2) inliers of a pair and its guided matches, one to one, as (K, 2).
 
-    Args:
-        first: image 1.
-        second: image 2.
-        guide: the geometry of the pair.
-        options: what counts as a match.
-        inliers: (M, 2) matches that the geometry was estimated from; they stay. Guided matches
-            that disagree with one of them are left out.
-
-    Returns:
-        (K, 2), by rising features of image 1; the inliers alone where their frames do not agree
-        with the geometry (:data:`MIN_AGREEING`); without inliers those of the guided matches must.
-        Frames are not asked where an image has none that could tell
-        (:attr:`GuidableImage.has_directions`); there nothing is found without inliers.
+    They rise by features of image 1. The inliers, which the geometry was estimated from, stay;
+    guided matches that disagree with one of them are left out, and all where the frames of the
+    inliers, or else of the guided matches, do not agree with the geometry (:data:`MIN_AGREEING`).
+    Frames are not asked where an image has none that could tell
+    (:attr:`GuidableImage.has_directions`); there nothing is found without inliers.
     """
     found = nearest_allowed(first, second, guide, options)
     if not (first.has_directions and second.has_directions):

@@ -25,7 +25,9 @@ from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import OptionError, WeightsError
 from colmap_affrect.features.weights import load_state_dict
 from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.geometry.arrays import Array, Indices, Singles
 from colmap_affrect.geometry.neighbors import without_duplicates
+from colmap_affrect.geometry.shapes import of_unit_area
 from colmap_affrect.matchers.base import (
     ImageFeatures,
     MatcherContext,
@@ -40,20 +42,11 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-MIN_VIEW_FEATURES = 8
-"""Views with fewer features are left out: no geometry could be verified by what they add."""
-
-TRAINING_SIZE_PX = 1024
-"""Longer side of the images of training, whose pixels scales of features are in."""
-
-KORNIA_SIGMAS = 12.0
-"""Radius of kornia's frames of DoG features, in units of sigma."""
-
-CHUNK_ROWS = 1 << 10
-"""Features of an image whose similarities are held at once, which bounds memory."""
-
-DUPLICATE_RADIUS_PX = 2.0
-"""Of matches of several views that are closer than this at both ends the best one stays."""
+MIN_VIEW_FEATURES = 8  # of a view: no geometry could be verified by what fewer add
+TRAINING_SIZE_PX = 1024  # longer side in training, whose pixels scales of features are in
+KORNIA_SIGMAS = 12.0  # radius of kornia's frames of DoG features, in units of sigma
+CHUNK_ROWS = 1 << 10  # features whose similarities are held at once, which bounds memory
+DUPLICATE_RADIUS_PX = 2.0  # of nearer matches of several views, at both ends, the best stays
 
 TrainedFor = Literal[
     "aliked", "disk", "xfeat", "sift", "dog-affnet-hardnet", "keynet-affnet-hardnet"
@@ -62,32 +55,20 @@ TrainedFor = Literal[
 
 @dataclass(frozen=True)
 class Training:
-    """What weights were trained for.
+    """What weights were trained for."""
 
-    Attributes:
-        weights: key of the file.
-        kornia: name of the configuration in kornia.
-        extractor: whose features they take.
-        has_circles: whether frames are circles of one radius in the view, upright.
-    """
-
-    weights: str
-    kornia: str
-    extractor: str
-    has_circles: bool = True
+    weights: str  # key of the file
+    extractor: str  # whose features they take
+    has_circles: bool = True  # whether frames are circles of one radius in the view, upright
 
 
 TRAININGS: dict[str, Training] = {
-    "aliked": Training("lightglue-aliked", "aliked", "aliked"),
-    "disk": Training("lightglue-disk", "disk", "disk"),
-    "xfeat": Training("lighterglue-xfeat", "xfeat", "xfeat"),
-    "sift": Training("lightglue-sift", "sift", "rootsift", False),
-    "dog-affnet-hardnet": Training(
-        "lightglue-dog-affnet-hardnet", "dog_affnet_hardnet", "affnet-hardnet", False
-    ),
-    "keynet-affnet-hardnet": Training(
-        "lightglue-keynet-affnet-hardnet", "keynet_affnet_hardnet", "affnet-hardnet", False
-    ),
+    "aliked": Training("lightglue-aliked", "aliked"),
+    "disk": Training("lightglue-disk", "disk"),
+    "xfeat": Training("lighterglue-xfeat", "xfeat"),
+    "sift": Training("lightglue-sift", "rootsift", False),
+    "dog-affnet-hardnet": Training("lightglue-dog-affnet-hardnet", "affnet-hardnet", False),
+    "keynet-affnet-hardnet": Training("lightglue-keynet-affnet-hardnet", "affnet-hardnet", False),
 }
 
 
@@ -116,6 +97,11 @@ class LightGlueOptions(MatcherOptions):
         """Key of the file of weights."""
         return (TRAININGS[self.trained_for].weights,)
 
+    @property
+    def kornia(self) -> str:
+        """Name of the configuration in kornia."""
+        return self.trained_for.replace("-", "_")
+
     def require_extractor(self, extractor: str) -> None:
         """Refuse features that the weights were not trained for."""
         wanted = TRAININGS[self.trained_for].extractor
@@ -128,15 +114,10 @@ class LightGlueOptions(MatcherOptions):
 
 @dataclass(frozen=True)
 class PreparedView:
-    """One view of an image as the network takes it.
+    """One view of an image as the network takes it."""
 
-    Attributes:
-        rows: (N,) of the image's features.
-        inputs: the network's, a batch of one, on its device.
-    """
-
-    rows: NDArray[np.int64]
-    inputs: dict[str, Tensor]
+    rows: Indices  # (N,) of the image's features
+    inputs: dict[str, Tensor]  # the network's, a batch of one, on its device
 
 
 @dataclass(frozen=True)
@@ -144,7 +125,7 @@ class PreparedViews:
     """All views of an image that have features enough, and (N, 2) centres of all features, px."""
 
     views: tuple[PreparedView, ...]
-    keypoints: NDArray[np.float64]
+    keypoints: Array
 
     @property
     def nbytes(self) -> int:
@@ -163,11 +144,7 @@ class LightGlue:
     Options = LightGlueOptions
 
     def __init__(self, options: LightGlueOptions, context: MatcherContext) -> None:
-        """Load the network.
-
-        Raises WeightsError when the file is damaged or of another network, DeviceError when the
-        device is not there.
-        """
+        """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
         from colmap_affrect.features.networks import resolve_device
 
         self.options, self.training = options, TRAININGS[options.trained_for]
@@ -193,14 +170,14 @@ class LightGlue:
         return PreparedViews(tuple(views), features.keypoints)
 
     def _view(
-        self, features: LocalFeatures, rows: NDArray[np.int64], image_size: tuple[int, int]
+        self, features: LocalFeatures, rows: Indices, image_size: tuple[int, int]
     ) -> PreparedView:
         import torch
 
         lafs, size = features.lafs, np.asarray(image_size, np.float64)
         if features.rectification_ids[0]:
             lafs, size = frames_of_view(lafs, has_circles=self.training.has_circles)
-        values = network_inputs(lafs, size, max(image_size), self.training.kornia)
+        values = network_inputs(lafs, size, max(image_size), self.options.kornia)
         values["descriptors"] = features.descriptors
         inputs = {
             name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
@@ -237,7 +214,7 @@ class LightGlue:
 
     def _run(
         self, network: torch.nn.Module, pair: dict[str, dict[str, Tensor]], device: torch.device
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    ) -> tuple[Indices, Indices, Singles]:
         import torch
 
         on_gpu = device.type != "cpu"
@@ -271,7 +248,7 @@ def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) 
     from kornia.feature import LightGlue as Network
 
     configuration = {
-        **Network.features[TRAININGS[options.trained_for].kornia],
+        **Network.features[options.kornia],
         "weights": None,
         "depth_confidence": options.depth_confidence,
         "width_confidence": options.width_confidence,
@@ -287,8 +264,7 @@ def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) 
             f"{path}: not the weights of LightGlue for {options.trained_for} (of another size)"
         ) from error
     parameters = dict(network.named_parameters())
-    missing = [name for name in found.missing_keys if name in parameters]
-    if missing:
+    if missing := [name for name in found.missing_keys if name in parameters]:
         raise WeightsError(
             f"{path}: not the weights of LightGlue for {options.trained_for} (no {missing[0]})"
         )
@@ -305,18 +281,14 @@ def renamed(name: str) -> str:
     return re.sub(r"^(self_attn|cross_attn)\.(\d+)\.", r"transformers.\2.\1.", name)
 
 
-def frames_of_view(
-    lafs: NDArray[np.float64], *, has_circles: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def frames_of_view(lafs: Array, *, has_circles: bool) -> tuple[Array, Array]:
     """Undo the warp of a view, whose frames were carried back into the image.
 
     Circles became the map of the warp. Other frames have a common shape, which tells the map up to
-    a rotation; the one without is taken. The view is as large as its features reach.
-
-    Returns:
-        (N, 2, 3) frames in px of the view, and its (width, height).
+    a rotation; the one without is taken. The view is as large as its features reach. Returns the
+    (N, 2, 3) frames in px of the view, and its (width, height).
     """
-    shapes = lafs[:, :, :2] / np.sqrt(determinants(lafs[:, :, :2]))[:, None, None]
+    shapes = of_unit_area(lafs[:, :, :2])
     if has_circles:
         linear = shapes.mean(axis=0)
     else:
@@ -330,7 +302,7 @@ def frames_of_view(
 
 
 def network_inputs(
-    lafs: NDArray[np.float64], size: NDArray[np.float64], longer_side_px: int, kornia: str
+    lafs: Array, size: Array, longer_side_px: int, kornia: str
 ) -> dict[str, NDArray[np.floating[Any]]]:
     """Return what the network reads of (N, 2, 3) frames in a view of (width, height).
 
@@ -381,9 +353,7 @@ def promising(
     return [(first[i], second[j]) for i, j in zip(*np.divmod(chosen, len(second)), strict=True)]
 
 
-def united(
-    parts: list[Matches], keypoints1: NDArray[np.float64], keypoints2: NDArray[np.float64]
-) -> Matches:
+def united(parts: list[Matches], keypoints1: Array, keypoints2: Array) -> Matches:
     """Unite matches of several pairs of views: one-to-one, and each place once, the best first."""
     if not sum(len(part.scores) for part in parts):
         return NO_MATCHES

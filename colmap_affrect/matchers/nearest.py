@@ -14,8 +14,8 @@ from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.neighbors import NeighborLists, neighbors_within, without_duplicates
 from colmap_affrect.matchers.base import (
     ImageFeatures,
@@ -33,14 +33,9 @@ from colmap_affrect.matchers.nearest_8bit import (
 )
 from colmap_affrect.options import within
 
-CHUNK_ELEMENTS = 1 << 22
-"""Similarities held at once, which bounds memory."""
-
-CHUNK_ROWS = 1 << 12
-"""Pairs of descriptors held at once, which bounds memory."""
-
-NO_LIMIT = 2.0
-"""No ratio is larger than 1."""
+CHUNK_ELEMENTS = 1 << 22  # similarities held at once, which bounds memory
+CHUNK_ROWS = 1 << 12  # pairs of descriptors held at once, which bounds memory
+NO_LIMIT = 2.0  # no ratio is larger than 1
 
 
 class NearestOptions(MatcherOptions):
@@ -58,15 +53,11 @@ class NearestOptions(MatcherOptions):
 
 
 class NearestNeighbors:
-    """Every descriptor of one image is compared with every one of the other.
-
-    Where the memory of a GPU is full the CPU matches, with the same result.
-    """
+    """Compares all descriptors; where the memory of a GPU is full, a CPU does, just the same."""
 
     Options = NearestOptions
 
     def __init__(self, options: NearestOptions, context: MatcherContext) -> None:
-        """Choose how similarities are computed."""
         self.options = options
         self._make_coarse = coarse_descriptors(context.num_similarities, context.device)
 
@@ -89,18 +80,12 @@ class NearestNeighbors:
 
 @dataclass(frozen=True)
 class MatchableImage:
-    """What matching needs of one image, prepared once for all of its pairs.
+    """What matching needs of one image, prepared once for all of its pairs."""
 
-    Attributes:
-        descriptors: (N, D) float32 rows of unit length.
-        keypoints: (N, 2) pixel-centre px.
-        rivals: for each feature those too close to serve as its second neighbour.
-        coarse: the descriptors in few bits; None where that does not pay.
-    """
-
-    descriptors: NDArray[np.float32]
-    keypoints: NDArray[np.floating]
-    rivals: NeighborLists
+    descriptors: Singles  # (N, D) float32 rows of unit length
+    keypoints: Floats  # (N, 2) pixel-centre px
+    rivals: NeighborLists  # for each feature those too close to serve as its second neighbour
+    # the descriptors in few bits; None where that does not pay
     coarse: CoarseDescriptors | None = None
 
     @property
@@ -111,15 +96,12 @@ class MatchableImage:
 
 
 def matchable(
-    descriptors: NDArray[np.floating],
-    keypoints: NDArray[np.floating],
+    descriptors: Floats,
+    keypoints: Floats,
     options: NearestOptions,
     make_coarse: MakeCoarse | None = None,
 ) -> MatchableImage:
-    """Prepare (N, D) descriptors of unit length and (N, 2) keypoints, px, for matching.
-
-    ``make_coarse`` is the same for all images that are matched with each other.
-    """
+    """Prepare (N, D) unit descriptors at (N, 2) px; ``make_coarse`` is the same for all images."""
     descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
     return MatchableImage(
         descriptors,
@@ -132,10 +114,7 @@ def matchable(
 def match_features(
     image1: MatchableImage, image2: MatchableImage, options: NearestOptions
 ) -> Matches:
-    """Match two images; see the module docstring. Either may have no features.
-
-    The score is 1 minus the larger of the ratios of distances.
-    """
+    """Match two images, with or without features; scores are 1 - the larger ratio of distances."""
     if not len(image1.descriptors) or not len(image2.descriptors):
         return Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
     everything = np.arange(len(image1.descriptors))
@@ -157,9 +136,9 @@ def match_features(
 
 
 def _nearest(
-    image1: MatchableImage, rows: NDArray[np.int64], image2: MatchableImage, max_ratio: float
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the nearest feature of each of some features, and the ratio to the nearest non-rival.
+    image1: MatchableImage, rows: Indices, image2: MatchableImage, max_ratio: float
+) -> tuple[Indices, Singles]:
+    """Return nearest features, and the ratios to the nearest non-rivals.
 
     They may be -1 and infinite where the ratio is ``max_ratio`` or larger.
     """
@@ -177,12 +156,11 @@ def _nearest(
 
 
 def _nearest_of_listed(
-    queries: NDArray[np.float32], image: MatchableImage, short: ShortList
-) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.bool_]]:
+    queries: Singles, image: MatchableImage, short: ShortList
+) -> tuple[Indices, Singles, Bools]:
     """Return nearest and ratio among the features listed for each row, and where they are doubtful.
 
-    That is where the list says so, and where the second neighbour by coarse similarities is a rival
-    of the nearest by exact ones: what takes its place may not be listed.
+    So they are, too, where the second neighbour by coarse similarities is a rival of the nearest.
     """
     similarity = np.empty(len(short.entry_rows), np.float32)
     for begin in range(0, len(similarity), CHUNK_ROWS):
@@ -206,9 +184,7 @@ def _nearest_of_listed(
     return nearest, distance_ratios(first, second), doubtful
 
 
-def _places(
-    short: ShortList, rows: NDArray[np.int64], columns: NDArray[np.int64], count: int
-) -> NDArray[np.int64]:
+def _places(short: ShortList, rows: Indices, columns: Indices, count: int) -> Indices:
     """Return the entries of a short list that are among some rows and columns of ``count``."""
     listed = short.entry_rows * count + short.entry_columns
     wanted = rows * count + columns
@@ -217,9 +193,7 @@ def _places(
     return np.asarray(places[listed[places] == wanted])
 
 
-def _nearest_of_all(
-    queries: NDArray[np.float32], image: MatchableImage
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def _nearest_of_all(queries: Singles, image: MatchableImage) -> tuple[Indices, Singles]:
     """Return the nearest feature of each query and the ratio to the nearest non-rival."""
     count = len(image.descriptors)
     nearest = np.empty(len(queries), np.int64)

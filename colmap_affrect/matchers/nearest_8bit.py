@@ -13,53 +13,41 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.geometry.arrays import Bools, Bytes, Floats, Indices, Singles
 from colmap_affrect.geometry.neighbors import NeighborLists
 from colmap_affrect.parallel.executor import available_cores, one_openmp_thread
 
-MIN_SIMILARITIES_PER_CORE = 6e8
-"""With fewer than this, loading torch takes longer than it saves."""
+MIN_SIMILARITIES_PER_CORE = 6e8  # with fewer than this, loading torch takes longer than it saves
 
 ERROR_SIGMAS = 6.0
 MAX_CODE, ZERO_CODE = 127, 128
-CODE_STEP = 1.0 / 250
-"""Step of similarities in 8 bits; negative ones are 0, and errors may make them more than 1."""
-NUM_ROWS_8_BIT = 512
-"""Rows of similarities computed at once, a multiple of ``SIZE_MULTIPLE``."""
+CODE_STEP = 1.0 / 250  # of similarities in 8 bits; negative ones are 0, few more than 1
+NUM_ROWS_8_BIT = 512  # rows of similarities computed at once, a multiple of ``SIZE_MULTIPLE``
 SIZE_MULTIPLE = 256
 """Both factors of a product are filled up to a multiple of it: oneDNN prepares and keeps a program
 for every size, and many sizes take memory and time."""
-FOLD = 8
-"""Similarities that share a maximum."""
+FOLD = 8  # similarities that share a maximum
 NO_HALF_SIMILARITY = -4.0
 NUM_ROWS_16_BIT = 4096
-HALF_ERROR = 2.0**-11
-"""Standard deviation, rounded up, of the similarity of unit vectors in 16 bits."""
+HALF_ERROR = 2.0**-11  # standard deviation, rounded up, of similarities in 16 bits
 
 
 @dataclass(frozen=True)
 class ShortList:
-    """Features that may pass the ratio test, and what may be their two nearest neighbours.
+    """Features that may pass the ratio test, and what may be their two nearest neighbours."""
 
-    Attributes:
-        rows: (R,) int64 features of the first image that may pass, rising.
-        runners_up: (R,) int64 the second neighbour of each by coarse similarities.
-        doubtful: (R,) bool those whose neighbours may not all be listed.
-        entry_rows: (E,) int64 indices into ``rows``, rising.
-        entry_columns: (E,) int64 features of the second image, rising in each row.
-    """
-
-    rows: NDArray[np.int64]
-    runners_up: NDArray[np.int64]
-    doubtful: NDArray[np.bool_]
-    entry_rows: NDArray[np.int64]
-    entry_columns: NDArray[np.int64]
+    rows: Indices  # (R,) int64 features of the first image that may pass, rising
+    runners_up: Indices  # (R,) int64 the second neighbour of each by coarse similarities
+    doubtful: Bools  # (R,) bool those whose neighbours may not all be listed
+    entry_rows: Indices  # (E,) int64 indices into ``rows``, rising
+    entry_columns: Indices  # (E,) int64 features of the second image, rising in each row
 
 
 class CoarseDescriptors(Protocol):
@@ -70,11 +58,7 @@ class CoarseDescriptors(Protocol):
         """Memory they take."""
 
     def short_list(
-        self,
-        rows: NDArray[np.int64],
-        other: Self,
-        rivals: NeighborLists,
-        max_ratio: float,
+        self, rows: Indices, other: Self, rivals: NeighborLists, max_ratio: float
     ) -> ShortList:
         """Compare some features (``rows``, rising) with all of another image of the same kind.
 
@@ -83,8 +67,7 @@ class CoarseDescriptors(Protocol):
         """
 
 
-MakeCoarse = Callable[[NDArray[np.float32]], CoarseDescriptors]
-"""Makes coarse descriptors of (N, D) unit rows."""
+MakeCoarse = Callable[[Singles], CoarseDescriptors]  # makes coarse descriptors of (N, D) unit rows
 
 
 def coarse_descriptors(num_similarities: float, device: str = "auto") -> MakeCoarse | None:
@@ -106,20 +89,14 @@ def coarse_descriptors(num_similarities: float, device: str = "auto") -> MakeCoa
 
 @dataclass(frozen=True)
 class EightBitDescriptors:
-    """Descriptors as signed 8-bit numbers, on the CPU.
+    """Descriptors as signed 8-bit numbers, on the CPU."""
 
-    Attributes:
-        codes: (N, D) int8, the descriptors divided by ``step`` and rounded.
-        packed: the same as the second factor of products, filled up with zeros.
-        step: the largest value over 127.
-    """
-
-    codes: NDArray[np.int8]
-    packed: Any
-    step: float
+    codes: NDArray[np.int8]  # (N, D) int8, the descriptors divided by ``step`` and rounded
+    packed: Any  # the same as the second factor of products, filled up with zeros
+    step: float  # the largest value over 127
 
     @classmethod
-    def of(cls, descriptors: NDArray[np.float32]) -> Self:
+    def of(cls, descriptors: Singles) -> Self:
         """Round (N, D) unit rows."""
         step = max(float(np.abs(descriptors).max(initial=0.0)), 1e-6) / MAX_CODE
         codes = np.rint(descriptors / step).astype(np.int8)
@@ -131,11 +108,7 @@ class EightBitDescriptors:
         return 2 * self.codes.nbytes
 
     def short_list(
-        self,
-        rows: NDArray[np.int64],
-        other: Self,
-        rivals: NeighborLists,
-        max_ratio: float,
+        self, rows: Indices, other: Self, rivals: NeighborLists, max_ratio: float
     ) -> ShortList:
         """See :class:`CoarseDescriptors`."""
         import torch  # noqa: F401 - its threads can only be limited once they are there
@@ -170,28 +143,24 @@ class _Similarities:
     """Similarities of R features to N = ``FOLD`` G others, and the largest of every few.
 
     Large ones are looked for among the maxima, which are fewer.
-
-    Attributes:
-        groups: (R, FOLD, G) uint8; columns g, g + G, g + 2 G, ... are group g.
-        maxima: (R, G) uint8 the largest of each group.
     """
 
-    groups: NDArray[np.uint8]
-    maxima: NDArray[np.uint8]
+    groups: Bytes  # (R, FOLD, G) uint8; columns g, g + G, g + 2 G, ... are group g
+    maxima: Bytes  # (R, G) uint8 the largest of each group
 
     @classmethod
-    def of(cls, codes: NDArray[np.uint8]) -> Self:
+    def of(cls, codes: Bytes) -> Self:
         """Group (R, N) similarities, N a multiple of ``FOLD``."""
         groups = codes.reshape(len(codes), FOLD, -1)
         return cls(groups, groups.max(axis=1))
 
-    def largest(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def largest(self) -> tuple[Indices, Indices]:
         """Return the column of a largest similarity of each row, and the similarity."""
         every, group = np.arange(len(self.maxima)), self.maxima.argmax(axis=1)
         member = self.groups[every, :, group].argmax(axis=1)
         return member * self.maxima.shape[1] + group, self.maxima[every, group].astype(np.int64)
 
-    def take_out(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.uint8]:
+    def take_out(self, rows: Indices, columns: Indices) -> Bytes:
         """Make some similarities 0; return what they were."""
         member, group = np.divmod(columns, self.maxima.shape[1])
         before = self.groups[rows, member, group]
@@ -199,9 +168,7 @@ class _Similarities:
         self.maxima[rows, group] = self.groups[rows, :, group].max(axis=1)
         return before
 
-    def at_least(
-        self, rows: NDArray[np.int64], least: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def at_least(self, rows: Indices, least: Indices) -> tuple[Indices, Indices]:
         """Return where some rows reach a limit each: indices into ``rows``, and columns."""
         above = self.maxima[rows] >= least.astype(np.uint8)[:, None]
         index, group = np.divmod(np.flatnonzero(above), above.shape[1])
@@ -211,16 +178,12 @@ class _Similarities:
 
 @dataclass(frozen=True)
 class HalfDescriptors:
-    """Descriptors as 16-bit floating point numbers, on a GPU.
+    """Descriptors as 16-bit floating point numbers, on a GPU."""
 
-    Attributes:
-        values: (N, D) tensor.
-    """
-
-    values: Any
+    values: Any  # (N, D) tensor
 
     @classmethod
-    def of(cls, descriptors: NDArray[np.float32], device: str) -> Self:
+    def of(cls, descriptors: Singles, device: str) -> Self:
         """Copy (N, D) unit rows to a device."""
         import torch
 
@@ -232,11 +195,7 @@ class HalfDescriptors:
         return int(self.values.nbytes)
 
     def short_list(
-        self,
-        rows: NDArray[np.int64],
-        other: Self,
-        rivals: NeighborLists,
-        max_ratio: float,
+        self, rows: Indices, other: Self, rivals: NeighborLists, max_ratio: float
     ) -> ShortList:
         """See :class:`CoarseDescriptors`."""
         import torch
@@ -267,23 +226,16 @@ class HalfDescriptors:
 
 
 def _is_hidden(
-    best: NDArray[np.int64],
-    runners_up: NDArray[np.int64],
-    of_best: tuple[NDArray[np.int64], NDArray[np.int64]],
-    is_close: NDArray[np.bool_],
+    best: Indices,
+    runners_up: Indices,
+    of_best: tuple[Indices, Indices],
+    is_close: Bools,
     rivals: NeighborLists,
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Tell where the second neighbour is not known, for each of R rows.
 
     That is where a rival of the best may be nearer than it, and has the runner-up for a rival, of
     which the best is none. What takes the place of the runner-up then may be far less similar.
-
-    Args:
-        best: (R,) nearest by coarse similarities.
-        runners_up: (R,) second neighbours by coarse similarities.
-        of_best: (E,) rows and columns of the rivals of the best, itself included.
-        is_close: (E,) those that may be nearer than the best.
-        rivals: of each column.
     """
     rows, columns = (indices[is_close] for indices in of_best)
     is_other = columns != best[rows]
@@ -294,19 +246,17 @@ def _is_hidden(
     return hidden
 
 
-def _may_pass(
-    first: NDArray[np.floating], second: NDArray[np.floating], max_ratio: float, margin: float
-) -> NDArray[np.bool_]:
+def _may_pass(first: Floats, second: Floats, max_ratio: float, margin: float) -> Bools:
     """Tell where sqrt((1 - first) / (1 - second)) may be under a limit."""
     return np.asarray(1.0 - first - margin < max_ratio**2 * (1.0 - second + margin))
 
 
 def _part(
-    rows: NDArray[np.int64],
-    runners_up: NDArray[np.int64],
-    doubtful: NDArray[np.bool_],
-    near: tuple[NDArray[np.int64], ...],
-    of_best: tuple[NDArray[np.int64], NDArray[np.int64]],
+    rows: Indices,
+    runners_up: Indices,
+    doubtful: Bools,
+    near: tuple[Indices, ...],
+    of_best: tuple[Indices, Indices],
 ) -> ShortList:
     """Unite the entries near the second neighbour with the first one and its rivals, sorted."""
     entry_rows, columns = (np.concatenate(both) for both in zip(near, of_best, strict=True))
@@ -317,16 +267,10 @@ def _part(
 def _joined(parts: list[ShortList]) -> ShortList:
     """Put the lists of consecutive rows together."""
     begins = np.cumsum([0, *(len(part.rows) for part in parts)])
-    nothing = np.zeros(0, np.int64)
-    return ShortList(
-        np.concatenate([nothing, *(part.rows for part in parts)]),
-        np.concatenate([nothing, *(part.runners_up for part in parts)]),
-        np.concatenate([np.zeros(0, bool), *(part.doubtful for part in parts)]),
-        np.concatenate(
-            [nothing, *(p.entry_rows + b for p, b in zip(parts, begins[:-1], strict=True))]
-        ),
-        np.concatenate([nothing, *(part.entry_columns for part in parts)]),
-    )
+    moved = (replace(p, entry_rows=p.entry_rows + b) for p, b in zip(parts, begins, strict=False))
+    none = np.zeros(0, np.int64)
+    every = [vars(ShortList(none, none, none.astype(bool), none, none)), *map(vars, moved)]
+    return ShortList(**{name: np.concatenate([part[name] for part in every]) for name in every[0]})
 
 
 def _packed(codes: NDArray[np.int8]) -> Any:
@@ -341,12 +285,11 @@ def _filled_up(codes: NDArray[np.int8]) -> NDArray[np.int8]:
     return np.pad(codes, ((0, -len(codes) % SIZE_MULTIPLE), (0, 0)))
 
 
-def _similarity_codes(codes: NDArray[np.int8], packed: Any, unit: float) -> NDArray[np.uint8]:
+def _similarity_codes(codes: NDArray[np.int8], packed: Any, unit: float) -> Bytes:
     """Return similarities over ``CODE_STEP`` of (R, D) and (N, D) codes, rounded: 0...255.
 
-    The columns that ``packed`` has been filled up with are 0. They stay: without them rows would
-    not follow each other in memory, and numpy would make a copy before it looks for maxima.
-    ``unit`` is the similarity of the codes 1 and 1.
+    Columns that ``packed`` was filled up with stay, as 0: numpy would copy before it looks for
+    maxima. ``unit`` is the similarity of the codes 1 and 1.
     """
     import torch
 
@@ -362,10 +305,7 @@ def _similarity_codes(codes: NDArray[np.int8], packed: Any, unit: float) -> NDAr
 
 @cache
 def has_fast_8_bit_products() -> bool:
-    """Tell whether torch and the processor multiply 8-bit numbers, and without saturation.
-
-    Older processors do it more slowly than floating point, or lose bits on the way.
-    """
+    """Tell whether 8-bit products are fast here and right: old processors lose bits."""
     import torch
 
     if not torch.backends.cpu.get_cpu_capability().startswith("AVX512"):

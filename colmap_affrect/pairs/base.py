@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from colmap_affrect.geometry.arrays import Bools
 from colmap_affrect.options import Options, within
 
-Pair = tuple[str, str]
-"""Names of two photographs, in order."""
+Pair = tuple[str, str]  # names of two photographs, in order
 
-AT_ONCE = 1 << 16
-"""Pairs that are given names together."""
+AT_ONCE = 1 << 16  # pairs that are given names together
 
 
 class PairList(Sequence[Pair]):
@@ -29,7 +28,6 @@ class PairList(Sequence[Pair]):
     """
 
     def __init__(self, names: Sequence[str], numbers: NDArray[np.integer]) -> None:
-        """Keep them as they are."""
         self.names, self.numbers = names, numbers.astype(np.int32, copy=False).reshape(-1, 2)
 
     @classmethod
@@ -60,7 +58,7 @@ class PairList(Sequence[Pair]):
             for first, second in self.numbers[start : start + AT_ONCE].tolist():
                 yield self.names[first], self.names[second]
 
-    def at(self, which: NDArray[np.bool_] | NDArray[np.integer] | slice) -> PairList:
+    def at(self, which: Bools | NDArray[np.integer] | slice) -> PairList:
         """Return the pairs of a slice, of a mask (N,), or at indices in their order."""
         return PairList(self.names, self.numbers[which])
 

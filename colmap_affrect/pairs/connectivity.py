@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
 
 
-def weakly_connected_images(
-    matches: Mapping[Pair, NDArray[np.int64]], min_num_features: int
-) -> set[str]:
+def weakly_connected_images(matches: Mapping[Pair, Indices], min_num_features: int) -> set[str]:
     """Return the images with fewer features than that in tracks through three images or more.
 
     A mapper registers an image by features whose matches it has triangulated already. That takes

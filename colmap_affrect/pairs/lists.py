@@ -1,4 +1,4 @@
-"""Lists of pairs: all, by sequence, the most similar; their order, and their files."""
+"""Lists of pairs: all, by sequence or place, the most similar; their order, and their files."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_affrect.colmap.database import nearest_positions
 from colmap_affrect.errors import PairListError
-from colmap_affrect.pairs.base import Pair, PairList
+from colmap_affrect.geometry.arrays import Indices, Singles
+from colmap_affrect.pairs.base import Pair, PairList, PairOptions
 from colmap_affrect.project.atomic_files import replace_lines
 
 MAX_NAMES_IN_MESSAGE = 5
-CANDIDATES_PER_NEIGHBOR = 5
-"""An image may have that many times as many neighbours as images have on average."""
+CANDIDATES_PER_NEIGHBOR = 5  # times as many may an image have as images have on average
 
 
 def exhaustive_pairs(names: Sequence[str]) -> list[Pair]:
@@ -27,16 +28,25 @@ def exhaustive_pairs(names: Sequence[str]) -> list[Pair]:
 
 
 def sequence_pairs(names: Sequence[str], num_neighbors: int) -> list[Pair]:
-    """Return the pairs of each name and the ``num_neighbors`` after it, sorted.
-
-    Numbers in names count by value: frame 9 comes before frame 10.
-    """
+    """Return the sorted pairs of each name and the next ones; frame 9 comes before frame 10."""
     ordered = sorted(names, key=_by_numbers)
     return sorted(
         (min(first, second), max(first, second))
         for index, first in enumerate(ordered)
         for second in ordered[index + 1 : index + 1 + num_neighbors]
     )
+
+
+def pairs_by_place(names: Sequence[str], database_path: Path, options: PairOptions) -> set[Pair]:
+    """Return pairs by ``gps`` (DatabaseError without positions) and ``sequence``, as asked for."""
+    pairs: set[Pair] = set()
+    if "sequence" in options.methods:
+        pairs |= set(sequence_pairs(names, options.num_neighbors))
+    if "gps" in options.methods:
+        near = nearest_positions(database_path, options.num_neighbors, options.max_distance_m)
+        known = set(names)
+        pairs |= {pair for pair in near if known.issuperset(pair)}
+    return pairs
 
 
 def _by_numbers(name: str) -> tuple[list[str | int], str]:
@@ -77,8 +87,8 @@ def most_similar_pairs(
 
 
 def _candidates(
-    index: int, row: NDArray[np.float32], max_num: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:
+    index: int, row: Singles, max_num: int
+) -> tuple[Indices, Indices, Singles, Indices]:
     """Return the smaller and larger indices, similarities and ranks of an image's best pairs."""
     order = np.argsort(-row, kind="stable")
     others = order[order != index][:max_num]
@@ -93,8 +103,7 @@ def _candidates(
 def ordered_for_reuse(pairs: Iterable[Pair], num_images: int) -> PairList:
     """Order pairs so that those of the same images come close together.
 
-    Images are numbered by walking breadth first through the graph of pairs. Then come, block by
-    block, the pairs of ``num_images`` with as many others: memory must hold twice as many.
+    Images are numbered breadth first; then come blocks of ``num_images`` with as many others.
     """
     listed = PairList.of(pairs)
     low, high = np.sort(_breadth_first(listed)[listed.numbers], axis=1).T

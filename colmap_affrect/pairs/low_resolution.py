@@ -12,23 +12,16 @@ from colmap_affrect.pairs.lists import most_similar_pairs
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
 
-NUM_STRONGEST = 1000
-"""Features of each image that low-resolution matching looks at."""
-
-IMAGES_AT_ONCE = 256
-"""Pairs are matched in blocks of that many images with that many others."""
+NUM_STRONGEST = 1000  # features of each image that low-resolution matching looks at
+IMAGES_AT_ONCE = 256  # pairs are matched in blocks of that many images with that many others
 
 
 def low_resolution_pairs(
-    names: Sequence[str],
-    match: Callable[[Pair], Matches],
-    num_neighbors: int,
-    progress: Progress,
+    names: Sequence[str], match: Callable[[Pair], Matches], num_neighbors: int, progress: Progress
 ) -> list[Pair]:
     """Return the pairs of images of which the strongest features have the most matches.
 
-    ``match`` matches the strongest features of two images, best if it keeps ``2 * IMAGES_AT_ONCE``
-    images in memory; ``num_neighbors`` is that of an image on average.
+    ``match`` should keep ``2 * IMAGES_AT_ONCE`` images; neighbours are counted on average.
     """
     counts = np.zeros((len(names), len(names)), np.uint16)
 

@@ -16,23 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
+from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import most_similar_pairs
 from colmap_affrect.progress import Progress
 
 NUM_WORDS = 256
-NUM_SAMPLED_IMAGES = 512
-"""The vocabulary of larger sets is built from that many of their images."""
-NUM_SAMPLES = 1 << 15
-"""Descriptors that the vocabulary is built from."""
+NUM_SAMPLED_IMAGES = 512  # the vocabulary of larger sets is built from that many of their images
+NUM_SAMPLES = 1 << 15  # descriptors that the vocabulary is built from
 NUM_ITERATIONS = 10
-VECTORS_AT_ONCE = 512
-"""Image vectors that are compared with as many others at a time, which bounds memory."""
+VECTORS_AT_ONCE = 512  # compared with as many others at a time, which bounds memory
 
 
-def build_vocabulary(
-    samples: NDArray[np.float32], random: np.random.Generator
-) -> NDArray[np.float32]:
+def build_vocabulary(samples: Singles, random: np.random.Generator) -> Singles:
     """Find (K, D) words of (M, D) descriptors by k-means, ``NUM_WORDS`` or as many as there are."""
     words = random.permutation(samples)[:NUM_WORDS]
     if len(samples) <= len(words):
@@ -43,30 +39,21 @@ def build_vocabulary(
     return np.asarray(found[2], dtype=np.float32)
 
 
-def nearest_words(
-    descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]
-) -> NDArray[np.int64]:
+def nearest_words(descriptors: Singles, vocabulary: Singles) -> Indices:
     """Return the (N,) nearest of (K, D) words to (N, D) descriptors."""
     half_squares = 0.5 * np.einsum("kd,kd->k", vocabulary, vocabulary)
     return np.asarray((descriptors @ vocabulary.T - half_squares).argmax(axis=1))
 
 
-def image_vector(
-    descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]
-) -> NDArray[np.float16]:
-    """Describe an image by one (K * D,) vector of unit length; zeros without descriptors.
-
-    From its (N, D) descriptors and (K, D) words.
-    """
+def image_vector(descriptors: Singles, vocabulary: Singles) -> NDArray[np.float16]:
+    """Describe (N, D) descriptors by (K, D) words: (K * D,) of unit length, or zeros."""
     words = nearest_words(descriptors, vocabulary)
     sums = _unit_rows(_sums(descriptors - vocabulary[words], words, len(vocabulary)))
     damped = np.sign(sums) * np.sqrt(np.abs(sums))
     return np.asarray(_unit_rows(damped.reshape(1, -1))[0], dtype=np.float16)
 
 
-def _sums(
-    rows: NDArray[np.float32], words: NDArray[np.int64], num_words: int
-) -> NDArray[np.float32]:
+def _sums(rows: Singles, words: Indices, num_words: int) -> Singles:
     """Add up the (N, D) rows of each word; (K, D), zeros where there are none."""
     order = np.argsort(words, kind="stable")
     present, begins = np.unique(words[order], return_index=True)
@@ -76,15 +63,12 @@ def _sums(
     return sums
 
 
-def similarities(vectors: NDArray[np.float16]) -> Iterator[NDArray[np.float32]]:
-    """Yield for each of (N, V) image vectors its (N,) similarities with all of them.
-
-    They are the cosines after the mean of all vectors has been subtracted.
-    """
+def similarities(vectors: NDArray[np.float16]) -> Iterator[Singles]:
+    """Yield the (N,) cosines of each of (N, V) image vectors with all, the mean subtracted."""
     mean = vectors.mean(axis=0, dtype=np.float32)
     begins = range(0, len(vectors), VECTORS_AT_ONCE)
 
-    def centered(begin: int) -> NDArray[np.float32]:
+    def centered(begin: int) -> Singles:
         return _unit_rows(vectors[begin : begin + VECTORS_AT_ONCE] - mean)
 
     for begin in begins:
@@ -92,7 +76,7 @@ def similarities(vectors: NDArray[np.float16]) -> Iterator[NDArray[np.float32]]:
         yield from np.concatenate([queries @ centered(other).T for other in begins], axis=1)
 
 
-def _unit_rows(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+def _unit_rows(rows: Singles) -> Singles:
     """Divide (N, V) rows by their lengths; rows of zeros stay."""
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     return np.asarray(rows / np.maximum(lengths, np.finfo(np.float32).tiny))
@@ -104,10 +88,9 @@ def retrieved_pairs(
     num_neighbors: int,
     progress: Progress,
 ) -> list[Pair]:
-    """Return the pairs of images whose descriptors are alike as a whole.
+    """Return pairs of images that are alike as a whole, of so many neighbours on average.
 
-    None if all features are those of warps, which are not looked at. ``num_neighbors`` is that of
-    an image on average.
+    None if all features are those of warps, which are not looked at.
     """
     random = np.random.default_rng(0)
     sampled = random.permutation(len(names))[:NUM_SAMPLED_IMAGES]
@@ -128,7 +111,7 @@ def retrieved_pairs(
     return most_similar_pairs(names, similarities(vectors), num_neighbors)
 
 
-def _original_descriptors(features: LocalFeatures) -> NDArray[np.float32]:
+def _original_descriptors(features: LocalFeatures) -> Singles:
     """Return the (N, D) descriptors of the image itself; with those of warps recall is lower."""
     descriptors = features.descriptors[features.rectification_ids == 0]
     return np.asarray(descriptors, dtype=np.float32)

@@ -13,8 +13,7 @@ from colmap_affrect.errors import PairListError
 from colmap_affrect.matchers.base import Matches
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair, PairList, PairOptions
-from colmap_affrect.pairs.by_place import pairs_by_place
-from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, write_pairs
+from colmap_affrect.pairs.lists import exhaustive_pairs, pairs_by_place, read_pairs, write_pairs
 from colmap_affrect.pairs.low_resolution import NUM_STRONGEST, low_resolution_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.project.contents import Contents

@@ -306,8 +306,7 @@ def test_search_loads_neither_torch_nor_kornia(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "variables",
-    [{}, {"TORCH_HOME": "~/here"}, {"XDG_CACHE_HOME": "/there"}, {"TORCH_HOME": "/a"}],
+    "variables", [{}, {"TORCH_HOME": "~/here"}, {"XDG_CACHE_HOME": "/there"}, {"TORCH_HOME": "/a"}]
 )
 def test_cache_is_that_of_torch(variables: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("TORCH_HOME", "XDG_CACHE_HOME"):

@@ -80,3 +80,20 @@ def test_what_is_there_is_not_made_again(scans: Path, tmp_path: Path) -> None:
 def test_new_folder_inside_the_old_one_is_refused(scans: Path) -> None:
     with pytest.raises(ImageError, match="give a folder beside it"):
         convert_images(scans, scans / "png")
+
+
+def test_whatever_pillow_raises_of_a_damaged_file_the_others_are_converted(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    intact = Image.open
+
+    def fail_of_one(path: Path) -> Image.Image:
+        if path.name == "b.webp":
+            raise RuntimeError("Failed to decode image")  # as of AVIF
+        return intact(path)
+
+    monkeypatch.setattr(Image, "open", fail_of_one)
+    report = convert_images(scans, tmp_path / "photos")
+    assert list(report.failures) == ["b.webp", "broken.jp2"]
+    assert report.failures["b.webp"].endswith("b.webp: cannot be read (Failed to decode image)")
+    assert len(report.written) == 3

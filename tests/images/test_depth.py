@@ -21,10 +21,7 @@ from synthetic import write_image
 from colmap_affrect.colmap.poses import read_poses
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError
-from colmap_affrect.images.depth import (
-    DepthFiles,
-    DepthFilesOptions,
-)
+from colmap_affrect.images.depth import DepthFiles, DepthFilesOptions
 from colmap_affrect.images.reading import read_gray
 
 PNG_METRES = 0.002

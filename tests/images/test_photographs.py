@@ -270,8 +270,7 @@ def test_list_images_takes_those_of_a_list(tmp_path: Path) -> None:
 def test_list_images_leaves_out_a_name_that_is_not_utf8(tmp_path: Path) -> None:
     Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.png")).write_bytes(b"")
     with pytest.raises(
-        ImageError,
-        match=r"names: 1 left out, such as \\udcff.png: the name is",
+        ImageError, match=r"names: 1 left out, such as \\udcff.png: the name is"
     ) as error:
         list_images(tmp_path)
     str(error.value).encode("utf-8")

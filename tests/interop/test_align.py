@@ -108,6 +108,16 @@ def test_distances_of_photographs_and_marked_points_give_the_scale(
     assert np.linalg.norm(new["a.png"] - new["d.png"]) == pytest.approx(length)
 
 
+@pytest.mark.parametrize("length", [0.0, -1.0, float("nan"), float("inf")])
+def test_distances_that_are_none_are_refused(tmp_path: Path, length: float) -> None:
+    write_model(tmp_path / "model")
+    with pytest.raises(OptionError, match=r"a\.png,d\.png: must be of two places, and positive"):
+        align(
+            tmp_path / "model", tmp_path / "new", Reference(distances=(("a.png", "d.png", length),))
+        )
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.parametrize(
     ("rows", "message"),
     [

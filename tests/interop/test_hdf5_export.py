@@ -28,12 +28,7 @@ from small_scene import INTRINSICS
 
 import colmap_affrect
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import (
-    DatabaseError,
-    OptionError,
-    StoreError,
-    WorkspaceError,
-)
+from colmap_affrect.errors import DatabaseError, OptionError, StoreError, WorkspaceError
 from colmap_affrect.interop.hdf5 import export_h5, import_h5
 from colmap_affrect.pipeline import RunOptions
 

@@ -234,7 +234,7 @@ def test_half_precision_is_for_gpus(matcher: LightGlue, comparing: Path) -> None
 @pytest.mark.parametrize("trained_for", TRAININGS)
 def test_every_kind_of_features_is_matched_and_in_warps(trained_for: str, tmp_path: Path) -> None:
     training = TRAININGS[trained_for]
-    path = write_comparing_lightglue(tmp_path / "lightglue.pth", training.kornia)
+    path = write_comparing_lightglue(tmp_path / "lightglue.pth", trained_for.replace("-", "_"))
     options = LightGlueOptions.from_mapping({"trained_for": trained_for}, "")
     matcher = LightGlue(options, MatcherContext({training.weights: path}, "cpu"))
     dimension = 64 if trained_for == "xfeat" else 128

@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.matchers import nearest
 from colmap_affrect.matchers.base import Matches
-from colmap_affrect.matchers.nearest import (
-    NearestOptions,
-    match_features,
-    matchable,
-)
+from colmap_affrect.matchers.nearest import NearestOptions, match_features, matchable
 
 RATIO_ERROR = 2e-3
 """Ratios are roots of differences of float32 cosines near 1: sqrt(1e-7) where a distance is 0."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,7 +90,7 @@ def test_what_a_gpu_has_no_memory_for_is_matched_by_the_cpu(
     make_coarse: MakeCoarse,
 ) -> None:
     expected = matches(store)
-    base._warn_that_gpu_is_full.cache_clear()
+    monkeypatch.setattr(base, "_SAID", threading.Lock())
     monkeypatch.setattr(nearest, "coarse_descriptors", lambda *_: make_coarse)
     with caplog.at_level(logging.WARNING):
         assert matches(store) == expected

@@ -4,8 +4,7 @@ AffNet (Mishkin, Radenovic, Matas 2018) reads the shape of a feature off a 32 x 
 the final pooling it is fully convolutional and gives a shape every 4 px: the paper's
 DenseAffNet (Sec. 3).
 
-The three outputs o of the network make the frame L = [[1 + o0, 0], [o1, 1 + o2]], image from
-patch, up to scale; shapes are the unit metrics of L^-1.
+The three outputs o of the network make a frame L; shapes are the unit metrics of L^-1.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, grid_origin, resized_from_original
@@ -25,8 +23,10 @@ from colmap_affrect.data import GrayImage, Mask, ShapeGrid, ShapeSamples
 from colmap_affrect.features.base import PATCH_SIZE_PX, FeatureOptions, NetworkContext, ShapeOptions
 from colmap_affrect.features.sift import DogOptions, detect_dog
 from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.geometry.shapes import (
     STEP_PX,
+    frames_from_affnet,
     log_metrics,
     metrics_from_log,
     rectifying_metrics,
@@ -43,32 +43,15 @@ LEAD_PX = (PATCH_SIZE_PX - STEP_PX) // 2
 """Cell (0, 0) of the network has the patch of the rows and columns 0...31. With 14 px more in
 front, that patch has the block of rows and columns 0...3 in its middle."""
 
-PAPER_CROP_PX = (-LEAD_PX) % STEP_PX
-"""Without padding, 2 px fewer in front put the patches of all cells round whole blocks."""
-
-PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX
-"""Blocks before the first one that then has a patch."""
-
-CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9
-"""Cell i depends on the rows 4 i - 11...4 i + 39: on those of the cells i - 3...i + 9."""
-
-STRIP_CELLS = 64
-"""Rows of cells that are computed at once, to bound the memory."""
-
-WINDOW_PX = 33
-"""Surroundings whose mean and deviation normalise a pixel."""
-
-DEVIATION_FLOOR = 0.01 * 255
-"""Added to the deviation of the surroundings, gray values: blank ones stay blank."""
-
-MAX_NORMALISED = 6.0
-"""Largest normalised value (as in the AffNet authors' own fully convolutional network)."""
-
-PATCH_SIGMAS = 12.0
-"""Half width of the patch of a keypoint in units of its sigma (kornia-moons, the paper)."""
-
-BATCH_SIZE = 256
-"""Patches that go through the network at once."""
+PAPER_CROP_PX = (-LEAD_PX) % STEP_PX  # puts the patches of all cells round whole blocks
+PAPER_LEAD_CELLS = (LEAD_PX + PAPER_CROP_PX) // STEP_PX  # blocks before the first with a patch
+CELLS_SEEN_BEFORE, CELLS_SEEN_AFTER = 3, 9  # cell i depends on rows 4 i - 11...4 i + 39
+STRIP_CELLS = 64  # rows of cells that are computed at once, to bound the memory
+WINDOW_PX = 33  # surroundings whose mean and deviation normalise a pixel
+DEVIATION_FLOOR = 0.01 * 255  # added to deviations, gray values: blank surroundings stay blank
+MAX_NORMALISED = 6.0  # as in the AffNet authors' own fully convolutional network
+PATCH_SIGMAS = 12.0  # half width of a keypoint's patch in its sigmas (kornia-moons, the paper)
+BATCH_SIZE = 256  # patches that go through the network at once
 
 
 class AffNetOptions(ShapeOptions):
@@ -97,8 +80,7 @@ class AffNetOptions(ShapeOptions):
 class AffNet:
     """Shapes of all 4 x 4 blocks of an image, or of its keypoints.
 
-    Sparse shapes are those of DoG keypoints; where the recipe's features are found by DoG, with
-    their thresholds.
+    Keypoints are by DoG, with the thresholds of the recipe's features where those are.
     """
 
     Options = AffNetOptions
@@ -122,14 +104,10 @@ class AffNet:
     def grid(self, image: GrayImage) -> ShapeGrid:
         """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
 
-        By default pixels are normalised by mean and deviation of the 33 x 33 px around them,
-        the border is reflected, and the shapes of several sizes of the image are combined by
-        their log-Euclidean mean. Blocks whose surroundings deviate by less than
-        ``min_deviation`` are not textured and get the identity.
-
-        With ``paper``, the image is normalised as a whole, the network sees the full size
-        without padding (the shorter side must have 32 px), and blocks near the border get the
-        shape of the nearest one that has a patch inside. All blocks are textured.
+        By default the border is reflected, and blocks whose surroundings deviate by less than
+        ``min_deviation`` are not textured and get the identity. With ``paper`` the network sees
+        the image without padding (the shorter side must have 32 px), and blocks near the border
+        get the shape of the nearest one that has a patch inside. All blocks are textured.
         """
         if self.options.paper:
             logs = self._paper_logs(image)
@@ -140,10 +118,9 @@ class AffNet:
         return ShapeGrid(metrics_from_log(logs), textured, grid_origin(STEP_PX), STEP_PX)
 
     def samples(self, image: GrayImage) -> ShapeSamples:
-        """Estimate the affine shapes of the strongest keypoints of a (H, W) uint8 image.
+        """Estimate the shapes of the strongest keypoints of a (H, W) uint8 image.
 
-        Each shape is read off the 32 x 32 patch of half width 12 sigma. Keypoints whose shape
-        is not finite or turns the patch over are left out.
+        Keypoints whose shape is not finite or turns the patch over are left out.
         """
         keypoints = self.detect(image)
         order = np.argsort(-keypoints.responses, kind="stable")
@@ -152,7 +129,7 @@ class AffNet:
         valid = np.isfinite(shapes).all(axis=(1, 2)) & (determinants(shapes) > 0)
         return ShapeSamples(keypoints.keypoints[valid], rectifying_metrics(shapes[valid]))
 
-    def _mean_logs(self, image: GrayImage) -> NDArray[np.float32]:
+    def _mean_logs(self, image: GrayImage) -> Singles:
         """Return (R, C, 2) logarithms of metrics, the mean over all sizes of the image."""
         size = image.shape[::-1]
         resized = [shrink_to(image, round(max(size) * scale)) for scale in self.options.scales]
@@ -166,7 +143,7 @@ class AffNet:
             mean += _read_grid(logs, level_from_image, mean.shape[:2]) / len(levels)
         return mean
 
-    def _paper_logs(self, image: GrayImage) -> NDArray[np.float32]:
+    def _paper_logs(self, image: GrayImage) -> Singles:
         """Return (R, C, 2) logarithms of metrics as in the paper, border cells replicated."""
         values = image.astype(np.float32)
         normalised = (values - values.mean()) / (values.std() + 1e-6)
@@ -178,12 +155,8 @@ class AffNet:
         widths = ((PAPER_LEAD_CELLS, below), (PAPER_LEAD_CELLS, right), (0, 0))
         return np.pad(logs, widths, mode="edge")
 
-    def _dense_logs(self, normalised: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return (R, C, 2) logarithms of the metrics that the network sees in a float image.
-
-        Computed in strips of ``STRIP_CELLS`` rows of cells, with as many rows around as
-        these depend on.
-        """
+    def _dense_logs(self, normalised: Singles) -> Singles:
+        """Return (R, C, 2) logarithms of the metrics that the network sees in a float image."""
         import torch
 
         image = torch.from_numpy(normalised)[None, None]
@@ -199,7 +172,7 @@ class AffNet:
             strips.append(log_metrics(metrics))
         return np.concatenate(strips)
 
-    def _patch_outputs(self, image: GrayImage, lafs: NDArray[np.float64]) -> torch.Tensor:
+    def _patch_outputs(self, image: GrayImage, lafs: Array) -> torch.Tensor:
         """Return the (N, 3) outputs of the network on the patches of (N, 2, 3) frames."""
         import torch
 
@@ -218,10 +191,10 @@ class AffNet:
 
 
 def fully_convolutional(network: LAFAffNetShapeEstimator) -> nn.Sequential:
-    """Return the layers of AffNet without the final pooling, for inference.
+    """Return the layers of AffNet without the final pooling, batch normalisation folded in.
 
-    Batch normalisation is folded into the convolutions. An image of H x W px gives (ceil(H / 4) -
-    7) x (ceil(W / 4) - 7) cells; cell (i, j) has the patch whose first pixel is (4 j, 4 i).
+    An image of H x W px gives (ceil(H / 4) - 7) x (ceil(W / 4) - 7) cells; cell (i, j) has the
+    patch whose first pixel is (4 j, 4 i).
     """
     import torch
     from torch import nn
@@ -235,17 +208,12 @@ def fully_convolutional(network: LAFAffNetShapeEstimator) -> nn.Sequential:
     return convert_conv2d_weight_memory_format(sequence, torch.channels_last)
 
 
-def _frames(outputs: torch.Tensor) -> NDArray[np.float64]:
-    """Return (..., 2, 2) frames L = [[1 + o0, 0], [o1, 1 + o2]] of (..., 3) outputs."""
-    values = outputs.cpu().numpy().astype(np.float64)
-    frames = np.zeros((*values.shape[:-1], 2, 2))
-    frames[..., 0, 0] = 1.0 + values[..., 0]
-    frames[..., 1, 0] = values[..., 1]
-    frames[..., 1, 1] = 1.0 + values[..., 2]
-    return frames
+def _frames(outputs: torch.Tensor) -> Array:
+    """Return (..., 2, 2) frames L of (..., 3) outputs."""
+    return frames_from_affnet(outputs.cpu().numpy().astype(np.float64))
 
 
-def _mean_and_deviation(image: GrayImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _mean_and_deviation(image: GrayImage) -> tuple[Array, Array]:
     """Return (H, W) mean and standard deviation of the window round each pixel."""
     window, border = (WINDOW_PX, WINDOW_PX), cv2.BORDER_REFLECT_101
     mean = np.asarray(cv2.boxFilter(image, cv2.CV_64F, window, borderType=border), np.float64)
@@ -253,13 +221,13 @@ def _mean_and_deviation(image: GrayImage) -> tuple[NDArray[np.float64], NDArray[
     return mean, np.sqrt(np.maximum(mean_square - mean**2, 0.0))
 
 
-def _locally_normalised(image: GrayImage) -> NDArray[np.float32]:
+def _locally_normalised(image: GrayImage) -> Singles:
     mean, deviation = _mean_and_deviation(image)
     normalised = (image - mean) / (deviation + DEVIATION_FLOOR)
     return np.clip(normalised, -MAX_NORMALISED, MAX_NORMALISED).astype(np.float32)
 
 
-def _with_reflected_border(values: NDArray[np.floating]) -> NDArray[np.floating]:
+def _with_reflected_border(values: Floats) -> Floats:
     """Add a border so that the cells of the network are the 4 x 4 blocks of the image."""
     bottom, right = (LEAD_PX + -length % STEP_PX for length in values.shape)
     return np.asarray(
@@ -274,13 +242,10 @@ def _textured(image: GrayImage, min_deviation: float) -> Mask:
     return np.asarray(deviation[middle:-LEAD_PX:STEP_PX, middle:-LEAD_PX:STEP_PX] > min_deviation)
 
 
-def _read_grid(
-    values: NDArray[np.float32], level_from_image: NDArray[np.float64], cells: tuple[int, int]
-) -> NDArray[np.float32]:
-    """Interpolate a grid of a resized image bilinearly at the (R, C) cells of the image's own.
+def _read_grid(values: Singles, level_from_image: Array, cells: tuple[int, int]) -> Singles:
+    """Interpolate (r, c, D) values at the blocks of a resized image at (R, C) cells of the image.
 
-    ``values`` are (r, c, D) at the blocks of the resized image, the map (3, 3) of pixel-centre
-    coordinates. Beyond the outermost centres their values count.
+    The map (3, 3) is of pixel-centre px; beyond the outermost centres their values count.
     """
     weights = []
     for axis, (count, length) in enumerate(zip(cells, values.shape[:2], strict=True)):

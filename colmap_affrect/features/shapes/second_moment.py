@@ -10,12 +10,12 @@ from typing import Annotated, ClassVar, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from colmap_affrect.conventions import grid_origin
 from colmap_affrect.data import GrayImage, ShapeGrid, ShapeSamples
 from colmap_affrect.features.base import FeatureOptions, NetworkContext, ShapeOptions
+from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.geometry.shapes import STEP_PX, log_metrics, metrics_from_log
 from colmap_affrect.options import within
 
@@ -46,17 +46,11 @@ class SecondMoment:
         network: NetworkContext | None = None,
         features: FeatureOptions | None = None,
     ) -> None:
-        """Keep the options; there is no network, and there are no keypoints."""
         del network, features
         self.options = options
 
     def grid(self, image: GrayImage) -> ShapeGrid:
-        """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
-
-        The tensor is averaged over blocks, then over each integration scale; the scales are
-        combined by the log-Euclidean mean of the unit metrics. Blocks whose gradients stay
-        under ``min_gradient`` are not textured and get the identity.
-        """
+        """Estimate a shape per 4 x 4 block of (H, W) uint8; identity under ``min_gradient``."""
         tensor = _block_tensor(image, self.options.derivative_sigma_px)
         sigmas_px = self.options.integration_sigmas_px
         mean_log = np.zeros((*tensor.shape[:2], 2), dtype=np.float32)
@@ -72,16 +66,16 @@ class SecondMoment:
         return self.grid(image).samples()
 
 
-def _smooth(tensor: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+def _smooth(tensor: Singles, sigma_px: float) -> Singles:
     return np.asarray(cv2.GaussianBlur(tensor, (0, 0), sigma_px / STEP_PX), dtype=np.float32)
 
 
-def _block_tensor(image: GrayImage, derivative_sigma_px: float) -> NDArray[np.float32]:
+def _block_tensor(image: GrayImage, derivative_sigma_px: float) -> Singles:
     """Return (R, C, 3) block means of (Ix^2, Iy^2, Ix Iy); gradients in gray values per px."""
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), derivative_sigma_px)
-    right = cv2.copyMakeBorder(smooth, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)
-    gradient_x = (right[1:-1, 2:] - right[1:-1, :-2]) / 2
-    gradient_y = (right[2:, 1:-1] - right[:-2, 1:-1]) / 2
+    gradient_x, gradient_y = (  # central differences
+        cv2.Sobel(smooth, cv2.CV_32F, dx, dy, ksize=1, scale=0.5) for dx, dy in ((1, 0), (0, 1))
+    )
     products = np.dstack([gradient_x**2, gradient_y**2, gradient_x * gradient_y])
     height, width = image.shape
     bottom, side = -height % STEP_PX, -width % STEP_PX
