@@ -32,7 +32,7 @@ class _Kept:
     bridges: tuple[Bridge, ...]
     taken_out: Mapping[str, str]
     rival_focals_px: Mapping[str, tuple[float, float]]
-    displaced: tuple[str, ...] = ()
+    loose: tuple[str, ...] = ()
 
 
 _KEPT = TypeAdapter(_Kept)
@@ -40,7 +40,7 @@ _KEPT = TypeAdapter(_Kept)
 
 def write_arrivals(model: MappedModel, folder: Path) -> None:
     """Keep what :func:`read_arrivals` needs; nothing where COLMAP's model says it all."""
-    kept = _Kept(model.bridges, model.taken_out, model.rival_focals_px, model.displaced)
+    kept = _Kept(model.bridges, model.taken_out, model.rival_focals_px, model.loose)
     if kept != _Kept((), {}, {}):
         replace_text(folder / FILE_NAME, _KEPT.dump_json(kept, indent=2).decode() + "\n")
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import num_long_tracks, registered_names, write_model
-from colmap_affrect.colmap.poses import disagreeing_images, model_poses
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.arrivals import arrivals, read_arrivals, write_arrivals
@@ -18,14 +17,13 @@ from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.doubts import find_doubts, without_impossible
 from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.last_adjustment import MIN_NUM_TRACKS, adjust_last
+from colmap_affrect.mappers.loose_cameras import loose_images
 from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.mappers.starts import (
-    Judged,
     Start,
     focals_px,
     rival_focals_px,
-    rivals_of_best,
     runaways,
     started,
     starts,
@@ -75,6 +73,8 @@ def map_database(
         best = _best_attempt(mapper, task, sparse_path, partial, next_image)
         if not task.extend and _adjust_weak(mapper, task, best):
             best = sorted(_possible(best, task), key=_size, reverse=True)
+        if best and not task.extend:
+            best[0] = replace(best[0], loose=loose_images(best[0].reconstruction, task))
         shutil.rmtree(sparse_path, ignore_errors=True)
         for index, model in enumerate(best):
             write_model(model.reconstruction, partial / str(index))
@@ -139,7 +139,7 @@ class _Attempts:
         self._most = self._limit + MAX_HOLDING_ATTEMPTS
         self._done = 0
         self._ran: set[int] = set()
-        self._judged: list[Judged] = []
+        self._focals: list[tuple[float, dict[str, float]]] = []
 
     def go_on(self, best: list[MappedModel]) -> bool:
         """Tell whether there is another attempt, after the best models so far."""
@@ -155,23 +155,16 @@ class _Attempts:
         return self._done < len(self._starts) and not _is_well_tied(best[0].reconstruction)
 
     def judge(self, found: list[MappedModel]) -> None:
-        """Keep how well the largest model of an attempt agrees with the pairs."""
+        """Keep how well the largest model of an attempt agrees with the pairs, and its focals."""
         if found and len(self._starts) > 1:
             model = found[0].reconstruction
-            score = graph_of(self._task).score_of(model)
-            self._judged.append(Judged(score, focals_px(model), model_poses(model)))
+            self._focals.append((graph_of(self._task).score_of(model), focals_px(model)))
 
     def with_rivals(self, best: list[MappedModel]) -> list[MappedModel]:
-        """Return models whose largest one knows what those as good as it say otherwise."""
-        rivals = rivals_of_best(self._judged)
-        if not best or not rivals:
+        """Return models whose largest one knows the focal lengths of those as good as it."""
+        if not self._focals:
             return best
-        poses = model_poses(best[0].reconstruction)
-        displaced = {name for each in rivals for name in disagreeing_images(poses, each.poses)}
-        first = replace(
-            best[0], rival_focals_px=rival_focals_px(rivals), displaced=tuple(sorted(displaced))
-        )
-        return [first, *best[1:]]
+        return [replace(best[0], rival_focals_px=rival_focals_px(self._focals)), *best[1:]]
 
     def next(
         self, database_path: Path, output_path: Path, show: Callable[[int], None]

@@ -135,14 +135,14 @@ class MappedModel:
         bridges: in the order in which they were made.
         taken_out: images that were certainly wrong and had to leave, with the reason.
         rival_focals_px: see :class:`~colmap_affrect.project.report.ModelSummary`.
-        displaced: images that models which agree as well with the pairs put elsewhere.
+        loose: images whose points do not tell the focal length.
     """
 
     reconstruction: pycolmap.Reconstruction
     bridges: tuple[Bridge, ...] = ()
     taken_out: Mapping[str, str] = field(default_factory=dict)
     rival_focals_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    displaced: tuple[str, ...] = ()
+    loose: tuple[str, ...] = ()
 
 
 class Mapper(Protocol):

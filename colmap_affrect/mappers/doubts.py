@@ -155,7 +155,7 @@ def _image_doubts(model: MappedModel, graph: PairGraph, task: MappingTask) -> Do
             ),
             *_place_doubts(near[image_id], len(registered) - 1),
             *_bridge_doubts(bridges.get(image.name)),
-            *_rival_doubts(image.name in model.displaced),
+            *_focal_doubts(image.name in model.loose),
         ]
         if found:
             reasons[image.name] = "; ".join(text for text, _ in found)
@@ -207,9 +207,9 @@ def _bridge_doubts(bridge: Bridge | None) -> Iterator[tuple[str, bool]]:
         yield f"bridged by {bridge.pair[0]}, where only {some} depths agree on the scale", False
 
 
-def _rival_doubts(is_displaced: bool) -> Iterator[tuple[str, bool]]:
-    if is_displaced:
-        yield "other models agree with the verified pairs as well and put it elsewhere", False
+def _focal_doubts(is_loose: bool) -> Iterator[tuple[str, bool]]:
+    if is_loose:
+        yield "any focal length fits, and where it stands depends on that", False
 
 
 def _model_doubts(model: MappedModel, graph: PairGraph) -> Iterator[str]:

@@ -69,12 +69,17 @@ def adjust_last(
     for image_id, index in zip(dropped >> 32, dropped & 0xFFFFFFFF, strict=True):
         if model.images[image_id].points2D[index].has_point3D():
             model.delete_observation(image_id, index)
+    adjust(model, robust_options(), constant_cameras)
+    return len(dropped)
+
+
+def robust_options() -> pycolmap.BundleAdjustmentOptions:
+    """Return options of an adjustment in which what fits well counts more."""
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = LOSS_SCALE_PX
     options.ceres.solver_options.num_threads = 1
-    adjust(model, options, constant_cameras)
-    return len(dropped)
+    return options
 
 
 def _keys(ties: Observations) -> NDArray[np.complex128]:
@@ -125,13 +130,19 @@ def adjust(
     constant_cameras: Collection[int],
 ) -> None:
     """Adjust a model, of which some cameras stay, and take out what does not fit."""
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        config.add_image(image_id)
+    config = config_of(model)
     for camera_id in constant_cameras:
         config.set_constant_cam_intrinsics(camera_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     for _ in range(NUM_ROUNDS):
         pycolmap.create_default_bundle_adjuster(options, config, model).solve()
         pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
     model.update_point_3d_errors()
+
+
+def config_of(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfig:
+    """Return the adjustment of all images of a model."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    return config

@@ -14,7 +14,6 @@ from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.camera_vote import apply_records
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.poses import Poses
 from colmap_affrect.mappers.base import MappingTask
 
 MIN_STEP = 1.15
@@ -128,39 +127,26 @@ def runaways(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:
     }
 
 
-@dataclass(frozen=True)
-class Judged:
-    """An attempt, as far as others are compared with it.
-
-    Attributes:
-        score: how well its largest model agrees with the verified pairs.
-        focals_px: of the camera of each image of this model.
-        poses: of the images.
-    """
-
-    score: float
-    focals_px: Mapping[str, float]
-    poses: Poses
-
-
 def focals_px(model: pycolmap.Reconstruction) -> dict[str, float]:
     """Return the focal length of the camera of each registered image."""
     images = (model.images[image_id] for image_id in model.reg_image_ids())
     return {image.name: model.cameras[image.camera_id].mean_focal_length() for image in images}
 
 
-def rivals_of_best(attempts: Sequence[Judged]) -> list[Judged]:
-    """Return the attempts that agree with the verified pairs as well as the best one does."""
-    least = MIN_SHARE_OF_RIVAL * max((attempt.score for attempt in attempts), default=0.0)
-    return [attempt for attempt in attempts if attempt.score >= least]
+def rival_focals_px(
+    attempts: Sequence[tuple[float, Mapping[str, float]]],
+) -> dict[str, tuple[float, float]]:
+    """Return lowest and highest focal length of images for which the best attempts differ.
 
-
-def rival_focals_px(attempts: Sequence[Judged]) -> dict[str, tuple[float, float]]:
-    """Return lowest and highest focal length of images for which attempts differ."""
+    Args:
+        attempts: how well each agrees with the verified pairs, and its focal lengths by image.
+    """
+    least = MIN_SHARE_OF_RIVAL * max(score for score, _ in attempts)
     rivals: dict[str, list[float]] = defaultdict(list)
-    for attempt in attempts:
-        for name, focal in attempt.focals_px.items():
-            rivals[name].append(focal)
+    for score, focals in attempts:
+        if score >= least:
+            for name, focal in focals.items():
+                rivals[name].append(focal)
     spreads = {name: (min(focals), max(focals)) for name, focals in sorted(rivals.items())}
     return {name: spread for name, spread in spreads.items() if spread[1] > MIN_STEP * spread[0]}
 

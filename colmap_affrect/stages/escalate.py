@@ -68,6 +68,10 @@ from colmap_affrect.stages.verify import (
     verify_new,
 )
 
+MIN_SHARE_KEPT = 0.9
+"""Of the inliers of measured frames in one geometry with others. Right ones keep 95 per cent and
+more; wrong matches of a similar side bend the geometry, which then loses a quarter of them."""
+
 
 def recorded_escalation(workspace: Workspace) -> EscalateOptions:
     """Return the options on record of escalation, done or still to be done."""
@@ -415,7 +419,7 @@ class Escalation:
         explained = self._inliers(united, verifier)
         is_measured = bool(self.measured(found.names, inliers).all())
         measured = inliers if is_measured else others
-        if self.measured(found.names, explained).sum() >= MIN_SHARE * len(measured):
+        if self.measured(found.names, explained).sum() >= MIN_SHARE_KEPT * len(measured):
             return united, (len(explained), 0)
         return found, (math.inf if is_measured else 0, 0)
 

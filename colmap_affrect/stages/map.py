@@ -94,7 +94,8 @@ def map_images(
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models, num_rejected = _map(context, mapper, task, advance)
-    if not is_copy(workspace) and _num_registered(models) < min(num_images, LARGE_MODEL):
+    is_whole = _num_registered(models) >= min(num_images, LARGE_MODEL)
+    if not is_copy(workspace) and not (is_whole and models[0].is_trustworthy):
         models = _or_first_level(context, mapper, task, models)
     warnings = {}
     if num_rejected:
@@ -155,17 +156,18 @@ def _or_first_level(
 ) -> list[ModelSummary]:
     """Keep the models of the pairs as they were before they climbed, where those have more images.
 
-    So escalation never loses an image; but a model that is doubtful as a whole does not take the
-    place of one that is not.
+    So escalation never loses an image; but a model that is doubtful does not take the place of one
+    that is not.
     """
     with first_level_database(context) as path:
-        if path is None or _num_tied(context, path) <= _num_registered(models):
+        least = _num_registered(models) if models and models[0].is_trustworthy else 0
+        if path is None or _num_tied(context, path) <= least:
             return models
         sparse = path.with_name("sparse")
         firsts = map_database(mapper, replace(task, database_path=path), sparse, _ignore)
         if _rank(firsts) <= _rank(models):
             return models
-        logger.info("the model of the pairs before they climbed has more images and is kept")
+        logger.info("the model of the pairs before they climbed is better and is kept")
         rmtree(context.workspace.sparse)
         sparse.rename(context.workspace.sparse)
     return firsts

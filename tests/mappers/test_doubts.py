@@ -209,6 +209,15 @@ def test_images_of_nearly_one_place(tmp_path: Path, share: float, num_doubted: i
     assert doubted == [image.name for image in images[:num_doubted]]
 
 
+def test_images_whose_points_do_not_tell_their_focal_length(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    name = last(model).name
+    doubts = find_doubts(dataclasses.replace(model, loose=(name,)), task)
+    assert list(doubts.images) == [name]
+    assert "any focal length fits" in doubts.images[name]
+    assert doubts.impossible == ()
+
+
 def test_tracks_of_two_views_tie_nothing_unless_images_are_bridged(tmp_path: Path) -> None:
     model, task = scene(tmp_path)
     for point_id in sorted(model.reconstruction.point3D_ids()):

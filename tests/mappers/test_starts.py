@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from mapping_tasks import ALL_GIVEN, WHOLE
 
@@ -21,16 +20,13 @@ from colmap_affrect.mappers.base import MAPPERS, Bridge, MappedModel, MapperOpti
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.mappers.starts import (
     MAX_EXCESS,
-    Judged,
     Start,
     is_within,
     rival_focals_px,
-    rivals_of_best,
     runaways,
     started,
     starts,
 )
-from colmap_affrect.project.report import ModelSummary
 
 TRUE_FOCAL, NUM_IMAGES = 1280.0, 4
 VAGUE = CameraRecord(("a",), "guess", 1000.0, 500.0, 2000.0, size=(1024, 768))
@@ -130,12 +126,10 @@ def mapped(
     tmp_path: Path,
     mapper: object,
     cameras: dict[int, CameraRecord],
-) -> list[ModelSummary]:
+) -> None:
     task = MappingTask(scene[0], None, cameras=cameras)
-    sparse_path = tmp_path / "sparse"
-    models = map_database(mapper, task, sparse_path, lambda _: None)  # type: ignore[arg-type]
+    map_database(mapper, task, tmp_path / "sparse", lambda _: None)  # type: ignore[arg-type]
     assert not (tmp_path / "sparse.partial").exists()
-    return models
 
 
 def without(
@@ -176,9 +170,7 @@ def test_rivals_agree_as_well_with_the_pairs_and_differ_by_more_than_a_step() ->
     best, worse = {"a": 1000.0, "b": 500.0, "c": 800.0}, {"a": 100.0}
     rival, other = {"a": 1300.0, "b": 550.0}, {"a": 900.0, "b": 500.0}
     attempts = [(0.96, worse), (1.0, best), (0.98, rival), (0.97, other)]
-    rivals = rivals_of_best([Judged(score, focals, {}) for score, focals in attempts])
-    assert [each.focals_px for each in rivals] == [best, rival, other]
-    assert rival_focals_px(rivals) == {"a": (900.0, 1300.0)}
+    assert rival_focals_px(attempts) == {"a": (900.0, 1300.0)}
 
 
 def test_focal_lengths_that_pairs_cannot_tell_apart_are_kept_beside_the_model(
@@ -194,32 +186,6 @@ def test_focal_lengths_that_pairs_cannot_tell_apart_are_kept_beside_the_model(
     (name,) = (image.name for image in scene[1].images.values() if image.camera_id == 2)
     read = read_arrivals(pycolmap.Reconstruction(folder), folder)
     assert read.rival_focals_px == {name: (1150.0, 1360.0)}
-    assert read.displaced == ()
-
-
-def test_images_that_a_model_as_good_puts_elsewhere_are_doubtful(
-    scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    moved: list[str] = []
-
-    def answer(_: MappingTask) -> list[MappedModel]:
-        found = without(scene, 0)
-        model = found[0].reconstruction
-        if not moved:
-            image = model.images[max(model.reg_image_ids())]
-            turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.2, 0.0])), np.zeros(3))
-            model.frame(image.frame_id).rig_from_world = turn * image.cam_from_world()
-            moved.append(image.name)
-        return found
-
-    monkeypatch.setattr(attempts, "MIN_NUM_TRACKS", 1_000)
-    monkeypatch.setattr(attempts, "_possible", lambda models, _: models)  # it would be taken out
-    cameras = {**records(scene, replace(KNOWN, focal_px=TRUE_FOCAL)), 2: VAGUE}
-    for share, expected in ((0.0, moved), (1.0, [])):
-        moved.clear()
-        monkeypatch.setattr(module, "MIN_SHARE_OF_RIVAL", share)
-        summary = mapped(scene, tmp_path, Recorder(answer), cameras)[0]
-        assert [name for name, why in summary.doubtful.items() if "elsewhere" in why] == expected
 
 
 def test_a_camera_that_ran_away_is_held(
