@@ -12,7 +12,7 @@ from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import num_long_tracks, registered_names, write_model
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.errors import StoreError
-from colmap_affrect.mappers.arrivals import arrivals, read_arrivals, write_arrivals
+from colmap_affrect.mappers.arrivals import arrivals
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.doubts import find_doubts, without_impossible
 from colmap_affrect.mappers.existing import require_extends
@@ -28,6 +28,7 @@ from colmap_affrect.mappers.starts import (
     started,
     starts,
 )
+from colmap_affrect.mappers.summaries import read_summary, write_summary
 from colmap_affrect.project.report import ModelSummary
 
 ATTEMPT_SEED_STEP = 1_000_003
@@ -76,13 +77,15 @@ def map_database(
         if best and not task.extend:
             best[0] = replace(best[0], loose=loose_images(best[0].reconstruction, task))
         shutil.rmtree(sparse_path, ignore_errors=True)
+        summaries = []
         for index, model in enumerate(best):
             write_model(model.reconstruction, partial / str(index))
-            write_arrivals(model, partial / str(index))
+            summaries.append(summarize(model, task))
+            write_summary(summaries[-1], partial / str(index))
         partial.rename(sparse_path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return [summarize(model, task) for model in best]
+    return summaries
 
 
 def _best_attempt(
@@ -221,17 +224,24 @@ def better(
 
 
 def read_models(sparse_path: Path, task: MappingTask) -> list[ModelSummary]:
-    """Summarize the models that :func:`map_database` wrote for a task."""
+    """Return the summaries of the models that :func:`map_database` wrote for a task.
+
+    A model that was changed since is judged anew.
+    """
     folders = sorted(
         (p for p in sparse_path.iterdir() if p.name.isdigit()), key=lambda p: int(p.name)
     )
-    for folder in folders:
-        try:
-            registered_names(folder)
-        except StoreError as error:
-            raise StoreError(f"{error}; run map again with --overwrite") from error
-    models = (read_arrivals(pycolmap.Reconstruction(folder), folder) for folder in folders)
-    return [summarize(model, task) for model in models]
+    return [read_summary(folder) or _judged_anew(folder, task) for folder in folders]
+
+
+def _judged_anew(folder: Path, task: MappingTask) -> ModelSummary:
+    try:
+        registered_names(folder)  # pycolmap's reader may never end on a damaged file
+    except StoreError as error:
+        raise StoreError(f"{error}; run map again with --overwrite") from error
+    summary = summarize(MappedModel(pycolmap.Reconstruction(folder)), task)
+    write_summary(summary, folder)
+    return summary
 
 
 def summarize(mapped: MappedModel, task: MappingTask) -> ModelSummary:

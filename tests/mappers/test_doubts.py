@@ -12,9 +12,8 @@ from mapping_tasks import task_with_given_cameras
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import inlier_matches
-from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.parallax import mirrored_share
-from colmap_affrect.mappers.arrivals import FILE_NAME, arrivals, read_arrivals, write_arrivals
+from colmap_affrect.mappers.arrivals import arrivals
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 from colmap_affrect.mappers.doubts import find_doubts, without_impossible
 from colmap_affrect.project.report import Arrival
@@ -252,29 +251,14 @@ def test_bridges_of_uncertain_scale(
     assert doubts.impossible == ()
 
 
-def test_how_images_came_in_is_kept_beside_the_model(tmp_path: Path) -> None:
+def test_how_images_came_in(tmp_path: Path) -> None:
     model, task = scene(tmp_path)
     name = last(model).name
     bridge = Bridge(("a.jpg", name), (name,), 32, 36, 0.031)
-    mapped = MappedModel(
-        model.reconstruction,
-        (bridge,),
-        {"č.jpg": "only 3 points hold it"},
-        {name: (700.0, 900.0)},
-        (name,),
-    )
-    write_arrivals(mapped, tmp_path)
-    read = read_arrivals(model.reconstruction, tmp_path)
-    assert dataclasses.replace(read, reconstruction=None) == dataclasses.replace(
-        mapped, reconstruction=None
-    )
-    found = arrivals(read, task)
+    found = arrivals(MappedModel(model.reconstruction, (bridge,)), task)
     assert found.pop(name) == Arrival("bridged", "a.jpg", 32, 36, 0.031)
     assert set(found.values()) == {Arrival("tracks")}
     assert Arrival("tracks").to_mapping() == {"how": "tracks"}
-    (tmp_path / FILE_NAME).write_text('{"bridges": [1]}')
-    with pytest.raises(StoreError, match="damaged"):
-        read_arrivals(model.reconstruction, tmp_path)
 
 
 def test_image_tied_by_guided_matches_only(tmp_path: Path) -> None:

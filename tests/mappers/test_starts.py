@@ -14,7 +14,6 @@ from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers import starts as module
-from colmap_affrect.mappers.arrivals import read_arrivals
 from colmap_affrect.mappers.attempts import MAX_HOLDING_ATTEMPTS, map_database
 from colmap_affrect.mappers.base import MAPPERS, Bridge, MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.incremental import IncrementalOptions
@@ -27,6 +26,7 @@ from colmap_affrect.mappers.starts import (
     started,
     starts,
 )
+from colmap_affrect.mappers.summaries import read_summary
 
 TRUE_FOCAL, NUM_IMAGES = 1280.0, 4
 VAGUE = CameraRecord(("a",), "guess", 1000.0, 500.0, 2000.0, size=(1024, 768))
@@ -182,9 +182,9 @@ def test_focal_lengths_that_pairs_cannot_tell_apart_are_kept_beside_the_model(
     mapper = Recorder(lambda _: without(scene, 0, c2=next(focals)))
     cameras = {**records(scene, replace(KNOWN, focal_px=TRUE_FOCAL)), 2: VAGUE}
     mapped(scene, tmp_path, mapper, cameras)
-    folder = tmp_path / "sparse" / "0"
     (name,) = (image.name for image in scene[1].images.values() if image.camera_id == 2)
-    read = read_arrivals(pycolmap.Reconstruction(folder), folder)
+    read = read_summary(tmp_path / "sparse" / "0")
+    assert read
     assert read.rival_focals_px == {name: (1150.0, 1360.0)}
 
 
@@ -229,8 +229,9 @@ def test_images_that_the_last_adjustment_leaves_without_points_are_taken_out(
     bridge = Bridge(("a", "b"), ("b",), 20, 20, 0.01)
     mapper = Recorder(lambda _: [replace(m, bridges=(bridge,)) for m in without(scene, 0)])
     mapped(scene, tmp_path, mapper, records(scene, KNOWN))
-    model = read_arrivals(pycolmap.Reconstruction(tmp_path / "sparse" / "0"), tmp_path / "sparse/0")
-    assert model.reconstruction.num_reg_images() == NUM_IMAGES - 1
+    model = read_summary(tmp_path / "sparse" / "0")
+    assert model
+    assert len(model.registered_names) == NUM_IMAGES - 1
     assert list(model.taken_out.values()) == ["only 3 points hold it"]
 
 
