@@ -166,17 +166,18 @@ def _cost_rows(methods: Sequence[MethodResult]) -> list[Row]:
 
 
 def span_text(span: Span | None, digits: int = 1, digits_of_ends: int = 0) -> str:
-    """Write a mean, and the range where it is one.
+    """Write a mean, and the range where its ends differ as they are written.
 
     >>> span_text(Span.of([7, 8])), span_text(Span.of([8, 8])), span_text(None)
     ('7.5 (7-8)', '8.0', '-')
+    >>> span_text(Span.of([2.891, 2.893]), 2, 2)
+    '2.89'
     """
     if span is None:
         return NOTHING
     mean = f"{span.mean:,.{digits}f}"
-    if span.min == span.max:
-        return mean
-    return f"{mean} ({span.min:,.{digits_of_ends}f}-{span.max:,.{digits_of_ends}f})"
+    low, high = (f"{end:,.{digits_of_ends}f}" for end in (span.min, span.max))
+    return mean if low == high else f"{mean} ({low}-{high})"
 
 
 def _splits(method: MethodResult) -> str:

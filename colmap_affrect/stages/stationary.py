@@ -71,21 +71,24 @@ class StationaryFilter:
         """Name the files; what is known of places is read now."""
         self._features, self._matches = features, matches
         self._points = lru_cache(256)(lambda name: features.read_frames(name)[:, :, 2])
-        self._places = {
-            size: _enlarged(cells) for size, cells in matches.stationary_cells().items()
-        }
+        self._places = {size: _mask(cells) for size, cells in matches.stationary_cells().items()}
 
     @cached_property
     def _sizes(self) -> dict[str, Size]:
         return self._features.image_sizes()
 
     def filtered(self, found: PairMatches) -> PairMatches:
-        """Return the matches of a pair without those that never move."""
+        """Return the matches of a pair without those that never move.
+
+        Nor those from one place where nothing moves to another, as of equal letters of a caption;
+        what never moves is looked for beside these places too, since what is faint matches less.
+        """
         size = self._common_size(found.names) if self._places else None
         if size is None or size not in self._places:
             return found
-        still, cells = self._still(found, size)
-        left = ~(still & self._places[size][cells[:, 1], cells[:, 0]])
+        still, first, second = self._still(found, size)
+        places = self._places[size]
+        left = ~(still & _at(grown(places, 1), first) | _at(places, first) & _at(places, second))
         return replace(found, indices=found.indices[left], scores=found.scores[left])
 
     def learn(self, pairs: Sequence[Pair]) -> str:
@@ -99,7 +102,7 @@ class StationaryFilter:
             return ""
         for size, cells in found.items():
             known[size] = np.unique(np.concatenate([known.get(size, cells), cells]), axis=0)
-            self._places[size] = _enlarged(known[size])
+            self._places[size] = _mask(known[size])
         self._matches.record_stationary_cells(known)
         num_pairs = num_matches = 0
         for pair in pairs:
@@ -124,20 +127,22 @@ class StationaryFilter:
         for found in self._matches.read(alike):
             size = self._sizes[found.names[0]]
             of_size = evidence.setdefault(size, _Evidence.empty(size))
-            still, cells = self._still(found, size)
+            still, cells, _ = self._still(found, size)
             of_size.matched[tuple(np.unique(cells, axis=0).T[::-1])] += 1
             for column, row in np.unique(cells[still], axis=0).tolist():
                 of_size.still[row, column] += 1
                 of_size.images[column, row].update(found.names)
         return {size: np.argwhere(e.places())[:, ::-1] for size, e in evidence.items()}
 
-    def _still(self, found: PairMatches, size: Size) -> tuple[Mask, NDArray[np.int64]]:
-        """Tell which matches do not move; also the (M, 2) cells, column and row, they begin in."""
+    def _still(
+        self, found: PairMatches, size: Size
+    ) -> tuple[Mask, NDArray[np.int64], NDArray[np.int64]]:
+        """Tell which matches do not move; also the (M, 2) cells, column and row, of both ends."""
         first, second = (
             self._points(name)[found.indices[:, side]] for side, name in enumerate(found.names)
         )
         motion = np.linalg.norm(second - first, axis=1)
-        return motion <= MAX_MOTION_FRAC * max(size), _cells(first, size)
+        return motion <= MAX_MOTION_FRAC * max(size), _cells(first, size), _cells(second, size)
 
     def _common_size(self, pair: Pair) -> Size | None:
         size = self._sizes[pair[0]]
@@ -150,8 +155,13 @@ def _cells(points: NDArray[np.floating], size: Size) -> NDArray[np.int64]:
     return np.asarray(inside * (NUM_CELLS / max(size)), np.int64)
 
 
-def _enlarged(cells: NDArray[np.int64]) -> Mask:
-    """Return a mask of cells and those beside them: what is faint there matches less often."""
+def _mask(cells: NDArray[np.int64]) -> Mask:
+    """Return a mask of (N, 2) cells, column and row."""
     mask = np.zeros((NUM_CELLS, NUM_CELLS), bool)
     mask[cells[:, 1], cells[:, 0]] = True
-    return grown(mask, 1)
+    return mask
+
+
+def _at(mask: Mask, cells: NDArray[np.int64]) -> Mask:
+    """Look up (N, 2) cells, column and row."""
+    return np.asarray(mask[cells[:, 1], cells[:, 0]])

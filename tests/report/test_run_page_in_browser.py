@@ -89,3 +89,9 @@ def test_hostile_names_stay_text(browser: Browser) -> None:
 @pytest.mark.parametrize("width", [390, 1400])
 def test_page_fits_and_is_readable(browser: Browser, scheme: str, width: int) -> None:
     assert_fits_and_is_readable(browser, scheme, width)
+
+
+def test_no_table_scrolls_on_a_phone(browser: Browser) -> None:
+    browser.resize(390)
+    table = "const table = document.querySelector('.scroll');"
+    assert browser.run(f"{table} return table.scrollWidth - table.clientWidth") == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -65,6 +66,21 @@ def test_pair_that_is_matched_later_is_filtered_by_what_is_known(tmp_path: Path)
     StationaryFilter(features, matches).learn(pairs)
     again = StationaryFilter(features, MatchStore(matches.path)).filtered(given)
     assert len(again.indices) == len(SCENE)
+
+
+def test_match_of_equal_letters_at_two_places_of_a_caption_is_left_out(tmp_path: Path) -> None:
+    """It moves, as a match of the scene does, but both of its ends are where nothing moves."""
+    features, matches, pairs = stores(tmp_path, scans(4))
+    given = next(matches.read(pairs))
+    StationaryFilter(features, matches).learn(pairs)
+    swapped = given.indices.copy()
+    swapped[len(SCENE) :, 1] = swapped[: len(SCENE) - 1 : -1, 1]
+    to_caption = replace(given, indices=np.roll(given.indices, len(CAPTION), axis=0))
+    to_caption.indices[:, 0] = given.indices[:, 0]  # from the scene to the caption and back
+    again = StationaryFilter(features, MatchStore(matches.path))
+    assert len(again.filtered(replace(given, indices=swapped)).indices) == len(SCENE)
+    kept = again.filtered(to_caption).indices
+    assert len(kept) == len(SCENE) + len(CAPTION)
 
 
 def test_call_that_was_killed_is_repeated_to_the_same_result(
