@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 
 from colmap_affrect.conventions import is_inside
 from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Singles
 
-GrayImage = NDArray[np.uint8]
-"""(H, W) gray values, 0.299 R + 0.587 G + 0.114 B."""
-
-ColorImage = NDArray[np.uint8]
-"""(H, W, 3) red, green, blue."""
-
-Mask = NDArray[np.bool_]
-View = tuple[GrayImage | ColorImage, NDArray[np.uint8] | None]
+GrayImage = Bytes  # (H, W) gray values, 0.299 R + 0.587 G + 0.114 B
+ColorImage = Bytes  # (H, W, 3) red, green, blue
+Mask = Bools
+View = tuple[GrayImage | ColorImage, Bytes | None]
 """An image or a warp to find features in, and where (mask not 0; everywhere if it is None)."""
 
 
@@ -29,25 +26,15 @@ def _require(condition: bool, message: str) -> None:
 
 @dataclass(frozen=True)
 class Photograph:
-    """An image as rectifiers and depth sources see it.
+    """An image as rectifiers and depth sources see it."""
 
-    Attributes:
-        gray: (H, W) uint8 at the size of processing, at most ``max_image_size_px``.
-        name: relative POSIX path below the image folder, the key of depth maps.
-        path: the file; None for an image that was never one.
-        camera_matrix: (3, 3) pinhole intrinsics in pixel-centre px of ``gray``.
-        mask: (H, W) bool, where features may be; None means everywhere.
-        color: (H, W, 3), for feature extractors that ask for it.
-        stretched: whether its contrast was low, and its tones have been stretched.
-    """
-
-    gray: GrayImage
-    name: str
-    path: Path | None
-    camera_matrix: NDArray[np.float64]
-    mask: Mask | None = None
-    color: ColorImage | None = None
-    stretched: bool = False
+    gray: GrayImage  # (H, W) uint8 at the size of processing, at most ``max_image_size_px``
+    name: str  # relative POSIX path below the image folder, the key of depth maps
+    path: Path | None  # the file; None for an image that was never one
+    camera_matrix: Array  # (3, 3) pinhole intrinsics in pixel-centre px of ``gray``
+    mask: Mask | None = None  # (H, W) bool, where features may be; None means everywhere
+    color: ColorImage | None = None  # (H, W, 3), for feature extractors that ask for it
+    stretched: bool = False  # whether its contrast was low, and its tones have been stretched
 
     @property
     def size(self) -> tuple[int, int]:
@@ -57,32 +44,20 @@ class Photograph:
 
 @dataclass(frozen=True)
 class ShapeSamples:
-    """Affine shapes at points of an image.
+    """Affine shapes at points of an image."""
 
-    Attributes:
-        points: (N, 2) pixel-centre px.
-        metrics: (N, 3) unit metrics (S11, S22, S12) of the *rectifying* maps.
-    """
-
-    points: NDArray[np.float64]
-    metrics: NDArray[np.floating]
+    points: Array  # (N, 2) pixel-centre px
+    metrics: Floats  # (N, 3) unit metrics (S11, S22, S12) of the *rectifying* maps
 
 
 @dataclass(frozen=True)
 class ShapeGrid:
-    """Affine shapes on a regular grid over an image; what every dense shape source returns.
+    """Affine shapes on a regular grid over an image; what every dense shape source returns."""
 
-    Attributes:
-        metrics: (R, C, 3) unit metrics (S11, S22, S12) of the *rectifying* maps.
-        textured: (R, C) bool, False where the image has no structure to read a shape from.
-        origin_px: centre of cell (0, 0) in x and in y, pixel-centre px.
-        step_px: distance of neighbouring cells in px.
-    """
-
-    metrics: NDArray[np.floating]
-    textured: Mask
-    origin_px: float
-    step_px: int
+    metrics: Floats  # (R, C, 3) unit metrics (S11, S22, S12) of the *rectifying* maps
+    textured: Mask  # (R, C) bool, False where the image has no structure to read a shape from
+    origin_px: float  # centre of cell (0, 0) in x and in y, pixel-centre px
+    step_px: int  # distance of neighbouring cells in px
 
     def __post_init__(self) -> None:
         _require(
@@ -99,19 +74,14 @@ class ShapeGrid:
 
 @dataclass(frozen=True)
 class LocalFeatures:
-    """Local features of one image as full local affine frames.
+    """Local features of one image as full local affine frames."""
 
-    Attributes:
-        lafs: (N, 2, 3) float64 frames in image px; x = A u + c maps the unit circle to the
-            measurement ellipse (conventions, item 6); det A > 0.
-        responses: (N,) float32 detector responses, > 0.
-        descriptors: (N, D) float32 of unit length; D = 0 before they are described.
-        rectification_ids: (N,) int32, the warp each feature comes from; 0 is the image itself.
-    """
-
-    lafs: NDArray[np.float64]
-    responses: NDArray[np.float32]
-    descriptors: NDArray[np.float32]
+    # (N, 2, 3) float64 frames in image px; x = A u + c maps the unit circle to the measurement
+    # ellipse (conventions, item 6); det A > 0
+    lafs: Array
+    responses: Singles  # (N,) float32 detector responses, > 0
+    descriptors: Singles  # (N, D) float32 of unit length; D = 0 before they are described
+    # (N,) int32, the warp each feature comes from; 0 is the image itself
     rectification_ids: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
     def __post_init__(self) -> None:
@@ -132,12 +102,12 @@ class LocalFeatures:
         return len(self.lafs)
 
     @property
-    def keypoints(self) -> NDArray[np.float64]:
+    def keypoints(self) -> Array:
         """(N, 2) centres of the frames, pixel-centre px."""
         return self.lafs[:, :, 2]
 
     @property
-    def scales(self) -> NDArray[np.float64]:
+    def scales(self) -> Array:
         """(N,) geometric mean radius sqrt(det A) of the measurement ellipses in px."""
         return np.asarray(np.sqrt(determinants(self.lafs[:, :, :2])))
 
@@ -159,7 +129,7 @@ class LocalFeatures:
             np.zeros((0, descriptor_size), np.float32),
         )
 
-    def with_frames(self, lafs: NDArray[np.float64]) -> LocalFeatures:
+    def with_frames(self, lafs: Array) -> LocalFeatures:
         """Replace the frames."""
         return replace(self, lafs=lafs)
 
@@ -207,7 +177,7 @@ class Rectification:
         segment_id: the segment of the image it belongs to, from 0; several warps may share one.
     """
 
-    rectified_from_image: NDArray[np.float64]
+    rectified_from_image: Array
     canvas_size: tuple[int, int]
     region: Mask | None
     tilt: float
@@ -215,14 +185,14 @@ class Rectification:
     region_origin: tuple[int, int] = (0, 0)
     segment_id: int = 0
 
-    def in_region(self, points: NDArray[np.floating]) -> Mask:
+    def in_region(self, points: Floats) -> Mask:
         """Tell which (N, 2) points, rounded to pixels of the image, belong to the region."""
         if self.region is None:
             return np.ones(len(points), dtype=bool)
         return in_mask(self.region, points, self.region_origin)
 
     @property
-    def image_from_rectified(self) -> NDArray[np.float64]:
+    def image_from_rectified(self) -> Array:
         """(3, 3) inverse map."""
         return np.asarray(np.linalg.inv(self.rectified_from_image), dtype=np.float64)
 
@@ -237,7 +207,7 @@ class Rectification:
         return bool(np.array_equal(self.rectified_from_image[2], [0.0, 0.0, 1.0]))
 
 
-def in_mask(mask: Mask, points: NDArray[np.floating], origin: tuple[int, int] = (0, 0)) -> Mask:
+def in_mask(mask: Mask, points: Floats, origin: tuple[int, int] = (0, 0)) -> Mask:
     """Tell which (N, 2) points, rounded to pixels, an (h, w) mask holds that begins at origin."""
     height, width = mask.shape
     columns, rows = (np.rint(points).astype(int) - origin).T
@@ -252,20 +222,15 @@ class RectificationPlan:
 
     The image itself is always looked at and not listed. Warp k of ``items`` has the
     rectification id k + 1.
-
-    Attributes:
-        image_size: (width, height) in px.
-        items: the warps; may be empty.
-        original_region: (H, W) bool, where features of the image itself are kept; None
-            means everywhere.
-        replaces_original: a feature of the image itself gives way to one of a warp at the same
-            place and scale. For disjoint regions, each with the map that suits it best; where
-            several warps show the same place none of them is better than the image for sure.
     """
 
-    image_size: tuple[int, int]
-    items: tuple[Rectification, ...] = ()
+    image_size: tuple[int, int]  # (width, height) in px
+    items: tuple[Rectification, ...] = ()  # the warps; may be empty
+    # (H, W) bool, where features of the image itself are kept; None means everywhere
     original_region: Mask | None = None
+    # a feature of the image itself gives way to one of a warp at the same place and scale. For
+    # disjoint regions, each with the map that suits it best; where several warps show the same
+    # place none of them is better than the image for sure.
     replaces_original: bool = False
 
     @property

@@ -33,10 +33,8 @@ MAX_SEED = 2_000_000_000
 """COLMAP keeps seeds in 32 bits, and those of repeated mapping are larger than the one given."""
 PLAIN_NAMES = {"model": "options", "dict": "options", "tuple": "list"}
 """What pydantic's names of types are called in messages."""
-MAX_COMMENT = 96
-"""Width of comments in printed options."""
-CUSTOM = "custom"
-"""Name of options that are no preset."""
+MAX_COMMENT = 96  # width of comments in printed options
+CUSTOM = "custom"  # name of options that are no preset
 
 
 def within(low: float, high: float) -> Any:
@@ -141,19 +139,13 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True)
 class Registry(Generic[Part]):
-    """The exchangeable parts of one kind, by name.
+    """The exchangeable parts of one kind, by name."""
 
-    Attributes:
-        kind: what they are called in messages.
-        group: of the entry points by which other packages add theirs.
-        built_in: ``module:Class`` of those of this package; modules are imported when needed.
-        default: name of the part where none is given.
-    """
-
-    kind: str
-    group: str
+    kind: str  # what they are called in messages
+    group: str  # of the entry points by which other packages add theirs
+    # ``module:Class`` of those of this package; modules are imported when needed
     built_in: Mapping[str, str]
-    default: str
+    default: str  # name of the part where none is given
 
     def names(self) -> list[str]:
         """Return the names of all parts, those of this package first."""

@@ -84,30 +84,20 @@ def holds_vote(focal_vote: FocalVote, mapping: MapperOptions, *, is_others: bool
 
 @dataclass(frozen=True, kw_only=True)
 class InputOptions:
-    """What runs and comparisons of methods both depend on, beside images and recipes.
+    """What runs and comparisons of methods both depend on, beside images and recipes."""
 
-    Attributes:
-        cameras: how images share cameras.
-        masks: where features may be.
-        pairs: how the pairs to match are chosen.
-        verification: thresholds of two-view geometry.
-        mapping: mapper and its options.
-        image_list_path: list of the images to use; None for all below the folder.
-        from_database: COLMAP database whose images, cameras, rigs, frames and pose priors are
-            used; it stays as it is.
-        resources: weights and device of networks.
-        focal_vote: whether verified pairs vote on cameras that nobody knows.
-    """
-
-    cameras: CameraOptions = field(default_factory=CameraOptions)
-    masks: MaskOptions = field(default_factory=MaskOptions)
-    pairs: PairOptions = field(default_factory=PairOptions)
+    cameras: CameraOptions = field(default_factory=CameraOptions)  # how images share cameras
+    masks: MaskOptions = field(default_factory=MaskOptions)  # where features may be
+    pairs: PairOptions = field(default_factory=PairOptions)  # how the pairs to match are chosen
+    # thresholds of two-view geometry
     verification: VerificationOptions = field(default_factory=VerificationOptions)
-    mapping: MapperOptions = field(default_factory=SparseOptions)
-    image_list_path: Path | None = None
+    mapping: MapperOptions = field(default_factory=SparseOptions)  # mapper and its options
+    image_list_path: Path | None = None  # list of the images to use; None for all below the folder
+    # COLMAP database whose images, cameras, rigs, frames and pose priors are used; it stays as it
+    # is
     from_database: Path | None = None
-    resources: Resources = field(default_factory=Resources)
-    focal_vote: FocalVote = "auto"
+    resources: Resources = field(default_factory=Resources)  # weights and device of networks
+    focal_vote: FocalVote = "auto"  # whether verified pairs vote on cameras that nobody knows
 
     @property
     def holds_vote(self) -> bool:
@@ -127,17 +117,13 @@ class InputOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(InputOptions):
-    """Everything a run depends on beside its images and its output folder.
+    """Everything a run depends on beside its images and its output folder."""
 
-    Attributes:
-        recipe: options of extraction and matching.
-        database_descriptors: also write descriptors into the database, as COLMAP's matchers
-            need them.
-        extend: register the photographs into this model instead of beginning one.
-    """
-
+    # options of extraction and matching
     recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
+    # also write descriptors into the database, as COLMAP's matchers need them
     database_descriptors: bool = False
+    # register the photographs into this model instead of beginning one
     extend: Extension | None = None
 
     def forecast(self, num_images: int) -> Forecast:

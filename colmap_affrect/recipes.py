@@ -45,21 +45,14 @@ class LevelOptions(Options):
 
 @dataclass(frozen=True)
 class Level:
-    """One way to look at images and match them, all of it known.
+    """One way to look at images and match them, all of it known."""
 
-    Attributes:
-        rectifier: which warps.
-        features: of the image and the warps.
-        max_image_size_px: larger images are shrunk to this longer side.
-        matching: how pairs are matched; None as the recipe says.
-        base: the lowest level with such features. It has those of the image itself, which are
-            matched together with those of this level.
-    """
-
-    rectifier: RectifierOptions
-    features: FeatureOptions
-    max_image_size_px: int
-    matching: MatcherOptions | None
+    rectifier: RectifierOptions  # which warps
+    features: FeatureOptions  # of the image and the warps
+    max_image_size_px: int  # larger images are shrunk to this longer side
+    matching: MatcherOptions | None  # how pairs are matched; None as the recipe says
+    # the lowest level with such features. It has those of the image itself, which are matched
+    # together with those of this level.
     base: int
 
     @property
@@ -159,24 +152,16 @@ class RecipeOptions(ExtractionOptions):
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a recipe decides, resolved once.
+    """What a recipe decides, resolved once."""
 
-    Attributes:
-        name: its name, or the path it was read from.
-        summary: one line for people.
-        extraction: everything that decides the features of an image.
-        matching: the matcher.
-        escalate: which pairs climb.
-        guided: guided matching.
-        mapping: the mapper's ``name`` and options that differ from the preset.
-    """
-
-    name: str
-    summary: str = ""
+    name: str  # its name, or the path it was read from
+    summary: str = ""  # one line for people
+    # everything that decides the features of an image
     extraction: ExtractionOptions = field(default_factory=ExtractionOptions)
-    matching: MatcherOptions = field(default_factory=NearestOptions)
-    escalate: EscalateOptions = field(default_factory=EscalateOptions)
-    guided: GuidedOptions = field(default_factory=GuidedOptions)
+    matching: MatcherOptions = field(default_factory=NearestOptions)  # the matcher
+    escalate: EscalateOptions = field(default_factory=EscalateOptions)  # which pairs climb
+    guided: GuidedOptions = field(default_factory=GuidedOptions)  # guided matching
+    # the mapper's ``name`` and options that differ from the preset
     mapping: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod

@@ -11,13 +11,13 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.two_views import PLANAR
 from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES, ExtractedPx, of_pair
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.focal_evidence import MatchedPair
 from colmap_affrect.geometry.focal_vote import (
     Ballot,
@@ -32,22 +32,12 @@ from colmap_affrect.progress import SILENT, Advance, Progress
 MIN_NUM_INLIERS = 20
 """Of a pair that votes; a fundamental matrix of few more than it needs says nothing else."""
 
-MATCH_ERROR_PX = 0.5
-"""Least error of matches, px of the photograph as features were extracted."""
-
-MAX_PAIRS_OF_IMAGE = 4
-"""The strongest pairs of each image vote."""
-
-MAX_PAIRS_OF_DECISION = 24
-"""Pairs that are asked whether images of one size share a camera."""
-
-MIN_LOG_EVIDENCE = 3.0
-"""For one camera against many: twenty to one."""
-
+MATCH_ERROR_PX = 0.5  # least error of matches, px of the photograph as features were extracted
+MAX_PAIRS_OF_IMAGE = 4  # the strongest pairs of each image vote
+MAX_PAIRS_OF_DECISION = 24  # pairs that are asked whether images of one size share a camera
+MIN_LOG_EVIDENCE = 3.0  # for one camera against many: twenty to one
 UNDECIDED = "pairs do not tell whether images of this size share a camera"
-
-MAX_SPREAD = 1.4
-"""Ratio of the ends of an interval that counts as knowledge."""
+MAX_SPREAD = 1.4  # ratio of the ends of an interval that counts as knowledge
 
 
 @dataclass(frozen=True)
@@ -61,20 +51,14 @@ class VotingPair:
 
 @dataclass
 class CameraVote:
-    """Decides on cameras by the votes of pairs.
+    """Decides on cameras by the votes of pairs."""
 
-    Attributes:
-        records: of all cameras by id.
-        pairs: that vote.
-        may_share: whether cameras of images of one size may turn out to be the same.
-        tied: cameras that have one focal length, each by the first of them.
-        decisions: what was found out about cameras of one size.
-    """
-
-    records: Mapping[int, CameraRecord]
-    pairs: Sequence[VotingPair]
-    may_share: bool
+    records: Mapping[int, CameraRecord]  # of all cameras by id
+    pairs: Sequence[VotingPair]  # that vote
+    may_share: bool  # whether cameras of images of one size may turn out to be the same
+    # cameras that have one focal length, each by the first of them
     tied: dict[int, int] = field(default_factory=dict)
+    # what was found out about cameras of one size
     decisions: dict[int, str] = field(default_factory=dict)
 
     def decide(self, progress: Progress = SILENT) -> dict[int, CameraRecord]:
@@ -245,7 +229,7 @@ def voting_pairs(
                 num.update(pair)
 
         @lru_cache(NUM_CACHED_IMAGES)
-        def keypoints(image_id: int) -> NDArray[np.float64]:
+        def keypoints(image_id: int) -> Array:
             return np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
 
         return [
@@ -263,7 +247,7 @@ def voting_pairs(
 def _voting_pair(
     images: tuple[int, int],
     cameras: Sequence[pycolmap.Camera],
-    keypoints: Sequence[NDArray[np.float64]],
+    keypoints: Sequence[Array],
     geometry: pycolmap.TwoViewGeometry,
     extracted_px: int | None,
 ) -> VotingPair:

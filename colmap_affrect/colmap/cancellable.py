@@ -10,7 +10,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.parallel.executor import return_freed_memory
 
 Result = TypeVar("Result")
-
 POLL_S = 0.2
 
 

@@ -31,13 +31,13 @@ from colmap_affrect.colmap.tables import (
     rows_of,
 )
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.shown import such_as
 
 Problems = dict[str, list[str]]
 """What was found: by kind, the images, pairs or cameras concerned, none if it is the database."""
 
-MAX_SIDE_PX = 1 << 24
-"""Of a photograph; the largest panoramas have a tenth of it."""
+MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
 
 MATRICES = {
     ("two_view_geometries", "pair_id"): {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
@@ -51,14 +51,12 @@ CAMERA_OF_PAIR = struct.Struct("<IiQQBQ")
 """What a camera of a two-view geometry begins with: id, model, width, height, whether its focal
 length is a prior, and the number of parameters that follow, float64."""
 
-KEYPOINT_COLUMNS = (2, 4, 6)
-"""x, y; with scale and orientation; with an affine shape."""
+KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
 
 OUTSIDE_TOLERANCE_PX = 1.0
 """Keypoints of an image that was shrunk for detection may lie a little outside it."""
 
-UNDEFINED = 0
-"""Configuration of a two-view geometry that COLMAP 4.2 passes over."""
+UNDEFINED = 0  # configuration of a two-view geometry that COLMAP 4.2 passes over
 
 
 def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
@@ -264,7 +262,7 @@ def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[
     return np.frombuffer(blob, dtype).reshape(rows, columns)
 
 
-def _are_outside(keypoints: NDArray[np.float32], camera: Camera | None) -> bool:
+def _are_outside(keypoints: Singles, camera: Camera | None) -> bool:
     """Tell whether any keypoints, whose origin is the corner of the image, are not in it."""
     if camera is None:
         return False

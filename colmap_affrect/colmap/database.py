@@ -22,11 +22,11 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Indices, Singles
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 
 BYTES_PER_ROW = 4096
-BYTES_OF_EMPTY_DATABASE = 1 << 19
-"""What :func:`require_database_space` reckons with."""
+BYTES_OF_EMPTY_DATABASE = 1 << 19  # what :func:`require_database_space` reckons with
 
 
 @contextmanager
@@ -147,7 +147,7 @@ def keypoint_counts(path: Path) -> dict[str, int]:
         }
 
 
-def unverified_pairs(path: Path) -> NDArray[np.int64]:
+def unverified_pairs(path: Path) -> Indices:
     """Return the (N, 2) image ids with raw matches and no two-view geometry, good or bad."""
     with open_database(path) as database:
         pair_ids, counts = map(np.asarray, database.read_num_matches())
@@ -158,17 +158,17 @@ def unverified_pairs(path: Path) -> NDArray[np.int64]:
         return pairs[np.array(is_new, np.bool_)]
 
 
-def lack_matches(database: pycolmap.Database, image_ids: NDArray[np.integer]) -> NDArray[np.bool_]:
+def lack_matches(database: pycolmap.Database, image_ids: NDArray[np.integer]) -> Bools:
     """Tell which of (N, 2) image ids have no row of raw matches; not those with an id of 0."""
     low, high = np.sort(image_ids, axis=1).T
     matched, _ = database.read_num_matches()
-    lacking: NDArray[np.bool_] = (low > 0) & ~np.isin(low * MAX_NUM_IMAGES + high, matched)
+    lacking: Bools = (low > 0) & ~np.isin(low * MAX_NUM_IMAGES + high, matched)
     for row in np.flatnonzero(lacking):  # a row of none does not count there
         lacking[row] = not database.exists_matches(*image_ids[row])
     return lacking
 
 
-def colmap_keypoints(lafs: NDArray[np.floating]) -> NDArray[np.float32]:
+def colmap_keypoints(lafs: Floats) -> Singles:
     """Turn (N, 2, 3) frames into COLMAP's 6 columns x, y, a11, a12, a21, a22.
 
     The centre moves to COLMAP's corner origin; the shape maps the unit circle to one
@@ -189,7 +189,7 @@ def has_keypoints(database: pycolmap.Database, image_id: int, count: int) -> boo
 def write_keypoints(
     database: pycolmap.Database,
     image_id: int,
-    lafs: NDArray[np.floating],
+    lafs: Floats,
     level_ends: Sequence[int] = (),
 ) -> None:
     """Write the frames of one image, in the place of fewer ones that it may have had before.
@@ -225,7 +225,7 @@ SIGNED_SHIFT = 0.30
 """Added to descriptors with negative elements: COLMAP's brute-force matcher needs cosines >= 0."""
 
 
-def colmap_descriptors(descriptors: NDArray[np.floating]) -> NDArray[np.uint8]:
+def colmap_descriptors(descriptors: Floats) -> Bytes:
     """Encode (N, 128) unit descriptors as (N, 128) uint8 rows of length 512, as COLMAP's SIFT.
 
     Descriptors without negative elements, as RootSIFT, keep their angles. Others are shifted to
@@ -246,9 +246,7 @@ def colmap_descriptors(descriptors: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.asarray(np.minimum(np.rint(scaled), 255), dtype=np.uint8)
 
 
-def write_descriptors(
-    database: pycolmap.Database, image_id: int, descriptors: NDArray[np.floating]
-) -> None:
+def write_descriptors(database: pycolmap.Database, image_id: int, descriptors: Floats) -> None:
     """Write (N, 128) unit descriptors of an image that has none, see :func:`colmap_descriptors`."""
     rows = pycolmap.FeatureDescriptors(
         type=pycolmap.FeatureExtractorType.SIFT, data=colmap_descriptors(descriptors)
@@ -278,7 +276,7 @@ def reject_pairs(path: Path, pairs: Iterable[tuple[str, str]]) -> None:
             database.write_two_view_geometry(ids[first], ids[second], pycolmap.TwoViewGeometry())
 
 
-def camera_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
+def camera_matrix(camera: pycolmap.Camera) -> Array:
     """Return (3, 3) intrinsics in pixel-centre px, without distortion."""
     matrix = np.asarray(camera.calibration_matrix(), dtype=np.float64)
     matrix[:2, 2] = pixel_from_colmap(matrix[:2, 2])

@@ -22,8 +22,7 @@ from colmap_affrect.colmap.problems import FATAL, FATAL_FOR_IMAGES
 from colmap_affrect.colmap.reading import DAMAGED, open_read_only
 from colmap_affrect.errors import DatabaseError
 
-FIRST_TYPED_SCHEMA = 4_000_000
-"""Descriptors have a type since COLMAP 4.0."""
+FIRST_TYPED_SCHEMA = 4_000_000  # descriptors have a type since COLMAP 4.0
 
 
 def schema_version(path: Path) -> int:

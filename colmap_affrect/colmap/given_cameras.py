@@ -20,27 +20,16 @@ COLUMNS = ("name", "camera", "model", "params", "focal_px", "focal_mm", *WIDTHS,
 
 @dataclass(frozen=True)
 class GivenCamera:
-    """What the user says of the camera of an image; empty where nothing is said.
+    """What the user says of the camera of an image; empty where nothing is said."""
 
-    Attributes:
-        model: COLMAP's name of the camera model.
-        params: all parameters of the model.
-        focal_px: focal length.
-        focal_widths: focal length in units of the width of what the whole image shows.
-        principal_point: x, y in COLMAP's px, from the corner of the image.
-        size: (width, height) in px of the images that it is of.
-        label: images with one label share a camera.
-        where: file and line.
-    """
-
-    model: str = ""
-    params: tuple[float, ...] = ()
-    focal_px: float = 0.0
-    focal_widths: float = 0.0
-    principal_point: tuple[float, ...] = ()
-    size: tuple[int, ...] = ()
-    label: str = field(default="", compare=False)
-    where: str = field(default="", compare=False)
+    model: str = ""  # COLMAP's name of the camera model
+    params: tuple[float, ...] = ()  # all parameters of the model
+    focal_px: float = 0.0  # focal length
+    focal_widths: float = 0.0  # focal length in units of the width of what the whole image shows
+    principal_point: tuple[float, ...] = ()  # x, y in COLMAP's px, from the corner of the image
+    size: tuple[int, ...] = ()  # (width, height) in px of the images that it is of
+    label: str = field(default="", compare=False)  # images with one label share a camera
+    where: str = field(default="", compare=False)  # file and line
 
 
 def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:

@@ -13,8 +13,6 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
 
-import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -36,6 +34,7 @@ from colmap_affrect.colmap.database import (
 )
 from colmap_affrect.colmap.given_cameras import GivenCamera, read_given_cameras, unknown_names
 from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.exif import (
     MAX_CONTRADICTION,
     PLAUSIBLE_FOCALS,
@@ -47,10 +46,8 @@ from colmap_affrect.images.headers import is_too_large
 from colmap_affrect.images.photographs import CameraOptions
 
 logger = logging.getLogger(__name__)
-
 Size = tuple[int, int]
-Group = tuple[object, ...]
-"""Images of one group share a camera."""
+Group = tuple[object, ...]  # images of one group share a camera
 
 
 class InitialCameras:
@@ -203,7 +200,7 @@ class InitialCameras:
             return ExifFocal(None, why=why)
         return trusted[0]
 
-    def matrix(self, name: str, names: Sequence[str]) -> NDArray[np.float64] | None:
+    def matrix(self, name: str, names: Sequence[str]) -> Array | None:
         """Return the (3, 3) intrinsics that an image will have, in pixel-centre px.
 
         Args:

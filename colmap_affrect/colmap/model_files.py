@@ -13,17 +13,14 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.project.atomic_files import cannot_write
 
-SENSOR_BYTES = 8
-"""Type and id of a sensor."""
-
-POSE_BYTES = 7 * 8
-"""Quaternion and translation."""
+SENSOR_BYTES = 8  # type and id of a sensor
+POSE_BYTES = 7 * 8  # quaternion and translation
 
 
 class _Reader:
@@ -175,7 +172,7 @@ def num_long_tracks(model: pycolmap.Reconstruction) -> Counter[int]:
     )
 
 
-def seen_points(image: pycolmap.Image) -> NDArray[np.int64]:
+def seen_points(image: pycolmap.Image) -> Indices:
     """Return the id of the point that each keypoint sees, -1 for none, (N,)."""
     seen = np.full(image.num_points2D(), -1, np.int64)
     for index in image.get_observation_point2D_idxs():

@@ -18,7 +18,6 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.options import flat
 
 Plain = bool | int | float | str
-
 TRUTH_VALUES = {"true": True, "1": True, "false": False, "0": False}
 
 OWNED = {

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import PLANAR, epipolar_pair, keypoint_shapes
+from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.epipolar import common_sign
 from colmap_affrect.geometry.pair_models import HomographyModel, PairModel, Points, Rows
 from colmap_affrect.geometry.shapes import of_unit_area, vary_singly
@@ -25,10 +25,8 @@ from colmap_affrect.geometry.significance import (
 
 MAX_FRAME_ANGLE_DEG = 20.0
 """Frames agree up to here: those of right matches are off by 5 to 10 degrees."""
-CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0
-"""Of frames that are turned at random."""
-MAX_CHANCE = 0.99
-"""Frames that agree by chance nearly always, upright ones for one, say nothing."""
+CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0  # of frames that are turned at random
+MAX_CHANCE = 0.99  # frames that agree by chance nearly always, upright ones for one, say nothing
 MIN_VARIETY = 0.05
 """Elements of shapes of area one that differ by less are all alike: they have no direction."""
 
@@ -36,7 +34,7 @@ MIN_VARIETY = 0.05
 def significance(
     geometry: pycolmap.TwoViewGeometry,
     cameras: tuple[pycolmap.Camera, pycolmap.Camera],
-    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+    keypoints: tuple[Floats, Floats],
     max_error_px: float,
 ) -> float:
     """Return the decimal logarithm of how many pairs chance needs to have one that looks as good.
@@ -66,7 +64,7 @@ def significance(
         return _frame_evidence(model, inliers, (shapes[0], shapes[1])) - alarms
 
 
-def telling_shapes(keypoints: NDArray[np.floating]) -> Points | None:
+def telling_shapes(keypoints: Floats) -> Points | None:
     """Return the shapes of keypoints; None if they tell nothing.
 
     That is without any, of circles, if all are alike, or only differ from view to view.
@@ -81,7 +79,7 @@ def telling_shapes(keypoints: NDArray[np.floating]) -> Points | None:
 def _model(
     geometry: pycolmap.TwoViewGeometry,
     cameras: tuple[pycolmap.Camera, pycolmap.Camera],
-    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+    keypoints: tuple[Floats, Floats],
 ) -> PairModel | None:
     if geometry.config in PLANAR and geometry.H is not None:
         points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)

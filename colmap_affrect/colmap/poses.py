@@ -11,16 +11,14 @@ from statistics import median
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import ComparisonError
+from colmap_affrect.geometry.arrays import Array
 
-Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""cam_from_world: rotation matrix and translation."""
-Poses = dict[str, Pose]
-"""Poses by image name."""
+Pose = tuple[Array, Array]  # cam_from_world: rotation matrix and translation
+Poses = dict[str, Pose]  # poses by image name
 PairErrors = Mapping[tuple[str, str], tuple[float, float]]
 """By the sorted names of two images: the errors of their relative pose in degrees, of the rotation
 and of the direction of the translation."""
@@ -36,23 +34,18 @@ MAX_ALIGNMENT_ERROR = 0.05
 
 @dataclass(frozen=True)
 class PoseScores:
-    """A model against ground truth.
+    """A model against ground truth."""
 
-    Attributes:
-        correct_names: images registered correctly (``MAX_CORRECT_ERROR_DEG``).
-        pair_errors_deg: of every pair of registered images that have ground truth.
-        num_pairs: pairs of all given images that have ground truth; those that are not in
-            ``pair_errors_deg`` count as failures.
-        auc: area under the curve of pairs whose larger error is below a threshold, up to
-            1, 3, 5 and 10 degrees, by threshold; 0 to 1.
-        median_position_error: of camera centres after similarity alignment, in units of the
-            ground truth; None with fewer than three images, or all on one line.
-    """
-
-    correct_names: tuple[str, ...]
-    pair_errors_deg: PairErrors
+    correct_names: tuple[str, ...]  # images registered correctly (``MAX_CORRECT_ERROR_DEG``)
+    pair_errors_deg: PairErrors  # of every pair of registered images that have ground truth
+    # pairs of all given images that have ground truth; those that are not in ``pair_errors_deg``
+    # count as failures
     num_pairs: int
+    # area under the curve of pairs whose larger error is below a threshold, up to 1, 3, 5 and 10
+    # degrees, by threshold; 0 to 1
     auc: Mapping[float, float]
+    # of camera centres after similarity alignment, in units of the ground truth; None with fewer
+    # than three images, or all on one line
     median_position_error: float | None
 
     @property

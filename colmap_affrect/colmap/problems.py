@@ -6,9 +6,7 @@ from typing import Literal
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-
-Check = tuple[Severity, str, str]
-"""How serious a problem is, what it is, and what to do about it."""
+Check = tuple[Severity, str, str]  # how serious a problem is, what it is, and what to do about it
 
 CHECKS: dict[str, Check] = {
     "no-images": ("warning", "holds no images",

@@ -27,29 +27,17 @@ class Camera:
 
 @dataclass(frozen=True)
 class Tables:
-    """What a database holds, without the data of keypoints and matches.
+    """What a database holds, without the data of keypoints and matches."""
 
-    Attributes:
-        cameras: by id.
-        names: of the images, by id.
-        camera_ids: by image id.
-        frame_images: ids of the images that are in a frame.
-        num_frames: number of frames.
-        keypoints: rows and columns by image id.
-        descriptors: type and rows by image id.
-        matches: number of raw matches by pair id.
-        geometries: number of inliers and configuration by pair id.
-    """
-
-    cameras: dict[int, Camera]
-    names: dict[int, str]
-    camera_ids: dict[int, int]
-    frame_images: set[int]
-    num_frames: int
-    keypoints: dict[int, tuple[int, int]]
-    descriptors: dict[int, tuple[int, int]]
-    matches: dict[int, int]
-    geometries: dict[int, tuple[int, int]]
+    cameras: dict[int, Camera]  # by id
+    names: dict[int, str]  # of the images, by id
+    camera_ids: dict[int, int]  # by image id
+    frame_images: set[int]  # ids of the images that are in a frame
+    num_frames: int  # number of frames
+    keypoints: dict[int, tuple[int, int]]  # rows and columns by image id
+    descriptors: dict[int, tuple[int, int]]  # type and rows by image id
+    matches: dict[int, int]  # number of raw matches by pair id
+    geometries: dict[int, tuple[int, int]]  # number of inliers and configuration by pair id
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of keypoints of the images that have a row of them, by name."""

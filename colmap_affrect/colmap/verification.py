@@ -23,15 +23,13 @@ from colmap_affrect.colmap.database import (
 from colmap_affrect.colmap.native_options import Plain, differences
 from colmap_affrect.colmap.pair_significance import significance, telling_shapes
 from colmap_affrect.geometry.affine import homography_errors
+from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.options import MAX_SEED, PresetOptions, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 logger = logging.getLogger(__name__)
-
-PAIRS_PER_WRITE = 200
-"""A killed run loses at most as many."""
-NUM_CACHED_IMAGES = 256
-"""As COLMAP keeps: 80 MB of 13,000 keypoints each."""
+PAIRS_PER_WRITE = 200  # A killed run loses at most as many
+NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
 
 
 class VerificationOptions(PresetOptions):
@@ -94,7 +92,7 @@ class Side:
     """One image of a pair: its camera and (N, 2, 4 or 6) keypoints as in the database."""
 
     camera: pycolmap.Camera
-    keypoints: NDArray[np.float32]
+    keypoints: Singles
 
 
 def estimate_geometry(
@@ -138,7 +136,7 @@ def estimate_geometry(
 
 def _planar_geometry(
     geometry: pycolmap.TwoViewGeometry,
-    points: tuple[NDArray[np.float64], NDArray[np.float64]],
+    points: tuple[Array, Array],
     options: VerificationOptions,
 ) -> pycolmap.TwoViewGeometry:
     """Return the homography of the inliers of an epipolar geometry, with all matches it explains.
@@ -283,9 +281,9 @@ class PairVerifier:
     def inliers(
         self,
         names: tuple[str, str],
-        frames: tuple[NDArray[np.floating], NDArray[np.floating]],
+        frames: tuple[Floats, Floats],
         indices: NDArray[np.integer],
-    ) -> NDArray[np.int64]:
+    ) -> Indices:
         """Return the (K, 2) matches that a two-view geometry explains; none if it is rejected.
 
         Args:
@@ -300,7 +298,7 @@ class PairVerifier:
     def geometry(
         self,
         names: tuple[str, str],
-        frames: tuple[NDArray[np.floating], NDArray[np.floating]],
+        frames: tuple[Floats, Floats],
         indices: NDArray[np.integer],
     ) -> pycolmap.TwoViewGeometry:
         """Return the two-view geometry, from the image with the lower id to the other one.
@@ -329,7 +327,7 @@ def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], in
     }
 
 
-def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], NDArray[np.int64]]:
+def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], Indices]:
     """Return the (M, 2) features of each verified pair of image ids that are inliers."""
     with open_database(path) as database:
         pair_ids, geometries = database.read_two_view_geometries()

@@ -16,11 +16,8 @@ from colmap_affrect.shown import such_as
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
 
-FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
-"""How cells begin that spreadsheets compute."""
-
-MAX_LINES, MAX_ADVICE = 12, 4
-"""Of each list in a summary; report.json has all."""
+FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")  # how cells begin that spreadsheets compute
+MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
 
 SOURCES = {
     "exif": "from EXIF", "exif-rescaled": "from EXIF, for another size", "pairs": "from matches",
@@ -28,8 +25,7 @@ SOURCES = {
 }  # fmt: skip
 """How a summary calls where focal lengths are from; others are called by their own names."""
 
-USUAL = "sparse, sparse mapper"
-"""Preset and mapper that a summary does not name."""
+USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
 
 def _some(lines: Iterable[str]) -> list[str]:
@@ -85,22 +81,14 @@ def _no_formula(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class StageReport:
-    """One stage of a run.
+    """One stage of a run."""
 
-    Attributes:
-        name: extract, pairs, match, verify, escalate, guide or map.
-        wall_s: seconds.
-        num_done: images, pairs or models made now.
-        num_kept: those found done already.
-        failures: image name to reason.
-        warnings: image name to what went less well than asked for.
-    """
-
-    name: str
-    wall_s: float
-    num_done: int
-    num_kept: int = 0
-    failures: dict[str, str] = dataclasses.field(default_factory=dict)
+    name: str  # extract, pairs, match, verify, escalate, guide or map
+    wall_s: float  # seconds
+    num_done: int  # images, pairs or models made now
+    num_kept: int = 0  # those found done already
+    failures: dict[str, str] = dataclasses.field(default_factory=dict)  # image name to reason
+    # image name to what went less well than asked for
     warnings: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def summary(self) -> str:
@@ -113,22 +101,15 @@ class StageReport:
 
 @dataclass(frozen=True)
 class Arrival:
-    """How an image came into a model.
+    """How an image came into a model."""
 
-    Attributes:
-        how: by ``tracks`` through three images, by tracks that ``guided`` matching made, or
-            ``bridged``: by one verified pair whose scale comes from neighbouring depths.
-        by: of a bridge, the image that had been there; other fields are of bridges too.
-        num_agreeing: depths that agree on the scale.
-        num_ratios: depths compared.
-        scale_error_frac: standard error of the scale.
-    """
-
+    # by ``tracks`` through three images, by tracks that ``guided`` matching made, or ``bridged``:
+    # by one verified pair whose scale comes from neighbouring depths
     how: str
-    by: str = ""
-    num_agreeing: int = 0
-    num_ratios: int = 0
-    scale_error_frac: float = 0.0
+    by: str = ""  # of a bridge, the image that had been there; other fields are of bridges too
+    num_agreeing: int = 0  # depths that agree on the scale
+    num_ratios: int = 0  # depths compared
+    scale_error_frac: float = 0.0  # standard error of the scale
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what ``report.json`` holds."""
@@ -144,27 +125,22 @@ class Arrival:
 
 @dataclass(frozen=True)
 class ModelSummary:
-    """One COLMAP model; the error is the mean over observations in px.
-
-    Attributes:
-        doubtful: images whose pose or camera is doubtful, with the reason.
-        doubts: reasons to doubt the model as a whole.
-        arrivals: how each image came in.
-        taken_out: images that were certainly wrong, with the reason.
-        focals_px: focal length of each image's camera.
-        rival_focals_px: lowest and highest of models that agree as well with the pairs, of images
-            for which these differ.
-    """
+    """One COLMAP model; the error is the mean over observations in px."""
 
     registered_names: tuple[str, ...]
     num_points3D: int
     mean_track_length: float
     mean_reprojection_error_px: float
+    # images whose pose or camera is doubtful, with the reason
     doubtful: dict[str, str] = dataclasses.field(default_factory=dict)
-    doubts: tuple[str, ...] = ()
-    arrivals: dict[str, Arrival] = dataclasses.field(default_factory=dict)
+    doubts: tuple[str, ...] = ()  # reasons to doubt the model as a whole
+    arrivals: dict[str, Arrival] = dataclasses.field(default_factory=dict)  # how each image came in
+    # images that were certainly wrong, with the reason
     taken_out: dict[str, str] = dataclasses.field(default_factory=dict)
+    # focal length of each image's camera
     focals_px: dict[str, float] = dataclasses.field(default_factory=dict)
+    # lowest and highest of models that agree as well with the pairs, of images for which these
+    # differ
     rival_focals_px: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
     @property

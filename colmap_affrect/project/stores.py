@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
+from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.project.feature_index import Entries, entries, forget
 from colmap_affrect.project.group_store import GroupStore, complete_groups
 
@@ -39,21 +40,13 @@ FINISHED = "finished_list"
 
 @dataclass(frozen=True)
 class PairMatches:
-    """Raw matches of one pair.
+    """Raw matches of one pair."""
 
-    Attributes:
-        names: the two image names, in the order of the columns.
-        indices: (M, 2) int64, strictly rising in column 0.
-        scores: (M,) float32 in [0, 1], larger is better.
-        num_keypoints1: number of features of the first image.
-        level: of escalation, whose features were looked at together with those of level 0.
-    """
-
-    names: tuple[str, str]
-    indices: NDArray[np.int64]
-    scores: NDArray[np.float32]
-    num_keypoints1: int
-    level: int = 0
+    names: tuple[str, str]  # the two image names, in the order of the columns
+    indices: Indices  # (M, 2) int64, strictly rising in column 0
+    scores: Singles  # (M,) float32 in [0, 1], larger is better
+    num_keypoints1: int  # number of features of the first image
+    level: int = 0  # of escalation, whose features were looked at together with those of level 0
 
 
 def _indexed(file: h5py.File) -> Entries:
@@ -65,7 +58,7 @@ def _indexed(file: h5py.File) -> Entries:
     return found
 
 
-def frame_datasets(lafs: NDArray[np.floating]) -> dict[str, NDArray[np.float32]]:
+def frame_datasets(lafs: Floats) -> dict[str, Singles]:
     """Return (N, 2, 3) frames, and their scales in sigmas and orientations in degrees."""
     stored = lafs.astype(np.float32)
     shapes = stored[:, :, :2].astype(np.float64)
@@ -169,7 +162,7 @@ class FeatureStore(GroupStore):
             group = self._group(file, name)
             return self._features(group, group["level_ends"][()].tolist()[-1])
 
-    def level_indices(self, name: str, level: int, base: int = 0) -> NDArray[np.int64]:
+    def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
         """Return the indices of the features of two levels, each once, in their order."""
         ends = [0, *self.level_ends(name)]
         return np.concatenate([np.arange(*ends[k : k + 2]) for k in sorted({base, level})])
@@ -208,7 +201,7 @@ class FeatureStore(GroupStore):
         """Return the (width, height) of each image in px."""
         return {name: size for name, (*_, size) in self._entries().items()}
 
-    def read_frames(self, name: str) -> NDArray[np.float32]:
+    def read_frames(self, name: str) -> Singles:
         """Read the (N, 2, 3) frames of one image."""
         with self._open("r") as file:
             return np.asarray(file[name]["lafs"][()])
@@ -280,7 +273,7 @@ class MatchStore(GroupStore):
                 ):
                     del file[key]
 
-    def stationary_cells(self) -> dict[tuple[int, int], NDArray[np.int64]]:
+    def stationary_cells(self) -> dict[tuple[int, int], Indices]:
         """Return the (N, 2) cells that never move by size of photographs (stages/stationary)."""
         if not self.path.exists():
             return {}
@@ -288,12 +281,12 @@ class MatchStore(GroupStore):
             known = json.loads(file.attrs.get(STATIONARY, "[]"))
         return {tuple(size): np.array(cells, np.int64).reshape(-1, 2) for size, cells in known}
 
-    def record_stationary_cells(self, cells: Mapping[tuple[int, int], NDArray[np.int64]]) -> None:
+    def record_stationary_cells(self, cells: Mapping[tuple[int, int], Indices]) -> None:
         """Keep the cells that never move."""
         with self._open("a") as file:
             file.attrs[STATIONARY] = json.dumps([(s, found.tolist()) for s, found in cells.items()])
 
-    def has(self, pairs: Sequence[tuple[str, str]]) -> NDArray[np.bool_]:
+    def has(self, pairs: Sequence[tuple[str, str]]) -> Bools:
         """Tell, as (N,) bools, which of N pairs are there and complete."""
         if not self.path.exists():
             return np.zeros(len(pairs), np.bool_)
@@ -355,19 +348,13 @@ class MatchStore(GroupStore):
 
 @dataclass(frozen=True)
 class GuidedPair:
-    """What guided matching found for a pair.
+    """What guided matching found for a pair."""
 
-    Attributes:
-        names: of the two images, in the order of the columns.
-        exact: (M, 2) inliers before; what adjusts models most accurately.
-        candidates: (K, 2) the same and guided matches, to verify.
-        num_inliers: of the geometry that was estimated from the candidates and took the place of
-            the one before; 0 where that stayed.
-    """
-
-    names: tuple[str, str]
-    exact: NDArray[np.int64]
-    candidates: NDArray[np.int64]
+    names: tuple[str, str]  # of the two images, in the order of the columns
+    exact: Indices  # (M, 2) inliers before; what adjusts models most accurately
+    candidates: Indices  # (K, 2) the same and guided matches, to verify
+    # of the geometry that was estimated from the candidates and took the place of the one before; 0
+    # where that stayed
     num_inliers: int
 
 

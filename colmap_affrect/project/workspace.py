@@ -31,19 +31,14 @@ PLACES = {
 }  # fmt: skip
 """Options that say where files are: other places are no other options, what the files hold counts
 (:mod:`colmap_affrect.project.contents`). But none at all is another option."""
-GIVEN = "given"
-"""What stands in the place of such an option when options are compared."""
+GIVEN = "given"  # what stands in the place of such an option when options are compared
 INPUTS = "inputs.sha256"
 """File in sparse/ that names the verified pairs, and the extended model, they were made from."""
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
-COPY_STAGES = ("copy", "verify", "map")
-"""Of a folder in which another program's database is mapped."""
-BYTES_OF_MARK = 200
-"""At the beginning of our files, in which they tell what they are."""
-TEMPORARY_PREFIX = ".affrect-"
-"""Of folders for what is not complete yet."""
-FORMAT_VERSION = 6
-"""Of ``config.toml``: counts up when a stage records other options than before."""
+COPY_STAGES = ("copy", "verify", "map")  # of a folder in which another program's database is mapped
+BYTES_OF_MARK = 200  # at the beginning of our files, in which they tell what they are
+TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
+FORMAT_VERSION = 6  # of ``config.toml``: counts up when a stage records other options than before
 
 
 @lru_cache(maxsize=2)

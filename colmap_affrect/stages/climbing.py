@@ -48,18 +48,13 @@ def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> l
 
 @dataclass(frozen=True)
 class ClimbingGraph:
-    """The pairs of a set as they are now.
+    """The pairs of a set as they are now."""
 
-    Attributes:
-        num_inliers: of each pair, 0 where it is not verified.
-        num_consistent: matches that confirm each other, of each pair that is not verified.
-        insecure: images that mapping may well lose.
-        stalled: pairs to which the last level that they climbed to brought nothing.
-    """
-
-    num_inliers: Mapping[Pair, int]
+    num_inliers: Mapping[Pair, int]  # of each pair, 0 where it is not verified
+    # matches that confirm each other, of each pair that is not verified
     num_consistent: Mapping[Pair, int]
-    insecure: Set[str]
+    insecure: Set[str]  # images that mapping may well lose
+    # pairs to which the last level that they climbed to brought nothing
     stalled: Set[Pair] = frozenset()
 
     @cached_property

@@ -16,16 +16,13 @@ from colmap_affrect.project.workspace import Workspace
 
 @dataclass(frozen=True)
 class Resources:
-    """What is needed from outside and does not change results.
+    """What is needed from outside and does not change results."""
 
-    Attributes:
-        weights_path: folder with the weights of networks; None searches the usual places.
-        device: ``auto``, ``cpu``, ``cuda``, ``cuda:1``, ``mps``; of networks and of matching.
-        depth_cache_path: folder that keeps the depth maps of a network; None keeps none.
-    """
-
+    # folder with the weights of networks; None searches the usual places
     weights_path: Path | None = None
+    # ``auto``, ``cpu``, ``cuda``, ``cuda:1``, ``mps``; of networks and of matching
     device: str = "auto"
+    # folder that keeps the depth maps of a network; None keeps none
     depth_cache_path: Path | None = None
 
     def require_device(self, *, uses_network: bool = False) -> str:
@@ -52,20 +49,13 @@ def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) 
 
 @dataclass(frozen=True)
 class Context:
-    """Where a run works and with what; none of it changes a result.
+    """Where a run works and with what; none of it changes a result."""
 
-    Attributes:
-        workspace: the output folder.
-        resources: weights and device.
-        executor: where images and pairs are worked on, a cluster for one; by default in threads
-            of this process.
-        progress: where to show progress.
-    """
-
-    workspace: Workspace
-    resources: Resources = field(default_factory=Resources)
+    workspace: Workspace  # the output folder
+    resources: Resources = field(default_factory=Resources)  # weights and device
+    # where images and pairs are worked on, a cluster for one; by default in threads of this process
     executor: Executor | None = None
-    progress: Progress = SILENT
+    progress: Progress = SILENT  # where to show progress
 
     @property
     def features(self) -> FeatureStore:

@@ -7,7 +7,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap.database import camera_matrix as intrinsics
 from colmap_affrect.colmap.database import read_cameras
@@ -15,6 +14,7 @@ from colmap_affrect.conventions import camera_matrix, pixel_from_colmap, resized
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError, ImageError
 from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.arrays import Array, Floats, Singles
 from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.mappers.base import DepthLookup
@@ -22,9 +22,7 @@ from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
 
 logger = logging.getLogger(__name__)
-
-NUM_CACHED_MAPS = 8
-"""One image is asked for each of its pairs."""
+NUM_CACHED_MAPS = 8  # one image is asked for each of its pairs
 
 
 def depth_lookup(context: Context) -> DepthLookup | None:
@@ -41,7 +39,7 @@ def depth_lookup(context: Context) -> DepthLookup | None:
     folder, cameras = Path(Inputs.recorded(workspace).image_path), read_cameras(workspace.database)
 
     @lru_cache(NUM_CACHED_MAPS)
-    def photograph_and_map(name: str) -> tuple[tuple[int, int], NDArray[np.float32]] | None:
+    def photograph_and_map(name: str) -> tuple[tuple[int, int], Singles] | None:
         try:
             gray = read_gray(folder / name)
             size = (gray.shape[1], gray.shape[0])
@@ -52,7 +50,7 @@ def depth_lookup(context: Context) -> DepthLookup | None:
             logger.debug("%s: no depth: %s", name, error)
             return None
 
-    def depth_at(name: str, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    def depth_at(name: str, points: Floats) -> Array:
         found = photograph_and_map(name)
         if found is None:
             return np.full(len(points), np.nan)

@@ -38,6 +38,7 @@ from colmap_affrect.colmap.verification import (
     verify,
 )
 from colmap_affrect.errors import ImageError
+from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.consistency import num_consistent_matches
 from colmap_affrect.mappers.pair_graph import MIN_SHARE
 from colmap_affrect.pairs.base import Pair
@@ -262,9 +263,7 @@ class Escalation:
                 known[pair] = key, num_consistent_matches(*self._frames(pair, indices))
         return {pair: known[pair][1] for pair in pairs}
 
-    def _frames(
-        self, pair: Pair, indices: NDArray[np.integer]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _frames(self, pair: Pair, indices: NDArray[np.integer]) -> tuple[Singles, Singles]:
         first, second = (self.features.read_frames(name) for name in pair)
         return first[indices[:, 0]], second[indices[:, 1]]
 
@@ -356,7 +355,7 @@ class Escalation:
                 if reached == level:
                     advance(1)
 
-    def measured(self, pair: Pair, indices: NDArray[np.integer]) -> NDArray[np.bool_]:
+    def measured(self, pair: Pair, indices: NDArray[np.integer]) -> Bools:
         """Return which of the (M, 2) matches of a pair are of frames that were measured singly."""
         kinds = np.array([level.features.has_shapes for level in self.extraction.levels])
         sides = []
@@ -394,7 +393,7 @@ class Escalation:
                 record()
 
     def _judged(
-        self, found: PairMatches, others: NDArray[np.int64] | None, verifier: PairVerifier
+        self, found: PairMatches, others: Indices | None, verifier: PairVerifier
     ) -> tuple[PairMatches, tuple[float, int]]:
         """Return what a pair may have at a level, and what that is worth beside what it has.
 
@@ -419,13 +418,11 @@ class Escalation:
             return united, (len(explained), 0)
         return found, (math.inf if is_measured else 0, 0)
 
-    def _inliers(self, found: PairMatches, verifier: PairVerifier) -> NDArray[np.int64]:
+    def _inliers(self, found: PairMatches, verifier: PairVerifier) -> Indices:
         first, second = (self.features.read_frames(name) for name in found.names)
         return verifier.inliers(found.names, (first, second), found.indices)
 
-    def _inliers_of_other_kind(
-        self, pairs: Sequence[Pair], level: int
-    ) -> dict[Pair, NDArray[np.int64]]:
+    def _inliers_of_other_kind(self, pairs: Sequence[Pair], level: int) -> dict[Pair, Indices]:
         """Return the (M, 2) inliers, of frames measured or not, that a level does not look for."""
         is_measured, todo = self.extraction.levels[level].features.has_shapes, set(pairs)
         found = {}

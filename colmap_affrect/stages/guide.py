@@ -14,11 +14,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.connectivity import weakly_connected_images
@@ -42,13 +42,12 @@ from colmap_affrect.stages.verify import (
     verify_new,
 )
 
-Matches = NDArray[np.int64]
+Matches = Indices
 
 MIN_SHARE_KEPT = 0.8
 """Of the inliers before, so many are still inliers of a geometry with guided matches."""
 
-IMAGES_IN_MEMORY = 40
-"""Of 13,000 features; pairs come in an order that reads these seldom."""
+IMAGES_IN_MEMORY = 40  # of 13,000 features; pairs come in an order that reads these seldom
 
 
 def recorded_guiding(workspace: Workspace) -> GuidedOptions:

@@ -41,9 +41,7 @@ from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import recorded_verification
 
 logger = logging.getLogger(__name__)
-
-NUM_BEST_PAIRS = 3
-"""Pairs that are named for each image that was not registered."""
+NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
 
 STRONGER_RECIPE, LEARNED_RECIPE = "on-demand", "on-demand-learned"
 """Advised where photographs are missing; the second needs weights."""

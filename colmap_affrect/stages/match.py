@@ -24,15 +24,13 @@ from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.stationary import StationaryFilter
 
 logger = logging.getLogger(__name__)
-
 PAIRS_PER_WRITE = 64
 
 SECONDS_PER_WRITE = 30.0
 """Pairs of a network take seconds each: what is found is stored before there are so many."""
 
 
-WEIGHTS = "weights"
-"""Of the record, beside the options: file name to sha256."""
+WEIGHTS = "weights"  # of the record, beside the options: file name to sha256
 
 
 def recorded_matching(workspace: Workspace) -> MatcherOptions:

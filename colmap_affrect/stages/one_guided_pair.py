@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import epipolar_pair, homography_of
+from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.matchers.guided import (
     BANDS_OF_HOMOGRAPHY,
     EpipolarGuide,
@@ -26,26 +26,19 @@ from colmap_affrect.stages.one_pair import ImageCache
 MIN_OFF_PLANE = 20
 """Fewer inliers off a plane may be accidental, as many as verification asks of a pair."""
 
-Points = NDArray[np.float64]
+Points = Array
 
 
 @dataclass(frozen=True)
 class GuidedTask:
-    """One pair to match again.
+    """One pair to match again."""
 
-    Attributes:
-        names: of the two images.
-        matrix: (3, 3) fundamental matrix, or a homography of image 2 from image 1.
-        is_homography: which of both.
-        points: of each image the (N, 2) keypoints in the pixels that the matrix holds in.
-        inliers: (M, 2) of the geometry.
-    """
-
-    names: Pair
-    matrix: NDArray[np.float64]
-    is_homography: bool
+    names: Pair  # of the two images
+    matrix: Array  # (3, 3) fundamental matrix, or a homography of image 2 from image 1
+    is_homography: bool  # which of both
+    # of each image the (N, 2) keypoints in the pixels that the matrix holds in
     points: tuple[Points, Points]
-    inliers: NDArray[np.int64]
+    inliers: Indices  # (M, 2) of the geometry
 
     def __str__(self) -> str:
         return " and ".join(self.names)
@@ -66,7 +59,7 @@ class GuidedTask:
 def guided_task(
     names: Pair,
     cameras: tuple[pycolmap.Camera, pycolmap.Camera],
-    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+    keypoints: tuple[Floats, Floats],
     scales: tuple[float, float],
     geometry: pycolmap.TwoViewGeometry,
     band_px: float,
@@ -93,8 +86,8 @@ def guided_task(
 
 @dataclass(frozen=True)
 class _Descriptors:
-    descriptors: NDArray[np.float32]
-    shapes: NDArray[np.float64]
+    descriptors: Singles
+    shapes: Array
 
     @property
     def nbytes(self) -> int:

@@ -16,7 +16,6 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import camera_matrix, resized_from_original
 from colmap_affrect.data import (
@@ -31,6 +30,7 @@ from colmap_affrect.errors import DepthError, ImageError
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
 from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.geometry.affine import transform_frames
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
 from colmap_affrect.images.masks import shrink_mask
 from colmap_affrect.images.photographs import Photographs
@@ -55,42 +55,30 @@ MEMORY_IS_FULL = "extracted on the CPU, the memory of the GPU is full"
 
 @dataclass(frozen=True)
 class ExtractedImage:
-    """Features of one image file.
+    """Features of one image file."""
 
-    Attributes:
-        features: frames in px of the stored image.
-        image_size: (width, height) of the stored image in px.
-        warning: why it was not rectified though it was to be, or not on the GPU; empty if all
-            went well.
-        stretched: whether its contrast was low and was stretched.
-    """
-
-    features: LocalFeatures
-    image_size: tuple[int, int]
+    features: LocalFeatures  # frames in px of the stored image
+    image_size: tuple[int, int]  # (width, height) of the stored image in px
+    # why it was not rectified though it was to be, or not on the GPU; empty if all went well
     warning: str = ""
-    stretched: bool = False
+    stretched: bool = False  # whether its contrast was low and was stretched
 
 
 @dataclass(frozen=True)
 class ImageTask:
-    """One photograph to extract.
+    """One photograph to extract."""
 
-    Attributes:
-        photographs: where it and its masks are.
-        name: of the photograph.
-        level: of escalation: 0 for the features that every image gets; above that, only those
-            that the rectifier of this level adds.
-        intrinsics: (3, 3) camera matrix in pixel-centre px of the stored image; by default
-            COLMAP's guess of a focal length of 1.2 times the longer side.
-        camera_size: (width, height) of its camera, if it has one already.
-        sent: content of its files by absolute path; None where they are read.
-    """
-
-    photographs: Photographs
-    name: str
+    photographs: Photographs  # where it and its masks are
+    name: str  # of the photograph
+    # of escalation: 0 for the features that every image gets; above that, only those that the
+    # rectifier of this level adds
     level: int = 0
-    intrinsics: NDArray[np.float64] | None = None
+    # (3, 3) camera matrix in pixel-centre px of the stored image; by default COLMAP's guess of a
+    # focal length of 1.2 times the longer side
+    intrinsics: Array | None = None
+    # (width, height) of its camera, if it has one already
     camera_size: tuple[int, int] | None = None
+    # content of its files by absolute path; None where they are read
     sent: Mapping[Path, bytes] | None = None
 
     def __str__(self) -> str:
@@ -127,21 +115,15 @@ class ImageExtractor:
 
     It may work on several images at once, in threads. In another process (pickled) it is prepared
     there anew, with the weights and the device found there.
-
-    Attributes:
-        options: of the recipe.
-        extractors: detector and descriptor of each level, that of every image first.
-        rectifiers: of each level.
-        weights: files of the networks by key.
-        resources: that it was prepared with.
-        network_lock: held while networks run, which take one image at a time.
     """
 
-    options: ExtractionOptions
+    options: ExtractionOptions  # of the recipe
+    # detector and descriptor of each level, that of every image first
     extractors: tuple[FeatureExtractor, ...]
-    rectifiers: tuple[Rectifier, ...]
-    weights: Mapping[str, Path] = field(default_factory=dict)
-    resources: Resources = field(default_factory=Resources)
+    rectifiers: tuple[Rectifier, ...]  # of each level
+    weights: Mapping[str, Path] = field(default_factory=dict)  # files of the networks by key
+    resources: Resources = field(default_factory=Resources)  # that it was prepared with
+    # held while networks run, which take one image at a time
     network_lock: AbstractContextManager[Any] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -177,7 +159,7 @@ class ImageExtractor:
         self,
         path: Path,
         name: str = "",
-        intrinsics: NDArray[np.float64] | None = None,
+        intrinsics: Array | None = None,
         level: int = 0,
         mask: Mask | None = None,
     ) -> ExtractedImage:
@@ -225,7 +207,7 @@ class ImageExtractor:
         self,
         path: Path,
         name: str = "",
-        intrinsics: NDArray[np.float64] | None = None,
+        intrinsics: Array | None = None,
         mask: Mask | None = None,
         level: int = 0,
     ) -> tuple[Photograph, tuple[int, int]]:

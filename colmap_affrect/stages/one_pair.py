@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.features.weights import file_sha256, resolve
+from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.matchers.base import (
     MATCHERS,
     ImageFeatures,
@@ -30,36 +31,23 @@ from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.stores import FeatureStore, PairMatches
 from colmap_affrect.stages.context import Resources, require_same_files
 
-CACHE_BYTES = 1 << 29
-"""Memory that prepared images may take in a process."""
-
-BYTES_PER_FEATURE = 870
-"""Of a feature ready for matching, with descriptors of 128 and coarse ones."""
+CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
+BYTES_PER_FEATURE = 870  # of a feature ready for matching, with descriptors of 128 and coarse ones
 
 
 @dataclass(frozen=True)
 class Matching:
-    """What is matched, how, and with what.
+    """What is matched, how, and with what."""
 
-    Attributes:
-        store: of the features.
-        options: of the matcher.
-        level: of escalation: its features, together with those of its base.
-        base: level that has the features of the images themselves.
-        extractor: name of the feature extractor; empty for another program's.
-        resources: weights and device.
-        max_num_features: of each image, those of the largest responses; None for all.
-        num_similarities: about how many pairs of features there will be to compare.
-    """
-
-    store: FeatureStore
-    options: MatcherOptions
-    level: int = 0
-    base: int = 0
-    extractor: str = ""
-    resources: Resources = field(default_factory=Resources)
+    store: FeatureStore  # of the features
+    options: MatcherOptions  # of the matcher
+    level: int = 0  # of escalation: its features, together with those of its base
+    base: int = 0  # level that has the features of the images themselves
+    extractor: str = ""  # name of the feature extractor; empty for another program's
+    resources: Resources = field(default_factory=Resources)  # weights and device
+    # of each image, those of the largest responses; None for all
     max_num_features: int | None = None
-    num_similarities: float = 0
+    num_similarities: float = 0  # about how many pairs of features there will be to compare
 
 
 def iterate_matches(
@@ -89,15 +77,10 @@ def iterate_matches(
 
 @dataclass(frozen=True)
 class StoredFeatures:
-    """The features of an image that are matched.
+    """The features of an image that are matched."""
 
-    Attributes:
-        image: the features.
-        indices: (N,) int64 that they have in the store.
-    """
-
-    image: ImageFeatures
-    indices: NDArray[np.int64]
+    image: ImageFeatures  # the features
+    indices: Indices  # (N,) int64 that they have in the store
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Send what the store holds, in its precision."""
@@ -115,7 +98,7 @@ def _received(
     arrays: tuple[NDArray[Any], ...],
     image_size: tuple[int, int],
     extractor: str,
-    indices: NDArray[np.int64],
+    indices: Indices,
 ) -> StoredFeatures:
     lafs, responses, descriptors, ids = arrays
     features = LocalFeatures(
@@ -137,17 +120,11 @@ class PairTask:
 
 @dataclass(frozen=True)
 class PreparedImage:
-    """An image ready for matching.
+    """An image ready for matching."""
 
-    Attributes:
-        content: what the matcher made of it.
-        frames: (N, 2, 3) local affine frames in pixel-centre px.
-        indices: (N,) int64 that its features have in the store.
-    """
-
-    content: Any
-    frames: NDArray[np.floating]
-    indices: NDArray[np.int64]
+    content: Any  # what the matcher made of it
+    frames: Floats  # (N, 2, 3) local affine frames in pixel-centre px
+    indices: Indices  # (N,) int64 that its features have in the store
 
     @property
     def nbytes(self) -> int:

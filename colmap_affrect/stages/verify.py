@@ -5,9 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
-
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import (
     ExtractedPx,
@@ -15,6 +12,7 @@ from colmap_affrect.colmap.verification import (
     inlier_matches,
     verify,
 )
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
@@ -54,7 +52,7 @@ def verify_matches(
     return StageReport("verify", time.perf_counter() - start, todo, len(pairs) - todo)
 
 
-def verified_inliers(context: Context) -> dict[Pair, NDArray[np.int64]]:
+def verified_inliers(context: Context) -> dict[Pair, Indices]:
     """Return the (M, 2) features of each verified pair that are inliers."""
     path = context.workspace.database
     names = {number: name for name, number in colmap_database.image_ids(path).items()}
