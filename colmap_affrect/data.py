@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -113,21 +113,13 @@ class LocalFeatures:
 
     def select(self, index: NDArray[np.generic]) -> LocalFeatures:
         """Keep the features of an index or mask array, in its order."""
-        return LocalFeatures(
-            self.lafs[index],
-            self.responses[index],
-            self.descriptors[index],
-            self.rectification_ids[index],
-        )
+        return LocalFeatures(*(getattr(self, item.name)[index] for item in fields(self)))
 
     @classmethod
     def empty(cls, descriptor_size: int = 0) -> LocalFeatures:
         """Return the result for an image without features."""
-        return cls(
-            np.zeros((0, 2, 3)),
-            np.zeros(0, np.float32),
-            np.zeros((0, descriptor_size), np.float32),
-        )
+        descriptors = np.zeros((0, descriptor_size), np.float32)
+        return cls(np.zeros((0, 2, 3)), np.zeros(0, np.float32), descriptors)
 
     def with_frames(self, lafs: Array) -> LocalFeatures:
         """Replace the frames."""
@@ -144,46 +136,32 @@ class LocalFeatures:
 
 def of_one_size(parts: list[LocalFeatures]) -> list[LocalFeatures]:
     """Fill up shorter descriptors with zeros, so that features of two kinds can be united."""
-    size = max(part.descriptors.shape[1] for part in parts)
+    widths = [part.descriptors.shape[1] for part in parts]
     return [
-        replace(part, descriptors=np.pad(part.descriptors, ((0, 0), (0, size - width))))
-        for part in parts
-        for width in (part.descriptors.shape[1],)
+        replace(part, descriptors=np.pad(part.descriptors, ((0, 0), (0, max(widths) - width))))
+        for part, width in zip(parts, widths, strict=True)
     ]
 
 
 def union(parts: list[LocalFeatures]) -> LocalFeatures:
     """Concatenate features in the order given; at least one part."""
-    return LocalFeatures(
-        np.concatenate([part.lafs for part in parts]),
-        np.concatenate([part.responses for part in parts]),
-        np.concatenate([part.descriptors for part in parts]),
-        np.concatenate([part.rectification_ids for part in parts]),
-    )
+    names = [item.name for item in fields(LocalFeatures)]
+    return LocalFeatures(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
 @dataclass(frozen=True)
 class Rectification:
-    """One rectifying warp and the part of the image it is meant for.
+    """One rectifying warp and the part of the image it is meant for."""
 
-    Attributes:
-        rectified_from_image: (3, 3) float64 map of pixel-centre coordinates; a homography
-            has a positive third coordinate all over the region.
-        canvas_size: (width, height) of the warp in px.
-        region: (h, w) bool mask of the part of the image; None means all of it.
-        tilt, tilt_angle_rad: class of the map in the space of tilts; of a homography, that of
-            its Jacobian at the middle of the region.
-        region_origin: (x, y) image pixel of the mask's first pixel.
-        segment_id: the segment of the image it belongs to, from 0; several warps may share one.
-    """
-
+    # (3, 3) map of pixel-centre px; of a homography the third coordinate is positive in the region
     rectified_from_image: Array
-    canvas_size: tuple[int, int]
-    region: Mask | None
+    canvas_size: tuple[int, int]  # (width, height) of the warp in px
+    region: Mask | None  # (h, w) bool mask of the part of the image; None means all of it
+    # class of the map in the space of tilts; of a homography, of its Jacobian amid the region
     tilt: float
     tilt_angle_rad: float
-    region_origin: tuple[int, int] = (0, 0)
-    segment_id: int = 0
+    region_origin: tuple[int, int] = (0, 0)  # (x, y) image pixel of the mask's first pixel
+    segment_id: int = 0  # of the image it belongs to, from 0; several warps may share one
 
     def in_region(self, points: Floats) -> Mask:
         """Tell which (N, 2) points, rounded to pixels of the image, belong to the region."""

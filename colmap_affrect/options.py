@@ -70,18 +70,13 @@ class Options(BaseModel):
 
     def changed(self, **values: Any) -> Self:
         """Return the options with some other values, checked."""
-        return type(self)(
-            **{**{name: getattr(self, name) for name in self.__class__.model_fields}, **values}
-        )
+        return type(self)(**{**dict(self), **values})
 
     @classmethod
     def _problem(cls, error: ErrorDetails) -> str:
         """Say in one line what pydantic found."""
-        place, given, context = (
-            ".".join(map(str, error["loc"])),
-            error["input"],
-            error.get("ctx", {}),
-        )
+        place, given = ".".join(map(str, error["loc"])), error["input"]
+        context = error.get("ctx", {})
         match error["type"]:
             case "extra_forbidden":
                 return f"unknown option '{place}'{suggestion(place, cls.model_fields)}"
@@ -152,10 +147,9 @@ class Registry(Generic[Part]):
         return list(self._entry_points())
 
     def _entry_points(self) -> dict[str, metadata.EntryPoint]:
-        ours = [
-            metadata.EntryPoint(name, value, self.group) for name, value in self.built_in.items()
-        ]
-        return {point.name: point for point in [*metadata.entry_points(group=self.group), *ours]}
+        found = {point.name: point for point in metadata.entry_points(group=self.group)}
+        ours = {n: metadata.EntryPoint(n, value, self.group) for n, value in self.built_in.items()}
+        return ours | found | ours  # which come first, and win
 
     def part(self, name: str) -> Any:
         """Return the class of a part; OptionError for an unknown name."""

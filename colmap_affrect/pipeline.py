@@ -72,10 +72,7 @@ REPORTED_PACKAGES = (
 def holds_vote(focal_vote: FocalVote, mapping: MapperOptions, *, is_others: bool) -> bool:
     """Tell whether verified pairs vote on cameras that nobody knows.
 
-    Args:
-        focal_vote: what is asked for; by default there is one.
-        mapping: COLMAP's preset has none by default.
-        is_others: cameras of another program's database have none by default.
+    By default they do, but not with COLMAP's preset, nor of another program's database.
     """
     if focal_vote == "auto":
         return not is_others and mapping.preset_name != "colmap"
@@ -93,8 +90,7 @@ class InputOptions:
     verification: VerificationOptions = field(default_factory=VerificationOptions)
     mapping: MapperOptions = field(default_factory=SparseOptions)  # mapper and its options
     image_list_path: Path | None = None  # list of the images to use; None for all below the folder
-    # COLMAP database whose images, cameras, rigs, frames and pose priors are used; it stays as it
-    # is
+    # COLMAP database whose images, cameras, rigs, frames and pose priors are used; it stays as is
     from_database: Path | None = None
     resources: Resources = field(default_factory=Resources)  # weights and device of networks
     focal_vote: FocalVote = "auto"  # whether verified pairs vote on cameras that nobody knows
@@ -151,19 +147,14 @@ def run(
     Args:
         image_path: folder of the photographs, searched with its sub-folders.
         output_path: folder for all results, made if missing.
-        options: see :class:`RunOptions`.
+        options: of all stages.
         executor: where images and pairs are worked on, a cluster for one
-            (:func:`colmap_affrect.parallel.cluster.connected`); by default in threads of this
-            process.
+            (:func:`colmap_affrect.parallel.cluster.connected`); by default in threads here.
         overwrite: discard results that are there.
-        page: also write ``report.html``.
+        page: write ``report.html`` beside ``report.json``, whose content is returned.
         progress: where to show progress.
 
-    Returns:
-        The report that is also written to ``report.json``.
-
-    Raises:
-        AffrectError: for anything that the caller can mend; what is done stays.
+    AffrectError is raised for anything that the caller can mend; what is done stays.
     """
     options = options or RunOptions()
     mapper = MAPPERS.make(options.mapping)
@@ -220,14 +211,10 @@ def map_from_database(
         extend: register the images into this model instead of beginning one.
         check_cameras: let the pairs vote on cameras whose focal length is no prior.
         overwrite: discard results that are there.
-        page: also write ``report.html``.
+        page: write ``report.html`` beside ``report.json``, whose content is returned.
         progress: where to show progress.
 
-    Returns:
-        The report that is also written to ``report.json``.
-
-    Raises:
-        AffrectError: for anything that the caller can mend; what is done stays.
+    AffrectError is raised for anything that the caller can mend; what is done stays.
     """
     mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
     schema_version(database_path)  # refuses what is no database before anything is made
@@ -235,13 +222,8 @@ def map_from_database(
         extend.refuse_discarding(output_path)
     context = Context(Workspace(output_path), progress=progress)
     with context.workspace.locked():
-        report = copy_verified(
-            context,
-            database_path,
-            image_path,
-            verification or VerificationOptions(),
-            overwrite=overwrite,
-        )
+        chosen = verification or VerificationOptions()
+        report = copy_verified(context, database_path, image_path, chosen, overwrite=overwrite)
         reports = [report, choose_cameras(context)] if check_cameras else [report]
         return map_and_report(context, mapper, extend, earlier=reports, page=page)
 
@@ -329,11 +311,7 @@ def _require_photographs(context: Context) -> None:
 
 
 def map_guided(
-    context: Context,
-    mapper: Mapper,
-    extend: Extension | None = None,
-    *,
-    overwrite: bool = False,
+    context: Context, mapper: Mapper, extend: Extension | None = None, *, overwrite: bool = False
 ) -> tuple[list[StageReport], list[ModelSummary]]:
     """Map; where images are missing or hang on few tracks, guide their pairs and map again.
 

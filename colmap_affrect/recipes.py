@@ -168,17 +168,9 @@ class Recipe:
     def from_mapping(cls, name: str, values: Mapping[str, Any], where: str = "") -> Self:
         """Build from the sections of a recipe; OptionError for unknown or wrong options."""
         where = where or f"recipe {name}"
-        options = RecipeOptions.from_mapping(values, where)
-        fields = {key: getattr(options, key) for key in ExtractionOptions.model_fields}
-        recipe = cls(
-            name,
-            options.summary,
-            ExtractionOptions(**fields),
-            options.matching,
-            options.escalate,
-            options.guided,
-            options.mapping,
-        )
+        options = dict(RecipeOptions.from_mapping(values, where))
+        extraction = {key: options.pop(key) for key in ExtractionOptions.model_fields}
+        recipe = cls(name, extraction=ExtractionOptions(**extraction), **options)
         try:
             for level in recipe.extraction.levels:
                 (level.matching or recipe.matching).require_extractor(level.features.name)
@@ -195,9 +187,7 @@ class Recipe:
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights of all parts, sorted."""
         matching = (level.matching or self.matching for level in self.extraction.levels)
-        return tuple(
-            sorted({*self.extraction.weights, *(key for item in matching for key in item.weights)})
-        )
+        return tuple(sorted({*self.extraction.weights}.union(*(item.weights for item in matching))))
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all sections with all options, as :meth:`from_mapping` takes them."""

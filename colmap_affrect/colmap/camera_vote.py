@@ -14,7 +14,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
-from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.two_views import PLANAR
 from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES, ExtractedPx, of_pair
 from colmap_affrect.geometry.arrays import Array
@@ -131,9 +131,7 @@ class CameraVote:
 def log_evidence_for_sharing(pairs: Sequence[VotingPair], cameras: Collection[int]) -> float | None:
     """Return how much more likely one camera is than many, as a logarithm; None without pairs.
 
-    Args:
-        pairs: strongest first; those of other cameras are left out.
-        cameras: ids of cameras of which nothing is known.
+    Those come strongest first; pairs of other cameras than these ids are left out.
     """
     inside = [pair for pair in pairs if set(pair.cameras) <= set(cameras)]
     ballots = _ballots(inside[:MAX_PAIRS_OF_DECISION], {}, {})
@@ -168,12 +166,7 @@ def needs_vote(records: Mapping[int, CameraRecord]) -> bool:
 
 
 def forget_votes(path: Path, records: Mapping[int, CameraRecord]) -> dict[int, CameraRecord]:
-    """Return records as before a vote, and let the pairs of cameras that one decided go unverified.
-
-    Args:
-        path: of the database.
-        records: of its cameras.
-    """
+    """Return records as before a vote, and let pairs of cameras that one decided go unverified."""
     voted = {key for key, record in records.items() if record.source == "pairs"}
     if voted:
         with open_database(path) as database, pycolmap.DatabaseTransaction(database):
@@ -198,18 +191,13 @@ def voting_pairs(
 ) -> list[VotingPair]:
     """Read the verified pairs that can say something about cameras, strongest first.
 
-    Args:
-        path: of the database.
-        unknown: ids of the cameras that are asked for.
-        extracted_px: see :data:`~colmap_affrect.colmap.verification.ExtractedPx`.
-        silent: pairs of image names that are not asked.
+    ``unknown`` are the ids of the cameras that are asked for, ``silent`` pairs of image names that
+    are not asked.
     """
     with open_database(path) as database:
-        read = database.read_all_images()
-        images = {image.image_id: image.camera_id for image in read}
-        names = {image.image_id: image.name for image in read}
+        names = {image.image_id: image.name for image in database.read_all_images()}
         left_out = set(map(frozenset, silent))
-        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        cameras = cameras_of_images(database)
         pair_ids, geometries = database.read_two_view_geometries()
         ids = map(pycolmap.pair_id_to_image_pair, pair_ids)
         useful = [
@@ -218,7 +206,7 @@ def voting_pairs(
             if len(geometry.inlier_matches) >= MIN_NUM_INLIERS
             and geometry.F is not None
             and geometry.config not in PLANAR
-            and any(images[image_id] in unknown for image_id in pair)
+            and any(cameras[image_id].camera_id in unknown for image_id in pair)
             and frozenset(names[image_id] for image_id in pair) not in left_out
         ]
         useful.sort(key=lambda item: (-len(item[1].inlier_matches), item[0]))
@@ -235,7 +223,7 @@ def voting_pairs(
         return [
             _voting_pair(
                 pair,
-                tuple(cameras[images[image_id]] for image_id in pair),
+                tuple(cameras[image_id] for image_id in pair),
                 tuple(keypoints(image_id) for image_id in pair),
                 geometry,
                 of_pair(extracted_px, pair),
@@ -271,9 +259,7 @@ def _voting_pair(
 def apply_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
     """Make the cameras of a database what the records say, and let pairs go unverified by that.
 
-    Args:
-        path: of the database.
-        records: a record for each camera that stays; of its images some may have had another one.
+    There is a record for each camera that stays; of its images some may have had another one.
     """
     camera_of = {name: key for key, record in records.items() for name in record.names}
     with open_database(path) as database, pycolmap.DatabaseTransaction(database):

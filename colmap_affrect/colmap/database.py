@@ -50,13 +50,24 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         raise cannot_write(path, error) from error
 
 
+def write_frame(
+    database: pycolmap.Database, image: pycolmap.Image, rigs: dict[pycolmap.sensor_t, int]
+) -> None:
+    """Give an image a frame of the rig of its camera, which is made unless it is in ``rigs``."""
+    sensor = image.data_id.sensor_id
+    if sensor not in rigs:
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(sensor)
+        rigs[sensor] = database.write_rig(rig)
+    frame = pycolmap.Frame(rig_id=rigs[sensor])
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame)
+
+
 def require_database_space(path: Path, num_new: int) -> None:
     """Make sure that a database has room for so many new rows, and its log for all its content.
 
-    Called before functions of pycolmap that write, which end the process on a full disk.
-
-    Raises:
-        WorkspaceError: when there is no room.
+    Functions of pycolmap that write end the process on a full disk; here it is a WorkspaceError.
     """
     size = path.stat().st_size if path.exists() else 0
     require_space(path, 2 * size + num_new * BYTES_PER_ROW + BYTES_OF_EMPTY_DATABASE)
@@ -89,11 +100,7 @@ def nearest_positions(
 
 
 def spatial_pairs(path: Path, options: pycolmap.SpatialPairingOptions) -> list[tuple[str, str]]:
-    """Return the pairs of COLMAP's spatial matcher.
-
-    Raises:
-        DatabaseError: when fewer than two images have a position.
-    """
+    """Return the pairs of COLMAP's spatial matcher; DatabaseError without two positions."""
     with open_database(path) as database:
         count = sum(prior.has_position() for prior in database.read_all_pose_priors())
     if count < 2:
@@ -192,16 +199,10 @@ def write_keypoints(
     lafs: Floats,
     level_ends: Sequence[int] = (),
 ) -> None:
-    """Write the frames of one image, in the place of fewer ones that it may have had before.
+    """Write the (N, 2, 3) frames of an image, in the place of fewer that it may have had before.
 
-    Args:
-        database: an open database.
-        image_id: of the image.
-        lafs: (N, 2, 3) frames.
-        level_ends: how many frames it may have had before escalation appended others.
-
-    Raises:
-        DatabaseError: when it has another number of keypoints.
+    Those were as many as one of ``level_ends``, before escalation appended others; DatabaseError
+    for another number.
     """
     if has_keypoints(database, image_id, len(lafs)):
         return
@@ -230,9 +231,7 @@ def colmap_descriptors(descriptors: Floats) -> Bytes:
 
     Descriptors without negative elements, as RootSIFT, keep their angles. Others are shifted to
     positive values first, which makes all angles smaller and hardly changes their order.
-
-    Raises:
-        DatabaseError: for another size than 128, which COLMAP's SIFT matchers refuse.
+    DatabaseError for another size than 128, which COLMAP's SIFT matchers refuse.
     """
     if descriptors.shape[1] != DESCRIPTOR_SIZE:
         raise DatabaseError(
@@ -286,8 +285,14 @@ def camera_matrix(camera: pycolmap.Camera) -> Array:
 def read_cameras(path: Path) -> dict[str, pycolmap.Camera]:
     """Return the camera of every image of a database by image name."""
     with open_database(path) as database:
-        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-        return {image.name: cameras[image.camera_id] for image in database.read_all_images()}
+        cameras = cameras_of_images(database)
+        return {image.name: cameras[image.image_id] for image in database.read_all_images()}
+
+
+def cameras_of_images(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:
+    """Return the camera of each image by image id."""
+    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    return {image.image_id: cameras[image.camera_id] for image in database.read_all_images()}
 
 
 def write_matches(
@@ -296,25 +301,18 @@ def write_matches(
     image_id2: int,
     indices: NDArray[np.integer],
 ) -> None:
-    """Write raw matches of one pair unless it has some; every index is checked first."""
+    """Write (M, 2) raw matches of one pair unless it has some; every index is checked first."""
     if database.exists_matches(image_id1, image_id2):
         return
-    pair = (image_id1, image_id2)
-    _check_indices(indices, pair, [database.num_keypoints_for_image(i) for i in pair])
-    database.write_matches(image_id1, image_id2, indices.astype(np.uint32))
-
-
-def _check_indices(
-    indices: NDArray[np.integer], pair: tuple[int, int], counts: Sequence[int]
-) -> None:
-    """Refuse (M, 2) matches that do not belong to two images with so many keypoints."""
-    if pair[0] == pair[1]:
-        raise DatabaseError(f"image {pair[0]} cannot be matched with itself")
+    if image_id1 == image_id2:
+        raise DatabaseError(f"image {image_id1} cannot be matched with itself")
     if indices.ndim != 2 or indices.shape[1] != 2 or not np.issubdtype(indices.dtype, np.integer):
         raise DatabaseError(f"matches must be (M, 2) integers, not {indices.dtype}{indices.shape}")
+    counts = [database.num_keypoints_for_image(i) for i in (image_id1, image_id2)]
     if indices.size and (indices.min() < 0 or (indices.max(axis=0) >= counts).any()):
         raise DatabaseError(
-            f"matches of images {pair[0]}, {pair[1]} point at keypoints that do not exist "
+            f"matches of images {image_id1}, {image_id2} point at keypoints that do not exist "
             f"(largest {indices.max(axis=0).tolist()}, keypoints {counts}); run match again "
             "with --overwrite"
         )
+    database.write_matches(image_id1, image_id2, indices.astype(np.uint32))

@@ -35,9 +35,8 @@ class GivenCamera:
 def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
     """Return the cameras that the user gives by image name; ``""`` stands for all other images.
 
-    Raises:
-        OptionError: for options that are wrong or contradict each other, and for a file that
-            cannot be read, naming the line.
+    Raises OptionError for options that are wrong or contradict each other, and for a file that
+    cannot be read, naming the line.
     """
     _require_model(options.model, "--camera-model")
     others = GivenCamera(
@@ -99,10 +98,6 @@ def _require_params(given: GivenCamera, where: str) -> None:
         raise OptionError(f"{where}: a focal length of {given.params[0]:g} px cannot be")
 
 
-def _lines(path: Path) -> list[str]:
-    return read_lines(path, f"--cameras-path {path}")
-
-
 def _read_model(path: Path) -> dict[str, GivenCamera]:
     """Read the cameras of a COLMAP model: its folder, or its file of cameras."""
     folder = path if path.is_dir() else path.parent
@@ -125,7 +120,7 @@ def _read_model(path: Path) -> dict[str, GivenCamera]:
 def _read_text_model(folder: Path) -> dict[str, GivenCamera]:
     path, listed = folder / "cameras.txt", folder / "images.txt"
     cameras = {}
-    for number, line in enumerate(_lines(path), start=1):
+    for number, line in enumerate(read_lines(path, f"--cameras-path {path}"), start=1):
         words = line.split()
         if not words or line.startswith("#"):
             continue
@@ -142,9 +137,9 @@ def _read_text_model(folder: Path) -> dict[str, GivenCamera]:
     if len(cameras) == 1 and not listed.exists():
         return {"": next(iter(cameras.values()))}
     # Every other line lists the points of an image, which may be none.
-    lines = [(n, line) for n, line in enumerate(_lines(listed), 1) if not line.startswith("#")]
+    lines = enumerate(read_lines(listed, f"--cameras-path {listed}"), start=1)
     found = {}
-    for number, line in lines[::2]:
+    for number, line in [item for item in lines if not item[1].startswith("#")][::2]:
         words = line.split(maxsplit=9)
         if not words:
             continue

@@ -28,9 +28,11 @@ from colmap_affrect.colmap.camera_records import (
 )
 from colmap_affrect.colmap.database import (
     camera_matrix,
+    cameras_of_images,
     image_ids,
     open_database,
     require_database_space,
+    write_frame,
 )
 from colmap_affrect.colmap.given_cameras import GivenCamera, read_given_cameras, unknown_names
 from colmap_affrect.errors import DatabaseError, OptionError
@@ -54,11 +56,7 @@ class InitialCameras:
     """Which images share a camera, and which one."""
 
     def __init__(self, image_path: Path, options: CameraOptions) -> None:
-        """Read what the user gives.
-
-        Raises:
-            OptionError: when it is wrong.
-        """
+        """Read what the user gives; OptionError when it is wrong."""
         self.image_path = image_path
         self.options = options
         self._given = read_given_cameras(options)
@@ -92,19 +90,17 @@ class InitialCameras:
 
     def groups(self, names: Sequence[str]) -> dict[Group, list[str]]:
         """Return the names of each group, in the order in which the groups begin."""
-        found: dict[Group, list[str]] = {}
+        found: defaultdict[Group, list[str]] = defaultdict(list)
         for name in names:
-            found.setdefault(self.group(name), []).append(name)
-        return found
+            found[self.group(name)].append(name)
+        return dict(found)
 
     def check(self, names: Sequence[str]) -> None:
         """Refuse images that cannot share the cameras that they should.
 
-        Raises:
-            OptionError: naming the option, or file and line, and what to do.
+        OptionError names the option, or file and line, and what to do.
         """
-        unknown = unknown_names(self._given, self.image_path, names)
-        if unknown:
+        if unknown := unknown_names(self._given, self.image_path, names):
             given = self.given(unknown[0])
             raise OptionError(f"{given.where}: {unknown[0]} is not in {self.image_path}")
         for group, same in self.groups(names).items():
@@ -167,11 +163,10 @@ class InitialCameras:
     def _set_focal(
         self, camera: pycolmap.Camera, given: GivenCamera, names: Sequence[str]
     ) -> tuple[Source, str]:
-        if given.params:
-            return "given", ""
-        focal = given.focal_px or given.focal_widths * camera.width
         source: Source = "given"
-        why = ""
+        focal, why = given.focal_px or given.focal_widths * camera.width, ""
+        if given.params:
+            return source, why
         if not focal:
             found = self._exif_focal(names)
             focal = found.focal_px or 0.0
@@ -201,14 +196,10 @@ class InitialCameras:
         return trusted[0]
 
     def matrix(self, name: str, names: Sequence[str]) -> Array | None:
-        """Return the (3, 3) intrinsics that an image will have, in pixel-centre px.
+        """Return the (3, 3) intrinsics that an image will have, without distortion.
 
-        Args:
-            name: of the image.
-            names: all images, of which some may share its camera.
-
-        Returns:
-            The intrinsics without distortion; None for a file that cannot be read.
+        They are in pixel-centre px; None for a file that cannot be read. Of all ``names`` some may
+        share its camera.
         """
         size = self.size(name)
         if not size:
@@ -245,10 +236,8 @@ def import_images(
 
     Sizes and GPS priors are read by COLMAP, from the files as stored, not rotated. Images that
     are added later share cameras as if all had been added at once. All of them are added, or none;
-    a new database appears with them.
-
-    Returns:
-        Names of the images that COLMAP cannot read, or whose size is not that of their camera.
+    a new database appears with them. Returns the names of the images that COLMAP cannot read, or
+    whose size is not that of their camera.
     """
     initial = InitialCameras(image_path, options)
     new = path if path.exists() else path.with_name(path.name + ".new")
@@ -282,9 +271,9 @@ class _Import:
     ) -> None:
         self.initial, self.database = initial, database
         self.images = sorted(found.read_all_images(), key=lambda image: image.name)
-        cameras = {camera.camera_id: camera for camera in found.read_all_cameras()}
+        cameras = cameras_of_images(found)
         self.sizes = {
-            image.name: (cameras[image.camera_id].width, cameras[image.camera_id].height)
+            image.name: (cameras[image.image_id].width, cameras[image.image_id].height)
             for image in self.images
         }
         self.priors = {prior.corr_data_id.id: prior for prior in found.read_all_pose_priors()}
@@ -326,15 +315,9 @@ class _Import:
     def _write_image(
         self, image: pycolmap.Image, camera: pycolmap.Camera, rigs: dict[pycolmap.sensor_t, int]
     ) -> None:
-        if camera.sensor_id not in rigs:
-            rig = pycolmap.Rig()
-            rig.add_ref_sensor(camera.sensor_id)
-            rigs[camera.sensor_id] = self.database.write_rig(rig)
         written = pycolmap.Image(name=image.name, camera_id=camera.camera_id)
         written.image_id = self.database.write_image(written)
-        frame = pycolmap.Frame(rig_id=rigs[camera.sensor_id])
-        frame.add_data_id(written.data_id)
-        self.database.write_frame(frame)
+        write_frame(self.database, written, rigs)
         prior = self.priors.get(image.image_id)
         if prior:
             prior.corr_data_id = written.data_id
@@ -349,11 +332,8 @@ def record_cameras(
 ) -> None:
     """Put the cameras that are not on record yet on record, and log what is worth knowing of them.
 
-    Args:
-        database_path: the database.
-        records_path: where the records are.
-        initial: what the cameras were made from; None for those of another database.
-        known: records of the other database, if there are any.
+    ``initial`` is what they were made from; of cameras of another database that is None, and
+    ``known`` are its records, if there are any.
     """
     before = read_camera_records(records_path)
     known = before or known or {}

@@ -111,17 +111,17 @@ def _require_written(folder: Path) -> None:
 def _walk_camera(reader: _Reader) -> None:
     reader.skip(4)
     model = reader.number("I")
-    reader.skip(16 + 8 * _num_params().get(model, 0))
+    like = camera_like(model)
+    reader.skip(16 + 8 * (len(like.params) if like else 0))
 
 
 @cache
-def _num_params() -> dict[int, int]:
-    """Return the number of parameters of each camera model by COLMAP's number of it."""
-    models = [model for model in pycolmap.CameraModelId.__members__.values() if model.value >= 0]
-    return {
-        model.value: len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
-        for model in models
-    }
+def camera_like(model: int) -> pycolmap.Camera | None:
+    """Return a camera of a model of COLMAP by its number, None if there is no such model."""
+    try:
+        return pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
+    except (ValueError, RuntimeError, TypeError):
+        return None
 
 
 def _walk_rig(reader: _Reader) -> None:

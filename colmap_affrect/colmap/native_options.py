@@ -48,15 +48,10 @@ def set_values(options: Any, values: Mapping[str, Plain]) -> None:
 def resolve(options: Any, given: Mapping[str, Any], flag: str) -> dict[str, Plain]:
     """Check values against the type of pycolmap's and return them by full dotted key.
 
-    Args:
-        options: of the class that the values are for; they are changed.
-        given: value by key. Sections may be left out where a name exists once. Values may be text:
-            ``true``, ``false``, ``1`` or ``0`` for truth values, a name for enumerations.
-        flag: how a user gives them, for messages.
-
-    Raises:
-        OptionError: naming the key, if it is unknown, ambiguous or cannot be given in this way, or
-            if its value is of the wrong type.
+    ``options``, of the class that the values are for, are changed. Of keys sections may be left out
+    where a name exists once. Values may be text: ``true``, ``false``, ``1`` or ``0`` for truth
+    values, a name for enumerations. OptionError begins with ``flag``, how a user gives them, and
+    names a key that is unknown or ambiguous, or whose value is of a wrong type.
     """
     known = flat_values(options)
     resolved: dict[str, Plain] = {}

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.checks import FATAL
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.problems import FATAL
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 
@@ -82,11 +82,8 @@ geometries of configuration 9, calibrated with rigs, as 2, calibrated."""
 def export_database(source: Path, target: Path) -> list[str]:
     """Write a database as COLMAP 3.8 makes them; ids stay, and the source is only read.
 
-    Returns what COLMAP 3.8 has no place for and is left out, a line each.
-
-    Raises:
-        DatabaseError: when the source cannot be used or has a camera model that COLMAP 3.8 does not
-            know, or the target exists.
+    Returns what COLMAP 3.8 has no place for and is left out, a line each. DatabaseError when the
+    source cannot be used or has a camera model that COLMAP 3.8 does not know, or the target exists.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already and is not overwritten; give another name")

@@ -39,15 +39,9 @@ def significance(
 ) -> float:
     """Return the decimal logarithm of how many pairs chance needs to have one that looks as good.
 
-    Args:
-        geometry: as COLMAP estimated it from matches of keypoints of the same index.
-        cameras: of image 1 and 2.
-        keypoints: of the raw matches: twice (M, 2, 4 or 6), with columns as in the database;
-            without shapes, in 2 columns, positions count alone.
-        max_error_px: of inliers.
-
-    Returns:
-        Infinity for a geometry that there is nothing to test in (a watermark).
+    It is infinite for a geometry that there is nothing to test in (a watermark). ``keypoints`` are
+    those of the raw matches, from which COLMAP estimated the geometry: twice (M, 2, 4 or 6), with
+    columns as in the database; without shapes, in 2 columns, positions count alone.
     """
     with np.errstate(all="ignore"):  # points that a camera cannot undistort are no inliers
         model = _model(geometry, cameras, keypoints)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,7 +56,7 @@ class PoseScores:
 
     @property
     def median_direction_error_deg(self) -> float | None:
-        """Of the translations of the pairs of registered images; None without pairs."""
+        """Of their translations; None without pairs."""
         return median(d for _, d in self.pair_errors_deg.values()) if self.pair_errors_deg else None
 
     def to_mapping(self) -> dict[str, Any]:
@@ -133,13 +134,10 @@ def correct_images(errors: PairErrors) -> tuple[str, ...]:
 
     A pair is right if both of its errors are at most ``MAX_CORRECT_ERROR_DEG``; all are given.
     """
-    num_right = {name: 0 for pair in errors for name in pair}
-    for pair, both in errors.items():
-        if max(both) <= MAX_CORRECT_ERROR_DEG:
-            for name in pair:
-                num_right[name] += 1
-    num_others = len(num_right) - 1
-    return tuple(sorted(name for name, count in num_right.items() if 2 * count >= num_others))
+    right = (pair for pair, both in errors.items() if max(both) <= MAX_CORRECT_ERROR_DEG)
+    num_right = Counter(itertools.chain.from_iterable(right))
+    names = {name for pair in errors for name in pair}
+    return tuple(sorted(name for name in names if 2 * num_right[name] >= len(names) - 1))
 
 
 def area_under_curve(errors_deg: Iterable[float], num_pairs: int, threshold_deg: float) -> float:

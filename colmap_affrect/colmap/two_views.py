@@ -32,12 +32,8 @@ def epipolar_pair(
 ) -> EpipolarModel | None:
     """Return the epipolar geometry of a pair and all keypoints; None where it has none.
 
-    Where both cameras are known it holds in pixels without distortion.
-
-    Args:
-        geometry: as COLMAP estimated it.
-        cameras: of image 1 and 2.
-        keypoints: (N1, 2 or more) and (N2, 2 or more) as in the database.
+    Where both cameras are known it holds in pixels without distortion. Keypoints are twice
+    (N, 2 or more), as in the database.
     """
     points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
     essential, fundamental = geometry.E, geometry.F
@@ -114,13 +110,8 @@ def homography_of(
     """Return the homography of a pair whose epipolar geometry is arbitrary or hardly determined.
 
     That is one of :data:`PLANAR`, or whose homography explains all but fewer than
-    ``min_off_plane`` of its inliers: epipolar lines hold on the plane, but turn freely off it.
-
-    Args:
-        geometry: as COLMAP estimated it.
-        keypoints: (N1, 2 or more) and (N2, 2 or more) as in the database.
-        tolerance_px: how near to the place in image 2 is explained.
-        min_off_plane: so many inliers off the plane determine the geometry.
+    ``min_off_plane`` of its inliers, up to ``tolerance_px`` in image 2: epipolar lines hold on the
+    plane, but turn freely off it. Keypoints are twice (N, 2 or more), as in the database.
     """
     homography = homography_matrix(geometry)
     if homography is None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
+    cameras_of_images,
     colmap_keypoints,
     image_ids,
     open_database,
@@ -101,13 +102,10 @@ def estimate_geometry(
     options: VerificationOptions,
     extracted_px: int | None = None,
 ) -> pycolmap.TwoViewGeometry:
-    """Return the two-view geometry of (M, 2) matches; an empty one if it is rejected.
+    """Return the two-view geometry of (M, 2) raw matches; an empty one if it is rejected.
 
-    Args:
-        sides: the image of the smaller id first, as COLMAP has them.
-        matches: raw ones.
-        options: thresholds.
-        extracted_px: longest side that photographs were shrunk to before extraction, if any.
+    The side of the smaller id comes first, as COLMAP has them. ``extracted_px`` is the longest side
+    that photographs were shrunk to before extraction, if any.
     """
     cameras = (sides[0].camera, sides[1].camera)
     matched = (sides[0].keypoints[matches[:, 0]], sides[1].keypoints[matches[:, 1]])
@@ -193,20 +191,15 @@ def verify(
     """Estimate the two-view geometry of every matched pair that has none yet.
 
     As ``pycolmap.geometric_verification``, but a geometry is written when it has been judged:
-    whatever ends this, no pair is left that counts as verified and was not.
-
-    Args:
-        path: of the database.
-        options: thresholds.
-        extracted_px: see :data:`ExtractedPx`.
-        advance: called with the number of pairs that are done.
+    whatever ends this, no pair is left that counts as verified and was not. ``advance`` is called
+    with the number of pairs that are done.
     """
     todo = unverified_pairs(path)
     if not len(todo):
         return
     require_database_space(path, len(todo))
     with open_database(path) as database:
-        cameras = read_image_cameras(database)
+        cameras = cameras_of_images(database)
 
         @lru_cache(NUM_CACHED_IMAGES)
         def side(image_id: int) -> Side:
@@ -256,18 +249,8 @@ def _write(
         advance(count)
 
 
-def read_image_cameras(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:
-    """Return the camera of each image by image id."""
-    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-    return {image.image_id: cameras[image.camera_id] for image in database.read_all_images()}
-
-
 class PairVerifier:
-    """Tries matches of single pairs as :func:`verify` would, without writing anything.
-
-    With the same seed the result is that of :func:`verify` on a database with these matches
-    (pinned by a test).
-    """
+    """Tries matches of single pairs, with the result of :func:`verify` and the same seed."""
 
     def __init__(
         self, path: Path, options: VerificationOptions, extracted_px: ExtractedPx = None
@@ -276,7 +259,7 @@ class PairVerifier:
         self._options, self._extracted_px = options, extracted_px
         self._ids = image_ids(path)
         with open_database(path) as database:
-            self._cameras = read_image_cameras(database)
+            self._cameras = cameras_of_images(database)
 
     def inliers(
         self,
@@ -286,10 +269,7 @@ class PairVerifier:
     ) -> Indices:
         """Return the (K, 2) matches that a two-view geometry explains; none if it is rejected.
 
-        Args:
-            names: of the two images.
-            frames: (N1, 2, 3) and (N2, 2, 3) local affine frames in pixel-centre px.
-            indices: (M, 2) matches.
+        Of (M, 2) ``indices`` of (N1, 2, 3) and (N2, 2, 3) frames in pixel-centre px.
         """
         geometry = self.geometry(names, frames, indices)
         found = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
@@ -301,10 +281,7 @@ class PairVerifier:
         frames: tuple[Floats, Floats],
         indices: NDArray[np.integer],
     ) -> pycolmap.TwoViewGeometry:
-        """Return the two-view geometry, from the image with the lower id to the other one.
-
-        Arguments are those of :meth:`inliers`; without inliers where there is none.
-        """
+        """Return the geometry of the same from the image with the lower id; empty if rejected."""
         ids = self._ids[names[0]], self._ids[names[1]]
         first, second = (
             Side(self._cameras[image_id], colmap_keypoints(lafs))

@@ -87,8 +87,7 @@ class GroupStore:
         replace_bytes(self.path, content.getvalue())
 
     def _check_format(self, file: h5py.File) -> None:
-        known = file.attrs.get("format")
-        version = file.attrs.get("format_version")
+        known, version = file.attrs.get("format"), file.attrs.get("format_version")
         if known != f"colmap_affrect/{self.kind}" or version != FORMAT_VERSION:
             found = f"{known} {version}" if known else "a file of another program"
             raise StoreError(
@@ -102,11 +101,11 @@ class GroupStore:
             )
 
     def complete(self, keys: Iterable[str]) -> set[str]:
-        """Return those of the keys whose group is there and complete."""
+        """Return those of the keys whose group is complete."""
         if not self.path.exists():
             return set()
         with self._open("r") as file:
-            return {key for key in keys if key in file and file[key].attrs.get("complete", False)}
+            return {key for key in keys if is_complete(file, key)}
 
     def names(self) -> list[str]:
         """Return the sorted names of all complete groups."""
@@ -124,6 +123,11 @@ class GroupStore:
             group.create_dataset(name, data=values)
         group.attrs.update(attributes)
         group.attrs["complete"] = True
+
+
+def is_complete(file: h5py.File, key: str) -> bool:
+    """Tell whether a group is there and complete."""
+    return key in file and bool(file[key].attrs.get("complete", False))
 
 
 def complete_groups(group: h5py.Group, path: str = "") -> Iterator[tuple[str, h5py.Group]]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from colmap_affrect.shown import such_as
@@ -31,10 +30,9 @@ USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not nam
 def _some(lines: Iterable[str]) -> list[str]:
     """Return the first few lines of a list, and how many there are more."""
     shown = list(lines)
-    more = len(shown) - MAX_LINES
-    return (
-        [*shown[:MAX_LINES], f"            and {more} more, see report.json"] if more > 1 else shown
-    )
+    if (more := len(shown) - MAX_LINES) > 1:
+        shown[MAX_LINES:] = [f"            and {more} more, see report.json"]
+    return shown
 
 
 def _by_story(stories: Mapping[str, str], start: str) -> list[str]:
@@ -87,9 +85,8 @@ class StageReport:
     wall_s: float  # seconds
     num_done: int  # images, pairs or models made now
     num_kept: int = 0  # those found done already
-    failures: dict[str, str] = dataclasses.field(default_factory=dict)  # image name to reason
-    # image name to what went less well than asked for
-    warnings: dict[str, str] = dataclasses.field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)  # image name to reason
+    warnings: dict[str, str] = field(default_factory=dict)  # name to what went less well than asked
 
     def summary(self) -> str:
         """Return one line."""
@@ -113,7 +110,7 @@ class Arrival:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what ``report.json`` holds."""
-        return dataclasses.asdict(self) if self.by else {"how": self.how}
+        return asdict(self) if self.by else {"how": self.how}
 
     def text(self) -> str:
         """Return a few words."""
@@ -131,17 +128,13 @@ class ModelSummary:
     num_points3D: int
     mean_track_length: float
     mean_reprojection_error_px: float
-    # images whose pose or camera is doubtful, with the reason
-    doubtful: dict[str, str] = dataclasses.field(default_factory=dict)
+    doubtful: dict[str, str] = field(default_factory=dict)  # in pose or camera: name to reason
     doubts: tuple[str, ...] = ()  # reasons to doubt the model as a whole
-    arrivals: dict[str, Arrival] = dataclasses.field(default_factory=dict)  # how each image came in
-    # images that were certainly wrong, with the reason
-    taken_out: dict[str, str] = dataclasses.field(default_factory=dict)
-    # focal length of each image's camera
-    focals_px: dict[str, float] = dataclasses.field(default_factory=dict)
-    # lowest and highest of models that agree as well with the pairs, of images for which these
-    # differ
-    rival_focals_px: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    arrivals: dict[str, Arrival] = field(default_factory=dict)  # how each image came in
+    taken_out: dict[str, str] = field(default_factory=dict)  # certainly wrong: name to reason
+    focals_px: dict[str, float] = field(default_factory=dict)  # of each image's camera
+    # lowest and highest of models that agree as well with the pairs, of images where these differ
+    rival_focals_px: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def is_trustworthy(self) -> bool:
@@ -162,60 +155,47 @@ class ModelSummary:
         )
         lines += _by_story(self.doubtful, "doubtful")
         lines += [f"doubtful    the whole model: {why}" for why in self.doubts]
-        lines += [
+        return [
+            *lines,
             f"points      {self.num_points3D}, each in {self.mean_track_length:.2f} images",
             f"error       {self.mean_reprojection_error_px:.2f} px on average",
         ]
-        return lines
 
 
 @dataclass(frozen=True)
 class ReconstructionReport:
-    """A whole run; numbers of points and tracks are those of the largest model.
-
-    Attributes:
-        status: ``ok`` (all images in one model), ``partial``, ``doubtful`` (nothing that can
-            be trusted), or ``no_model``.
-        unregistered: image name to reason: unreadable, no features, no verified pair, not
-            registered (with its best pairs), taken out, or in another model.
-        models: all models, largest first, as written to sparse/0, sparse/1, ...
-        presets: of verification and of mapping: ``sparse``, ``colmap`` or ``custom``.
-        verification: options of two-view geometry.
-        mapping: the mapper and its options.
-        differs_from_colmap: for verification and mapping, what pycolmap was given that is not
-            COLMAP's default, by pycolmap's dotted keys.
-        pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
-            and ``none``; empty for other recipes.
-        contradicting_pairs: of these the verified ones that do not fit the largest model.
-        extended: names of the images of the model that was extended; empty where none was.
-        advice: what to try for the images that are missing.
-        guided: ``pairs`` that guided matching gave more inliers, and these inliers
-            ``matches_before`` and ``matches_after``; empty where no pair needed it.
-        cameras: for each its images, where its focal length is from, and its spread.
-    """
+    """A whole run; numbers of points and tracks are those of the largest model."""
 
     images_total: int
+    # image name to reason: unreadable, no features, no verified pair, not registered (with its best
+    # pairs), taken out, or in another model
     unregistered: dict[str, str]
-    models: tuple[ModelSummary, ...]
+    models: tuple[ModelSummary, ...]  # largest first, as written to sparse/0, sparse/1, ...
     num_verified_pairs: int
     num_pairs: int
     stages: tuple[StageReport, ...]
     recipe: str
     versions: dict[str, str]
-    presets: tuple[str, str]
-    verification: dict[str, Any]
-    mapping: dict[str, Any]
+    presets: tuple[str, str]  # of verification and of mapping: ``sparse``, ``colmap`` or ``custom``
+    verification: dict[str, Any]  # options of two-view geometry
+    mapping: dict[str, Any]  # the mapper and its options
+    # of verification and mapping what pycolmap was given that is not COLMAP's default, by its keys
     differs_from_colmap: dict[str, dict[str, Any]]
-    pair_levels: dict[str, int] = dataclasses.field(default_factory=dict)
-    contradicting_pairs: dict[str, int] = dataclasses.field(default_factory=dict)
-    extended: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
-    guided: dict[str, int] = dataclasses.field(default_factory=dict)
+    # that each level of an escalating recipe decided, by its rectifier, and ``none``; else empty
+    pair_levels: dict[str, int] = field(default_factory=dict)
+    # of these the verified ones that do not fit the largest model
+    contradicting_pairs: dict[str, int] = field(default_factory=dict)
+    extended: tuple[str, ...] = ()  # names of the images of the model that was extended, if any
+    advice: tuple[str, ...] = ()  # what to try for the images that are missing
+    # ``pairs`` that guided matching gave more inliers, and these inliers ``matches_before`` and
+    # ``matches_after``; empty where no pair needed it
+    guided: dict[str, int] = field(default_factory=dict)
+    # for each its images, where its focal length is from, and its spread
     cameras: tuple[dict[str, Any], ...] = ()
 
     @property
     def status(self) -> str:
-        """See the class docstring."""
+        """``ok`` (all images in one model), ``partial``, ``doubtful`` as a whole, ``no_model``."""
         if not self.models:
             return "no_model"
         if not self.models[0].is_trustworthy:
@@ -294,7 +274,7 @@ class ReconstructionReport:
             "contradicting_pairs": self.contradicting_pairs,
             "guided": self.guided,
             "cameras": list(self.cameras),
-            "stages": [dataclasses.asdict(stage) for stage in self.stages],
+            "stages": [asdict(stage) for stage in self.stages],
             "recipe": self.recipe,
             "preset": self.preset,
             "mapper": mapper,

@@ -31,7 +31,7 @@ from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.project.feature_index import Entries, entries, forget
-from colmap_affrect.project.group_store import GroupStore, complete_groups
+from colmap_affrect.project.group_store import GroupStore, complete_groups, is_complete
 
 MAX_INT16 = 32767
 STATIONARY = "stationary_cells"
@@ -168,7 +168,7 @@ class FeatureStore(GroupStore):
         return np.concatenate([np.arange(*ends[k : k + 2]) for k in sorted({base, level})])
 
     def _group(self, file: h5py.File, name: str) -> h5py.Group:
-        if name not in file or not file[name].attrs.get("complete", False):
+        if not is_complete(file, name):
             raise StoreError(f"{self.path}: no features of {name}; run extract first")
         return file[name]
 
@@ -291,8 +291,7 @@ class MatchStore(GroupStore):
         if not self.path.exists():
             return np.zeros(len(pairs), np.bool_)
         with self._open("r") as file:
-            keys = (pair_key(*pair) for pair in pairs)
-            there = (key in file and file[key].attrs.get("complete", False) for key in keys)
+            there = (is_complete(file, pair_key(*pair)) for pair in pairs)
             return np.fromiter(there, np.bool_, len(pairs))
 
     def num_pairs(self) -> int:
@@ -333,7 +332,7 @@ class MatchStore(GroupStore):
         with self._open("r") as file:
             for name1, name2 in pairs:
                 key = pair_key(name1, name2)
-                if key not in file or not file[key].attrs.get("complete", False):
+                if not is_complete(file, key):
                     raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
                 matches0 = file[key]["matches0"][()].astype(np.int64)
                 rows = np.flatnonzero(matches0 >= 0)

@@ -21,21 +21,12 @@ def insecure_images(
 ) -> set[str]:
     """Return the images that mapping may well lose.
 
-    Args:
-        num_inliers: of each pair, 0 where it is not verified.
-        strong_num_inliers: an image needs a pair with as many.
-        weakly_connected: images that have little in common with two others; see
-            :func:`colmap_affrect.stages.escalate.weakly_connected_images`.
+    Those are in no pair with ``strong_num_inliers``, or are among those that have little in common
+    with two others. ``num_inliers`` of each pair is 0 where it is not verified.
     """
-    strong = {
-        name
-        for pair, count in num_inliers.items()
-        if count >= max(1, strong_num_inliers)
-        for name in pair
-    }
-    return {name for pair in num_inliers for name in pair if name not in strong}.union(
-        weakly_connected
-    )
+    strong = (pair for pair, count in num_inliers.items() if count >= max(1, strong_num_inliers))
+    names = {name for pair in num_inliers for name in pair}
+    return names.difference(*strong).union(weakly_connected)
 
 
 def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> list[set[T]]:

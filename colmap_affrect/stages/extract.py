@@ -11,11 +11,10 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.camera_records import read_camera_records
-from colmap_affrect.colmap.checks import refuse_unusable
+from colmap_affrect.colmap.checks import CHECKS, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_without_features, read_names
 from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
-from colmap_affrect.colmap.problems import CHECKS, FATAL_FOR_IMAGES
 from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
 from colmap_affrect.features.weights import digests_by_name
 from colmap_affrect.images.photographs import (
@@ -131,11 +130,7 @@ class Inputs(Options):
         return [file for path in given for file in source_files(path)]
 
     def check(self) -> None:
-        """Refuse cameras and masks that cannot be used.
-
-        Raises:
-            OptionError: naming the option.
-        """
+        """Refuse cameras and masks that cannot be used; OptionError names the option."""
         self.photographs.check()
         read_given_cameras(self.cameras)
         if self.from_database and self.cameras != CameraOptions():
@@ -145,12 +140,7 @@ class Inputs(Options):
             )
 
     def check_names(self, names: Sequence[str]) -> None:
-        """Refuse photographs that cannot be used together.
-
-        Raises:
-            StoreError: when two have the same key in hloc's files.
-            OptionError: when photographs cannot share the cameras that they should.
-        """
+        """Refuse photographs with the same key in hloc's files, or that cannot share cameras."""
         refuse_colliding_keys(names)
         if not self.from_database:
             self.initial_cameras.check(names)
@@ -182,15 +172,8 @@ def extract(
 
     An image that cannot be read is reported and passed over. One that cannot be rectified, for
     want of a depth map, is extracted as it is, with a warning. The options of later stages are
-    put on record too.
-
-    Args:
-        context: where the results go.
-        inputs: the photographs.
-        recipe: what to extract.
-        image_names: the images to look at now, in the place of a list on record.
-        later: options of later stages by name, beside those of the recipe.
-        overwrite: discard the results of this and later stages first.
+    put on record too: ``later``, by name, beside those of the recipe. ``image_names`` are looked at
+    in the place of a list on record; ``overwrite`` discards what is there, and later stages.
     """
     start = time.perf_counter()
     workspace, folder = context.workspace, Path(inputs.image_path)
@@ -342,14 +325,8 @@ def extract_images(
 ) -> Generator[ExtractedImage | ImageError, None, None]:
     """Yield the features of images, or why one cannot be used, in order.
 
-    Args:
-        context: says where to work; by default in as many threads as cores and memory allow.
-        inputs: where the images are.
-        extractor: prepared.
-        images: names and levels of escalation.
-
-    Raises:
-        ClusterError: when the workers do not see the depth maps.
+    ``images`` are names and levels of escalation. By default there are as many threads as cores and
+    memory allow. ClusterError when workers do not see the depth maps.
     """
     if not images:
         return

@@ -68,14 +68,7 @@ def guide_by_model(context: Context, model: pycolmap.Reconstruction) -> StageRep
 
     A pair gets a two-view geometry when its guided matches verify. Images overlap when each sees as
     many points of the other as an image needs in tracks (``min_num_tracks``). Pairs that were
-    guided before are left alone.
-
-    Args:
-        context: with verified pairs.
-        model: of images of the workspace.
-
-    Returns:
-        ``num_done`` counts the pairs that were matched now.
+    guided before are left alone. ``num_done`` counts the pairs that were matched now.
     """
     start = time.perf_counter()
     context.workspace.require("verify")

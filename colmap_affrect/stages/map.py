@@ -17,11 +17,7 @@ from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.features.weights import missing as missing_weights
-from colmap_affrect.mappers.attempts import (
-    LARGE_MODEL,
-    map_database,
-    read_models,
-)
+from colmap_affrect.mappers.attempts import LARGE_MODEL, map_database, read_models
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
@@ -59,15 +55,9 @@ def map_images(
 ) -> tuple[StageReport, list[ModelSummary]]:
     """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
 
-    Args:
-        context: with verified pairs.
-        mapper: with its options.
-        extend: the model that images are registered into; None begins anew.
-        overwrite: discard the models that are there.
-
-    Raises:
-        MappingError: when the model cannot be extended with these images.
-        StaleStoreError: when the models that are there extend another one.
+    Images are registered into the model of ``extend``, or else begin anew; ``overwrite`` discards
+    the models that are there. MappingError when the model cannot be extended with these images,
+    StaleStoreError when the models that are there extend another one.
     """
     start = time.perf_counter()
     workspace = context.workspace
@@ -176,9 +166,7 @@ def _map(
 
     Learned matching verifies sides of a building that look the same as one. Its pairs have no say
     where the others register as many images without them; those that contradict are rejected.
-
-    Returns:
-        The models, and how many pairs were rejected.
+    Returns the models, and how many pairs were rejected.
     """
     sparse = context.workspace.sparse
     if task.extend or is_copy(context.workspace):
@@ -294,13 +282,7 @@ def _verified_by_name(workspace: Workspace) -> dict[str, dict[str, int]]:
 def advice(
     context: Context, missing: Collection[str], models: Sequence[ModelSummary]
 ) -> tuple[str, ...]:
-    """Say what may help when images are missing or the model is doubtful, best first.
-
-    Args:
-        context: of a run that has been mapped.
-        missing: images that are not in the largest model.
-        models: all models, largest first.
-    """
+    """Say what may help when images are missing or the largest model is doubtful, best first."""
     is_doubtful = bool(models and (models[0].doubtful or models[0].doubts))
     if not missing and not is_doubtful:
         return ()
@@ -378,10 +360,7 @@ def contradicting_pairs(context: Context) -> dict[str, int]:
 def images_in_need(context: Context, sparse_path: Path, min_num_tracks: int) -> set[str]:
     """Return the images that are not in the largest model, or there see few of its points.
 
-    Args:
-        context: after mapping.
-        sparse_path: folder of the models.
-        min_num_tracks: an image that sees fewer points of three images or more is in need.
+    Few are less than ``min_num_tracks`` that three images or more see.
     """
     names = set(colmap_database.image_ids(context.workspace.database))
     path = sparse_path / "0"

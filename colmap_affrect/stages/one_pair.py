@@ -13,9 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_affrect.data import LocalFeatures
 from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.matchers.base import (
@@ -84,27 +82,21 @@ class StoredFeatures:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Send what the store holds, in its precision."""
-        image, features = self.image, self.image.features
-        arrays = (
-            features.lafs.astype(np.float32),
-            features.responses,
-            features.descriptors.astype(np.float16),
-            features.rectification_ids,
-        )
-        return _received, (arrays, image.image_size, image.extractor, self.indices)
+        return _received, (_of_types(self.image, np.float32, np.float16), self.indices)
 
 
-def _received(
-    arrays: tuple[NDArray[Any], ...],
-    image_size: tuple[int, int],
-    extractor: str,
-    indices: Indices,
-) -> StoredFeatures:
-    lafs, responses, descriptors, ids = arrays
-    features = LocalFeatures(
-        lafs.astype(np.float64), responses, descriptors.astype(np.float32), ids
+def _received(image: ImageFeatures, indices: Indices) -> StoredFeatures:
+    return StoredFeatures(_of_types(image, np.float64, np.float32), indices)
+
+
+def _of_types(image: ImageFeatures, lafs: type, descriptors: type) -> ImageFeatures:
+    old = image.features
+    return replace(
+        image,
+        features=replace(
+            old, lafs=old.lafs.astype(lafs), descriptors=old.descriptors.astype(descriptors)
+        ),
     )
-    return StoredFeatures(ImageFeatures(features, image_size, extractor), indices)
 
 
 @dataclass(frozen=True)

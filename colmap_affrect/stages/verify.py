@@ -34,10 +34,8 @@ def verify_matches(
 ) -> StageReport:
     """Estimate the two-view geometries of all matched pairs.
 
-    Args:
-        context: with raw matches.
-        options: thresholds and seed; by default those on record.
-        overwrite: discard the results of this and later stages first.
+    ``options`` are by default those on record; ``overwrite`` discards what is there, and later
+    stages.
     """
     start = time.perf_counter()
     workspace = context.workspace
