@@ -204,8 +204,7 @@ class RectificationPlan:
 
     image_size: tuple[int, int]  # (width, height) in px
     items: tuple[Rectification, ...] = ()  # the warps; may be empty
-    # (H, W) bool, where features of the image itself are kept; None means everywhere
-    original_region: Mask | None = None
+    original_region: Mask | None = None  # (H, W) bool, where its own features are kept; None: all
     # a feature of the image itself gives way to one of a warp at the same place and scale. For
     # disjoint regions, each with the map that suits it best; where several warps show the same
     # place none of them is better than the image for sure.

@@ -27,12 +27,9 @@ from pydantic_core import ErrorDetails
 
 from colmap_affrect.errors import OptionError
 
-PRESETS = ("sparse", "colmap")
-"""Presets of verification and mapping: ours for few photographs, and COLMAP's defaults."""
-MAX_SEED = 2_000_000_000
-"""COLMAP keeps seeds in 32 bits, and those of repeated mapping are larger than the one given."""
-PLAIN_NAMES = {"model": "options", "dict": "options", "tuple": "list"}
-"""What pydantic's names of types are called in messages."""
+PRESETS = ("sparse", "colmap")  # ours for few photographs, and COLMAP's defaults
+MAX_SEED = 2_000_000_000  # COLMAP keeps 32 bits; repeated mapping counts up from it
+PLAIN_NAMES = {"model": "options", "dict": "options", "tuple": "list"}  # types in messages
 MAX_COMMENT = 96  # width of comments in printed options
 CUSTOM = "custom"  # name of options that are no preset
 
@@ -138,8 +135,7 @@ class Registry(Generic[Part]):
 
     kind: str  # what they are called in messages
     group: str  # of the entry points by which other packages add theirs
-    # ``module:Class`` of those of this package; modules are imported when needed
-    built_in: Mapping[str, str]
+    built_in: Mapping[str, str]  # ``module:Class`` of ours; imported when needed
     default: str  # name of the part where none is given
 
     def names(self) -> list[str]:

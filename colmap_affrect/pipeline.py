@@ -60,9 +60,7 @@ from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed
 from colmap_affrect.stages.verify import recorded_verification, verify_matches
 
 FocalVote = Literal["auto", "always", "never"]
-
-GUIDED_BEFORE = "guided-before.json"
-"""File beside models that wait for others to be compared with: the pairs that were guided then."""
+GUIDED_BEFORE = "guided-before.json"  # beside models that wait: the pairs guided then
 
 REPORTED_PACKAGES = (
     "colmap-affrect", "pycolmap", "opencv-python-headless", "numpy", "h5py", "torch", "kornia",
@@ -117,10 +115,8 @@ class RunOptions(InputOptions):
 
     # options of extraction and matching
     recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
-    # also write descriptors into the database, as COLMAP's matchers need them
-    database_descriptors: bool = False
-    # register the photographs into this model instead of beginning one
-    extend: Extension | None = None
+    database_descriptors: bool = False  # written too, for COLMAP's matchers
+    extend: Extension | None = None  # model that the photographs are registered into, if any
 
     def forecast(self, num_images: int) -> Forecast:
         """Return what so many images will take."""

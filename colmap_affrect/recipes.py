@@ -214,8 +214,7 @@ class Recipe:
         return options
 
 
-DEFAULT_MAPPERS = {"sparse": MAPPERS.default, "colmap": "incremental"}
-"""The mapper of each preset: ``colmap`` is what COLMAP does by default."""
+DEFAULT_MAPPERS = {"sparse": MAPPERS.default, "colmap": "incremental"}  # by preset
 
 
 def recipe_folder() -> Path:

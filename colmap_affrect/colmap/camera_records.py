@@ -38,14 +38,12 @@ class CameraRecord:
     names: tuple[str, ...]  # of its images, sorted
     source: Source  # of the focal length
     focal_px: float  # in px of the stored file; the mean of two
-    # lower end of what the focal length may be, None where nothing says so
-    low_px: float | None = None
+    low_px: float | None = None  # lower end of what it may be, None where nothing says so
     high_px: float | None = None  # upper end
     why: str = ""  # what was decided and for what reason, one clause
     size: tuple[int, int] = (0, 0)  # (width, height) of its images in px
     given: tuple[Given, ...] = ()  # what of the intrinsics is the user's, to be left as it is
-    # the pairs do not tell whether other such images of this size have the same camera
-    may_be_shared: bool = False
+    may_be_shared: bool = False  # pairs do not tell whether such images share a camera
 
     def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
         """Return the entry of ``report.json``, with the focal length that a model ended with."""

@@ -29,9 +29,7 @@ from colmap_affrect.geometry.focal_vote import (
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Advance, Progress
 
-MIN_NUM_INLIERS = 20
-"""Of a pair that votes; a fundamental matrix of few more than it needs says nothing else."""
-
+MIN_NUM_INLIERS = 20  # of a pair that votes: few more than a fundamental matrix needs say nothing
 MATCH_ERROR_PX = 0.5  # least error of matches, px of the photograph as features were extracted
 MAX_PAIRS_OF_IMAGE = 4  # the strongest pairs of each image vote
 MAX_PAIRS_OF_DECISION = 24  # pairs that are asked whether images of one size share a camera
@@ -56,10 +54,8 @@ class CameraVote:
     records: Mapping[int, CameraRecord]  # of all cameras by id
     pairs: Sequence[VotingPair]  # that vote
     may_share: bool  # whether cameras of images of one size may turn out to be the same
-    # cameras that have one focal length, each by the first of them
-    tied: dict[int, int] = field(default_factory=dict)
-    # what was found out about cameras of one size
-    decisions: dict[int, str] = field(default_factory=dict)
+    tied: dict[int, int] = field(default_factory=dict)  # with one focal length, by the first
+    decisions: dict[int, str] = field(default_factory=dict)  # about cameras of one size
 
     def decide(self, progress: Progress = SILENT) -> dict[int, CameraRecord]:
         """Return the records as they are after the vote; progress counts the pairs.
@@ -87,12 +83,11 @@ class CameraVote:
         num_votes = Counter(camera for item in ballots for camera in set(item.cameras))
         outcome = count(ballots, sorted(set(self.tied.values())))
         records = {key: record for key, record in self.records.items() if key in known}
-        for size, first in sorted({(self.records[key].size, self.tied[key]) for key in unknown}):
-            keys = [
-                key for key in unknown if (self.records[key].size, self.tied[key]) == (size, first)
-            ]
-            estimate = outcome.estimates[first]
-            records[keys[0]] = self._record(keys, estimate, num_votes[first])
+        same: dict[tuple[tuple[int, int], int], list[int]] = defaultdict(list)
+        for key in unknown:
+            same[self.records[key].size, self.tied[key]].append(key)
+        for (_, first), keys in sorted(same.items()):
+            records[keys[0]] = self._record(keys, outcome.estimates[first], num_votes[first])
         return records
 
     def _decide_sharing(self, same_size: Sequence[int]) -> None:
@@ -153,8 +148,7 @@ def _ballots(
 
     ballots = []
     for found in map_ordered(ask, pairs, available_cores()):
-        if found:
-            ballots.append(found)
+        ballots += [found] if found else []
         if advance:
             advance(1)
     return ballots

@@ -123,9 +123,7 @@ FATAL = FATAL_FOR_IMAGES | {
 }  # fmt: skip
 """The same of keypoints and matches."""
 
-Problems = dict[str, list[str]]
-"""What was found: by kind, the images, pairs or cameras concerned, none if it is the database."""
-
+Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
 MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
 
 MATRICES = {
@@ -141,10 +139,7 @@ CAMERA_OF_PAIR = struct.Struct("<IiQQBQ")
 length is a prior, and the number of parameters that follow, float64."""
 
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
-
-OUTSIDE_TOLERANCE_PX = 1.0
-"""Keypoints of an image that was shrunk for detection may lie a little outside it."""
-
+OUTSIDE_TOLERANCE_PX = 1.0  # keypoints of images shrunk for detection may lie outside
 UNDEFINED = 0  # configuration of a two-view geometry that COLMAP 4.2 passes over
 
 

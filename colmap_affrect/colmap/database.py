@@ -194,10 +194,7 @@ def has_keypoints(database: pycolmap.Database, image_id: int, count: int) -> boo
 
 
 def write_keypoints(
-    database: pycolmap.Database,
-    image_id: int,
-    lafs: Floats,
-    level_ends: Sequence[int] = (),
+    database: pycolmap.Database, image_id: int, lafs: Floats, level_ends: Sequence[int] = ()
 ) -> None:
     """Write the (N, 2, 3) frames of an image, in the place of fewer that it may have had before.
 
@@ -296,10 +293,7 @@ def cameras_of_images(database: pycolmap.Database) -> dict[int, pycolmap.Camera]
 
 
 def write_matches(
-    database: pycolmap.Database,
-    image_id1: int,
-    image_id2: int,
-    indices: NDArray[np.integer],
+    database: pycolmap.Database, image_id1: int, image_id2: int, indices: NDArray[np.integer]
 ) -> None:
     """Write (M, 2) raw matches of one pair unless it has some; every index is checked first."""
     if database.exists_matches(image_id1, image_id2):

@@ -20,10 +20,7 @@ from colmap_affrect.options import flat
 Plain = bool | int | float | str
 TRUTH_VALUES = {"true": True, "1": True, "false": False, "0": False}
 
-OWNED = {
-    "image_path": "it is the one that extract was given",
-    "random_seed": "use --random-seed",
-}
+OWNED = {"image_path": "it is the one that extract was given", "random_seed": "use --random-seed"}
 """Options, in any section, that are set by other means."""
 
 

@@ -20,8 +20,7 @@ from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 
-VERSION = 3800
-"""What COLMAP 3.8 writes into ``user_version``; newer ones take the tables over by it."""
+VERSION = 3800  # ``user_version`` of COLMAP 3.8; newer ones take the tables over by it
 
 MAPPER_OPTIONS = (
     "--Mapper.tri_ignore_two_view_tracks 0 --Mapper.init_min_num_inliers 50 "
@@ -29,9 +28,7 @@ MAPPER_OPTIONS = (
 )
 """Our preset for few photographs: by its defaults ``colmap mapper`` finds less, or nothing."""
 
-LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
-"""Camera models of COLMAP 3.8 have numbers up to this one."""
-
+LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)  # of cameras
 METRIC = pycolmap.PosePriorCoordinateSystem.CARTESIAN
 
 TABLES = f"""

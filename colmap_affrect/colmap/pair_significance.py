@@ -17,18 +17,12 @@ from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.epipolar import common_sign
 from colmap_affrect.geometry.pair_models import HomographyModel, PairModel, Points, Rows
 from colmap_affrect.geometry.shapes import of_unit_area, vary_singly
-from colmap_affrect.geometry.significance import (
-    log10_bayes_factor,
-    log10_false_alarms,
-    shuffled,
-)
+from colmap_affrect.geometry.significance import log10_bayes_factor, log10_false_alarms, shuffled
 
-MAX_FRAME_ANGLE_DEG = 20.0
-"""Frames agree up to here: those of right matches are off by 5 to 10 degrees."""
+MAX_FRAME_ANGLE_DEG = 20.0  # frames of right matches are off by 5 to 10 degrees
 CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0  # of frames that are turned at random
 MAX_CHANCE = 0.99  # frames that agree by chance nearly always, upright ones for one, say nothing
-MIN_VARIETY = 0.05
-"""Elements of shapes of area one that differ by less are all alike: they have no direction."""
+MIN_VARIETY = 0.05  # of elements of shapes of area one; below they have no direction
 
 
 def significance(

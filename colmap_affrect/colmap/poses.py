@@ -29,8 +29,7 @@ MAX_CORRECT_ERROR_DEG = 5.0
 """An image is registered correctly if its relative poses to at least half of the other registered
 images are off by at most this, in rotation and in translation direction."""
 MIN_IMAGES_TO_ALIGN = 3
-MAX_ALIGNMENT_ERROR = 0.05
-"""Centres farther off do not decide the alignment; in units of the extent of the true centres."""
+MAX_ALIGNMENT_ERROR = 0.05  # of the true extent; centres farther off do not decide alignment
 
 
 @dataclass(frozen=True)
@@ -39,12 +38,8 @@ class PoseScores:
 
     correct_names: tuple[str, ...]  # images registered correctly (``MAX_CORRECT_ERROR_DEG``)
     pair_errors_deg: PairErrors  # of every pair of registered images that have ground truth
-    # pairs of all given images that have ground truth; those that are not in ``pair_errors_deg``
-    # count as failures
-    num_pairs: int
-    # area under the curve of pairs whose larger error is below a threshold, up to 1, 3, 5 and 10
-    # degrees, by threshold; 0 to 1
-    auc: Mapping[float, float]
+    num_pairs: int  # of all images with truth; those without errors count as failures
+    auc: Mapping[float, float]  # area under the curve up to a threshold, 0 to 1
     # of camera centres after similarity alignment, in units of the ground truth; None with fewer
     # than three images, or all on one line
     median_position_error: float | None

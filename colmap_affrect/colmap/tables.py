@@ -15,18 +15,10 @@ from typing import Any
 
 from colmap_affrect.errors import DatabaseError
 
-TABLES = {"cameras", "images", "keypoints", "matches"}
-"""Tables that databases of all versions of COLMAP have."""
-
-HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")
-"""How a rollback journal begins while its changes are not complete."""
-
-DAMAGED = (sqlite3.Error, UnicodeDecodeError)
-"""What sqlite3 raises on damaged files; its messages may quote bytes that are not UTF-8."""
-
-MAX_NUM_IMAGES = 2**31 - 1
-"""COLMAP's id of a pair is the smaller image id times this, plus the larger one."""
-
+TABLES = {"cameras", "images", "keypoints", "matches"}  # of all versions of COLMAP
+HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins one of unfinished changes
+DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # what sqlite3 raises, also quoting odd bytes
+MAX_NUM_IMAGES = 2**31 - 1  # an id of a pair is the smaller image id times this, plus the larger
 SENSOR_CAMERA = 0
 
 

@@ -133,9 +133,7 @@ def estimate_geometry(
 
 
 def _planar_geometry(
-    geometry: pycolmap.TwoViewGeometry,
-    points: tuple[Array, Array],
-    options: VerificationOptions,
+    geometry: pycolmap.TwoViewGeometry, points: tuple[Array, Array], options: VerificationOptions
 ) -> pycolmap.TwoViewGeometry:
     """Return the homography of the inliers of an epipolar geometry, with all matches it explains.
 
@@ -178,8 +176,7 @@ def of_pair(extracted_px: ExtractedPx, ids: tuple[int, int]) -> int | None:
     return extracted_px.get(ids) if isinstance(extracted_px, Mapping) else extracted_px
 
 
-_Task = tuple[tuple[int, int], tuple[Side, Side], NDArray[np.integer]]
-"""A pair of image ids, its images and raw matches."""
+_Task = tuple[tuple[int, int], tuple[Side, Side], NDArray[np.integer]]  # ids, images, raw matches
 
 
 def verify(
@@ -262,10 +259,7 @@ class PairVerifier:
             self._cameras = cameras_of_images(database)
 
     def inliers(
-        self,
-        names: tuple[str, str],
-        frames: tuple[Floats, Floats],
-        indices: NDArray[np.integer],
+        self, names: tuple[str, str], frames: tuple[Floats, Floats], indices: NDArray[np.integer]
     ) -> Indices:
         """Return the (K, 2) matches that a two-view geometry explains; none if it is rejected.
 
@@ -276,10 +270,7 @@ class PairVerifier:
         return found if self._ids[names[0]] < self._ids[names[1]] else found[:, ::-1]
 
     def geometry(
-        self,
-        names: tuple[str, str],
-        frames: tuple[Floats, Floats],
-        indices: NDArray[np.integer],
+        self, names: tuple[str, str], frames: tuple[Floats, Floats], indices: NDArray[np.integer]
     ) -> pycolmap.TwoViewGeometry:
         """Return the geometry of the same from the image with the lower id; empty if rejected."""
         ids = self._ids[names[0]], self._ids[names[1]]

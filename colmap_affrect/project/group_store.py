@@ -107,6 +107,18 @@ class GroupStore:
         with self._open("r") as file:
             return {key for key in keys if is_complete(file, key)}
 
+    def _text(self, key: str) -> str | None:
+        """Return a text that is kept with the whole file, None where there is none."""
+        if not self.path.exists():
+            return None
+        with self._open("r") as file:
+            found = file.attrs.get(key)
+            return None if found is None else str(found)
+
+    def _record_text(self, key: str, text: str) -> None:
+        with self._open("a") as file:
+            file.attrs[key] = text
+
     def names(self) -> list[str]:
         """Return the sorted names of all complete groups."""
         if not self.path.exists():

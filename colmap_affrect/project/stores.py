@@ -124,7 +124,7 @@ class FeatureStore(GroupStore):
             group = self._group(file, name)
             size = tuple(group["image_size"][()].tolist())
             ends = group["level_ends"][()].tolist()
-            there = self._features(group, ends[-1])
+            there = self._features(group)
             first_id = int(there.rectification_ids.max(initial=0))
             ids = features.rectification_ids
             added = replace(features, rectification_ids=np.where(ids, ids + first_id, 0))
@@ -141,26 +141,21 @@ class FeatureStore(GroupStore):
         level_ends: list[int],
         content: str,
     ) -> None:
-        self._write(
-            file,
-            name,
-            {
-                "keypoints": features.keypoints.astype(np.float32),
-                "descriptors": features.descriptors.T.astype(np.float16),
-                "scores": features.responses,
-                "image_size": np.asarray(image_size),
-                **frame_datasets(features.lafs),
-                "rectification_ids": features.rectification_ids,
-                "level_ends": np.asarray(level_ends),
-            },
-            content=content,
-        )
+        datasets = {
+            "keypoints": features.keypoints.astype(np.float32),
+            "descriptors": features.descriptors.T.astype(np.float16),
+            "scores": features.responses,
+            "image_size": np.asarray(image_size),
+            **frame_datasets(features.lafs),
+            "rectification_ids": features.rectification_ids,
+            "level_ends": np.asarray(level_ends),
+        }
+        self._write(file, name, datasets, content=content)
 
     def read(self, name: str) -> LocalFeatures:
         """Read all features of one image; StoreError if they are missing or incomplete."""
         with self._open("r") as file:
-            group = self._group(file, name)
-            return self._features(group, group["level_ends"][()].tolist()[-1])
+            return self._features(self._group(file, name))
 
     def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
         """Return the indices of the features of two levels, each once, in their order."""
@@ -173,7 +168,8 @@ class FeatureStore(GroupStore):
         return file[name]
 
     @staticmethod
-    def _features(group: h5py.Group, end: int) -> LocalFeatures:
+    def _features(group: h5py.Group) -> LocalFeatures:
+        end = group["level_ends"][-1]
         return LocalFeatures(
             group["lafs"][:end].astype(np.float64),
             group["scores"][:end],
@@ -244,13 +240,8 @@ class MatchStore(GroupStore):
         """Write a batch of pairs; record that a level was tried for others, which keep theirs."""
         with self._open("a") as file:
             for pair in pairs:
-                self._write(
-                    file,
-                    pair_key(*pair.names),
-                    hloc_matches(pair),
-                    level=pair.level,
-                    tried_level=pair.level,
-                )
+                key, level = pair_key(*pair.names), pair.level
+                self._write(file, key, hloc_matches(pair), level=level, tried_level=level)
             for names in tried:
                 file[pair_key(*names)].attrs["tried_level"] = tried_level
 
@@ -266,25 +257,18 @@ class MatchStore(GroupStore):
         with self._open("a") as file:
             file.attrs[FINISHED] = ""
             for key, group in list(complete_groups(file)):
-                if (
-                    key in keys
-                    or not names.isdisjoint(key.split("/"))
-                    or group.attrs.get("tried_level")
-                ):
+                is_asked = key in keys or not names.isdisjoint(key.split("/"))
+                if is_asked or group.attrs.get("tried_level"):
                     del file[key]
 
     def stationary_cells(self) -> dict[tuple[int, int], Indices]:
         """Return the (N, 2) cells that never move by size of photographs (stages/stationary)."""
-        if not self.path.exists():
-            return {}
-        with self._open("r") as file:
-            known = json.loads(file.attrs.get(STATIONARY, "[]"))
+        known = json.loads(self._text(STATIONARY) or "[]")
         return {tuple(size): np.array(cells, np.int64).reshape(-1, 2) for size, cells in known}
 
     def record_stationary_cells(self, cells: Mapping[tuple[int, int], Indices]) -> None:
         """Keep the cells that never move."""
-        with self._open("a") as file:
-            file.attrs[STATIONARY] = json.dumps([(s, found.tolist()) for s, found in cells.items()])
+        self._record_text(STATIONARY, json.dumps([(s, c.tolist()) for s, c in cells.items()]))
 
     def has(self, pairs: Sequence[tuple[str, str]]) -> Bools:
         """Tell, as (N,) bools, which of N pairs are there and complete."""
@@ -304,16 +288,11 @@ class MatchStore(GroupStore):
 
         Empty if a run has begun with another one since, None if nothing is known.
         """
-        if not self.path.exists():
-            return None
-        with self._open("r") as file:
-            found = file.attrs.get(FINISHED)
-            return None if found is None else str(found)
+        return self._text(FINISHED)
 
     def record_finished_list(self, digest: str) -> None:
         """Keep the digest of the list that is finished, empty while there is none."""
-        with self._open("a") as file:
-            file.attrs[FINISHED] = digest
+        self._record_text(FINISHED, digest)
 
     def levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
         """Return the level of escalation that the matches of each pair are from."""
@@ -373,13 +352,16 @@ class GuidedStore(GroupStore):
 
     def read(self) -> list[GuidedPair]:
         """Read all pairs."""
-        found: list[GuidedPair] = []
         if not self.path.exists():
-            return found
+            return []
         with self._open("r") as file:
-            for _, group in sorted(complete_groups(file), key=lambda item: item[0]):
-                first, second = (str(name) for name in group.attrs["names"])
-                exact, candidates = group["exact"][()], group["candidates"][()]
-                count = int(group.attrs["num_inliers"])
-                found.append(GuidedPair((first, second), exact, candidates, count))
-        return found
+            return [
+                GuidedPair(
+                    (str(first), str(second)),
+                    group["exact"][()],
+                    group["candidates"][()],
+                    int(group.attrs["num_inliers"]),
+                )
+                for _, group in sorted(complete_groups(file), key=lambda item: item[0])
+                for first, second in [group.attrs["names"]]
+            ]

@@ -22,9 +22,7 @@ from colmap_affrect.options import digest_of, flat
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 
 logger = logging.getLogger(__name__)
-
-LOCAL = ("image_path", "image_list_path", "from_database", "cameras")
-"""Options that :meth:`Workspace.options_digest` leaves out: where files are, and cameras."""
+LOCAL = ("image_path", "image_list_path", "from_database", "cameras")  # not in digests
 PLACES = {
     "image_path", "image_list_path", "from_database", "cameras.cameras_path", "masks.path",
     "masks.camera_path", "depth.path", "match_list_path", "database",
@@ -32,8 +30,7 @@ PLACES = {
 """Options that say where files are: other places are no other options, what the files hold counts
 (:mod:`colmap_affrect.project.contents`). But none at all is another option."""
 GIVEN = "given"  # what stands in the place of such an option when options are compared
-INPUTS = "inputs.sha256"
-"""File in sparse/ that names the verified pairs, and the extended model, they were made from."""
+INPUTS = "inputs.sha256"  # in sparse/: digests of what it was made from
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
 COPY_STAGES = ("copy", "verify", "map")  # of a folder in which another program's database is mapped
 BYTES_OF_MARK = 200  # at the beginning of our files, in which they tell what they are

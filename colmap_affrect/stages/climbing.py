@@ -42,11 +42,9 @@ class ClimbingGraph:
     """The pairs of a set as they are now."""
 
     num_inliers: Mapping[Pair, int]  # of each pair, 0 where it is not verified
-    # matches that confirm each other, of each pair that is not verified
-    num_consistent: Mapping[Pair, int]
+    num_consistent: Mapping[Pair, int]  # that confirm each other; of each not verified
     insecure: Set[str]  # images that mapping may well lose
-    # pairs to which the last level that they climbed to brought nothing
-    stalled: Set[Pair] = frozenset()
+    stalled: Set[Pair] = frozenset()  # to which the last level brought nothing
 
     @cached_property
     def components(self) -> dict[str, int]:

@@ -18,18 +18,12 @@ from colmap_affrect.project.workspace import Workspace
 class Resources:
     """What is needed from outside and does not change results."""
 
-    # folder with the weights of networks; None searches the usual places
-    weights_path: Path | None = None
-    # ``auto``, ``cpu``, ``cuda``, ``cuda:1``, ``mps``; of networks and of matching
-    device: str = "auto"
-    # folder that keeps the depth maps of a network; None keeps none
-    depth_cache_path: Path | None = None
+    weights_path: Path | None = None  # of networks; None searches the usual places
+    device: str = "auto"  # ``auto``, ``cpu``, ``cuda:1``, ``mps``; of networks and of matching
+    depth_cache_path: Path | None = None  # for the depth maps of a network; None keeps none
 
     def require_device(self, *, uses_network: bool = False) -> str:
-        """Return the device that is there, else raise DeviceError.
-
-        torch is loaded only where networks are used, or when a device is named.
-        """
+        """Return the device, if it is there; torch is loaded only to ask for one or use it."""
         if self.device in ("auto", "cpu") and not uses_network:
             return "cpu"
         from colmap_affrect.features.networks import resolve_device
@@ -53,8 +47,7 @@ class Context:
 
     workspace: Workspace  # the output folder
     resources: Resources = field(default_factory=Resources)  # weights and device
-    # where images and pairs are worked on, a cluster for one; by default in threads of this process
-    executor: Executor | None = None
+    executor: Executor | None = None  # for images and pairs, e.g. a cluster; None: threads here
     progress: Progress = SILENT  # where to show progress
 
     @property

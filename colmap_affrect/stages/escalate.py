@@ -32,11 +32,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.verification import (
-    PairVerifier,
-    verified_pairs,
-    verify,
-)
+from colmap_affrect.colmap.verification import PairVerifier, verified_pairs, verify
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.consistency import num_consistent_matches

@@ -318,10 +318,7 @@ def prepared_recipe(
 
 
 def extract_images(
-    context: Context,
-    inputs: Inputs,
-    extractor: ImageExtractor,
-    images: Sequence[tuple[str, int]],
+    context: Context, inputs: Inputs, extractor: ImageExtractor, images: Sequence[tuple[str, int]]
 ) -> Generator[ExtractedImage | ImageError, None, None]:
     """Yield the features of images, or why one cannot be used, in order.
 

@@ -39,10 +39,7 @@ from colmap_affrect.stages.verify import (
 )
 
 Matches = Indices
-
-MIN_SHARE_KEPT = 0.8
-"""Of the inliers before, so many are still inliers of a geometry with guided matches."""
-
+MIN_SHARE_KEPT = 0.8  # of the inliers before, in a geometry with guided matches
 IMAGES_IN_MEMORY = 40  # of 13,000 features; pairs come in an order that reads these seldom
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
@@ -38,20 +38,14 @@ from colmap_affrect.stages.verify import recorded_verification
 
 logger = logging.getLogger(__name__)
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
-
-STRONGER_RECIPE, LEARNED_RECIPE = "on-demand", "on-demand-learned"
-"""Advised where photographs are missing; the second needs weights."""
+STRONGER_RECIPE, LEARNED_RECIPE = "on-demand", "on-demand-learned"  # advised
 
 TOO_FEW = "more photographs: two that can be read and show the same from two places make a model"
 """Advised where nothing else would help."""
 
 
 def map_images(
-    context: Context,
-    mapper: Mapper,
-    extend: Extension | None = None,
-    *,
-    overwrite: bool = False,
+    context: Context, mapper: Mapper, extend: Extension | None = None, *, overwrite: bool = False
 ) -> tuple[StageReport, list[ModelSummary]]:
     """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
 
@@ -252,9 +246,7 @@ def unregistered(
     registered = set(models[0].registered_names) if models else set()
     taken_out = models[0].taken_out if models else {}
     reasons = {}
-    for name in names:
-        if name in registered:
-            continue
+    for name in [name for name in names if name not in registered]:
         if name in elsewhere:
             reasons[name] = elsewhere[name]
         elif name not in num_keypoints or name not in ids:
@@ -271,12 +263,12 @@ def unregistered(
     return reasons
 
 
-def _verified_by_name(workspace: Workspace) -> dict[str, dict[str, int]]:
+def _verified_by_name(workspace: Workspace) -> Mapping[str, dict[str, int]]:
     """Return for each image of a verified pair its partners, and how many inliers they share."""
     found: defaultdict[str, dict[str, int]] = defaultdict(dict)
     for (first, second), count in num_verified_inliers(workspace).items():
         found[first][second] = found[second][first] = count
-    return dict(found)
+    return found
 
 
 def advice(

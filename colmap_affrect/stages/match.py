@@ -25,9 +25,7 @@ from colmap_affrect.stages.stationary import StationaryFilter
 
 logger = logging.getLogger(__name__)
 PAIRS_PER_WRITE = 64
-
-SECONDS_PER_WRITE = 30.0
-"""Pairs of a network take seconds each: what is found is stored before there are so many."""
+SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
 
 
 WEIGHTS = "weights"  # of the record, beside the options: file name to sha256
@@ -77,10 +75,7 @@ def match(
 
 
 def match_pairs(
-    context: Context,
-    pairs: Sequence[Pair],
-    options: MatcherOptions,
-    advance: Callable[[int], None],
+    context: Context, pairs: Sequence[Pair], options: MatcherOptions, advance: Callable[[int], None]
 ) -> None:
     """Match pairs by the features that every image has, and store them batch by batch."""
     extractor = recorded_extraction(context.workspace).features.name

@@ -23,9 +23,7 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.stores import FeatureStore, GuidedPair
 from colmap_affrect.stages.one_pair import ImageCache
 
-MIN_OFF_PLANE = 20
-"""Fewer inliers off a plane may be accidental, as many as verification asks of a pair."""
-
+MIN_OFF_PLANE = 20  # fewer inliers off a plane may be accidental
 Points = Array
 
 
@@ -36,8 +34,7 @@ class GuidedTask:
     names: Pair  # of the two images
     matrix: Array  # (3, 3) fundamental matrix, or a homography of image 2 from image 1
     is_homography: bool  # which of both
-    # of each image the (N, 2) keypoints in the pixels that the matrix holds in
-    points: tuple[Points, Points]
+    points: tuple[Points, Points]  # (N, 2) keypoints in the pixels of the matrix
     inliers: Indices  # (M, 2) of the geometry
 
     def __str__(self) -> str:

@@ -47,9 +47,7 @@ from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, Rectifier, 
 from colmap_affrect.rectifiers.execute import extract_rectified
 from colmap_affrect.stages.context import Resources, require_same_files
 
-MIN_RECTIFIABLE_PX = 32
-"""Images with a shorter side are not rectified: no block would see its surroundings."""
-
+MIN_RECTIFIABLE_PX = 32  # shorter side; else no block would see its surroundings
 MEMORY_IS_FULL = "extracted on the CPU, the memory of the GPU is full"
 
 
@@ -59,8 +57,7 @@ class ExtractedImage:
 
     features: LocalFeatures  # frames in px of the stored image
     image_size: tuple[int, int]  # (width, height) of the stored image in px
-    # why it was not rectified though it was to be, or not on the GPU; empty if all went well
-    warning: str = ""
+    warning: str = ""  # why it was not rectified, or not on the GPU; empty if all went well
     stretched: bool = False  # whether its contrast was low and was stretched
 
 
@@ -70,16 +67,11 @@ class ImageTask:
 
     photographs: Photographs  # where it and its masks are
     name: str  # of the photograph
-    # of escalation: 0 for the features that every image gets; above that, only those that the
-    # rectifier of this level adds
-    level: int = 0
-    # (3, 3) camera matrix in pixel-centre px of the stored image; by default COLMAP's guess of a
-    # focal length of 1.2 times the longer side
+    level: int = 0  # of escalation: above 0 only the features that its rectifier adds
+    # (3, 3) camera matrix in pixel-centre px of the stored image; by default COLMAP's guess
     intrinsics: Array | None = None
-    # (width, height) of its camera, if it has one already
-    camera_size: tuple[int, int] | None = None
-    # content of its files by absolute path; None where they are read
-    sent: Mapping[Path, bytes] | None = None
+    camera_size: tuple[int, int] | None = None  # (width, height) of its camera, if any
+    sent: Mapping[Path, bytes] | None = None  # its files by absolute path; None to read them
 
     def __str__(self) -> str:
         return self.name
@@ -118,8 +110,7 @@ class ImageExtractor:
     """
 
     options: ExtractionOptions  # of the recipe
-    # detector and descriptor of each level, that of every image first
-    extractors: tuple[FeatureExtractor, ...]
+    extractors: tuple[FeatureExtractor, ...]  # of each level, that of every image first
     rectifiers: tuple[Rectifier, ...]  # of each level
     weights: Mapping[str, Path] = field(default_factory=dict)  # files of the networks by key
     resources: Resources = field(default_factory=Resources)  # that it was prepared with
@@ -146,12 +137,12 @@ class ImageExtractor:
                 )
         except ImageError as error:
             return error
-        if task.camera_size and task.camera_size != found.image_size:
-            (width, height), expected = found.image_size, task.camera_size
+        size, expected = found.image_size, task.camera_size
+        if expected and expected != size:
             return ImageError(
-                f"{task.photographs.folder / task.name}: is {width} x {height} px, and its camera "
-                f"in the database {expected[0]} x {expected[1]} px; give the images that the "
-                "database is of"
+                f"{task.photographs.folder / task.name}: is {size[0]} x {size[1]} px, and its "
+                f"camera in the database {expected[0]} x {expected[1]} px; give the images that "
+                "the database is of"
             )
         return found
 
@@ -178,16 +169,14 @@ class ImageExtractor:
             )
         features = found.features
         if photograph.size != original_size:
-            original_from_resized = np.linalg.inv(
-                resized_from_original(original_size, photograph.size)
-            )
-            features = features.with_frames(transform_frames(original_from_resized, features.lafs))
+            resized = resized_from_original(original_size, photograph.size)
+            frames = transform_frames(np.linalg.inv(resized), features.lafs)
+            features = features.with_frames(frames)
         keep = features.inside(original_size)
         if mask is not None:
             keep &= in_mask(mask, features.keypoints)
-        return ExtractedImage(
-            features.select(keep), original_size, found.warning, photograph.stretched
-        )
+        kept = features.select(keep)
+        return ExtractedImage(kept, original_size, found.warning, photograph.stretched)
 
     def extract(self, photograph: Photograph, level: int = 0) -> ExtractedImage:
         """Plan and execute; frames are in px of the photograph at the size of processing."""
@@ -283,10 +272,8 @@ def num_images_at_once(extractor: ImageExtractor) -> int:
     They take at most half of the memory there is. With networks at most two: one is read while
     the networks run on the other.
     """
-    num_bytes = max(
-        level.features.bytes_per_px * level.max_image_size_px**2
-        for level in extractor.options.levels
-    )
+    levels = extractor.options.levels
+    num_bytes = max(x.features.bytes_per_px * x.max_image_size_px**2 for x in levels)
     most = 2 if extractor.options.uses_networks else available_cores()
     return min(most, max(1, available_memory_bytes() // 2 // num_bytes))
 
@@ -320,10 +307,8 @@ def prepare(
     weights = resolve(options.weights, resources.weights_path, progress=progress)
     device = resources.require_device(uses_network=options.uses_networks)
     network = NetworkContext(weights, device)
-    levels = options.levels
-    extractors = {
-        features: EXTRACTORS.make(features, network) for features in {x.features for x in levels}
-    }
+    extractor = cache(lambda features: EXTRACTORS.make(features, network))
+    extractors = tuple(extractor(level.features) for level in options.levels)
     depth = None
     if options.uses_depth:
         depth_context = DepthContext(resources.depth_cache_path, network.device)
@@ -332,15 +317,13 @@ def prepare(
             depth.require_some(image_names)
     shapes = cache(lambda source, features: SHAPES.make(source, network, features))
     rectifiers = []
-    for level in levels:
-        item = level.rectifier
-        source = None
+    for level in options.levels:
+        item, source = level.rectifier, None
         if isinstance(item, CoverOptions):
             source = shapes(item.shape_source, level.features)
         inputs = RectifierInputs(source, depth if item.uses_depth else None)
         rectifiers.append(RECTIFIERS.make(item, inputs))
-    of_levels = tuple(extractors[level.features] for level in levels)
-    return ImageExtractor(options, of_levels, tuple(rectifiers), weights, resources)
+    return ImageExtractor(options, extractors, tuple(rectifiers), weights, resources)
 
 
 def _prepared_elsewhere(

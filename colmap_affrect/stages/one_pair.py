@@ -43,8 +43,7 @@ class Matching:
     base: int = 0  # level that has the features of the images themselves
     extractor: str = ""  # name of the feature extractor; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
-    # of each image, those of the largest responses; None for all
-    max_num_features: int | None = None
+    max_num_features: int | None = None  # of each image, by response; None for all
     num_similarities: float = 0  # about how many pairs of features there will be to compare
 
 
