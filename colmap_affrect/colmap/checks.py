@@ -245,10 +245,8 @@ def _check_names(connection: sqlite3.Connection, found: Problems) -> None:
 
 
 def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
-    tables = [
-        name for name in ("rig_sensors", "frames", "frame_data") if columns_of(connection, name)
-    ]
-    for table in tables:
+    tables = ("rig_sensors", "frames", "frame_data")
+    for table in [name for name in tables if columns_of(connection, name)]:
         for _, row, parent, _ in connection.execute(f"PRAGMA foreign_key_check({table})"):
             found["frame-links"].append(f"row {row} of {table}, {parent}")
     if columns_of(connection, "rigs"):
@@ -266,8 +264,7 @@ def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
             for row, blob in rows_of(connection, f"{key} {name}", table):
                 values = _array(blob, 1, columns[name], np.dtype("<f8")) if blob else True
                 # Priors of position that are not known are not a number.
-                is_odd = values is None or (name in "FEH" and not np.isfinite(values).all())
-                if is_odd:
+                if values is None or (name in "FEH" and not np.isfinite(values).all()):
                     found["matrix-data"].append(f"{name} of {key} {row}")
     if {"qvec", "tvec"} <= columns_of(connection, "two_view_geometries"):
         query = "SELECT pair_id FROM two_view_geometries WHERE (qvec IS NULL) != (tvec IS NULL)"

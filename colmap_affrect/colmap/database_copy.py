@@ -20,6 +20,7 @@ from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusabl
 from colmap_affrect.colmap.database import open_database, write_frame
 from colmap_affrect.colmap.tables import DAMAGED, columns_of, open_read_only
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.project.workspace import remove_database
 
 FIRST_TYPED_SCHEMA = 4_000_000  # descriptors have a type since COLMAP 4.0
 
@@ -86,7 +87,7 @@ def copy_database(
     if refused:
         refuse_unusable(source, refused)
     new = target.with_name(target.name + ".new")
-    new.unlink(missing_ok=True)
+    remove_database(new)
     try:
         copy_as_it_is(source, new)
         positions = _old_positions(new)
@@ -96,7 +97,7 @@ def copy_database(
                 change(database)
         new.replace(target)
     finally:
-        new.unlink(missing_ok=True)
+        remove_database(new)
 
 
 def _old_positions(path: Path) -> dict[int, tuple[float, float, float]]:

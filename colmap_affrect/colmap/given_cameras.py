@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import read_given_model
+from colmap_affrect.colmap.model_files import camera_like, read_given_model
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.project.tables import read_lines, read_table
@@ -76,9 +76,8 @@ def _numbers(text: str, where: str) -> tuple[float, ...]:
 def _require_model(name: str, where: str) -> None:
     models = [
         model
-        for model in pycolmap.CameraModelId.__members__
-        if model != "INVALID"
-        and len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).focal_length_idxs())
+        for model, number in pycolmap.CameraModelId.__members__.items()
+        if (like := camera_like(number.value)) and len(like.focal_length_idxs())
     ]
     if name not in models:
         raise OptionError(f"{where} {name}: not one of {', '.join(models)}")

@@ -46,6 +46,7 @@ from colmap_affrect.images.exif import (
 )
 from colmap_affrect.images.headers import is_too_large
 from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.project.workspace import remove_database
 
 logger = logging.getLogger(__name__)
 Size = tuple[int, int]
@@ -243,7 +244,7 @@ def import_images(
     new = path if path.exists() else path.with_name(path.name + ".new")
     read = path.with_name(path.name + ".read")
     for file in {path, new, read} if new != path else {read}:
-        _remove_database(file)
+        remove_database(file)
     missing = sorted(set(names) - set(image_ids(new)))
     missing = [name for name in missing if not is_too_large(initial.size(name))]
     if missing:
@@ -252,15 +253,10 @@ def import_images(
         pycolmap.import_images(read, image_path, pycolmap.CameraMode.PER_IMAGE, missing)
         with open_database(read) as found, open_database(new) as database:
             _Import(initial, found, database).add()
-        _remove_database(read)
+        remove_database(read)
     if new != path:
         new.replace(path)
     return sorted(set(names) - set(image_ids(path)))
-
-
-def _remove_database(path: Path) -> None:
-    for suffix in ("", "-wal", "-shm"):
-        path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
 class _Import:

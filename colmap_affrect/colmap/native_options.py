@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -117,13 +118,10 @@ def _converted(value: Any, example: Any, where: str) -> Plain:
     kind = next((kind for kind in EXPECTED if isinstance(example, kind)), None)
     if kind is None:
         raise OptionError(f"{where}: cannot be given, it is of type {type(example).__name__}")
-    try:
-        converted = _convert(value, kind)
-    except (ValueError, OverflowError):
-        converted = None
-    if converted is None:
-        raise OptionError(f"{where}={value}: expected {kind.__name__.lower()} ({EXPECTED[kind]})")
-    return converted
+    with suppress(ValueError, OverflowError):
+        if (converted := _convert(value, kind)) is not None:
+            return converted
+    raise OptionError(f"{where}={value}: expected {kind.__name__.lower()} ({EXPECTED[kind]})")
 
 
 def _convert(value: Any, kind: type) -> Plain | None:

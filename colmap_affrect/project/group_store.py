@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -100,13 +100,6 @@ class GroupStore:
                 "run again with --overwrite"
             )
 
-    def complete(self, keys: Iterable[str]) -> set[str]:
-        """Return those of the keys whose group is complete."""
-        if not self.path.exists():
-            return set()
-        with self._open("r") as file:
-            return {key for key in keys if is_complete(file, key)}
-
     def _text(self, key: str) -> str | None:
         """Return a text that is kept with the whole file, None where there is none."""
         if not self.path.exists():
@@ -118,13 +111,6 @@ class GroupStore:
     def _record_text(self, key: str, text: str) -> None:
         with self._open("a") as file:
             file.attrs[key] = text
-
-    def names(self) -> list[str]:
-        """Return the sorted names of all complete groups."""
-        if not self.path.exists():
-            return []
-        with self._open("r") as file:
-            return sorted(name for name, _ in complete_groups(file))
 
     @staticmethod
     def _write(file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:

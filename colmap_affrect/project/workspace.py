@@ -315,6 +315,12 @@ def database_files(path: Path) -> list[Path]:
     return [path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", "-journal"))]
 
 
+def remove_database(path: Path) -> None:
+    """Remove a database and the files beside it, if they are there."""
+    for file in database_files(path):
+        file.unlink(missing_ok=True)
+
+
 def placeless(options: Mapping[str, Any], there: str = "", prefix: str = "") -> dict[str, Any]:
     """Return options without places of files; ``there`` stands where one is given."""
     found = dict(options)
@@ -330,9 +336,8 @@ def first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Say where options on record differ from those given now; empty if they do not."""
     old, new = flat(known), flat(now)
     # The name of a part first: with another one most other options differ too.
-    for key in sorted(
-        old.keys() | new.keys(), key=lambda key: (key.rpartition(".")[2] != "name", key)
-    ):
+    keys = sorted(old.keys() | new.keys(), key=lambda key: (key.rpartition(".")[2] != "name", key))
+    for key in keys:
         if old.get(key) != new.get(key):
             return f"{key}={old.get(key)!r}, and it is {new.get(key)!r} now"
     return ""

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -53,11 +53,14 @@ from colmap_affrect.stages.extract import (
     write_images_and_keypoints,
 )
 from colmap_affrect.stages.guide import restore_exact
-from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, recorded_matching
+from colmap_affrect.stages.match import (
+    PAIRS_PER_WRITE,
+    match_pairs,
+    matched_at_level,
+    recorded_matching,
+)
 from colmap_affrect.stages.one_image import ImageExtractor
-from colmap_affrect.stages.one_pair import Matching, iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
-from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import (
     extracted_px,
     recorded_verification,
@@ -281,7 +284,8 @@ class Escalation:
 
     def climb(self, pairs: Sequence[Pair], level: int) -> None:
         """Match pairs with the features of a level and keep what has more inliers."""
-        names = self._images_to_extend(pairs, level)
+        images = sorted({name for pair in pairs for name in pair})
+        names = [name for name in images if len(self.features.level_ends(name)) <= level]
         title, total = f"escalate, level {level}", len(names) + len(pairs)
         with self.context.progress.stage(title, total, "steps") as advance:
             self._extend(names, level, advance)
@@ -308,29 +312,12 @@ class Escalation:
     def match_first_level(self, pairs: Sequence[Pair], path: Path) -> None:
         """Give pairs of a copy of the database the matches that they had before they climbed."""
         ids = colmap_database.image_ids(path)
-        with closing(self._iterate_matches(pairs, 0)) as found_pairs:
-            found_matches = list(found_pairs)
+        found_matches = list(matched_at_level(self.context, pairs, self.matching, 0))
         with colmap_database.open_database(path) as database:
             for found in found_matches:
                 first, second = (ids[name] for name in found.names)
                 colmap_database.replace_matches(database, first, second, found.indices)
         verify(path, self.verification, extracted_px(self.context))
-
-    def _iterate_matches(
-        self, pairs: Sequence[Pair], level: int
-    ) -> Generator[PairMatches, None, None]:
-        chosen = self.extraction.levels[level]
-        options, extractor = chosen.matching or self.matching, chosen.features.name
-        resources, executor = self.context.resources, self.context.executor
-        matching = Matching(self.features, options, level, chosen.base, extractor, resources)
-        stationary = StationaryFilter(self.features, self.matches)
-        with closing(iterate_matches(pairs, matching, executor)) as found_pairs:
-            for found in found_pairs:
-                yield stationary.filtered(found)
-
-    def _images_to_extend(self, pairs: Sequence[Pair], level: int) -> list[str]:
-        names = sorted({name for pair in pairs for name in pair})
-        return [name for name in names if len(self.features.level_ends(name)) <= level]
 
     def _extend(self, names: Sequence[str], level: int, advance: Callable[[int], None]) -> None:
         """Add to images the features of all levels that they lack, up to this one."""
@@ -375,7 +362,8 @@ class Escalation:
             better.clear()
 
         try:
-            with closing(self._iterate_matches(pairs, level)) as found_pairs:
+            matched = matched_at_level(self.context, pairs, self.matching, level)
+            with closing(matched) as found_pairs:
                 for found in found_pairs:
                     tried.append(found.names)
                     chosen, worth = self._judged(found, others.get(found.names), verifier)

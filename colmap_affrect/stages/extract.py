@@ -199,24 +199,15 @@ def extract(
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
     failures = _extract_missing(context, inputs, extractor, missing, digests, warnings)
-    _require_some(folder, names, failures)
-    failures |= write_images_and_keypoints(context)
-    return StageReport(
-        "extract",
-        time.perf_counter() - start,
-        len(set(missing) - set(failures)),
-        len(done - set(failures)),
-        failures,
-        warnings,
-    )
-
-
-def _require_some(folder: Path, names: Sequence[str], failures: Mapping[str, str]) -> None:
     if len(failures) == len(names):
+        first = failures[names[0]]
         raise ImageError(
-            f"{folder}: none of the {len(names)} images can be used; the first: "
-            f"{failures[names[0]]}"
+            f"{folder}: none of the {len(names)} images can be used; the first: {first}"
         )
+    failures |= write_images_and_keypoints(context)
+    new, kept = set(missing) - failures.keys(), done - failures.keys()
+    wall_s = time.perf_counter() - start
+    return StageReport("extract", wall_s, len(new), len(kept), failures, warnings)
 
 
 def _passed_over(

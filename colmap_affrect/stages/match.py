@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 
 import numpy as np
@@ -78,16 +78,11 @@ def match_pairs(
     context: Context, pairs: Sequence[Pair], options: MatcherOptions, advance: Callable[[int], None]
 ) -> None:
     """Match pairs by the features that every image has, and store them batch by batch."""
-    extractor = recorded_extraction(context.workspace).features.name
-    matching = Matching(context.features, options, extractor=extractor, resources=context.resources)
-    matches = context.matches
-    stationary = StationaryFilter(context.features, matches)
-    batch: list[PairMatches] = []
-    written = time.monotonic()
+    matches, batch, written = context.matches, list[PairMatches](), time.monotonic()
     try:
-        with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
+        with closing(matched_at_level(context, pairs, options, 0)) as found_pairs:
             for found in found_pairs:
-                batch.append(stationary.filtered(found))
+                batch.append(found)
                 advance(1)
                 is_due = time.monotonic() - written > SECONDS_PER_WRITE
                 if len(batch) == PAIRS_PER_WRITE or is_due:
@@ -96,6 +91,19 @@ def match_pairs(
     finally:
         if batch:
             matches.write(batch)
+
+
+def matched_at_level(
+    context: Context, pairs: Sequence[Pair], options: MatcherOptions, level: int
+) -> Generator[PairMatches, None, None]:
+    """Match pairs with the features of a level, by default with these options; what moves stays."""
+    features, chosen = context.features, recorded_extraction(context.workspace).levels[level]
+    options, extractor = chosen.matching or options, chosen.features.name
+    matching = Matching(features, options, level, chosen.base, extractor, context.resources)
+    stationary = StationaryFilter(features, context.matches)
+    with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
+        for found in found_pairs:
+            yield stationary.filtered(found)
 
 
 def write_matches(context: Context, pairs: Sequence[Pair]) -> None:
