@@ -333,9 +333,8 @@ def _are_outside(keypoints: Singles, camera: Camera | None) -> bool:
     """Tell whether any keypoints, whose origin is the corner of the image, are not in it."""
     if camera is None:
         return False
-    points, size = keypoints[:, :2], np.array([camera.width, camera.height])
-    tolerance = OUTSIDE_TOLERANCE_PX
-    return bool(((points < -tolerance) | (points > size + tolerance)).any())
+    beyond = np.maximum(-keypoints[:, :2], keypoints[:, :2] - [camera.width, camera.height])
+    return bool((beyond > OUTSIDE_TOLERANCE_PX).any())
 
 
 def _check_descriptors(tables: Tables, found: Problems) -> None:

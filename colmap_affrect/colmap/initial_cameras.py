@@ -49,6 +49,7 @@ from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.project.workspace import remove_database
 
 logger = logging.getLogger(__name__)
+
 Size = tuple[int, int]
 Group = tuple[object, ...]  # images of one group share a camera
 

@@ -22,6 +22,7 @@ from typing import BinaryIO
 from colmap_affrect.errors import WorkspaceError
 
 logger = logging.getLogger(__name__)
+
 PAGE_BYTES = 4096
 LINES_AT_ONCE = 10_000
 NEW_SUFFIX = ".affrect-new"  # of files that are being written; a killed program leaves them

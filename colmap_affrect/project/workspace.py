@@ -22,6 +22,7 @@ from colmap_affrect.options import digest_of, flat
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 
 logger = logging.getLogger(__name__)
+
 LOCAL = ("image_path", "image_list_path", "from_database", "cameras")  # not in digests
 PLACES = {
     "image_path", "image_list_path", "from_database", "cameras.cameras_path", "masks.path",

@@ -88,9 +88,3 @@ def _other_sizes(database: Path, image_path: Path) -> dict[str, str]:
 def is_copy(workspace: Workspace) -> bool:
     """Tell whether a folder holds the copy of another program's database."""
     return "copy" in workspace.recorded().get("begun", [])
-
-
-def copied_image_path(workspace: Workspace) -> Path | None:
-    """Return the folder of the photographs of a copied database, None if it was not given."""
-    path = workspace.require("copy")["image_path"]
-    return Path(path) if path else None

@@ -22,6 +22,7 @@ from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
 
 logger = logging.getLogger(__name__)
+
 NUM_CACHED_MAPS = 8  # one image is asked for each of its pairs
 
 

@@ -28,7 +28,7 @@ from colmap_affrect.project.workspace import INPUTS, Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.climbing import connected_parts
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.copy import copied_image_path, is_copy
+from colmap_affrect.stages.copy import is_copy
 from colmap_affrect.stages.depth_lookup import depth_lookup
 from colmap_affrect.stages.escalate import first_level_database, measured_database, reject
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
@@ -37,6 +37,7 @@ from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import recorded_verification
 
 logger = logging.getLogger(__name__)
+
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
 STRONGER_RECIPE, LEARNED_RECIPE = "on-demand", "on-demand-learned"  # advised
 
@@ -120,9 +121,8 @@ def _inputs(workspace: Workspace, extend: Extension | None) -> str:
 
 def image_path_of(workspace: Workspace) -> Path | None:
     """Return the folder of the photographs, None where another program's database names none."""
-    if is_copy(workspace):
-        return copied_image_path(workspace)
-    return Path(Inputs.recorded(workspace).image_path)
+    path = workspace.require("copy" if is_copy(workspace) else "extract")["image_path"]
+    return Path(path) if path else None
 
 
 def image_names(workspace: Workspace) -> list[str]:

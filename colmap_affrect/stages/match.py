@@ -24,6 +24,7 @@ from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.stationary import StationaryFilter
 
 logger = logging.getLogger(__name__)
+
 PAIRS_PER_WRITE = 64
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
 

@@ -81,23 +81,13 @@ def guided_task(
     return task.scaled(scales)
 
 
-@dataclass(frozen=True)
-class _Descriptors:
-    descriptors: Singles
-    shapes: Array
-
-    @property
-    def nbytes(self) -> int:
-        return self.descriptors.nbytes + self.shapes.nbytes
-
-
 class GuidedMatcher:
     """Matches pairs again, with the features that it keeps of some images."""
 
     def __init__(self, store: FeatureStore, options: GuidedOptions) -> None:
         """Name the features."""
         self._store, self._options = store, options
-        self._images = ImageCache(self._read)
+        self._images = ImageCache(self._read, lambda arrays: sum(x.nbytes for x in arrays))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return GuidedMatcher, (self._store, self._options)
@@ -105,13 +95,15 @@ class GuidedMatcher:
     def __call__(self, task: GuidedTask) -> GuidedPair:
         """Return the inliers of a pair and its guided matches."""
         first, second = (
-            GuidableImage(image.descriptors, points, image.shapes)
-            for image, points in zip(map(self._images.get, task.names), task.points, strict=True)
+            GuidableImage(descriptors, points, shapes)
+            for points, (descriptors, shapes) in zip(
+                task.points, map(self._images.get, task.names), strict=True
+            )
         )
         guide = task.guide(self._options.band_px)
         both = guided_matches(first, second, guide, self._options, task.inliers)
         return GuidedPair(task.names, task.inliers, both, 0)
 
-    def _read(self, name: str) -> _Descriptors:
+    def _read(self, name: str) -> tuple[Singles, Array]:
         features = self._store.read(name)
-        return _Descriptors(features.descriptors, features.lafs[:, :, :2])
+        return features.descriptors, features.lafs[:, :, :2]

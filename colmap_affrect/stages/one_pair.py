@@ -10,7 +10,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -88,14 +88,12 @@ def _received(image: ImageFeatures, indices: Indices) -> StoredFeatures:
     return StoredFeatures(_of_types(image, np.float64, np.float32), indices)
 
 
-def _of_types(image: ImageFeatures, lafs: type, descriptors: type) -> ImageFeatures:
+def _of_types(
+    image: ImageFeatures, lafs: type[np.floating[Any]], descriptors: type[np.floating[Any]]
+) -> ImageFeatures:
     old = image.features
-    return replace(
-        image,
-        features=replace(
-            old, lafs=old.lafs.astype(lafs), descriptors=old.descriptors.astype(descriptors)
-        ),
-    )
+    frames, rows = old.lafs.astype(lafs), old.descriptors.astype(descriptors)
+    return replace(image, features=replace(old, lafs=frames, descriptors=rows))
 
 
 @dataclass(frozen=True)
@@ -117,21 +115,8 @@ class PreparedImage:
     frames: Floats  # (N, 2, 3) local affine frames in pixel-centre px
     indices: Indices  # (N,) int64 that its features have in the store
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of what the matcher made."""
-        return int(self.content.nbytes)
 
-
-class HasBytes(Protocol):
-    """What says how much memory it takes."""
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of all arrays."""
-
-
-Content = TypeVar("Content", bound=HasBytes)
+Content = TypeVar("Content")
 
 
 class ImageCache(Generic[Content]):
@@ -140,9 +125,9 @@ class ImageCache(Generic[Content]):
     Those not used for longest are dropped first.
     """
 
-    def __init__(self, make: Callable[[str], Content]) -> None:
-        """Say how to make what is missing, of the name of an image."""
-        self._make, self._lock = make, threading.Lock()
+    def __init__(self, make: Callable[[str], Content], nbytes: Callable[[Content], int]) -> None:
+        """Say how to make what is missing, of the name of an image, and what memory it takes."""
+        self._make, self._nbytes, self._lock = make, nbytes, threading.Lock()
         self._images: OrderedDict[str, Content] = OrderedDict()
 
     def get(self, name: str) -> Content:
@@ -151,9 +136,9 @@ class ImageCache(Generic[Content]):
             if name not in self._images:
                 self._images[name] = self._make(name)
             self._images.move_to_end(name)
-            nbytes = sum(image.nbytes for image in self._images.values())
+            nbytes = sum(map(self._nbytes, self._images.values()))
             while nbytes > CACHE_BYTES and len(self._images) > 1:
-                nbytes -= self._images.popitem(last=False)[1].nbytes
+                nbytes -= self._nbytes(self._images.popitem(last=False)[1])
             return self._images[name]
 
 
@@ -171,7 +156,9 @@ class CachedMatcher:
         self._weights = resolve(options.weights, resources.weights_path)
         context = MatcherContext(self._weights, resources.device, matching.num_similarities)
         self._matcher = MATCHERS.make(options, context)
-        self._images = ImageCache(lambda name: self._prepare(self.read(name)))
+        self._images = ImageCache(
+            lambda name: self._prepare(self.read(name)), lambda image: int(image.content.nbytes)
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         digests = {key: file_sha256(path) for key, path in self._weights.items()}

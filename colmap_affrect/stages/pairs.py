@@ -23,6 +23,7 @@ from colmap_affrect.stages.extract import Inputs, write_images_and_keypoints
 from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 
 logger = logging.getLogger(__name__)
+
 MANY_IMAGES = 300
 MANY_PAIRS = (
     "all pairs of %d images are %d; --pairs retrieval matches the promising ones only "
