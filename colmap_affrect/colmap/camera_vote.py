@@ -54,7 +54,7 @@ class CameraVote:
     records: Mapping[int, CameraRecord]  # of all cameras by id
     pairs: Sequence[VotingPair]  # that vote
     may_share: bool  # whether cameras of images of one size may turn out to be the same
-    tied: dict[int, int] = field(default_factory=dict)  # with one focal length, by the first
+    tied: dict[int, int] = field(default_factory=dict)  # of one focal length, by their first
     decisions: dict[int, str] = field(default_factory=dict)  # about cameras of one size
 
     def decide(self, progress: Progress = SILENT) -> dict[int, CameraRecord]:
@@ -237,11 +237,9 @@ def _voting_pair(
     to_px, points, errors = [], [], []
     for side, camera in enumerate(cameras):
         longer = max(camera.width, camera.height)
-        center = np.array([camera.principal_point_x, camera.principal_point_y])
-        points.append((keypoints[side][matches[:, side]] - center) / longer)
-        to_px.append(
-            np.array([[longer, 0.0, center[0]], [0.0, longer, center[1]], [0.0, 0.0, 1.0]])
-        )
+        x, y = camera.principal_point_x, camera.principal_point_y
+        points.append((keypoints[side][matches[:, side]] - [x, y]) / longer)
+        to_px.append(np.array([[longer, 0.0, x], [0.0, longer, y], [0.0, 0.0, 1.0]]))
         errors.append(MATCH_ERROR_PX / min(longer, extracted_px or longer))
     fundamental = to_px[1].T @ np.asarray(geometry.F, np.float64) @ to_px[0]
     matched = MatchedPair.of(

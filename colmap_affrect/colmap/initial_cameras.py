@@ -114,9 +114,8 @@ class InitialCameras:
                     by_mode = group[0] in ("single", "per-folder")
                     who = f"--camera-mode {group[0]}" if by_mode else self.given(name).where
                     raise OptionError(
-                        f"{who}: {first} is {expected[0]} x "
-                        f"{expected[1]} px, {name} is {size[0]} x {size[1]} px; images that share "
-                        "a camera must have one size"
+                        f"{who}: {first} is {expected[0]} x {expected[1]} px, {name} is {size[0]} "
+                        f"x {size[1]} px; images that share a camera must have one size"
                     )
                 given = self.given(name)
                 if given.size and size != given.size:
@@ -253,72 +252,56 @@ def import_images(
         image_ids(read)  # makes it
         pycolmap.import_images(read, image_path, pycolmap.CameraMode.PER_IMAGE, missing)
         with open_database(read) as found, open_database(new) as database:
-            _Import(initial, found, database).add()
+            _take_over(initial, found, database)
         remove_database(read)
     if new != path:
         new.replace(path)
     return sorted(set(names) - set(image_ids(path)))
 
 
-class _Import:
-    """Takes over images that COLMAP has read into a database of their own."""
+def _take_over(
+    initial: InitialCameras, found: pycolmap.Database, database: pycolmap.Database
+) -> None:
+    """Take over images that COLMAP has read into a database of their own: all of them, or none."""
+    images = sorted(found.read_all_images(), key=lambda image: image.name)
+    read = cameras_of_images(found)
+    sizes = {i.name: (read[i.image_id].width, read[i.image_id].height) for i in images}
+    priors = {prior.corr_data_id.id: prior for prior in found.read_all_pose_priors()}
+    cameras, new = _known_cameras(initial, database, list(sizes)), {}
+    for group, names in initial.groups(list(sizes)).items():
+        if group not in cameras:
+            size = sizes[names[0]]
+            new[group], _ = initial.camera([n for n in names if sizes[n] == size], size)
+    rigs = {rig.ref_sensor_id: rig.rig_id for rig in database.read_all_rigs()}
+    with pycolmap.DatabaseTransaction(database):
+        for camera in new.values():
+            camera.camera_id = database.write_camera(camera)
+        cameras |= new
+        for image in images:
+            camera = cameras[initial.group(image.name)]
+            if sizes[image.name] == (camera.width, camera.height):
+                written = pycolmap.Image(name=image.name, camera_id=camera.camera_id)
+                written.image_id = database.write_image(written)
+                write_frame(database, written, rigs)
+                if prior := priors.get(image.image_id):
+                    prior.corr_data_id = written.data_id
+                    database.write_pose_prior(prior)
 
-    def __init__(
-        self, initial: InitialCameras, found: pycolmap.Database, database: pycolmap.Database
-    ) -> None:
-        self.initial, self.database = initial, database
-        self.images = sorted(found.read_all_images(), key=lambda image: image.name)
-        cameras = cameras_of_images(found)
-        self.sizes = {
-            image.name: (cameras[image.image_id].width, cameras[image.image_id].height)
-            for image in self.images
-        }
-        self.priors = {prior.corr_data_id.id: prior for prior in found.read_all_pose_priors()}
 
-    def add(self) -> None:
-        """Write all of them, or none."""
-        groups = self.initial.groups([image.name for image in self.images])
-        cameras = self._known_cameras()
-        new = {
-            group: self._camera(names) for group, names in groups.items() if group not in cameras
-        }
-        rigs = {rig.ref_sensor_id: rig.rig_id for rig in self.database.read_all_rigs()}
-        with pycolmap.DatabaseTransaction(self.database):
-            for camera in new.values():
-                camera.camera_id = self.database.write_camera(camera)
-            cameras |= new
-            for image in self.images:
-                camera = cameras[self.initial.group(image.name)]
-                if self.sizes[image.name] == (camera.width, camera.height):
-                    self._write_image(image, camera, rigs)
-
-    def _known_cameras(self) -> dict[Group, pycolmap.Camera]:
-        """Return the cameras of the database that new images of a group get."""
-        cameras = {camera.camera_id: camera for camera in self.database.read_all_cameras()}
-        existing = self.initial.options.existing_camera_id
-        if existing >= 0:
-            if existing not in cameras:
-                raise DatabaseError(f"the database has no camera {existing} (existing_camera_id)")
-            return {self.initial.group(name): cameras[existing] for name in self.sizes}
-        used: dict[Group, set[int]] = defaultdict(set)
-        for image in self.database.read_all_images():
-            used[self.initial.group(image.name)].add(image.camera_id)
-        return {group: cameras[min(ids)] for group, ids in used.items() if len(ids) == 1}
-
-    def _camera(self, names: Sequence[str]) -> pycolmap.Camera:
-        size = self.sizes[names[0]]
-        return self.initial.camera([n for n in names if self.sizes[n] == size], size)[0]
-
-    def _write_image(
-        self, image: pycolmap.Image, camera: pycolmap.Camera, rigs: dict[pycolmap.sensor_t, int]
-    ) -> None:
-        written = pycolmap.Image(name=image.name, camera_id=camera.camera_id)
-        written.image_id = self.database.write_image(written)
-        write_frame(self.database, written, rigs)
-        prior = self.priors.get(image.image_id)
-        if prior:
-            prior.corr_data_id = written.data_id
-            self.database.write_pose_prior(prior)
+def _known_cameras(
+    initial: InitialCameras, database: pycolmap.Database, names: Sequence[str]
+) -> dict[Group, pycolmap.Camera]:
+    """Return the cameras of the database that new images of a group get."""
+    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    existing = initial.options.existing_camera_id
+    if existing >= 0:
+        if existing not in cameras:
+            raise DatabaseError(f"the database has no camera {existing} (existing_camera_id)")
+        return {initial.group(name): cameras[existing] for name in names}
+    used: dict[Group, set[int]] = defaultdict(set)
+    for image in database.read_all_images():
+        used[initial.group(image.name)].add(image.camera_id)
+    return {group: cameras[min(ids)] for group, ids in used.items() if len(ids) == 1}
 
 
 def record_cameras(
@@ -341,12 +324,12 @@ def record_cameras(
     for image in images:
         names[image.camera_id].append(image.name)
     records = {}
-    for camera_id, same in names.items():
-        record = known.get(camera_id)
+    for camera_id, of_camera in names.items():
+        record, same = known.get(camera_id), tuple(sorted(of_camera))
         if record and set(record.names) <= set(same):
-            records[camera_id] = replace(record, names=tuple(sorted(same)))
+            records[camera_id] = replace(record, names=same)
         else:
-            records[camera_id] = _record(cameras[camera_id], tuple(sorted(same)), initial)
+            records[camera_id] = _record(cameras[camera_id], same, initial)
     if records != before:
         write_camera_records(records_path, records)
         for line in notable_lines(r for key, r in records.items() if r != before.get(key)):

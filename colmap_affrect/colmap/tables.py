@@ -1,7 +1,4 @@
-"""What a COLMAP database of any version holds, read by SQLite itself.
-
-COLMAP migrates whatever it opens.
-"""
+"""What a COLMAP database of any version holds, read by SQLite: COLMAP migrates what it opens."""
 
 from __future__ import annotations
 

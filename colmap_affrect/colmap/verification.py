@@ -40,7 +40,7 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 logger = logging.getLogger(__name__)
 
-PAIRS_PER_WRITE = 200  # A killed run loses at most as many
+PAIRS_PER_WRITE = 200  # a killed run loses at most as many
 NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
 MAX_FRAME_ANGLE_DEG = 20.0  # frames of right matches are off by 5 to 10 degrees
 CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0  # of frames that are turned at random
@@ -334,7 +334,6 @@ class PairVerifier:
     def __init__(
         self, path: Path, options: VerificationOptions, extracted_px: ExtractedPx = None
     ) -> None:
-        """Read cameras and image ids of a database."""
         self._options, self._extracted_px = options, extracted_px
         self._ids = image_ids(path)
         with open_database(path) as database:

@@ -299,9 +299,8 @@ class ReconstructionReport:
             lines += [f"            new {name}" for name in self.added]
         lines += _by_story(self.unregistered, "        not")
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
-        if counts := [
-            by_level(*item) for item in self.pair_levels.items() if item[0] != "none" and item[1]
-        ]:
+        decided = {level: count for level, count in self.pair_levels.items() if count}
+        if counts := [by_level(*item) for item in decided.items() if item[0] != "none"]:
             lines += [f"            {', '.join(counts)}"]
         if self.contradicting_pairs:
             counts = [by_level(*item) for item in self.contradicting_pairs.items()]

@@ -23,7 +23,7 @@ from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 
 logger = logging.getLogger(__name__)
 
-LOCAL = ("image_path", "image_list_path", "from_database", "cameras")  # not in digests
+LOCAL = ("image_path", "image_list_path", "from_database", "cameras")  # not in digests of options
 PLACES = {
     "image_path", "image_list_path", "from_database", "cameras.cameras_path", "masks.path",
     "masks.camera_path", "depth.path", "match_list_path", "database",

@@ -30,10 +30,7 @@ def source_files(path: Path) -> list[Path]:
 def refuse_other_photographs(
     workspace: Workspace, image_path: str, digests: Mapping[str, str]
 ) -> None:
-    """Refuse another folder of photographs unless it has some of those that were worked on.
-
-    StaleStoreError names both folders.
-    """
+    """Refuse another folder of photographs unless it has some that were worked on."""
     before = (workspace.planned("extract") or {}).get("image_path", image_path)
     if before == image_path:
         return

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -193,7 +193,6 @@ class Escalation:
     """Lets pairs of a workspace climb to a level, with the options on record."""
 
     def __init__(self, context: Context, options: EscalateOptions) -> None:
-        """Read what is on record."""
         self.context, self.options = context, options
         self.extraction = recorded_extraction(context.workspace)
         self.matching = recorded_matching(context.workspace)
@@ -296,7 +295,9 @@ class Escalation:
     def write(self) -> None:
         """Bring the database up to what is stored."""
         write_images_and_keypoints(self.context)
-        self._replace_matches()
+        ids = colmap_database.image_ids(self.path)
+        if pairs := [pair for pair in self.pairs if pair[0] in ids and pair[1] in ids]:
+            _replace_matches(self.path, ids, self.matches.read(pairs))
         verify_new(self.context)
         self._unwritten = set()
 
@@ -311,12 +312,8 @@ class Escalation:
 
     def match_first_level(self, pairs: Sequence[Pair], path: Path) -> None:
         """Give pairs of a copy of the database the matches that they had before they climbed."""
-        ids = colmap_database.image_ids(path)
-        found_matches = list(matched_at_level(self.context, pairs, self.matching, 0))
-        with colmap_database.open_database(path) as database:
-            for found in found_matches:
-                first, second = (ids[name] for name in found.names)
-                colmap_database.replace_matches(database, first, second, found.indices)
+        found = list(matched_at_level(self.context, pairs, self.matching, 0))
+        _replace_matches(path, colmap_database.image_ids(path), found)
         verify(path, self.verification, extracted_px(self.context))
 
     def _extend(self, names: Sequence[str], level: int, advance: Callable[[int], None]) -> None:
@@ -420,12 +417,10 @@ class Escalation:
                     found[pair] = others
         return found
 
-    def _replace_matches(self) -> None:
-        """Put matches into the database where they differ from the ones there."""
-        ids = colmap_database.image_ids(self.path)
-        pairs = [pair for pair in self.pairs if pair[0] in ids and pair[1] in ids]
-        if not pairs:
-            return
-        with colmap_database.open_database(self.path) as database:
-            for (first, second), found in zip(pairs, self.matches.read(pairs), strict=True):
-                colmap_database.replace_matches(database, ids[first], ids[second], found.indices)
+
+def _replace_matches(path: Path, ids: Mapping[str, int], matches: Iterable[PairMatches]) -> None:
+    """Put matches into a database where they differ from the ones there."""
+    with colmap_database.open_database(path) as database:
+        for found in matches:
+            first, second = (ids[name] for name in found.names)
+            colmap_database.replace_matches(database, first, second, found.indices)

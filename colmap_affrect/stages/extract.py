@@ -99,10 +99,7 @@ class Inputs(Options):
         return Photographs(Path(self.image_path), self.masks)
 
     def names(self) -> list[str]:
-        """Return the images of the folder, of the list, or of the database.
-
-        With list and database they are those of the list.
-        """
+        """Return the images of the list, else of the database, else of the folder."""
         folder, listed = Path(self.image_path), Path(self.image_list_path)
         if not self.from_database:
             return list_images(folder, listed if self.image_list_path else None)

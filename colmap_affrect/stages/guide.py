@@ -86,12 +86,8 @@ def restore_exact(context: Context, pairs: Collection[Pair] | None = None) -> No
 
     They stay on record as tried, so that :func:`guide` leaves them alone.
     """
-    workspace = context.workspace
-    guided = [
-        pair
-        for pair in current(context)
-        if pair.num_inliers and (pairs is None or pair.names in pairs)
-    ]
+    workspace, guided = context.workspace, _gained(context)
+    guided = [pair for pair in guided if pairs is None or pair.names in pairs]
     if not guided:
         return
     ids = colmap_database.image_ids(workspace.database)
@@ -110,7 +106,7 @@ def exact_inliers(context: Context, guided: Iterable[GuidedPair]) -> dict[Pair, 
 
 def guided_matches(context: Context) -> dict[tuple[int, int], Matches]:
     """Return the inliers, by image ids, that only guided matching has found."""
-    guided = [pair for pair in current(context) if pair.num_inliers]
+    guided = _gained(context)
     if not guided:
         return {}
     verified = verified_inliers(context)
@@ -142,16 +138,19 @@ def current(context: Context) -> list[GuidedPair]:
     ]
 
 
+def _gained(context: Context) -> list[GuidedPair]:
+    return [pair for pair in current(context) if pair.num_inliers]
+
+
 def weak_images(exact: Mapping[Pair, Matches], min_num_tracks: int) -> set[str]:
     """Return the images with few features in tracks through three images, where there are three."""
-    if len({name for pair in exact for name in pair}) < 3:
-        return set()
-    return weakly_connected_images(exact, min_num_tracks)
+    num_images = len({name for pair in exact for name in pair})
+    return weakly_connected_images(exact, min_num_tracks) if num_images > 2 else set()
 
 
 def guided_counts(context: Context) -> dict[str, int]:
     """Return what the report says: pairs with more inliers, and these before and after."""
-    gained = [pair for pair in current(context) if pair.num_inliers]
+    gained = _gained(context)
     if not gained:
         return {}
     return {
@@ -165,7 +164,6 @@ class Guiding:
     """Guides the pairs of a workspace, with the options on record."""
 
     def __init__(self, context: Context, options: GuidedOptions) -> None:
-        """Read what is on record."""
         self.context, self.options = context, options
         self.path = context.workspace.database
         self.ids = colmap_database.image_ids(self.path)

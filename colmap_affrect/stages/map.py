@@ -39,7 +39,7 @@ from colmap_affrect.stages.verify import recorded_verification
 logger = logging.getLogger(__name__)
 
 NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
-STRONGER_RECIPE, LEARNED_RECIPE = "on-demand", "on-demand-learned"  # advised
+STRONGER_RECIPE, LEARNED_RECIPE = "on-demand", "on-demand-learned"  # advised; one needs weights
 
 TOO_FEW = "more photographs: two that can be read and show the same from two places make a model"
 """Advised where nothing else would help."""

@@ -85,7 +85,6 @@ class GuidedMatcher:
     """Matches pairs again, with the features that it keeps of some images."""
 
     def __init__(self, store: FeatureStore, options: GuidedOptions) -> None:
-        """Name the features."""
         self._store, self._options = store, options
         self._images = ImageCache(self._read, lambda arrays: sum(x.nbytes for x in arrays))
 

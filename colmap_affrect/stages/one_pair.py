@@ -120,10 +120,7 @@ Content = TypeVar("Content")
 
 
 class ImageCache(Generic[Content]):
-    """Keeps what is made of images, as many as ``CACHE_BYTES`` hold.
-
-    Those not used for longest are dropped first.
-    """
+    """Keeps what is made of images, those used last, as many as ``CACHE_BYTES`` hold."""
 
     def __init__(self, make: Callable[[str], Content], nbytes: Callable[[Content], int]) -> None:
         """Say how to make what is missing, of the name of an image, and what memory it takes."""
@@ -143,13 +140,9 @@ class ImageCache(Generic[Content]):
 
 
 class CachedMatcher:
-    """Matches pairs, and keeps the images that it has prepared (:class:`ImageCache`).
-
-    A copy in another process starts with none.
-    """
+    """Matches pairs, and keeps the images that it has prepared; a copy elsewhere has none."""
 
     def __init__(self, matching: Matching) -> None:
-        """Build the matcher."""
         options, resources = matching.options, matching.resources
         options.require_extractor(matching.extractor)
         self._matching = matching
