@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 
 from colmap_affrect.conventions import is_inside
 from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Singles
 
-GrayImage = NDArray[np.uint8]
-"""(H, W) gray values, 0.299 R + 0.587 G + 0.114 B."""
-
-ColorImage = NDArray[np.uint8]
-"""(H, W, 3) red, green, blue."""
-
-Mask = NDArray[np.bool_]
-View = tuple[GrayImage | ColorImage, NDArray[np.uint8] | None]
+GrayImage = Bytes  # (H, W) gray values, 0.299 R + 0.587 G + 0.114 B
+ColorImage = Bytes  # (H, W, 3) red, green, blue
+Mask = Bools
+View = tuple[GrayImage | ColorImage, Bytes | None]
 """An image or a warp to find features in, and where (mask not 0; everywhere if it is None)."""
 
 
@@ -29,25 +26,15 @@ def _require(condition: bool, message: str) -> None:
 
 @dataclass(frozen=True)
 class Photograph:
-    """An image as rectifiers and depth sources see it.
+    """An image as rectifiers and depth sources see it."""
 
-    Attributes:
-        gray: (H, W) uint8 at the size of processing, at most ``max_image_size_px``.
-        name: relative POSIX path below the image folder, the key of depth maps.
-        path: the file; None for an image that was never one.
-        camera_matrix: (3, 3) pinhole intrinsics in pixel-centre px of ``gray``.
-        mask: (H, W) bool, where features may be; None means everywhere.
-        color: (H, W, 3), for feature extractors that ask for it.
-        stretched: whether its contrast was low, and its tones have been stretched.
-    """
-
-    gray: GrayImage
-    name: str
-    path: Path | None
-    camera_matrix: NDArray[np.float64]
-    mask: Mask | None = None
-    color: ColorImage | None = None
-    stretched: bool = False
+    gray: GrayImage  # (H, W) uint8 at the size of processing, at most ``max_image_size_px``
+    name: str  # relative POSIX path below the image folder, the key of depth maps
+    path: Path | None  # the file; None for an image that was never one
+    camera_matrix: Array  # (3, 3) pinhole intrinsics in pixel-centre px of ``gray``
+    mask: Mask | None = None  # (H, W) bool, where features may be; None means everywhere
+    color: ColorImage | None = None  # (H, W, 3), for feature extractors that ask for it
+    stretched: bool = False  # whether its contrast was low, and its tones have been stretched
 
     @property
     def size(self) -> tuple[int, int]:
@@ -57,32 +44,20 @@ class Photograph:
 
 @dataclass(frozen=True)
 class ShapeSamples:
-    """Affine shapes at points of an image.
+    """Affine shapes at points of an image."""
 
-    Attributes:
-        points: (N, 2) pixel-centre px.
-        metrics: (N, 3) unit metrics (S11, S22, S12) of the *rectifying* maps.
-    """
-
-    points: NDArray[np.float64]
-    metrics: NDArray[np.floating]
+    points: Array  # (N, 2) pixel-centre px
+    metrics: Floats  # (N, 3) unit metrics (S11, S22, S12) of the *rectifying* maps
 
 
 @dataclass(frozen=True)
 class ShapeGrid:
-    """Affine shapes on a regular grid over an image; what every dense shape source returns.
+    """Affine shapes on a regular grid over an image; what every dense shape source returns."""
 
-    Attributes:
-        metrics: (R, C, 3) unit metrics (S11, S22, S12) of the *rectifying* maps.
-        textured: (R, C) bool, False where the image has no structure to read a shape from.
-        origin_px: centre of cell (0, 0) in x and in y, pixel-centre px.
-        step_px: distance of neighbouring cells in px.
-    """
-
-    metrics: NDArray[np.floating]
-    textured: Mask
-    origin_px: float
-    step_px: int
+    metrics: Floats  # (R, C, 3) unit metrics (S11, S22, S12) of the *rectifying* maps
+    textured: Mask  # (R, C) bool, False where the image has no structure to read a shape from
+    origin_px: float  # centre of cell (0, 0) in x and in y, pixel-centre px
+    step_px: int  # distance of neighbouring cells in px
 
     def __post_init__(self) -> None:
         _require(
@@ -99,19 +74,14 @@ class ShapeGrid:
 
 @dataclass(frozen=True)
 class LocalFeatures:
-    """Local features of one image as full local affine frames.
+    """Local features of one image as full local affine frames."""
 
-    Attributes:
-        lafs: (N, 2, 3) float64 frames in image px; x = A u + c maps the unit circle to the
-            measurement ellipse (conventions, item 6); det A > 0.
-        responses: (N,) float32 detector responses, > 0.
-        descriptors: (N, D) float32 of unit length; D = 0 before they are described.
-        rectification_ids: (N,) int32, the warp each feature comes from; 0 is the image itself.
-    """
-
-    lafs: NDArray[np.float64]
-    responses: NDArray[np.float32]
-    descriptors: NDArray[np.float32]
+    # (N, 2, 3) float64 frames in image px; x = A u + c maps the unit circle to the measurement
+    # ellipse (conventions, item 6); det A > 0
+    lafs: Array
+    responses: Singles  # (N,) float32 detector responses, > 0
+    descriptors: Singles  # (N, D) float32 of unit length; D = 0 before they are described
+    # (N,) int32, the warp each feature comes from; 0 is the image itself
     rectification_ids: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
     def __post_init__(self) -> None:
@@ -132,34 +102,26 @@ class LocalFeatures:
         return len(self.lafs)
 
     @property
-    def keypoints(self) -> NDArray[np.float64]:
+    def keypoints(self) -> Array:
         """(N, 2) centres of the frames, pixel-centre px."""
         return self.lafs[:, :, 2]
 
     @property
-    def scales(self) -> NDArray[np.float64]:
+    def scales(self) -> Array:
         """(N,) geometric mean radius sqrt(det A) of the measurement ellipses in px."""
         return np.asarray(np.sqrt(determinants(self.lafs[:, :, :2])))
 
     def select(self, index: NDArray[np.generic]) -> LocalFeatures:
         """Keep the features of an index or mask array, in its order."""
-        return LocalFeatures(
-            self.lafs[index],
-            self.responses[index],
-            self.descriptors[index],
-            self.rectification_ids[index],
-        )
+        return LocalFeatures(*(getattr(self, item.name)[index] for item in fields(self)))
 
     @classmethod
     def empty(cls, descriptor_size: int = 0) -> LocalFeatures:
         """Return the result for an image without features."""
-        return cls(
-            np.zeros((0, 2, 3)),
-            np.zeros(0, np.float32),
-            np.zeros((0, descriptor_size), np.float32),
-        )
+        descriptors = np.zeros((0, descriptor_size), np.float32)
+        return cls(np.zeros((0, 2, 3)), np.zeros(0, np.float32), descriptors)
 
-    def with_frames(self, lafs: NDArray[np.float64]) -> LocalFeatures:
+    def with_frames(self, lafs: Array) -> LocalFeatures:
         """Replace the frames."""
         return replace(self, lafs=lafs)
 
@@ -174,55 +136,41 @@ class LocalFeatures:
 
 def of_one_size(parts: list[LocalFeatures]) -> list[LocalFeatures]:
     """Fill up shorter descriptors with zeros, so that features of two kinds can be united."""
-    size = max(part.descriptors.shape[1] for part in parts)
+    widths = [part.descriptors.shape[1] for part in parts]
     return [
-        replace(part, descriptors=np.pad(part.descriptors, ((0, 0), (0, size - width))))
-        for part in parts
-        for width in (part.descriptors.shape[1],)
+        replace(part, descriptors=np.pad(part.descriptors, ((0, 0), (0, max(widths) - width))))
+        for part, width in zip(parts, widths, strict=True)
     ]
 
 
 def union(parts: list[LocalFeatures]) -> LocalFeatures:
     """Concatenate features in the order given; at least one part."""
-    return LocalFeatures(
-        np.concatenate([part.lafs for part in parts]),
-        np.concatenate([part.responses for part in parts]),
-        np.concatenate([part.descriptors for part in parts]),
-        np.concatenate([part.rectification_ids for part in parts]),
-    )
+    names = [item.name for item in fields(LocalFeatures)]
+    return LocalFeatures(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
 
 @dataclass(frozen=True)
 class Rectification:
-    """One rectifying warp and the part of the image it is meant for.
+    """One rectifying warp and the part of the image it is meant for."""
 
-    Attributes:
-        rectified_from_image: (3, 3) float64 map of pixel-centre coordinates; a homography
-            has a positive third coordinate all over the region.
-        canvas_size: (width, height) of the warp in px.
-        region: (h, w) bool mask of the part of the image; None means all of it.
-        tilt, tilt_angle_rad: class of the map in the space of tilts; of a homography, that of
-            its Jacobian at the middle of the region.
-        region_origin: (x, y) image pixel of the mask's first pixel.
-        segment_id: the segment of the image it belongs to, from 0; several warps may share one.
-    """
-
-    rectified_from_image: NDArray[np.float64]
-    canvas_size: tuple[int, int]
-    region: Mask | None
+    # (3, 3) map of pixel-centre px; of a homography the third coordinate is positive in the region
+    rectified_from_image: Array
+    canvas_size: tuple[int, int]  # (width, height) of the warp in px
+    region: Mask | None  # (h, w) bool mask of the part of the image; None means all of it
+    # class of the map in the space of tilts; of a homography, of its Jacobian amid the region
     tilt: float
     tilt_angle_rad: float
-    region_origin: tuple[int, int] = (0, 0)
-    segment_id: int = 0
+    region_origin: tuple[int, int] = (0, 0)  # (x, y) image pixel of the mask's first pixel
+    segment_id: int = 0  # of the image it belongs to, from 0; several warps may share one
 
-    def in_region(self, points: NDArray[np.floating]) -> Mask:
+    def in_region(self, points: Floats) -> Mask:
         """Tell which (N, 2) points, rounded to pixels of the image, belong to the region."""
         if self.region is None:
             return np.ones(len(points), dtype=bool)
         return in_mask(self.region, points, self.region_origin)
 
     @property
-    def image_from_rectified(self) -> NDArray[np.float64]:
+    def image_from_rectified(self) -> Array:
         """(3, 3) inverse map."""
         return np.asarray(np.linalg.inv(self.rectified_from_image), dtype=np.float64)
 
@@ -237,7 +185,7 @@ class Rectification:
         return bool(np.array_equal(self.rectified_from_image[2], [0.0, 0.0, 1.0]))
 
 
-def in_mask(mask: Mask, points: NDArray[np.floating], origin: tuple[int, int] = (0, 0)) -> Mask:
+def in_mask(mask: Mask, points: Floats, origin: tuple[int, int] = (0, 0)) -> Mask:
     """Tell which (N, 2) points, rounded to pixels, an (h, w) mask holds that begins at origin."""
     height, width = mask.shape
     columns, rows = (np.rint(points).astype(int) - origin).T
@@ -252,20 +200,14 @@ class RectificationPlan:
 
     The image itself is always looked at and not listed. Warp k of ``items`` has the
     rectification id k + 1.
-
-    Attributes:
-        image_size: (width, height) in px.
-        items: the warps; may be empty.
-        original_region: (H, W) bool, where features of the image itself are kept; None
-            means everywhere.
-        replaces_original: a feature of the image itself gives way to one of a warp at the same
-            place and scale. For disjoint regions, each with the map that suits it best; where
-            several warps show the same place none of them is better than the image for sure.
     """
 
-    image_size: tuple[int, int]
-    items: tuple[Rectification, ...] = ()
-    original_region: Mask | None = None
+    image_size: tuple[int, int]  # (width, height) in px
+    items: tuple[Rectification, ...] = ()  # the warps; may be empty
+    original_region: Mask | None = None  # (H, W) bool, where its own features are kept; None: all
+    # a feature of the image itself gives way to one of a warp at the same place and scale. For
+    # disjoint regions, each with the map that suits it best; where several warps show the same
+    # place none of them is better than the image for sure.
     replaces_original: bool = False
 
     @property

@@ -46,14 +46,10 @@ class Forecast:
         may_climb: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take what is ahead.
+        """Take what is ahead, if all images are new.
 
-        Args:
-            num_images: to extract and map.
-            num_pairs: to match and verify, if all images are new.
-            by_network: a network matches them.
-            may_climb: pairs may be matched again with more warps; how many nobody knows before.
-            clock: gives seconds.
+        ``by_network``: a network matches; ``may_climb``: pairs may be matched again with more
+        warps, how many nobody knows before.
         """
         match_cost = COSTS["match by network" if by_network else "match"]
         self._stages = {

@@ -27,16 +27,11 @@ from pydantic_core import ErrorDetails
 
 from colmap_affrect.errors import OptionError
 
-PRESETS = ("sparse", "colmap")
-"""Presets of verification and mapping: ours for few photographs, and COLMAP's defaults."""
-MAX_SEED = 2_000_000_000
-"""COLMAP keeps seeds in 32 bits, and those of repeated mapping are larger than the one given."""
-PLAIN_NAMES = {"model": "options", "dict": "options", "tuple": "list"}
-"""What pydantic's names of types are called in messages."""
-MAX_COMMENT = 96
-"""Width of comments in printed options."""
-CUSTOM = "custom"
-"""Name of options that are no preset."""
+PRESETS = ("sparse", "colmap")  # ours for few photographs, and COLMAP's defaults
+MAX_SEED = 2_000_000_000  # COLMAP keeps 32 bits; repeated mapping counts up from it
+PLAIN_NAMES = {"model": "options", "dict": "options", "tuple": "list"}  # types in messages
+MAX_COMMENT = 96  # width of comments in printed options
+CUSTOM = "custom"  # name of options that are no preset
 
 
 def within(low: float, high: float) -> Any:
@@ -72,18 +67,13 @@ class Options(BaseModel):
 
     def changed(self, **values: Any) -> Self:
         """Return the options with some other values, checked."""
-        return type(self)(
-            **{**{name: getattr(self, name) for name in self.__class__.model_fields}, **values}
-        )
+        return type(self)(**{**dict(self), **values})
 
     @classmethod
     def _problem(cls, error: ErrorDetails) -> str:
         """Say in one line what pydantic found."""
-        place, given, context = (
-            ".".join(map(str, error["loc"])),
-            error["input"],
-            error.get("ctx", {}),
-        )
+        place, given = ".".join(map(str, error["loc"])), error["input"]
+        context = error.get("ctx", {})
         match error["type"]:
             case "extra_forbidden":
                 return f"unknown option '{place}'{suggestion(place, cls.model_fields)}"
@@ -141,29 +131,21 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True)
 class Registry(Generic[Part]):
-    """The exchangeable parts of one kind, by name.
+    """The exchangeable parts of one kind, by name."""
 
-    Attributes:
-        kind: what they are called in messages.
-        group: of the entry points by which other packages add theirs.
-        built_in: ``module:Class`` of those of this package; modules are imported when needed.
-        default: name of the part where none is given.
-    """
-
-    kind: str
-    group: str
-    built_in: Mapping[str, str]
-    default: str
+    kind: str  # what they are called in messages
+    group: str  # of the entry points by which other packages add theirs
+    built_in: Mapping[str, str]  # ``module:Class`` of ours; imported when needed
+    default: str  # name of the part where none is given
 
     def names(self) -> list[str]:
         """Return the names of all parts, those of this package first."""
         return list(self._entry_points())
 
     def _entry_points(self) -> dict[str, metadata.EntryPoint]:
-        ours = [
-            metadata.EntryPoint(name, value, self.group) for name, value in self.built_in.items()
-        ]
-        return {point.name: point for point in [*metadata.entry_points(group=self.group), *ours]}
+        found = {point.name: point for point in metadata.entry_points(group=self.group)}
+        ours = {n: metadata.EntryPoint(n, value, self.group) for n, value in self.built_in.items()}
+        return ours | found | ours  # which come first, and win
 
     def part(self, name: str) -> Any:
         """Return the class of a part; OptionError for an unknown name."""

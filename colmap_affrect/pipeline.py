@@ -60,9 +60,7 @@ from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed
 from colmap_affrect.stages.verify import recorded_verification, verify_matches
 
 FocalVote = Literal["auto", "always", "never"]
-
-GUIDED_BEFORE = "guided-before.json"
-"""File beside models that wait for others to be compared with: the pairs that were guided then."""
+GUIDED_BEFORE = "guided-before.json"  # beside models that wait: the pairs guided then
 
 REPORTED_PACKAGES = (
     "colmap-affrect", "pycolmap", "opencv-python-headless", "numpy", "h5py", "torch", "kornia",
@@ -72,10 +70,7 @@ REPORTED_PACKAGES = (
 def holds_vote(focal_vote: FocalVote, mapping: MapperOptions, *, is_others: bool) -> bool:
     """Tell whether verified pairs vote on cameras that nobody knows.
 
-    Args:
-        focal_vote: what is asked for; by default there is one.
-        mapping: COLMAP's preset has none by default.
-        is_others: cameras of another program's database have none by default.
+    By default they do, but not with COLMAP's preset, nor of another program's database.
     """
     if focal_vote == "auto":
         return not is_others and mapping.preset_name != "colmap"
@@ -84,30 +79,19 @@ def holds_vote(focal_vote: FocalVote, mapping: MapperOptions, *, is_others: bool
 
 @dataclass(frozen=True, kw_only=True)
 class InputOptions:
-    """What runs and comparisons of methods both depend on, beside images and recipes.
+    """What runs and comparisons of methods both depend on, beside images and recipes."""
 
-    Attributes:
-        cameras: how images share cameras.
-        masks: where features may be.
-        pairs: how the pairs to match are chosen.
-        verification: thresholds of two-view geometry.
-        mapping: mapper and its options.
-        image_list_path: list of the images to use; None for all below the folder.
-        from_database: COLMAP database whose images, cameras, rigs, frames and pose priors are
-            used; it stays as it is.
-        resources: weights and device of networks.
-        focal_vote: whether verified pairs vote on cameras that nobody knows.
-    """
-
-    cameras: CameraOptions = field(default_factory=CameraOptions)
-    masks: MaskOptions = field(default_factory=MaskOptions)
-    pairs: PairOptions = field(default_factory=PairOptions)
+    cameras: CameraOptions = field(default_factory=CameraOptions)  # how images share cameras
+    masks: MaskOptions = field(default_factory=MaskOptions)  # where features may be
+    pairs: PairOptions = field(default_factory=PairOptions)  # how the pairs to match are chosen
+    # thresholds of two-view geometry
     verification: VerificationOptions = field(default_factory=VerificationOptions)
-    mapping: MapperOptions = field(default_factory=SparseOptions)
-    image_list_path: Path | None = None
+    mapping: MapperOptions = field(default_factory=SparseOptions)  # mapper and its options
+    image_list_path: Path | None = None  # list of the images to use; None for all below the folder
+    # COLMAP database whose images, cameras, rigs, frames and pose priors are used; it stays as is
     from_database: Path | None = None
-    resources: Resources = field(default_factory=Resources)
-    focal_vote: FocalVote = "auto"
+    resources: Resources = field(default_factory=Resources)  # weights and device of networks
+    focal_vote: FocalVote = "auto"  # whether verified pairs vote on cameras that nobody knows
 
     @property
     def holds_vote(self) -> bool:
@@ -127,18 +111,12 @@ class InputOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(InputOptions):
-    """Everything a run depends on beside its images and its output folder.
+    """Everything a run depends on beside its images and its output folder."""
 
-    Attributes:
-        recipe: options of extraction and matching.
-        database_descriptors: also write descriptors into the database, as COLMAP's matchers
-            need them.
-        extend: register the photographs into this model instead of beginning one.
-    """
-
+    # options of extraction and matching
     recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
-    database_descriptors: bool = False
-    extend: Extension | None = None
+    database_descriptors: bool = False  # written too, for COLMAP's matchers
+    extend: Extension | None = None  # model that the photographs are registered into, if any
 
     def forecast(self, num_images: int) -> Forecast:
         """Return what so many images will take."""
@@ -165,19 +143,14 @@ def run(
     Args:
         image_path: folder of the photographs, searched with its sub-folders.
         output_path: folder for all results, made if missing.
-        options: see :class:`RunOptions`.
+        options: of all stages.
         executor: where images and pairs are worked on, a cluster for one
-            (:func:`colmap_affrect.parallel.cluster.connected`); by default in threads of this
-            process.
+            (:func:`colmap_affrect.parallel.cluster.connected`); by default in threads here.
         overwrite: discard results that are there.
-        page: also write ``report.html``.
+        page: write ``report.html`` beside ``report.json``, whose content is returned.
         progress: where to show progress.
 
-    Returns:
-        The report that is also written to ``report.json``.
-
-    Raises:
-        AffrectError: for anything that the caller can mend; what is done stays.
+    AffrectError is raised for anything that the caller can mend; what is done stays.
     """
     options = options or RunOptions()
     mapper = MAPPERS.make(options.mapping)
@@ -234,14 +207,10 @@ def map_from_database(
         extend: register the images into this model instead of beginning one.
         check_cameras: let the pairs vote on cameras whose focal length is no prior.
         overwrite: discard results that are there.
-        page: also write ``report.html``.
+        page: write ``report.html`` beside ``report.json``, whose content is returned.
         progress: where to show progress.
 
-    Returns:
-        The report that is also written to ``report.json``.
-
-    Raises:
-        AffrectError: for anything that the caller can mend; what is done stays.
+    AffrectError is raised for anything that the caller can mend; what is done stays.
     """
     mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
     schema_version(database_path)  # refuses what is no database before anything is made
@@ -249,13 +218,8 @@ def map_from_database(
         extend.refuse_discarding(output_path)
     context = Context(Workspace(output_path), progress=progress)
     with context.workspace.locked():
-        report = copy_verified(
-            context,
-            database_path,
-            image_path,
-            verification or VerificationOptions(),
-            overwrite=overwrite,
-        )
+        chosen = verification or VerificationOptions()
+        report = copy_verified(context, database_path, image_path, chosen, overwrite=overwrite)
         reports = [report, choose_cameras(context)] if check_cameras else [report]
         return map_and_report(context, mapper, extend, earlier=reports, page=page)
 
@@ -343,11 +307,7 @@ def _require_photographs(context: Context) -> None:
 
 
 def map_guided(
-    context: Context,
-    mapper: Mapper,
-    extend: Extension | None = None,
-    *,
-    overwrite: bool = False,
+    context: Context, mapper: Mapper, extend: Extension | None = None, *, overwrite: bool = False
 ) -> tuple[list[StageReport], list[ModelSummary]]:
     """Map; where images are missing or hang on few tracks, guide their pairs and map again.
 

@@ -45,21 +45,14 @@ class LevelOptions(Options):
 
 @dataclass(frozen=True)
 class Level:
-    """One way to look at images and match them, all of it known.
+    """One way to look at images and match them, all of it known."""
 
-    Attributes:
-        rectifier: which warps.
-        features: of the image and the warps.
-        max_image_size_px: larger images are shrunk to this longer side.
-        matching: how pairs are matched; None as the recipe says.
-        base: the lowest level with such features. It has those of the image itself, which are
-            matched together with those of this level.
-    """
-
-    rectifier: RectifierOptions
-    features: FeatureOptions
-    max_image_size_px: int
-    matching: MatcherOptions | None
+    rectifier: RectifierOptions  # which warps
+    features: FeatureOptions  # of the image and the warps
+    max_image_size_px: int  # larger images are shrunk to this longer side
+    matching: MatcherOptions | None  # how pairs are matched; None as the recipe says
+    # the lowest level with such features. It has those of the image itself, which are matched
+    # together with those of this level.
     base: int
 
     @property
@@ -159,41 +152,25 @@ class RecipeOptions(ExtractionOptions):
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a recipe decides, resolved once.
+    """What a recipe decides, resolved once."""
 
-    Attributes:
-        name: its name, or the path it was read from.
-        summary: one line for people.
-        extraction: everything that decides the features of an image.
-        matching: the matcher.
-        escalate: which pairs climb.
-        guided: guided matching.
-        mapping: the mapper's ``name`` and options that differ from the preset.
-    """
-
-    name: str
-    summary: str = ""
+    name: str  # its name, or the path it was read from
+    summary: str = ""  # one line for people
+    # everything that decides the features of an image
     extraction: ExtractionOptions = field(default_factory=ExtractionOptions)
-    matching: MatcherOptions = field(default_factory=NearestOptions)
-    escalate: EscalateOptions = field(default_factory=EscalateOptions)
-    guided: GuidedOptions = field(default_factory=GuidedOptions)
+    matching: MatcherOptions = field(default_factory=NearestOptions)  # the matcher
+    escalate: EscalateOptions = field(default_factory=EscalateOptions)  # which pairs climb
+    guided: GuidedOptions = field(default_factory=GuidedOptions)  # guided matching
+    # the mapper's ``name`` and options that differ from the preset
     mapping: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def from_mapping(cls, name: str, values: Mapping[str, Any], where: str = "") -> Self:
         """Build from the sections of a recipe; OptionError for unknown or wrong options."""
         where = where or f"recipe {name}"
-        options = RecipeOptions.from_mapping(values, where)
-        fields = {key: getattr(options, key) for key in ExtractionOptions.model_fields}
-        recipe = cls(
-            name,
-            options.summary,
-            ExtractionOptions(**fields),
-            options.matching,
-            options.escalate,
-            options.guided,
-            options.mapping,
-        )
+        options = dict(RecipeOptions.from_mapping(values, where))
+        extraction = {key: options.pop(key) for key in ExtractionOptions.model_fields}
+        recipe = cls(name, extraction=ExtractionOptions(**extraction), **options)
         try:
             for level in recipe.extraction.levels:
                 (level.matching or recipe.matching).require_extractor(level.features.name)
@@ -210,9 +187,7 @@ class Recipe:
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights of all parts, sorted."""
         matching = (level.matching or self.matching for level in self.extraction.levels)
-        return tuple(
-            sorted({*self.extraction.weights, *(key for item in matching for key in item.weights)})
-        )
+        return tuple(sorted({*self.extraction.weights}.union(*(item.weights for item in matching))))
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all sections with all options, as :meth:`from_mapping` takes them."""
@@ -239,8 +214,7 @@ class Recipe:
         return options
 
 
-DEFAULT_MAPPERS = {"sparse": MAPPERS.default, "colmap": "incremental"}
-"""The mapper of each preset: ``colmap`` is what COLMAP does by default."""
+DEFAULT_MAPPERS = {"sparse": MAPPERS.default, "colmap": "incremental"}  # by preset
 
 
 def recipe_folder() -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import re
+from importlib import metadata
 
 import pytest
 from pydantic import ValidationError
@@ -19,7 +20,7 @@ from colmap_affrect.mappers.global_mapper import GlobalOptions
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.matchers.nearest import NearestOptions
-from colmap_affrect.options import Options
+from colmap_affrect.options import Options, Registry
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
 from colmap_affrect.rectifiers.dense import DenseShapesOptions
@@ -181,3 +182,9 @@ def test_options_reject_names_and_lists_they_do_not_know(
 def test_options_cannot_be_changed() -> None:
     with pytest.raises(ValidationError):
         NearestOptions().max_ratio = 0.5  # type: ignore[misc]
+
+
+def test_parts_of_this_package_come_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    others = [metadata.EntryPoint(name, "module:Class", "group") for name in ("theirs", "ours")]
+    monkeypatch.setattr(metadata, "entry_points", lambda **_: others)
+    assert Registry("thing", "group", {"ours": "a:B"}, "ours").names() == ["ours", "theirs"]

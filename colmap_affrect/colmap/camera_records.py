@@ -5,6 +5,7 @@ COLMAP's database has one flag for a focal length, that somebody knows it. Here 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,36 +28,22 @@ Given = Literal["focal", "principal-point", "distortion"]
 TRUSTED: tuple[Source, ...] = ("given", "exif", "exif-rescaled")
 """Sources whose focal lengths are priors before any pair has been verified."""
 
-MAX_LINES = 5
-"""Groups of cameras that are logged."""
+MAX_LINES = 5  # groups of cameras that are logged
 
 
 @dataclass(frozen=True)
 class CameraRecord:
-    """One camera of the database.
+    """One camera of the database."""
 
-    Attributes:
-        names: of its images, sorted.
-        source: of the focal length.
-        focal_px: in px of the stored file; the mean of two.
-        low_px: lower end of what the focal length may be, None where nothing says so.
-        high_px: upper end.
-        why: what was decided and for what reason, one clause.
-        size: (width, height) of its images in px.
-        given: what of the intrinsics is the user's, to be left as it is.
-        may_be_shared: the pairs do not tell whether other such images of this size have the same
-            camera.
-    """
-
-    names: tuple[str, ...]
-    source: Source
-    focal_px: float
-    low_px: float | None = None
-    high_px: float | None = None
-    why: str = ""
-    size: tuple[int, int] = (0, 0)
-    given: tuple[Given, ...] = ()
-    may_be_shared: bool = False
+    names: tuple[str, ...]  # of its images, sorted
+    source: Source  # of the focal length
+    focal_px: float  # in px of the stored file; the mean of two
+    low_px: float | None = None  # lower end of what it may be, None where nothing says so
+    high_px: float | None = None  # upper end
+    why: str = ""  # what was decided and for what reason, one clause
+    size: tuple[int, int] = (0, 0)  # (width, height) of its images in px
+    given: tuple[Given, ...] = ()  # what of the intrinsics is the user's, to be left as it is
+    may_be_shared: bool = False  # pairs do not tell whether such images share a camera
 
     def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
         """Return the entry of ``report.json``, with the focal length that a model ended with."""
@@ -86,11 +73,7 @@ _RECORDS = TypeAdapter(dict[int, CameraRecord])
 
 
 def read_camera_records(path: Path) -> dict[int, CameraRecord]:
-    """Return the records by camera id of the database; none where there is no file.
-
-    Raises:
-        WorkspaceError: when the file is damaged.
-    """
+    """Return the records by camera id; none without the file, WorkspaceError if it is damaged."""
     try:
         return _RECORDS.validate_json(path.read_bytes())
     except FileNotFoundError:
@@ -108,10 +91,10 @@ def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> Non
 
 def notable_lines(records: Iterable[CameraRecord]) -> list[str]:
     """Return a line for cameras of one source and story, at most a few; none for those without."""
-    groups: dict[tuple[Source, str], list[CameraRecord]] = {}
+    groups = defaultdict(list)
     for record in records:
         if record.why:
-            groups.setdefault((record.source, record.why), []).append(record)
+            groups[record.source, record.why].append(record)
     lines = [_line(same) for same in groups.values()]
     more = len(lines) - MAX_LINES
     return lines if more <= 1 else [*lines[:MAX_LINES], f"and {more} more, see report.json"]
@@ -120,13 +103,9 @@ def notable_lines(records: Iterable[CameraRecord]) -> list[str]:
 def _line(records: Sequence[CameraRecord]) -> str:
     """Say what was decided for cameras of one source and story."""
     names = [name for record in records for name in record.names]
-    first = records[0]
-    spread = (
-        f" ({first.low_px:.0f} to {first.high_px:.0f})" if first.low_px and first.high_px else ""
-    )
+    first, spread = records[0], ""
+    if len(records) == 1 and first.low_px and first.high_px:
+        spread = f" ({first.low_px:.0f} to {first.high_px:.0f})"
     focals = sorted({round(record.focal_px) for record in records})
     focal = f"{focals[0]}" if len(focals) == 1 else f"{focals[0]} to {focals[-1]}"
-    return (
-        f"{such_as(names)}: focal length {focal} px"
-        f"{spread if len(records) == 1 else ''}, {first.source}: {first.why}"
-    )
+    return f"{such_as(names)}: focal length {focal} px{spread}, {first.source}: {first.why}"

@@ -11,13 +11,13 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
-from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.two_views import PLANAR
 from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES, ExtractedPx, of_pair
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.focal_evidence import MatchedPair
 from colmap_affrect.geometry.focal_vote import (
     Ballot,
@@ -29,25 +29,13 @@ from colmap_affrect.geometry.focal_vote import (
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Advance, Progress
 
-MIN_NUM_INLIERS = 20
-"""Of a pair that votes; a fundamental matrix of few more than it needs says nothing else."""
-
-MATCH_ERROR_PX = 0.5
-"""Least error of matches, px of the photograph as features were extracted."""
-
-MAX_PAIRS_OF_IMAGE = 4
-"""The strongest pairs of each image vote."""
-
-MAX_PAIRS_OF_DECISION = 24
-"""Pairs that are asked whether images of one size share a camera."""
-
-MIN_LOG_EVIDENCE = 3.0
-"""For one camera against many: twenty to one."""
-
+MIN_NUM_INLIERS = 20  # of a pair that votes: few more than a fundamental matrix needs say nothing
+MATCH_ERROR_PX = 0.5  # least error of matches, px of the photograph as features were extracted
+MAX_PAIRS_OF_IMAGE = 4  # the strongest pairs of each image vote
+MAX_PAIRS_OF_DECISION = 24  # pairs that are asked whether images of one size share a camera
+MIN_LOG_EVIDENCE = 3.0  # for one camera against many: twenty to one
 UNDECIDED = "pairs do not tell whether images of this size share a camera"
-
-MAX_SPREAD = 1.4
-"""Ratio of the ends of an interval that counts as knowledge."""
+MAX_SPREAD = 1.4  # ratio of the ends of an interval that counts as knowledge
 
 
 @dataclass(frozen=True)
@@ -61,21 +49,13 @@ class VotingPair:
 
 @dataclass
 class CameraVote:
-    """Decides on cameras by the votes of pairs.
+    """Decides on cameras by the votes of pairs."""
 
-    Attributes:
-        records: of all cameras by id.
-        pairs: that vote.
-        may_share: whether cameras of images of one size may turn out to be the same.
-        tied: cameras that have one focal length, each by the first of them.
-        decisions: what was found out about cameras of one size.
-    """
-
-    records: Mapping[int, CameraRecord]
-    pairs: Sequence[VotingPair]
-    may_share: bool
-    tied: dict[int, int] = field(default_factory=dict)
-    decisions: dict[int, str] = field(default_factory=dict)
+    records: Mapping[int, CameraRecord]  # of all cameras by id
+    pairs: Sequence[VotingPair]  # that vote
+    may_share: bool  # whether cameras of images of one size may turn out to be the same
+    tied: dict[int, int] = field(default_factory=dict)  # of one focal length, by their first
+    decisions: dict[int, str] = field(default_factory=dict)  # about cameras of one size
 
     def decide(self, progress: Progress = SILENT) -> dict[int, CameraRecord]:
         """Return the records as they are after the vote; progress counts the pairs.
@@ -103,12 +83,11 @@ class CameraVote:
         num_votes = Counter(camera for item in ballots for camera in set(item.cameras))
         outcome = count(ballots, sorted(set(self.tied.values())))
         records = {key: record for key, record in self.records.items() if key in known}
-        for size, first in sorted({(self.records[key].size, self.tied[key]) for key in unknown}):
-            keys = [
-                key for key in unknown if (self.records[key].size, self.tied[key]) == (size, first)
-            ]
-            estimate = outcome.estimates[first]
-            records[keys[0]] = self._record(keys, estimate, num_votes[first])
+        same: dict[tuple[tuple[int, int], int], list[int]] = defaultdict(list)
+        for key in unknown:
+            same[self.records[key].size, self.tied[key]].append(key)
+        for (_, first), keys in sorted(same.items()):
+            records[keys[0]] = self._record(keys, outcome.estimates[first], num_votes[first])
         return records
 
     def _decide_sharing(self, same_size: Sequence[int]) -> None:
@@ -147,9 +126,7 @@ class CameraVote:
 def log_evidence_for_sharing(pairs: Sequence[VotingPair], cameras: Collection[int]) -> float | None:
     """Return how much more likely one camera is than many, as a logarithm; None without pairs.
 
-    Args:
-        pairs: strongest first; those of other cameras are left out.
-        cameras: ids of cameras of which nothing is known.
+    Those come strongest first; pairs of other cameras than these ids are left out.
     """
     inside = [pair for pair in pairs if set(pair.cameras) <= set(cameras)]
     ballots = _ballots(inside[:MAX_PAIRS_OF_DECISION], {}, {})
@@ -171,8 +148,7 @@ def _ballots(
 
     ballots = []
     for found in map_ordered(ask, pairs, available_cores()):
-        if found:
-            ballots.append(found)
+        ballots += [found] if found else []
         if advance:
             advance(1)
     return ballots
@@ -184,12 +160,7 @@ def needs_vote(records: Mapping[int, CameraRecord]) -> bool:
 
 
 def forget_votes(path: Path, records: Mapping[int, CameraRecord]) -> dict[int, CameraRecord]:
-    """Return records as before a vote, and let the pairs of cameras that one decided go unverified.
-
-    Args:
-        path: of the database.
-        records: of its cameras.
-    """
+    """Return records as before a vote, and let pairs of cameras that one decided go unverified."""
     voted = {key for key, record in records.items() if record.source == "pairs"}
     if voted:
         with open_database(path) as database, pycolmap.DatabaseTransaction(database):
@@ -214,18 +185,13 @@ def voting_pairs(
 ) -> list[VotingPair]:
     """Read the verified pairs that can say something about cameras, strongest first.
 
-    Args:
-        path: of the database.
-        unknown: ids of the cameras that are asked for.
-        extracted_px: see :data:`~colmap_affrect.colmap.verification.ExtractedPx`.
-        silent: pairs of image names that are not asked.
+    ``unknown`` are the ids of the cameras that are asked for, ``silent`` pairs of image names that
+    are not asked.
     """
     with open_database(path) as database:
-        read = database.read_all_images()
-        images = {image.image_id: image.camera_id for image in read}
-        names = {image.image_id: image.name for image in read}
+        names = {image.image_id: image.name for image in database.read_all_images()}
         left_out = set(map(frozenset, silent))
-        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        cameras = cameras_of_images(database)
         pair_ids, geometries = database.read_two_view_geometries()
         ids = map(pycolmap.pair_id_to_image_pair, pair_ids)
         useful = [
@@ -234,7 +200,7 @@ def voting_pairs(
             if len(geometry.inlier_matches) >= MIN_NUM_INLIERS
             and geometry.F is not None
             and geometry.config not in PLANAR
-            and any(images[image_id] in unknown for image_id in pair)
+            and any(cameras[image_id].camera_id in unknown for image_id in pair)
             and frozenset(names[image_id] for image_id in pair) not in left_out
         ]
         useful.sort(key=lambda item: (-len(item[1].inlier_matches), item[0]))
@@ -245,13 +211,13 @@ def voting_pairs(
                 num.update(pair)
 
         @lru_cache(NUM_CACHED_IMAGES)
-        def keypoints(image_id: int) -> NDArray[np.float64]:
+        def keypoints(image_id: int) -> Array:
             return np.asarray(database.read_keypoints(image_id), np.float64)[:, :2]
 
         return [
             _voting_pair(
                 pair,
-                tuple(cameras[images[image_id]] for image_id in pair),
+                tuple(cameras[image_id] for image_id in pair),
                 tuple(keypoints(image_id) for image_id in pair),
                 geometry,
                 of_pair(extracted_px, pair),
@@ -263,7 +229,7 @@ def voting_pairs(
 def _voting_pair(
     images: tuple[int, int],
     cameras: Sequence[pycolmap.Camera],
-    keypoints: Sequence[NDArray[np.float64]],
+    keypoints: Sequence[Array],
     geometry: pycolmap.TwoViewGeometry,
     extracted_px: int | None,
 ) -> VotingPair:
@@ -271,11 +237,9 @@ def _voting_pair(
     to_px, points, errors = [], [], []
     for side, camera in enumerate(cameras):
         longer = max(camera.width, camera.height)
-        center = np.array([camera.principal_point_x, camera.principal_point_y])
-        points.append((keypoints[side][matches[:, side]] - center) / longer)
-        to_px.append(
-            np.array([[longer, 0.0, center[0]], [0.0, longer, center[1]], [0.0, 0.0, 1.0]])
-        )
+        x, y = camera.principal_point_x, camera.principal_point_y
+        points.append((keypoints[side][matches[:, side]] - [x, y]) / longer)
+        to_px.append(np.array([[longer, 0.0, x], [0.0, longer, y], [0.0, 0.0, 1.0]]))
         errors.append(MATCH_ERROR_PX / min(longer, extracted_px or longer))
     fundamental = to_px[1].T @ np.asarray(geometry.F, np.float64) @ to_px[0]
     matched = MatchedPair.of(
@@ -287,9 +251,7 @@ def _voting_pair(
 def apply_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
     """Make the cameras of a database what the records say, and let pairs go unverified by that.
 
-    Args:
-        path: of the database.
-        records: a record for each camera that stays; of its images some may have had another one.
+    There is a record for each camera that stays; of its images some may have had another one.
     """
     camera_of = {name: key for key, record in records.items() for name in record.names}
     with open_database(path) as database, pycolmap.DatabaseTransaction(database):

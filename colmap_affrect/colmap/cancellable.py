@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import TypeVar
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.parallel.executor import return_freed_memory
 
 Result = TypeVar("Result")
-
 POLL_S = 0.2
 
 
@@ -20,25 +20,21 @@ def run_cancellable(
 ) -> Result:
     """Run ``call`` in a thread; on Ctrl-C cancel it, wait until it has ended, and re-raise.
 
-    First, memory that this process has freed goes back to the system.
-
-    Args:
-        call: takes the token that pycolmap's call must be given.
-        token: of the caller, who may cancel too; by default a new one.
+    First, memory that this process has freed goes back to the system. ``call`` takes the token that
+    pycolmap's call must be given; the caller may have one too, to cancel by.
     """
     return_freed_memory()
     token = token or pycolmap.CancellationToken()
-    outcome: list[Result] = []
-    failure: list[BaseException] = []
+    outcome: Future[Result] = Future()
     # Not Thread.join: interrupted in Python 3.11, it takes the running thread for ended, and
     # the interpreter then ends under pycolmap's feet (bpo-45274).
     ended = threading.Event()
 
     def work() -> None:
         try:
-            outcome.append(call(token))
+            outcome.set_result(call(token))
         except BaseException as error:  # noqa: BLE001  (raised again by the waiting thread)
-            failure.append(error)
+            outcome.set_exception(error)
         finally:
             ended.set()
 
@@ -50,6 +46,4 @@ def run_cancellable(
         token.cancel()
         ended.wait()
         raise
-    if failure:
-        raise failure[0]
-    return outcome[0]
+    return outcome.result()

@@ -1,4 +1,4 @@
-"""What can be wrong in a COLMAP database, found without COLMAP.
+"""What can be wrong in a COLMAP database and what to do about it, found without COLMAP.
 
 Rows that COLMAP does not expect end the process inside COLMAP, so the tables are read by SQLite
 itself, of databases of all versions of COLMAP.
@@ -11,33 +11,120 @@ import struct
 from collections import defaultdict
 from collections.abc import Collection, Mapping
 from contextlib import closing
-from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.problems import CHECKS, FATAL
-from colmap_affrect.colmap.reading import DAMAGED, open_read_only
+from colmap_affrect.colmap.model_files import camera_like
 from colmap_affrect.colmap.tables import (
+    DAMAGED,
     SENSOR_CAMERA,
     Camera,
     Tables,
     columns_of,
+    open_read_only,
     pair_images,
     read_tables,
     rows_of,
 )
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.shown import such_as
 
-Problems = dict[str, list[str]]
-"""What was found: by kind, the images, pairs or cameras concerned, none if it is the database."""
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+Check = tuple[Severity, str, str]  # how serious a problem is, what it is, and what to do about it
 
-MAX_SIDE_PX = 1 << 24
-"""Of a photograph; the largest panoramas have a tenth of it."""
+CHECKS: dict[str, Check] = {
+    "no-images": ("warning", "holds no images",
+        "import some, e.g. by 'colmap feature_extractor --database_path {path} --image_path X'"),
+    "no-camera": ("error", "images whose camera does not exist",
+        "import these images again into a new database"),
+    "camera-model": ("error", "cameras of a model that COLMAP does not have",
+        "import their images again into a new database"),
+    "camera-panorama": ("warning", "cameras that look all around, which have no focal length",
+        "cut perspective views out of the panoramas, as COLMAP's example panorama.py does, and "
+        "give these"),
+    "camera-size": ("error", "cameras of a size that no photograph has",
+        "import their images again into a new database"),
+    "camera-params": ("error",
+        "cameras whose parameters are more or fewer than their model has, or not finite numbers",
+        "import their images again into a new database"),
+    "no-prior-focal": ("note", "cameras whose focal length is a guess",
+        "if you know the intrinsics, give them: --cameras-path or --focal-length-px here, "
+        "--ImageReader.camera_params in COLMAP"),
+    "no-frame": ("error", "images without a frame while others have one, at which mapping aborts",
+        "give each of them a frame (pycolmap.Database.write_frame), or begin anew with "
+        "'colmap-affrect run --database-path {path}', which adds frames to its copy"),
+    "frame-links": ("error", "rows of rigs and frames that belong to nothing",
+        "import the images again into a new database"),
+    "matrix-data": ("error",
+        "rows whose matrices or cameras have more or less data than they should, or no finite "
+        "numbers", "delete these rows; two-view geometries are made anew by 'colmap "
+        "geometric_verifier'"),
+    "bad-name": ("error", "images without a name, or with one that is not UTF-8",
+        "rename these files and import them again into a new database"),
+    "unsafe-name": ("warning", "image names that lead out of the image folder",
+        "rename these images; programs that write a file per image would write elsewhere"),
+    "no-keypoints": ("warning", "images without keypoints, which cannot be registered",
+        "extract their features, unless they are blank"),
+    "keypoint-columns": ("error", "images whose keypoints do not have 2, 4 or 6 columns",
+        "write them again as x, y; or x, y, scale, orientation; or x, y and an affine shape"),
+    "keypoint-data": ("error",
+        "images whose keypoints have more or less data than rows and columns",
+        "extract these images again into a new database"),
+    "keypoints-not-finite": ("error",
+        "images with keypoints that are not finite numbers, or are where no image reaches",
+        "extract these images again into a new database"),
+    "keypoints-outside": ("warning", "images with keypoints outside of them",
+        "see that they were found in the images as stored: not rotated, not resized"),
+    "descriptor-count": ("error", "images with another number of descriptors than of keypoints",
+        "extract these images again into a new database"),
+    "descriptor-types": ("error", "descriptors of several types, which COLMAP does not match",
+        "extract all images with the same features into a new database"),
+    "no-matches": ("note", "no pairs are matched yet",
+        "match them, e.g. by 'colmap exhaustive_matcher --database_path {path}'"),
+    "self-pair": ("error", "images that are matched with themselves",
+        "delete the matches of these pairs"),
+    "unknown-pair": ("error", "matches of images that do not exist",
+        "delete the matches of these pairs"),
+    "match-data": ("error", "pairs whose matches have more or less data than rows and 2 columns",
+        "delete the matches of these pairs and match them again"),
+    "match-range": ("error",
+        "pairs with matches of keypoints that do not exist, at which COLMAP crashes",
+        "delete the matches of these pairs and match them again"),
+    "no-geometry": ("warning",
+        "matched pairs without a two-view geometry, which mapping does not see",
+        "run 'colmap geometric_verifier --database_path {path}'"),
+    "undefined-geometry": ("warning",
+        "two-view geometries of undefined configuration, which mapping passes over",
+        "verify these pairs again: in a copy, delete their two-view geometries and run 'colmap "
+        "geometric_verifier'"),
+    "file-missing": ("warning", "images whose file is missing",
+        "put the files back, or give another --image-path"),
+    "file-unreadable": ("warning", "images whose file cannot be read",
+        "replace the files"),
+    "file-size": ("error", "images of another size than their camera",
+        "use the photographs that the database was made from: not resized, not rotated"),
+}  # fmt: skip
+"""The problems of a database by kind."""
+
+FATAL_FOR_IMAGES = frozenset({
+    "bad-name", "no-camera", "camera-model", "camera-panorama", "camera-size", "camera-params",
+    "frame-links",
+})  # fmt: skip
+"""Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
+
+FATAL = FATAL_FOR_IMAGES | {
+    "keypoint-columns", "keypoint-data", "keypoints-not-finite", "self-pair", "unknown-pair",
+    "match-data", "match-range", "matrix-data",
+}  # fmt: skip
+"""The same of keypoints and matches."""
+
+Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
+MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
 
 MATRICES = {
     ("two_view_geometries", "pair_id"): {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
@@ -51,25 +138,15 @@ CAMERA_OF_PAIR = struct.Struct("<IiQQBQ")
 """What a camera of a two-view geometry begins with: id, model, width, height, whether its focal
 length is a prior, and the number of parameters that follow, float64."""
 
-KEYPOINT_COLUMNS = (2, 4, 6)
-"""x, y; with scale and orientation; with an affine shape."""
-
-OUTSIDE_TOLERANCE_PX = 1.0
-"""Keypoints of an image that was shrunk for detection may lie a little outside it."""
-
-UNDEFINED = 0
-"""Configuration of a two-view geometry that COLMAP 4.2 passes over."""
+KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
+OUTSIDE_TOLERANCE_PX = 1.0  # keypoints of images shrunk for detection may lie outside
+UNDEFINED = 0  # configuration of a two-view geometry that COLMAP 4.2 passes over
 
 
 def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
-    """Refuse a database with problems that would end the process inside COLMAP.
+    """Refuse a damaged database, or one with problems that would end the process inside COLMAP.
 
-    Args:
-        path: of the database, which is only read.
-        kinds: of problems, keys of ``CHECKS``.
-
-    Raises:
-        DatabaseError: when it is damaged or has such a problem; one line.
+    It is only read; ``kinds`` of problems are keys of ``CHECKS``, and DatabaseError has one line.
     """
     with open_read_only(path) as connection:
         _, problems = _check(connection, path)
@@ -147,7 +224,7 @@ def is_unsafe(name: str) -> bool:
 def _check_cameras(tables: Tables, found: Problems) -> None:
     for camera_id, camera in tables.cameras.items():
         label = f"camera {camera_id}"
-        like = _camera_like(camera.model)
+        like = camera_like(camera.model)
         if not like:
             found["camera-model"].append(f"{label}: model {camera.model}")
             continue
@@ -160,15 +237,6 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
             found["camera-size"].append(f"{label}: {camera.width} x {camera.height} px")
 
 
-@cache
-def _camera_like(model: int) -> pycolmap.Camera | None:
-    """Return a camera of a model of COLMAP by its number, None if there is no such model."""
-    try:
-        return pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
-    except (ValueError, RuntimeError, TypeError):
-        return None
-
-
 def _check_names(connection: sqlite3.Connection, found: Problems) -> None:
     for image_id, raw in connection.execute("SELECT image_id, CAST(name AS BLOB) FROM images"):
         name = raw.decode("utf-8", "replace")
@@ -177,10 +245,8 @@ def _check_names(connection: sqlite3.Connection, found: Problems) -> None:
 
 
 def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
-    tables = [
-        name for name in ("rig_sensors", "frames", "frame_data") if columns_of(connection, name)
-    ]
-    for table in tables:
+    tables = ("rig_sensors", "frames", "frame_data")
+    for table in [name for name in tables if columns_of(connection, name)]:
         for _, row, parent, _ in connection.execute(f"PRAGMA foreign_key_check({table})"):
             found["frame-links"].append(f"row {row} of {table}, {parent}")
     if columns_of(connection, "rigs"):
@@ -198,8 +264,7 @@ def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
             for row, blob in rows_of(connection, f"{key} {name}", table):
                 values = _array(blob, 1, columns[name], np.dtype("<f8")) if blob else True
                 # Priors of position that are not known are not a number.
-                is_odd = values is None or (name in "FEH" and not np.isfinite(values).all())
-                if is_odd:
+                if values is None or (name in "FEH" and not np.isfinite(values).all()):
                     found["matrix-data"].append(f"{name} of {key} {row}")
     if {"qvec", "tvec"} <= columns_of(connection, "two_view_geometries"):
         query = "SELECT pair_id FROM two_view_geometries WHERE (qvec IS NULL) != (tvec IS NULL)"
@@ -215,7 +280,7 @@ def _check_cameras_of_pairs(connection: sqlite3.Connection, found: Problems) -> 
             header = blob[: CAMERA_OF_PAIR.size] if isinstance(blob, bytes) else b""
             if len(header) == CAMERA_OF_PAIR.size:
                 _, model, *_, count = CAMERA_OF_PAIR.unpack(header)
-                like = _camera_like(model)
+                like = camera_like(model)
                 if like and count == len(like.params) == (len(blob) - len(header)) / 8:
                     continue
             found["matrix-data"].append(f"{name} of pair_id {pair_id}")
@@ -264,13 +329,12 @@ def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[
     return np.frombuffer(blob, dtype).reshape(rows, columns)
 
 
-def _are_outside(keypoints: NDArray[np.float32], camera: Camera | None) -> bool:
+def _are_outside(keypoints: Singles, camera: Camera | None) -> bool:
     """Tell whether any keypoints, whose origin is the corner of the image, are not in it."""
     if camera is None:
         return False
-    points, size = keypoints[:, :2], np.array([camera.width, camera.height])
-    tolerance = OUTSIDE_TOLERANCE_PX
-    return bool(((points < -tolerance) | (points > size + tolerance)).any())
+    beyond = np.maximum(-keypoints[:, :2], keypoints[:, :2] - [camera.width, camera.height])
+    return bool((beyond > OUTSIDE_TOLERANCE_PX).any())
 
 
 def _check_descriptors(tables: Tables, found: Problems) -> None:

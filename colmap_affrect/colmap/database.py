@@ -22,11 +22,11 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Indices, Singles
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 
 BYTES_PER_ROW = 4096
-BYTES_OF_EMPTY_DATABASE = 1 << 19
-"""What :func:`require_database_space` reckons with."""
+BYTES_OF_EMPTY_DATABASE = 1 << 19  # what :func:`require_database_space` reckons with
 
 
 @contextmanager
@@ -50,13 +50,24 @@ def open_database(path: Path) -> Iterator[pycolmap.Database]:
         raise cannot_write(path, error) from error
 
 
+def write_frame(
+    database: pycolmap.Database, image: pycolmap.Image, rigs: dict[pycolmap.sensor_t, int]
+) -> None:
+    """Give an image a frame of the rig of its camera, which is made unless it is in ``rigs``."""
+    sensor = image.data_id.sensor_id
+    if sensor not in rigs:
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(sensor)
+        rigs[sensor] = database.write_rig(rig)
+    frame = pycolmap.Frame(rig_id=rigs[sensor])
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame)
+
+
 def require_database_space(path: Path, num_new: int) -> None:
     """Make sure that a database has room for so many new rows, and its log for all its content.
 
-    Called before functions of pycolmap that write, which end the process on a full disk.
-
-    Raises:
-        WorkspaceError: when there is no room.
+    Functions of pycolmap that write end the process on a full disk; here it is a WorkspaceError.
     """
     size = path.stat().st_size if path.exists() else 0
     require_space(path, 2 * size + num_new * BYTES_PER_ROW + BYTES_OF_EMPTY_DATABASE)
@@ -89,11 +100,7 @@ def nearest_positions(
 
 
 def spatial_pairs(path: Path, options: pycolmap.SpatialPairingOptions) -> list[tuple[str, str]]:
-    """Return the pairs of COLMAP's spatial matcher.
-
-    Raises:
-        DatabaseError: when fewer than two images have a position.
-    """
+    """Return the pairs of COLMAP's spatial matcher; DatabaseError without two positions."""
     with open_database(path) as database:
         count = sum(prior.has_position() for prior in database.read_all_pose_priors())
     if count < 2:
@@ -147,7 +154,7 @@ def keypoint_counts(path: Path) -> dict[str, int]:
         }
 
 
-def unverified_pairs(path: Path) -> NDArray[np.int64]:
+def unverified_pairs(path: Path) -> Indices:
     """Return the (N, 2) image ids with raw matches and no two-view geometry, good or bad."""
     with open_database(path) as database:
         pair_ids, counts = map(np.asarray, database.read_num_matches())
@@ -158,17 +165,17 @@ def unverified_pairs(path: Path) -> NDArray[np.int64]:
         return pairs[np.array(is_new, np.bool_)]
 
 
-def lack_matches(database: pycolmap.Database, image_ids: NDArray[np.integer]) -> NDArray[np.bool_]:
+def lack_matches(database: pycolmap.Database, image_ids: NDArray[np.integer]) -> Bools:
     """Tell which of (N, 2) image ids have no row of raw matches; not those with an id of 0."""
     low, high = np.sort(image_ids, axis=1).T
     matched, _ = database.read_num_matches()
-    lacking: NDArray[np.bool_] = (low > 0) & ~np.isin(low * MAX_NUM_IMAGES + high, matched)
+    lacking: Bools = (low > 0) & ~np.isin(low * MAX_NUM_IMAGES + high, matched)
     for row in np.flatnonzero(lacking):  # a row of none does not count there
         lacking[row] = not database.exists_matches(*image_ids[row])
     return lacking
 
 
-def colmap_keypoints(lafs: NDArray[np.floating]) -> NDArray[np.float32]:
+def colmap_keypoints(lafs: Floats) -> Singles:
     """Turn (N, 2, 3) frames into COLMAP's 6 columns x, y, a11, a12, a21, a22.
 
     The centre moves to COLMAP's corner origin; the shape maps the unit circle to one
@@ -187,21 +194,12 @@ def has_keypoints(database: pycolmap.Database, image_id: int, count: int) -> boo
 
 
 def write_keypoints(
-    database: pycolmap.Database,
-    image_id: int,
-    lafs: NDArray[np.floating],
-    level_ends: Sequence[int] = (),
+    database: pycolmap.Database, image_id: int, lafs: Floats, level_ends: Sequence[int] = ()
 ) -> None:
-    """Write the frames of one image, in the place of fewer ones that it may have had before.
+    """Write the (N, 2, 3) frames of an image, in the place of fewer that it may have had before.
 
-    Args:
-        database: an open database.
-        image_id: of the image.
-        lafs: (N, 2, 3) frames.
-        level_ends: how many frames it may have had before escalation appended others.
-
-    Raises:
-        DatabaseError: when it has another number of keypoints.
+    Those were as many as one of ``level_ends``, before escalation appended others; DatabaseError
+    for another number.
     """
     if has_keypoints(database, image_id, len(lafs)):
         return
@@ -225,14 +223,12 @@ SIGNED_SHIFT = 0.30
 """Added to descriptors with negative elements: COLMAP's brute-force matcher needs cosines >= 0."""
 
 
-def colmap_descriptors(descriptors: NDArray[np.floating]) -> NDArray[np.uint8]:
+def colmap_descriptors(descriptors: Floats) -> Bytes:
     """Encode (N, 128) unit descriptors as (N, 128) uint8 rows of length 512, as COLMAP's SIFT.
 
     Descriptors without negative elements, as RootSIFT, keep their angles. Others are shifted to
     positive values first, which makes all angles smaller and hardly changes their order.
-
-    Raises:
-        DatabaseError: for another size than 128, which COLMAP's SIFT matchers refuse.
+    DatabaseError for another size than 128, which COLMAP's SIFT matchers refuse.
     """
     if descriptors.shape[1] != DESCRIPTOR_SIZE:
         raise DatabaseError(
@@ -246,9 +242,7 @@ def colmap_descriptors(descriptors: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.asarray(np.minimum(np.rint(scaled), 255), dtype=np.uint8)
 
 
-def write_descriptors(
-    database: pycolmap.Database, image_id: int, descriptors: NDArray[np.floating]
-) -> None:
+def write_descriptors(database: pycolmap.Database, image_id: int, descriptors: Floats) -> None:
     """Write (N, 128) unit descriptors of an image that has none, see :func:`colmap_descriptors`."""
     rows = pycolmap.FeatureDescriptors(
         type=pycolmap.FeatureExtractorType.SIFT, data=colmap_descriptors(descriptors)
@@ -278,7 +272,7 @@ def reject_pairs(path: Path, pairs: Iterable[tuple[str, str]]) -> None:
             database.write_two_view_geometry(ids[first], ids[second], pycolmap.TwoViewGeometry())
 
 
-def camera_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
+def camera_matrix(camera: pycolmap.Camera) -> Array:
     """Return (3, 3) intrinsics in pixel-centre px, without distortion."""
     matrix = np.asarray(camera.calibration_matrix(), dtype=np.float64)
     matrix[:2, 2] = pixel_from_colmap(matrix[:2, 2])
@@ -288,35 +282,31 @@ def camera_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
 def read_cameras(path: Path) -> dict[str, pycolmap.Camera]:
     """Return the camera of every image of a database by image name."""
     with open_database(path) as database:
-        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-        return {image.name: cameras[image.camera_id] for image in database.read_all_images()}
+        cameras = cameras_of_images(database)
+        return {image.name: cameras[image.image_id] for image in database.read_all_images()}
+
+
+def cameras_of_images(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:
+    """Return the camera of each image by image id."""
+    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    return {image.image_id: cameras[image.camera_id] for image in database.read_all_images()}
 
 
 def write_matches(
-    database: pycolmap.Database,
-    image_id1: int,
-    image_id2: int,
-    indices: NDArray[np.integer],
+    database: pycolmap.Database, image_id1: int, image_id2: int, indices: NDArray[np.integer]
 ) -> None:
-    """Write raw matches of one pair unless it has some; every index is checked first."""
+    """Write (M, 2) raw matches of one pair unless it has some; every index is checked first."""
     if database.exists_matches(image_id1, image_id2):
         return
-    pair = (image_id1, image_id2)
-    _check_indices(indices, pair, [database.num_keypoints_for_image(i) for i in pair])
-    database.write_matches(image_id1, image_id2, indices.astype(np.uint32))
-
-
-def _check_indices(
-    indices: NDArray[np.integer], pair: tuple[int, int], counts: Sequence[int]
-) -> None:
-    """Refuse (M, 2) matches that do not belong to two images with so many keypoints."""
-    if pair[0] == pair[1]:
-        raise DatabaseError(f"image {pair[0]} cannot be matched with itself")
+    if image_id1 == image_id2:
+        raise DatabaseError(f"image {image_id1} cannot be matched with itself")
     if indices.ndim != 2 or indices.shape[1] != 2 or not np.issubdtype(indices.dtype, np.integer):
         raise DatabaseError(f"matches must be (M, 2) integers, not {indices.dtype}{indices.shape}")
+    counts = [database.num_keypoints_for_image(i) for i in (image_id1, image_id2)]
     if indices.size and (indices.min() < 0 or (indices.max(axis=0) >= counts).any()):
         raise DatabaseError(
-            f"matches of images {pair[0]}, {pair[1]} point at keypoints that do not exist "
+            f"matches of images {image_id1}, {image_id2} point at keypoints that do not exist "
             f"(largest {indices.max(axis=0).tolist()}, keypoints {counts}); run match again "
             "with --overwrite"
         )
+    database.write_matches(image_id1, image_id2, indices.astype(np.uint32))

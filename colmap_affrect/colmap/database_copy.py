@@ -16,24 +16,19 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import refuse_unusable
-from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.problems import FATAL, FATAL_FOR_IMAGES
-from colmap_affrect.colmap.reading import DAMAGED, open_read_only
+from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
+from colmap_affrect.colmap.database import open_database, write_frame
+from colmap_affrect.colmap.tables import DAMAGED, columns_of, open_read_only
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.project.workspace import remove_database
 
-FIRST_TYPED_SCHEMA = 4_000_000
-"""Descriptors have a type since COLMAP 4.0."""
+FIRST_TYPED_SCHEMA = 4_000_000  # descriptors have a type since COLMAP 4.0
 
 
 def schema_version(path: Path) -> int:
-    """Return the version of a database's tables, e.g. 4020100 for COLMAP 4.2.1.
-
-    Raises DatabaseError when the file is missing or no COLMAP database.
-    """
+    """Return the version of a database's tables, e.g. 4020100 for COLMAP 4.2.1."""
     with open_read_only(path) as connection:
-        version = connection.execute("PRAGMA user_version").fetchone()[0]
-    return int(version)
+        return int(connection.execute("PRAGMA user_version").fetchone()[0])
 
 
 def is_stamped(path: Path) -> bool:
@@ -42,9 +37,8 @@ def is_stamped(path: Path) -> bool:
     It does so when it opens one, before it fails at the tables, and changes nothing else.
     """
     with open_read_only(path) as connection:
-        (version,) = connection.execute("PRAGMA user_version").fetchone()
-        columns = {row[1] for row in connection.execute("PRAGMA table_info(descriptors)")}
-    return version < FIRST_TYPED_SCHEMA and "type" in columns
+        columns = columns_of(connection, "descriptors")
+    return schema_version(path) < FIRST_TYPED_SCHEMA and "type" in columns
 
 
 @cache
@@ -60,8 +54,7 @@ def newest_schema_version() -> int:
 def copy_as_it_is(source: Path, target: Path) -> None:
     """Copy a database as it is now, including its write-ahead log, with the schema that it has.
 
-    Raises DatabaseError when the source is missing, damaged, no COLMAP database, or one of a newer
-    COLMAP.
+    Raises DatabaseError unless it is an intact one of a COLMAP that is not newer than pycolmap.
     """
     version, newest = schema_version(source), newest_schema_version()
     if version > newest:
@@ -85,24 +78,16 @@ def copy_database(
     """Copy a database as it is now, including its write-ahead log.
 
     The copy, which appears as a whole, has the schema of the installed pycolmap, which leaves
-    positions (GPS) of COLMAP before 3.10 behind: they become pose priors.
-
-    Args:
-        source: the database, which stays as it is.
-        target: the copy.
-        refused: kinds of problems; databases of anybody are checked before COLMAP sees the copy.
-        change: what is done to the copy first.
-
-    Raises:
-        DatabaseError: when the source is missing, not a COLMAP database, one of a newer COLMAP or
-            has refused problems; when the target exists.
+    positions (GPS) of COLMAP before 3.10 behind: they become pose priors. ``change`` is done to it
+    first. Raises DatabaseError, beside :func:`copy_as_it_is`, when the target exists, and for
+    ``refused`` kinds of problems: databases of anybody are checked before COLMAP sees the copy.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
     if refused:
         refuse_unusable(source, refused)
     new = target.with_name(target.name + ".new")
-    new.unlink(missing_ok=True)
+    remove_database(new)
     try:
         copy_as_it_is(source, new)
         positions = _old_positions(new)
@@ -112,7 +97,7 @@ def copy_database(
                 change(database)
         new.replace(target)
     finally:
-        new.unlink(missing_ok=True)
+        remove_database(new)
 
 
 def _old_positions(path: Path) -> dict[int, tuple[float, float, float]]:
@@ -121,8 +106,7 @@ def _old_positions(path: Path) -> dict[int, tuple[float, float, float]]:
     Beside a rotation there is the translation of a pose instead; scripts wrote zeros for none.
     """
     with open_read_only(path) as connection:
-        columns = {row[1] for row in connection.execute("PRAGMA table_info(images)")}
-        if "prior_tx" not in columns:
+        if "prior_tx" not in columns_of(connection, "images"):
             return {}
         rows = connection.execute(
             "SELECT image_id, prior_tx, prior_ty, prior_tz FROM images "
@@ -184,19 +168,10 @@ def copy_without_pairs(source: Path, target: Path, pairs: Iterable[tuple[int, in
 
 
 def _add_frames(database: pycolmap.Database) -> None:
-    rig_of_sensor = {rig.ref_sensor_id: rig.rig_id for rig in database.read_all_rigs()}
-    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    rigs = {rig.ref_sensor_id: rig.rig_id for rig in database.read_all_rigs()}
     for image in database.read_all_images():
-        if image.has_frame_id():
-            continue
-        sensor = cameras[image.camera_id].sensor_id
-        if sensor not in rig_of_sensor:
-            rig = pycolmap.Rig()
-            rig.add_ref_sensor(sensor)
-            rig_of_sensor[sensor] = database.write_rig(rig)
-        frame = pycolmap.Frame(rig_id=rig_of_sensor[sensor])
-        frame.add_data_id(image.data_id)
-        database.write_frame(frame)
+        if not image.has_frame_id():
+            write_frame(database, image, rigs)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import read_given_model
+from colmap_affrect.colmap.model_files import camera_like, read_given_model
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.project.tables import read_lines, read_table
@@ -20,35 +20,23 @@ COLUMNS = ("name", "camera", "model", "params", "focal_px", "focal_mm", *WIDTHS,
 
 @dataclass(frozen=True)
 class GivenCamera:
-    """What the user says of the camera of an image; empty where nothing is said.
+    """What the user says of the camera of an image; empty where nothing is said."""
 
-    Attributes:
-        model: COLMAP's name of the camera model.
-        params: all parameters of the model.
-        focal_px: focal length.
-        focal_widths: focal length in units of the width of what the whole image shows.
-        principal_point: x, y in COLMAP's px, from the corner of the image.
-        size: (width, height) in px of the images that it is of.
-        label: images with one label share a camera.
-        where: file and line.
-    """
-
-    model: str = ""
-    params: tuple[float, ...] = ()
-    focal_px: float = 0.0
-    focal_widths: float = 0.0
-    principal_point: tuple[float, ...] = ()
-    size: tuple[int, ...] = ()
-    label: str = field(default="", compare=False)
-    where: str = field(default="", compare=False)
+    model: str = ""  # COLMAP's name of the camera model
+    params: tuple[float, ...] = ()  # all parameters of the model
+    focal_px: float = 0.0  # focal length
+    focal_widths: float = 0.0  # focal length in units of the width of what the whole image shows
+    principal_point: tuple[float, ...] = ()  # x, y in COLMAP's px, from the corner of the image
+    size: tuple[int, ...] = ()  # (width, height) in px of the images that it is of
+    label: str = field(default="", compare=False)  # images with one label share a camera
+    where: str = field(default="", compare=False)  # file and line
 
 
 def read_given_cameras(options: CameraOptions) -> dict[str, GivenCamera]:
     """Return the cameras that the user gives by image name; ``""`` stands for all other images.
 
-    Raises:
-        OptionError: for options that are wrong or contradict each other, and for a file that
-            cannot be read, naming the line.
+    Raises OptionError for options that are wrong or contradict each other, and for a file that
+    cannot be read, naming the line.
     """
     _require_model(options.model, "--camera-model")
     others = GivenCamera(
@@ -88,9 +76,8 @@ def _numbers(text: str, where: str) -> tuple[float, ...]:
 def _require_model(name: str, where: str) -> None:
     models = [
         model
-        for model in pycolmap.CameraModelId.__members__
-        if model != "INVALID"
-        and len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).focal_length_idxs())
+        for model, number in pycolmap.CameraModelId.__members__.items()
+        if (like := camera_like(number.value)) and len(like.focal_length_idxs())
     ]
     if name not in models:
         raise OptionError(f"{where} {name}: not one of {', '.join(models)}")
@@ -108,10 +95,6 @@ def _require_params(given: GivenCamera, where: str) -> None:
         )
     if any(given.params[index] <= 0.0 for index in expected.focal_length_idxs()):
         raise OptionError(f"{where}: a focal length of {given.params[0]:g} px cannot be")
-
-
-def _lines(path: Path) -> list[str]:
-    return read_lines(path, f"--cameras-path {path}")
 
 
 def _read_model(path: Path) -> dict[str, GivenCamera]:
@@ -136,7 +119,7 @@ def _read_model(path: Path) -> dict[str, GivenCamera]:
 def _read_text_model(folder: Path) -> dict[str, GivenCamera]:
     path, listed = folder / "cameras.txt", folder / "images.txt"
     cameras = {}
-    for number, line in enumerate(_lines(path), start=1):
+    for number, line in enumerate(read_lines(path, f"--cameras-path {path}"), start=1):
         words = line.split()
         if not words or line.startswith("#"):
             continue
@@ -153,9 +136,9 @@ def _read_text_model(folder: Path) -> dict[str, GivenCamera]:
     if len(cameras) == 1 and not listed.exists():
         return {"": next(iter(cameras.values()))}
     # Every other line lists the points of an image, which may be none.
-    lines = [(n, line) for n, line in enumerate(_lines(listed), 1) if not line.startswith("#")]
+    lines = enumerate(read_lines(listed, f"--cameras-path {listed}"), start=1)
     found = {}
-    for number, line in lines[::2]:
+    for number, line in [item for item in lines if not item[1].startswith("#")][::2]:
         words = line.split(maxsplit=9)
         if not words:
             continue

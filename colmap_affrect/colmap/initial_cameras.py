@@ -13,8 +13,6 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
 
-import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -30,12 +28,15 @@ from colmap_affrect.colmap.camera_records import (
 )
 from colmap_affrect.colmap.database import (
     camera_matrix,
+    cameras_of_images,
     image_ids,
     open_database,
     require_database_space,
+    write_frame,
 )
 from colmap_affrect.colmap.given_cameras import GivenCamera, read_given_cameras, unknown_names
 from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.exif import (
     MAX_CONTRADICTION,
     PLAUSIBLE_FOCALS,
@@ -45,23 +46,19 @@ from colmap_affrect.images.exif import (
 )
 from colmap_affrect.images.headers import is_too_large
 from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.project.workspace import remove_database
 
 logger = logging.getLogger(__name__)
 
 Size = tuple[int, int]
-Group = tuple[object, ...]
-"""Images of one group share a camera."""
+Group = tuple[object, ...]  # images of one group share a camera
 
 
 class InitialCameras:
     """Which images share a camera, and which one."""
 
     def __init__(self, image_path: Path, options: CameraOptions) -> None:
-        """Read what the user gives.
-
-        Raises:
-            OptionError: when it is wrong.
-        """
+        """Read what the user gives; OptionError when it is wrong."""
         self.image_path = image_path
         self.options = options
         self._given = read_given_cameras(options)
@@ -95,19 +92,17 @@ class InitialCameras:
 
     def groups(self, names: Sequence[str]) -> dict[Group, list[str]]:
         """Return the names of each group, in the order in which the groups begin."""
-        found: dict[Group, list[str]] = {}
+        found: defaultdict[Group, list[str]] = defaultdict(list)
         for name in names:
-            found.setdefault(self.group(name), []).append(name)
-        return found
+            found[self.group(name)].append(name)
+        return dict(found)
 
     def check(self, names: Sequence[str]) -> None:
         """Refuse images that cannot share the cameras that they should.
 
-        Raises:
-            OptionError: naming the option, or file and line, and what to do.
+        OptionError names the option, or file and line, and what to do.
         """
-        unknown = unknown_names(self._given, self.image_path, names)
-        if unknown:
+        if unknown := unknown_names(self._given, self.image_path, names):
             given = self.given(unknown[0])
             raise OptionError(f"{given.where}: {unknown[0]} is not in {self.image_path}")
         for group, same in self.groups(names).items():
@@ -119,9 +114,8 @@ class InitialCameras:
                     by_mode = group[0] in ("single", "per-folder")
                     who = f"--camera-mode {group[0]}" if by_mode else self.given(name).where
                     raise OptionError(
-                        f"{who}: {first} is {expected[0]} x "
-                        f"{expected[1]} px, {name} is {size[0]} x {size[1]} px; images that share "
-                        "a camera must have one size"
+                        f"{who}: {first} is {expected[0]} x {expected[1]} px, {name} is {size[0]} "
+                        f"x {size[1]} px; images that share a camera must have one size"
                     )
                 given = self.given(name)
                 if given.size and size != given.size:
@@ -170,11 +164,10 @@ class InitialCameras:
     def _set_focal(
         self, camera: pycolmap.Camera, given: GivenCamera, names: Sequence[str]
     ) -> tuple[Source, str]:
-        if given.params:
-            return "given", ""
-        focal = given.focal_px or given.focal_widths * camera.width
         source: Source = "given"
-        why = ""
+        focal, why = given.focal_px or given.focal_widths * camera.width, ""
+        if given.params:
+            return source, why
         if not focal:
             found = self._exif_focal(names)
             focal = found.focal_px or 0.0
@@ -203,15 +196,11 @@ class InitialCameras:
             return ExifFocal(None, why=why)
         return trusted[0]
 
-    def matrix(self, name: str, names: Sequence[str]) -> NDArray[np.float64] | None:
-        """Return the (3, 3) intrinsics that an image will have, in pixel-centre px.
+    def matrix(self, name: str, names: Sequence[str]) -> Array | None:
+        """Return the (3, 3) intrinsics that an image will have, without distortion.
 
-        Args:
-            name: of the image.
-            names: all images, of which some may share its camera.
-
-        Returns:
-            The intrinsics without distortion; None for a file that cannot be read.
+        They are in pixel-centre px; None for a file that cannot be read. Of all ``names`` some may
+        share its camera.
         """
         size = self.size(name)
         if not size:
@@ -248,16 +237,14 @@ def import_images(
 
     Sizes and GPS priors are read by COLMAP, from the files as stored, not rotated. Images that
     are added later share cameras as if all had been added at once. All of them are added, or none;
-    a new database appears with them.
-
-    Returns:
-        Names of the images that COLMAP cannot read, or whose size is not that of their camera.
+    a new database appears with them. Returns the names of the images that COLMAP cannot read, or
+    whose size is not that of their camera.
     """
     initial = InitialCameras(image_path, options)
     new = path if path.exists() else path.with_name(path.name + ".new")
     read = path.with_name(path.name + ".read")
     for file in {path, new, read} if new != path else {read}:
-        _remove_database(file)
+        remove_database(file)
     missing = sorted(set(names) - set(image_ids(new)))
     missing = [name for name in missing if not is_too_large(initial.size(name))]
     if missing:
@@ -265,83 +252,56 @@ def import_images(
         image_ids(read)  # makes it
         pycolmap.import_images(read, image_path, pycolmap.CameraMode.PER_IMAGE, missing)
         with open_database(read) as found, open_database(new) as database:
-            _Import(initial, found, database).add()
-        _remove_database(read)
+            _take_over(initial, found, database)
+        remove_database(read)
     if new != path:
         new.replace(path)
     return sorted(set(names) - set(image_ids(path)))
 
 
-def _remove_database(path: Path) -> None:
-    for suffix in ("", "-wal", "-shm"):
-        path.with_name(path.name + suffix).unlink(missing_ok=True)
+def _take_over(
+    initial: InitialCameras, found: pycolmap.Database, database: pycolmap.Database
+) -> None:
+    """Take over images that COLMAP has read into a database of their own: all of them, or none."""
+    images = sorted(found.read_all_images(), key=lambda image: image.name)
+    read = cameras_of_images(found)
+    sizes = {i.name: (read[i.image_id].width, read[i.image_id].height) for i in images}
+    priors = {prior.corr_data_id.id: prior for prior in found.read_all_pose_priors()}
+    cameras, new = _known_cameras(initial, database, list(sizes)), {}
+    for group, names in initial.groups(list(sizes)).items():
+        if group not in cameras:
+            size = sizes[names[0]]
+            new[group], _ = initial.camera([n for n in names if sizes[n] == size], size)
+    rigs = {rig.ref_sensor_id: rig.rig_id for rig in database.read_all_rigs()}
+    with pycolmap.DatabaseTransaction(database):
+        for camera in new.values():
+            camera.camera_id = database.write_camera(camera)
+        cameras |= new
+        for image in images:
+            camera = cameras[initial.group(image.name)]
+            if sizes[image.name] == (camera.width, camera.height):
+                written = pycolmap.Image(name=image.name, camera_id=camera.camera_id)
+                written.image_id = database.write_image(written)
+                write_frame(database, written, rigs)
+                if prior := priors.get(image.image_id):
+                    prior.corr_data_id = written.data_id
+                    database.write_pose_prior(prior)
 
 
-class _Import:
-    """Takes over images that COLMAP has read into a database of their own."""
-
-    def __init__(
-        self, initial: InitialCameras, found: pycolmap.Database, database: pycolmap.Database
-    ) -> None:
-        self.initial, self.database = initial, database
-        self.images = sorted(found.read_all_images(), key=lambda image: image.name)
-        cameras = {camera.camera_id: camera for camera in found.read_all_cameras()}
-        self.sizes = {
-            image.name: (cameras[image.camera_id].width, cameras[image.camera_id].height)
-            for image in self.images
-        }
-        self.priors = {prior.corr_data_id.id: prior for prior in found.read_all_pose_priors()}
-
-    def add(self) -> None:
-        """Write all of them, or none."""
-        groups = self.initial.groups([image.name for image in self.images])
-        cameras = self._known_cameras()
-        new = {
-            group: self._camera(names) for group, names in groups.items() if group not in cameras
-        }
-        rigs = {rig.ref_sensor_id: rig.rig_id for rig in self.database.read_all_rigs()}
-        with pycolmap.DatabaseTransaction(self.database):
-            for camera in new.values():
-                camera.camera_id = self.database.write_camera(camera)
-            cameras |= new
-            for image in self.images:
-                camera = cameras[self.initial.group(image.name)]
-                if self.sizes[image.name] == (camera.width, camera.height):
-                    self._write_image(image, camera, rigs)
-
-    def _known_cameras(self) -> dict[Group, pycolmap.Camera]:
-        """Return the cameras of the database that new images of a group get."""
-        cameras = {camera.camera_id: camera for camera in self.database.read_all_cameras()}
-        existing = self.initial.options.existing_camera_id
-        if existing >= 0:
-            if existing not in cameras:
-                raise DatabaseError(f"the database has no camera {existing} (existing_camera_id)")
-            return {self.initial.group(name): cameras[existing] for name in self.sizes}
-        used: dict[Group, set[int]] = defaultdict(set)
-        for image in self.database.read_all_images():
-            used[self.initial.group(image.name)].add(image.camera_id)
-        return {group: cameras[min(ids)] for group, ids in used.items() if len(ids) == 1}
-
-    def _camera(self, names: Sequence[str]) -> pycolmap.Camera:
-        size = self.sizes[names[0]]
-        return self.initial.camera([n for n in names if self.sizes[n] == size], size)[0]
-
-    def _write_image(
-        self, image: pycolmap.Image, camera: pycolmap.Camera, rigs: dict[pycolmap.sensor_t, int]
-    ) -> None:
-        if camera.sensor_id not in rigs:
-            rig = pycolmap.Rig()
-            rig.add_ref_sensor(camera.sensor_id)
-            rigs[camera.sensor_id] = self.database.write_rig(rig)
-        written = pycolmap.Image(name=image.name, camera_id=camera.camera_id)
-        written.image_id = self.database.write_image(written)
-        frame = pycolmap.Frame(rig_id=rigs[camera.sensor_id])
-        frame.add_data_id(written.data_id)
-        self.database.write_frame(frame)
-        prior = self.priors.get(image.image_id)
-        if prior:
-            prior.corr_data_id = written.data_id
-            self.database.write_pose_prior(prior)
+def _known_cameras(
+    initial: InitialCameras, database: pycolmap.Database, names: Sequence[str]
+) -> dict[Group, pycolmap.Camera]:
+    """Return the cameras of the database that new images of a group get."""
+    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    existing = initial.options.existing_camera_id
+    if existing >= 0:
+        if existing not in cameras:
+            raise DatabaseError(f"the database has no camera {existing} (existing_camera_id)")
+        return {initial.group(name): cameras[existing] for name in names}
+    used: dict[Group, set[int]] = defaultdict(set)
+    for image in database.read_all_images():
+        used[initial.group(image.name)].add(image.camera_id)
+    return {group: cameras[min(ids)] for group, ids in used.items() if len(ids) == 1}
 
 
 def record_cameras(
@@ -352,11 +312,8 @@ def record_cameras(
 ) -> None:
     """Put the cameras that are not on record yet on record, and log what is worth knowing of them.
 
-    Args:
-        database_path: the database.
-        records_path: where the records are.
-        initial: what the cameras were made from; None for those of another database.
-        known: records of the other database, if there are any.
+    ``initial`` is what they were made from; of cameras of another database that is None, and
+    ``known`` are its records, if there are any.
     """
     before = read_camera_records(records_path)
     known = before or known or {}
@@ -367,12 +324,12 @@ def record_cameras(
     for image in images:
         names[image.camera_id].append(image.name)
     records = {}
-    for camera_id, same in names.items():
-        record = known.get(camera_id)
+    for camera_id, of_camera in names.items():
+        record, same = known.get(camera_id), tuple(sorted(of_camera))
         if record and set(record.names) <= set(same):
-            records[camera_id] = replace(record, names=tuple(sorted(same)))
+            records[camera_id] = replace(record, names=same)
         else:
-            records[camera_id] = _record(cameras[camera_id], tuple(sorted(same)), initial)
+            records[camera_id] = _record(cameras[camera_id], same, initial)
     if records != before:
         write_camera_records(records_path, records)
         for line in notable_lines(r for key, r in records.items() if r != before.get(key)):

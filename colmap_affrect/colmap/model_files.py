@@ -13,17 +13,14 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.project.atomic_files import cannot_write
 
-SENSOR_BYTES = 8
-"""Type and id of a sensor."""
-
-POSE_BYTES = 7 * 8
-"""Quaternion and translation."""
+SENSOR_BYTES = 8  # type and id of a sensor
+POSE_BYTES = 7 * 8  # quaternion and translation
 
 
 class _Reader:
@@ -114,17 +111,17 @@ def _require_written(folder: Path) -> None:
 def _walk_camera(reader: _Reader) -> None:
     reader.skip(4)
     model = reader.number("I")
-    reader.skip(16 + 8 * _num_params().get(model, 0))
+    like = camera_like(model)
+    reader.skip(16 + 8 * (len(like.params) if like else 0))
 
 
 @cache
-def _num_params() -> dict[int, int]:
-    """Return the number of parameters of each camera model by COLMAP's number of it."""
-    models = [model for model in pycolmap.CameraModelId.__members__.values() if model.value >= 0]
-    return {
-        model.value: len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
-        for model in models
-    }
+def camera_like(model: int) -> pycolmap.Camera | None:
+    """Return a camera of a model of COLMAP by its number, None if there is no such model."""
+    try:
+        return pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
+    except (ValueError, RuntimeError, TypeError):
+        return None
 
 
 def _walk_rig(reader: _Reader) -> None:
@@ -175,7 +172,7 @@ def num_long_tracks(model: pycolmap.Reconstruction) -> Counter[int]:
     )
 
 
-def seen_points(image: pycolmap.Image) -> NDArray[np.int64]:
+def seen_points(image: pycolmap.Image) -> Indices:
     """Return the id of the point that each keypoint sees, -1 for none, (N,)."""
     seen = np.full(image.num_points2D(), -1, np.int64)
     for index in image.get_observation_point2D_idxs():

@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,9 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.options import flat
 
 Plain = bool | int | float | str
-
 TRUTH_VALUES = {"true": True, "1": True, "false": False, "0": False}
 
-OWNED = {
-    "image_path": "it is the one that extract was given",
-    "random_seed": "use --random-seed",
-}
+OWNED = {"image_path": "it is the one that extract was given", "random_seed": "use --random-seed"}
 """Options, in any section, that are set by other means."""
 
 
@@ -49,15 +46,10 @@ def set_values(options: Any, values: Mapping[str, Plain]) -> None:
 def resolve(options: Any, given: Mapping[str, Any], flag: str) -> dict[str, Plain]:
     """Check values against the type of pycolmap's and return them by full dotted key.
 
-    Args:
-        options: of the class that the values are for; they are changed.
-        given: value by key. Sections may be left out where a name exists once. Values may be text:
-            ``true``, ``false``, ``1`` or ``0`` for truth values, a name for enumerations.
-        flag: how a user gives them, for messages.
-
-    Raises:
-        OptionError: naming the key, if it is unknown, ambiguous or cannot be given in this way, or
-            if its value is of the wrong type.
+    ``options``, of the class that the values are for, are changed. Of keys sections may be left out
+    where a name exists once. Values may be text: ``true``, ``false``, ``1`` or ``0`` for truth
+    values, a name for enumerations. OptionError begins with ``flag``, how a user gives them, and
+    names a key that is unknown or ambiguous, or whose value is of a wrong type.
     """
     known = flat_values(options)
     resolved: dict[str, Plain] = {}
@@ -126,13 +118,10 @@ def _converted(value: Any, example: Any, where: str) -> Plain:
     kind = next((kind for kind in EXPECTED if isinstance(example, kind)), None)
     if kind is None:
         raise OptionError(f"{where}: cannot be given, it is of type {type(example).__name__}")
-    try:
-        converted = _convert(value, kind)
-    except (ValueError, OverflowError):
-        converted = None
-    if converted is None:
-        raise OptionError(f"{where}={value}: expected {kind.__name__.lower()} ({EXPECTED[kind]})")
-    return converted
+    with suppress(ValueError, OverflowError):
+        if (converted := _convert(value, kind)) is not None:
+            return converted
+    raise OptionError(f"{where}={value}: expected {kind.__name__.lower()} ({EXPECTED[kind]})")
 
 
 def _convert(value: Any, kind: type) -> Plain | None:

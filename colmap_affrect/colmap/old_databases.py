@@ -14,14 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.checks import FATAL
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.problems import FATAL
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 
-VERSION = 3800
-"""What COLMAP 3.8 writes into ``user_version``; newer ones take the tables over by it."""
+VERSION = 3800  # ``user_version`` of COLMAP 3.8; newer ones take the tables over by it
 
 MAPPER_OPTIONS = (
     "--Mapper.tri_ignore_two_view_tracks 0 --Mapper.init_min_num_inliers 50 "
@@ -29,9 +28,7 @@ MAPPER_OPTIONS = (
 )
 """Our preset for few photographs: by its defaults ``colmap mapper`` finds less, or nothing."""
 
-LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
-"""Camera models of COLMAP 3.8 have numbers up to this one."""
-
+LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)  # of cameras
 METRIC = pycolmap.PosePriorCoordinateSystem.CARTESIAN
 
 TABLES = f"""
@@ -82,11 +79,8 @@ geometries of configuration 9, calibrated with rigs, as 2, calibrated."""
 def export_database(source: Path, target: Path) -> list[str]:
     """Write a database as COLMAP 3.8 makes them; ids stay, and the source is only read.
 
-    Returns what COLMAP 3.8 has no place for and is left out, a line each.
-
-    Raises:
-        DatabaseError: when the source cannot be used or has a camera model that COLMAP 3.8 does not
-            know, or the target exists.
+    Returns what COLMAP 3.8 has no place for and is left out, a line each. DatabaseError when the
+    source cannot be used or has a camera model that COLMAP 3.8 does not know, or the target exists.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already and is not overwritten; give another name")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,16 +12,14 @@ from statistics import median
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import ComparisonError
+from colmap_affrect.geometry.arrays import Array
 
-Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""cam_from_world: rotation matrix and translation."""
-Poses = dict[str, Pose]
-"""Poses by image name."""
+Pose = tuple[Array, Array]  # cam_from_world: rotation matrix and translation
+Poses = dict[str, Pose]  # poses by image name
 PairErrors = Mapping[tuple[str, str], tuple[float, float]]
 """By the sorted names of two images: the errors of their relative pose in degrees, of the rotation
 and of the direction of the translation."""
@@ -30,29 +29,19 @@ MAX_CORRECT_ERROR_DEG = 5.0
 """An image is registered correctly if its relative poses to at least half of the other registered
 images are off by at most this, in rotation and in translation direction."""
 MIN_IMAGES_TO_ALIGN = 3
-MAX_ALIGNMENT_ERROR = 0.05
-"""Centres farther off do not decide the alignment; in units of the extent of the true centres."""
+MAX_ALIGNMENT_ERROR = 0.05  # of the true extent; centres farther off do not decide alignment
 
 
 @dataclass(frozen=True)
 class PoseScores:
-    """A model against ground truth.
+    """A model against ground truth."""
 
-    Attributes:
-        correct_names: images registered correctly (``MAX_CORRECT_ERROR_DEG``).
-        pair_errors_deg: of every pair of registered images that have ground truth.
-        num_pairs: pairs of all given images that have ground truth; those that are not in
-            ``pair_errors_deg`` count as failures.
-        auc: area under the curve of pairs whose larger error is below a threshold, up to
-            1, 3, 5 and 10 degrees, by threshold; 0 to 1.
-        median_position_error: of camera centres after similarity alignment, in units of the
-            ground truth; None with fewer than three images, or all on one line.
-    """
-
-    correct_names: tuple[str, ...]
-    pair_errors_deg: PairErrors
-    num_pairs: int
-    auc: Mapping[float, float]
+    correct_names: tuple[str, ...]  # images registered correctly (``MAX_CORRECT_ERROR_DEG``)
+    pair_errors_deg: PairErrors  # of every pair of registered images that have ground truth
+    num_pairs: int  # of all images with truth; those without errors count as failures
+    auc: Mapping[float, float]  # area under the curve up to a threshold, 0 to 1
+    # of camera centres after similarity alignment, in units of the ground truth; None with fewer
+    # than three images, or all on one line
     median_position_error: float | None
 
     @property
@@ -62,7 +51,7 @@ class PoseScores:
 
     @property
     def median_direction_error_deg(self) -> float | None:
-        """Of the translations of the pairs of registered images; None without pairs."""
+        """Of their translations; None without pairs."""
         return median(d for _, d in self.pair_errors_deg.values()) if self.pair_errors_deg else None
 
     def to_mapping(self) -> dict[str, Any]:
@@ -140,13 +129,10 @@ def correct_images(errors: PairErrors) -> tuple[str, ...]:
 
     A pair is right if both of its errors are at most ``MAX_CORRECT_ERROR_DEG``; all are given.
     """
-    num_right = {name: 0 for pair in errors for name in pair}
-    for pair, both in errors.items():
-        if max(both) <= MAX_CORRECT_ERROR_DEG:
-            for name in pair:
-                num_right[name] += 1
-    num_others = len(num_right) - 1
-    return tuple(sorted(name for name, count in num_right.items() if 2 * count >= num_others))
+    right = (pair for pair, both in errors.items() if max(both) <= MAX_CORRECT_ERROR_DEG)
+    num_right = Counter(itertools.chain.from_iterable(right))
+    names = {name for pair in errors for name in pair}
+    return tuple(sorted(name for name in names if 2 * num_right[name] >= len(names) - 1))
 
 
 def area_under_curve(errors_deg: Iterable[float], num_pairs: int, threshold_deg: float) -> float:

@@ -1,17 +1,53 @@
-"""What a COLMAP database holds, read by SQLite itself, of all versions of COLMAP."""
+"""What a COLMAP database of any version holds, read by SQLite: COLMAP migrates what it opens."""
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
-MAX_NUM_IMAGES = 2**31 - 1
-"""COLMAP's id of a pair is the smaller image id times this, plus the larger one."""
+from colmap_affrect.errors import DatabaseError
 
+TABLES = {"cameras", "images", "keypoints", "matches"}  # of all versions of COLMAP
+HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins one of unfinished changes
+DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # what sqlite3 raises, also quoting odd bytes
+MAX_NUM_IMAGES = 2**31 - 1  # an id of a pair is the smaller image id times this, plus the larger
 SENSOR_CAMERA = 0
+
+
+@contextmanager
+def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a COLMAP database so that nothing can change it.
+
+    Without a write-ahead log or a journal nobody is writing to it, and it is opened as immutable:
+    SQLite then makes no files beside it, so that its folder may be read-only.
+    """
+    if not path.is_file():
+        raise DatabaseError(f"{path}: no such file; give a COLMAP database")
+    wal, journal = (path.with_name(path.name + suffix) for suffix in ("-wal", "-journal"))
+    mode = "mode=ro" if wal.exists() or journal.exists() else "immutable=1"
+    address = f"{path.resolve().as_uri()}?{mode}"
+    try:
+        with closing(sqlite3.connect(address, uri=True)) as connection:
+            rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+            missing = TABLES - {name for (name,) in rows}
+            if missing:
+                raise DatabaseError(
+                    f"{path}: not a COLMAP database (it has no table {min(missing)})"
+                )
+            yield connection
+    except DAMAGED as error:
+        if journal.exists() and journal.read_bytes()[:8] == HOT_JOURNAL:
+            raise DatabaseError(
+                f"{path}: a program that was writing to it was killed, or is still at work, and "
+                f"{journal.name} undoes the half of it; wait, or open it once with a program that "
+                f"may write, e.g. sqlite3 {path.name} .tables"
+            ) from error
+        raise DatabaseError(f"{path}: not a usable COLMAP database ({error})") from error
 
 
 @dataclass(frozen=True)
@@ -27,29 +63,17 @@ class Camera:
 
 @dataclass(frozen=True)
 class Tables:
-    """What a database holds, without the data of keypoints and matches.
+    """What a database holds, without the data of keypoints and matches."""
 
-    Attributes:
-        cameras: by id.
-        names: of the images, by id.
-        camera_ids: by image id.
-        frame_images: ids of the images that are in a frame.
-        num_frames: number of frames.
-        keypoints: rows and columns by image id.
-        descriptors: type and rows by image id.
-        matches: number of raw matches by pair id.
-        geometries: number of inliers and configuration by pair id.
-    """
-
-    cameras: dict[int, Camera]
-    names: dict[int, str]
-    camera_ids: dict[int, int]
-    frame_images: set[int]
-    num_frames: int
-    keypoints: dict[int, tuple[int, int]]
-    descriptors: dict[int, tuple[int, int]]
-    matches: dict[int, int]
-    geometries: dict[int, tuple[int, int]]
+    cameras: dict[int, Camera]  # by id
+    names: dict[int, str]  # of the images, by id
+    camera_ids: dict[int, int]  # by image id
+    frame_images: set[int]  # ids of the images that are in a frame
+    num_frames: int  # number of frames
+    keypoints: dict[int, tuple[int, int]]  # rows and columns by image id
+    descriptors: dict[int, tuple[int, int]]  # type and rows by image id
+    matches: dict[int, int]  # number of raw matches by pair id
+    geometries: dict[int, tuple[int, int]]  # number of inliers and configuration by pair id
 
     def num_keypoints(self) -> dict[str, int]:
         """Return the number of keypoints of the images that have a row of them, by name."""
@@ -115,10 +139,7 @@ def read_tables(connection: sqlite3.Connection) -> Tables:
 def rows_of(connection: sqlite3.Connection, columns: str, table: str) -> Iterable[tuple[Any, ...]]:
     """Return columns of a table, row by row; nothing if there is no such table.
 
-    Args:
-        connection: to a database of any version of COLMAP.
-        columns: names with spaces between; those that the table lacks are 0.
-        table: its name.
+    Names of columns have spaces between; those that the table lacks are 0.
     """
     known = columns_of(connection, table)
     if not known:

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose
 from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.pair_models import EpipolarModel
 
 PLANAR = (
@@ -22,24 +22,18 @@ PLANAR = (
 """Pairs that a homography explains: their epipolar geometry is arbitrary."""
 
 CALIBRATED = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-
-MIN_TRANSLATION = 1e-9
-"""Of a decomposed homography, in units of the distance of its plane."""
+MIN_TRANSLATION = 1e-9  # of a decomposed homography, in units of the distance of its plane
 
 
 def epipolar_pair(
     geometry: pycolmap.TwoViewGeometry,
     cameras: tuple[pycolmap.Camera, pycolmap.Camera],
-    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+    keypoints: tuple[Floats, Floats],
 ) -> EpipolarModel | None:
     """Return the epipolar geometry of a pair and all keypoints; None where it has none.
 
-    Where both cameras are known it holds in pixels without distortion.
-
-    Args:
-        geometry: as COLMAP estimated it.
-        cameras: of image 1 and 2.
-        keypoints: (N1, 2 or more) and (N2, 2 or more) as in the database.
+    Where both cameras are known it holds in pixels without distortion. Keypoints are twice
+    (N, 2 or more), as in the database.
     """
     points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
     essential, fundamental = geometry.E, geometry.F
@@ -55,7 +49,7 @@ def epipolar_pair(
     return EpipolarModel(np.asarray(fundamental, np.float64), (points1, points2), sample_size)
 
 
-def undistorted(camera: pycolmap.Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def undistorted(camera: pycolmap.Camera, points: Array) -> Array:
     """Return (N, 2) pixels as a camera without distortion would have them.
 
     Points that the camera model cannot undistort become NaN.
@@ -67,7 +61,7 @@ def undistorted(camera: pycolmap.Camera, points: NDArray[np.float64]) -> NDArray
     return np.asarray(rays @ matrix[:2, :2].T + matrix[:2, 2])
 
 
-def keypoint_shapes(keypoints: NDArray[np.floating]) -> NDArray[np.float64] | None:
+def keypoint_shapes(keypoints: Floats) -> Array | None:
     """Return the (N, 2, 2) linear parts of a database's keypoints, up to a factor.
 
     Of 6 columns (x, y, a11, a12, a21, a22) they are affine; of 4 (x, y, scale, orientation in
@@ -84,7 +78,7 @@ def keypoint_shapes(keypoints: NDArray[np.floating]) -> NDArray[np.float64] | No
 
 
 def decomposed_homography(
-    homography: NDArray[np.float64], cameras: tuple[pycolmap.Camera, pycolmap.Camera]
+    homography: Array, cameras: tuple[pycolmap.Camera, pycolmap.Camera]
 ) -> list[Pose]:
     """Return the relative poses into which a homography of px can be decomposed.
 
@@ -101,7 +95,7 @@ def decomposed_homography(
     ]
 
 
-def homography_matrix(geometry: pycolmap.TwoViewGeometry) -> NDArray[np.float64] | None:
+def homography_matrix(geometry: pycolmap.TwoViewGeometry) -> Array | None:
     """Return the (3, 3) homography of a geometry, None where there is none."""
     has_one = geometry.H is not None and np.any(geometry.H)
     return np.asarray(geometry.H, np.float64) if has_one else None
@@ -109,20 +103,15 @@ def homography_matrix(geometry: pycolmap.TwoViewGeometry) -> NDArray[np.float64]
 
 def homography_of(
     geometry: pycolmap.TwoViewGeometry,
-    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+    keypoints: tuple[Floats, Floats],
     tolerance_px: float,
     min_off_plane: int,
-) -> NDArray[np.float64] | None:
+) -> Array | None:
     """Return the homography of a pair whose epipolar geometry is arbitrary or hardly determined.
 
     That is one of :data:`PLANAR`, or whose homography explains all but fewer than
-    ``min_off_plane`` of its inliers: epipolar lines hold on the plane, but turn freely off it.
-
-    Args:
-        geometry: as COLMAP estimated it.
-        keypoints: (N1, 2 or more) and (N2, 2 or more) as in the database.
-        tolerance_px: how near to the place in image 2 is explained.
-        min_off_plane: so many inliers off the plane determine the geometry.
+    ``min_off_plane`` of its inliers, up to ``tolerance_px`` in image 2: epipolar lines hold on the
+    plane, but turn freely off it. Keypoints are twice (N, 2 or more), as in the database.
     """
     homography = homography_matrix(geometry)
     if homography is None:

@@ -1,8 +1,14 @@
-"""Geometric verification of raw matches by pycolmap."""
+"""Geometric verification of raw matches by pycolmap, and how significant what it finds is.
+
+Significance is of inliers, and of what their local affine frames say. A match of two frames is a
+local map from image 1 to image 2. It must carry the epipolar direction of image 1 to that of image
+2. The epipolar geometry of a plane is arbitrary; there the map must turn as the homography does.
+"""
 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,6 +20,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
+    cameras_of_images,
     colmap_keypoints,
     image_ids,
     open_database,
@@ -21,17 +28,24 @@ from colmap_affrect.colmap.database import (
     unverified_pairs,
 )
 from colmap_affrect.colmap.native_options import Plain, differences
-from colmap_affrect.colmap.pair_significance import significance, telling_shapes
+from colmap_affrect.colmap.two_views import PLANAR, epipolar_pair, keypoint_shapes
 from colmap_affrect.geometry.affine import homography_errors
+from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
+from colmap_affrect.geometry.epipolar import common_sign
+from colmap_affrect.geometry.pair_models import HomographyModel, PairModel, Points, Rows
+from colmap_affrect.geometry.shapes import of_unit_area, vary_singly
+from colmap_affrect.geometry.significance import log10_bayes_factor, log10_false_alarms, shuffled
 from colmap_affrect.options import MAX_SEED, PresetOptions, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 logger = logging.getLogger(__name__)
 
-PAIRS_PER_WRITE = 200
-"""A killed run loses at most as many."""
-NUM_CACHED_IMAGES = 256
-"""As COLMAP keeps: 80 MB of 13,000 keypoints each."""
+PAIRS_PER_WRITE = 200  # a killed run loses at most as many
+NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
+MAX_FRAME_ANGLE_DEG = 20.0  # frames of right matches are off by 5 to 10 degrees
+CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0  # of frames that are turned at random
+MAX_CHANCE = 0.99  # frames that agree by chance nearly always, upright ones for one, say nothing
+MIN_VARIETY = 0.05  # of elements of shapes of area one; below they have no direction
 
 
 class VerificationOptions(PresetOptions):
@@ -94,7 +108,7 @@ class Side:
     """One image of a pair: its camera and (N, 2, 4 or 6) keypoints as in the database."""
 
     camera: pycolmap.Camera
-    keypoints: NDArray[np.float32]
+    keypoints: Singles
 
 
 def estimate_geometry(
@@ -103,13 +117,10 @@ def estimate_geometry(
     options: VerificationOptions,
     extracted_px: int | None = None,
 ) -> pycolmap.TwoViewGeometry:
-    """Return the two-view geometry of (M, 2) matches; an empty one if it is rejected.
+    """Return the two-view geometry of (M, 2) raw matches; an empty one if it is rejected.
 
-    Args:
-        sides: the image of the smaller id first, as COLMAP has them.
-        matches: raw ones.
-        options: thresholds.
-        extracted_px: longest side that photographs were shrunk to before extraction, if any.
+    The side of the smaller id comes first, as COLMAP has them. ``extracted_px`` is the longest side
+    that photographs were shrunk to before extraction, if any.
     """
     cameras = (sides[0].camera, sides[1].camera)
     matched = (sides[0].keypoints[matches[:, 0]], sides[1].keypoints[matches[:, 1]])
@@ -137,9 +148,7 @@ def estimate_geometry(
 
 
 def _planar_geometry(
-    geometry: pycolmap.TwoViewGeometry,
-    points: tuple[NDArray[np.float64], NDArray[np.float64]],
-    options: VerificationOptions,
+    geometry: pycolmap.TwoViewGeometry, points: tuple[Array, Array], options: VerificationOptions
 ) -> pycolmap.TwoViewGeometry:
     """Return the homography of the inliers of an epipolar geometry, with all matches it explains.
 
@@ -172,6 +181,73 @@ def max_error_px(
     return options.max_error_px * float(np.mean(np.maximum(sides, 1.0)))
 
 
+def significance(
+    geometry: pycolmap.TwoViewGeometry,
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
+    keypoints: tuple[Floats, Floats],
+    max_error_px: float,
+) -> float:
+    """Return the decimal logarithm of how many pairs chance needs to have one that looks as good.
+
+    It is infinite for a geometry that there is nothing to test in (a watermark). ``keypoints`` are
+    those of the raw matches, from which COLMAP estimated the geometry: twice (M, 2, 4 or 6), with
+    columns as in the database; without shapes, in 2 columns, positions count alone.
+    """
+    with np.errstate(all="ignore"):  # points that a camera cannot undistort are no inliers
+        model = _model(geometry, cameras, keypoints)
+        if model is None:
+            return math.inf
+        rows = np.arange(len(keypoints[0]))
+        inliers = rows[model.errors(rows, rows) <= max_error_px]
+        hits = model.errors(*shuffled(len(rows))) <= max_error_px
+        chance = max(float(hits.mean()), 1.0 / len(hits))
+        alarms = log10_false_alarms(len(rows), len(inliers), model.sample_size, chance)
+        shapes = (telling_shapes(keypoints[0]), telling_shapes(keypoints[1]))
+        if math.isinf(alarms) or shapes[0] is None or shapes[1] is None:
+            return -alarms
+        return _frame_evidence(model, inliers, (shapes[0], shapes[1])) - alarms
+
+
+def telling_shapes(keypoints: Floats) -> Points | None:
+    """Return the shapes of keypoints; None if they tell nothing.
+
+    That is without any, of circles, if all are alike, or only differ from view to view.
+    """
+    shapes = keypoint_shapes(keypoints)
+    if shapes is None or not len(shapes):
+        return None
+    alike = np.ptp(of_unit_area(shapes), axis=0).max() < MIN_VARIETY
+    return None if alike or not vary_singly(shapes) else shapes
+
+
+def _model(
+    geometry: pycolmap.TwoViewGeometry,
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
+    keypoints: tuple[Floats, Floats],
+) -> PairModel | None:
+    if geometry.config in PLANAR and geometry.H is not None:
+        points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
+        return HomographyModel(np.asarray(geometry.H, np.float64), (points1, points2))
+    if geometry.config == pycolmap.TwoViewGeometryConfiguration.WATERMARK:
+        return None
+    return epipolar_pair(geometry, cameras, keypoints)
+
+
+def _frame_evidence(model: PairModel, inliers: Rows, shapes: tuple[Points, Points]) -> float:
+    """Return the Bayes factor of the agreement of frames, as a decimal logarithm."""
+    cosines = model.cosines(inliers, inliers, shapes)
+    first, second = shuffled(len(inliers))
+    by_chance = model.cosines(inliers[first], inliers[second], shapes)
+    limit = math.cos(math.radians(MAX_FRAME_ANGLE_DEG))
+    signs = (1.0, -1.0) if model.has_sign else (1.0,)
+    chance = max(float((by_chance * sign >= limit).mean()) for sign in signs)
+    chance = min(max(chance, CHANCE_OF_AGREEMENT), MAX_CHANCE)
+    sign = common_sign(cosines) if model.has_sign else 1.0
+    num_agreeing = int(np.count_nonzero(cosines * sign >= limit))
+    # The better of two signs: chance has two tries.
+    return log10_bayes_factor(len(inliers), num_agreeing, chance) - math.log10(len(signs))
+
+
 ExtractedPx = int | Mapping[tuple[int, int], int] | None
 """Longest side that photographs were shrunk to before extraction, if any; or of pairs of image ids,
 the lower one first."""
@@ -182,8 +258,7 @@ def of_pair(extracted_px: ExtractedPx, ids: tuple[int, int]) -> int | None:
     return extracted_px.get(ids) if isinstance(extracted_px, Mapping) else extracted_px
 
 
-_Task = tuple[tuple[int, int], tuple[Side, Side], NDArray[np.integer]]
-"""A pair of image ids, its images and raw matches."""
+_Task = tuple[tuple[int, int], tuple[Side, Side], NDArray[np.integer]]  # ids, images, raw matches
 
 
 def verify(
@@ -195,20 +270,15 @@ def verify(
     """Estimate the two-view geometry of every matched pair that has none yet.
 
     As ``pycolmap.geometric_verification``, but a geometry is written when it has been judged:
-    whatever ends this, no pair is left that counts as verified and was not.
-
-    Args:
-        path: of the database.
-        options: thresholds.
-        extracted_px: see :data:`ExtractedPx`.
-        advance: called with the number of pairs that are done.
+    whatever ends this, no pair is left that counts as verified and was not. ``advance`` is called
+    with the number of pairs that are done.
     """
     todo = unverified_pairs(path)
     if not len(todo):
         return
     require_database_space(path, len(todo))
     with open_database(path) as database:
-        cameras = read_image_cameras(database)
+        cameras = cameras_of_images(database)
 
         @lru_cache(NUM_CACHED_IMAGES)
         def side(image_id: int) -> Side:
@@ -258,55 +328,32 @@ def _write(
         advance(count)
 
 
-def read_image_cameras(database: pycolmap.Database) -> dict[int, pycolmap.Camera]:
-    """Return the camera of each image by image id."""
-    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-    return {image.image_id: cameras[image.camera_id] for image in database.read_all_images()}
-
-
 class PairVerifier:
-    """Tries matches of single pairs as :func:`verify` would, without writing anything.
-
-    With the same seed the result is that of :func:`verify` on a database with these matches
-    (pinned by a test).
-    """
+    """Tries matches of single pairs, with the result of :func:`verify` and the same seed."""
 
     def __init__(
         self, path: Path, options: VerificationOptions, extracted_px: ExtractedPx = None
     ) -> None:
-        """Read cameras and image ids of a database."""
         self._options, self._extracted_px = options, extracted_px
         self._ids = image_ids(path)
         with open_database(path) as database:
-            self._cameras = read_image_cameras(database)
+            self._cameras = cameras_of_images(database)
 
     def inliers(
-        self,
-        names: tuple[str, str],
-        frames: tuple[NDArray[np.floating], NDArray[np.floating]],
-        indices: NDArray[np.integer],
-    ) -> NDArray[np.int64]:
+        self, names: tuple[str, str], frames: tuple[Floats, Floats], indices: NDArray[np.integer]
+    ) -> Indices:
         """Return the (K, 2) matches that a two-view geometry explains; none if it is rejected.
 
-        Args:
-            names: of the two images.
-            frames: (N1, 2, 3) and (N2, 2, 3) local affine frames in pixel-centre px.
-            indices: (M, 2) matches.
+        Of (M, 2) ``indices`` of (N1, 2, 3) and (N2, 2, 3) frames in pixel-centre px.
         """
         geometry = self.geometry(names, frames, indices)
         found = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
         return found if self._ids[names[0]] < self._ids[names[1]] else found[:, ::-1]
 
     def geometry(
-        self,
-        names: tuple[str, str],
-        frames: tuple[NDArray[np.floating], NDArray[np.floating]],
-        indices: NDArray[np.integer],
+        self, names: tuple[str, str], frames: tuple[Floats, Floats], indices: NDArray[np.integer]
     ) -> pycolmap.TwoViewGeometry:
-        """Return the two-view geometry, from the image with the lower id to the other one.
-
-        Arguments are those of :meth:`inliers`; without inliers where there is none.
-        """
+        """Return the geometry of the same from the image with the lower id; empty if rejected."""
         ids = self._ids[names[0]], self._ids[names[1]]
         first, second = (
             Side(self._cameras[image_id], colmap_keypoints(lafs))
@@ -329,7 +376,7 @@ def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], in
     }
 
 
-def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], NDArray[np.int64]]:
+def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], Indices]:
     """Return the (M, 2) features of each verified pair of image ids that are inliers."""
     with open_database(path) as database:
         pair_ids, geometries = database.read_two_view_geometries()

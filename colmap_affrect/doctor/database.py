@@ -18,7 +18,7 @@ from colmap_affrect.colmap.camera_vote import (
     log_evidence_for_sharing,
     voting_pairs,
 )
-from colmap_affrect.colmap.checks import check_database, check_image_files, is_unsafe
+from colmap_affrect.colmap.checks import CHECKS, check_database, check_image_files, is_unsafe
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import (
     copy_as_it_is,
@@ -26,7 +26,6 @@ from colmap_affrect.colmap.database_copy import (
     newest_schema_version,
     schema_version,
 )
-from colmap_affrect.colmap.problems import CHECKS
 from colmap_affrect.colmap.tables import Tables
 from colmap_affrect.doctor.findings import Findings, without_path
 from colmap_affrect.errors import DatabaseError, ImageError

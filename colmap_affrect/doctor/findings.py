@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_affrect.colmap.problems import CHECKS, SEVERITIES, Check, Severity
+from colmap_affrect.colmap.checks import CHECKS, SEVERITIES, Check, Severity
 from colmap_affrect.progress import Progress
 from colmap_affrect.shown import such_as
 

@@ -25,11 +25,9 @@ logger = logging.getLogger(__name__)
 
 PAGE_BYTES = 4096
 LINES_AT_ONCE = 10_000
-NEW_SUFFIX = ".affrect-new"
-"""Of files that are being written; a killed program leaves them."""
+NEW_SUFFIX = ".affrect-new"  # of files that are being written; a killed program leaves them
 JOURNAL_MARK = b"AFFRECT1"
-JOURNAL_HEADER = struct.Struct("<8sQ")
-"""Mark and size of the file; then pages after their numbers, then SHA-256 of all."""
+JOURNAL_HEADER = struct.Struct("<8sQ")  # mark, size of the file; then numbered pages, SHA-256
 SHA256_BYTES = 32
 
 

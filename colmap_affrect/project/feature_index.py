@@ -16,12 +16,8 @@ Entries = dict[str, tuple[str, int, Size]]
 """By image: the digest of the files that it was extracted from, the number of features, and
 (width, height) in px."""
 
-MIN_NUM_KEPT = 500
-"""Fewer are read as fast."""
-
-MIN_AGE_NS = 1_000_000_000
-"""A file that has just been written may change again without another time."""
-
+MIN_NUM_KEPT = 500  # fewer are read as fast
+MIN_AGE_NS = 1_000_000_000  # a file may change again within it without another time
 _known: dict[Path, tuple[list[int], Entries]] = {}
 
 

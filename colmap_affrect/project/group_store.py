@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -87,8 +87,7 @@ class GroupStore:
         replace_bytes(self.path, content.getvalue())
 
     def _check_format(self, file: h5py.File) -> None:
-        known = file.attrs.get("format")
-        version = file.attrs.get("format_version")
+        known, version = file.attrs.get("format"), file.attrs.get("format_version")
         if known != f"colmap_affrect/{self.kind}" or version != FORMAT_VERSION:
             found = f"{known} {version}" if known else "a file of another program"
             raise StoreError(
@@ -101,19 +100,17 @@ class GroupStore:
                 "run again with --overwrite"
             )
 
-    def complete(self, keys: Iterable[str]) -> set[str]:
-        """Return those of the keys whose group is there and complete."""
+    def _text(self, key: str) -> str | None:
+        """Return a text that is kept with the whole file, None where there is none."""
         if not self.path.exists():
-            return set()
+            return None
         with self._open("r") as file:
-            return {key for key in keys if key in file and file[key].attrs.get("complete", False)}
+            found = file.attrs.get(key)
+            return None if found is None else str(found)
 
-    def names(self) -> list[str]:
-        """Return the sorted names of all complete groups."""
-        if not self.path.exists():
-            return []
-        with self._open("r") as file:
-            return sorted(name for name, _ in complete_groups(file))
+    def _record_text(self, key: str, text: str) -> None:
+        with self._open("a") as file:
+            file.attrs[key] = text
 
     @staticmethod
     def _write(file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:
@@ -124,6 +121,11 @@ class GroupStore:
             group.create_dataset(name, data=values)
         group.attrs.update(attributes)
         group.attrs["complete"] = True
+
+
+def is_complete(file: h5py.File, key: str) -> bool:
+    """Tell whether a group is there and complete."""
+    return key in file and bool(file[key].attrs.get("complete", False))
 
 
 def complete_groups(group: h5py.Group, path: str = "") -> Iterator[tuple[str, h5py.Group]]:

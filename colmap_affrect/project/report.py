@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from colmap_affrect.shown import such_as
@@ -16,11 +15,8 @@ from colmap_affrect.shown import such_as
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
 
-FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
-"""How cells begin that spreadsheets compute."""
-
-MAX_LINES, MAX_ADVICE = 12, 4
-"""Of each list in a summary; report.json has all."""
+FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")  # how cells begin that spreadsheets compute
+MAX_LINES, MAX_ADVICE = 12, 4  # of each list in a summary; report.json has all
 
 SOURCES = {
     "exif": "from EXIF", "exif-rescaled": "from EXIF, for another size", "pairs": "from matches",
@@ -28,17 +24,15 @@ SOURCES = {
 }  # fmt: skip
 """How a summary calls where focal lengths are from; others are called by their own names."""
 
-USUAL = "sparse, sparse mapper"
-"""Preset and mapper that a summary does not name."""
+USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
 
 
 def _some(lines: Iterable[str]) -> list[str]:
     """Return the first few lines of a list, and how many there are more."""
     shown = list(lines)
-    more = len(shown) - MAX_LINES
-    return (
-        [*shown[:MAX_LINES], f"            and {more} more, see report.json"] if more > 1 else shown
-    )
+    if (more := len(shown) - MAX_LINES) > 1:
+        shown[MAX_LINES:] = [f"            and {more} more, see report.json"]
+    return shown
 
 
 def _by_story(stories: Mapping[str, str], start: str) -> list[str]:
@@ -85,23 +79,14 @@ def _no_formula(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class StageReport:
-    """One stage of a run.
+    """One stage of a run."""
 
-    Attributes:
-        name: extract, pairs, match, verify, escalate, guide or map.
-        wall_s: seconds.
-        num_done: images, pairs or models made now.
-        num_kept: those found done already.
-        failures: image name to reason.
-        warnings: image name to what went less well than asked for.
-    """
-
-    name: str
-    wall_s: float
-    num_done: int
-    num_kept: int = 0
-    failures: dict[str, str] = dataclasses.field(default_factory=dict)
-    warnings: dict[str, str] = dataclasses.field(default_factory=dict)
+    name: str  # extract, pairs, match, verify, escalate, guide or map
+    wall_s: float  # seconds
+    num_done: int  # images, pairs or models made now
+    num_kept: int = 0  # those found done already
+    failures: dict[str, str] = field(default_factory=dict)  # image name to reason
+    warnings: dict[str, str] = field(default_factory=dict)  # name to what went less well than asked
 
     def summary(self) -> str:
         """Return one line."""
@@ -113,26 +98,19 @@ class StageReport:
 
 @dataclass(frozen=True)
 class Arrival:
-    """How an image came into a model.
+    """How an image came into a model."""
 
-    Attributes:
-        how: by ``tracks`` through three images, by tracks that ``guided`` matching made, or
-            ``bridged``: by one verified pair whose scale comes from neighbouring depths.
-        by: of a bridge, the image that had been there; other fields are of bridges too.
-        num_agreeing: depths that agree on the scale.
-        num_ratios: depths compared.
-        scale_error_frac: standard error of the scale.
-    """
-
+    # by ``tracks`` through three images, by tracks that ``guided`` matching made, or ``bridged``:
+    # by one verified pair whose scale comes from neighbouring depths
     how: str
-    by: str = ""
-    num_agreeing: int = 0
-    num_ratios: int = 0
-    scale_error_frac: float = 0.0
+    by: str = ""  # of a bridge, the image that had been there; other fields are of bridges too
+    num_agreeing: int = 0  # depths that agree on the scale
+    num_ratios: int = 0  # depths compared
+    scale_error_frac: float = 0.0  # standard error of the scale
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what ``report.json`` holds."""
-        return dataclasses.asdict(self) if self.by else {"how": self.how}
+        return asdict(self) if self.by else {"how": self.how}
 
     def text(self) -> str:
         """Return a few words."""
@@ -144,28 +122,19 @@ class Arrival:
 
 @dataclass(frozen=True)
 class ModelSummary:
-    """One COLMAP model; the error is the mean over observations in px.
-
-    Attributes:
-        doubtful: images whose pose or camera is doubtful, with the reason.
-        doubts: reasons to doubt the model as a whole.
-        arrivals: how each image came in.
-        taken_out: images that were certainly wrong, with the reason.
-        focals_px: focal length of each image's camera.
-        rival_focals_px: lowest and highest of models that agree as well with the pairs, of images
-            for which these differ.
-    """
+    """One COLMAP model; the error is the mean over observations in px."""
 
     registered_names: tuple[str, ...]
     num_points3D: int
     mean_track_length: float
     mean_reprojection_error_px: float
-    doubtful: dict[str, str] = dataclasses.field(default_factory=dict)
-    doubts: tuple[str, ...] = ()
-    arrivals: dict[str, Arrival] = dataclasses.field(default_factory=dict)
-    taken_out: dict[str, str] = dataclasses.field(default_factory=dict)
-    focals_px: dict[str, float] = dataclasses.field(default_factory=dict)
-    rival_focals_px: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    doubtful: dict[str, str] = field(default_factory=dict)  # in pose or camera: name to reason
+    doubts: tuple[str, ...] = ()  # reasons to doubt the model as a whole
+    arrivals: dict[str, Arrival] = field(default_factory=dict)  # how each image came in
+    taken_out: dict[str, str] = field(default_factory=dict)  # certainly wrong: name to reason
+    focals_px: dict[str, float] = field(default_factory=dict)  # of each image's camera
+    # lowest and highest of models that agree as well with the pairs, of images where these differ
+    rival_focals_px: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def is_trustworthy(self) -> bool:
@@ -186,60 +155,47 @@ class ModelSummary:
         )
         lines += _by_story(self.doubtful, "doubtful")
         lines += [f"doubtful    the whole model: {why}" for why in self.doubts]
-        lines += [
+        return [
+            *lines,
             f"points      {self.num_points3D}, each in {self.mean_track_length:.2f} images",
             f"error       {self.mean_reprojection_error_px:.2f} px on average",
         ]
-        return lines
 
 
 @dataclass(frozen=True)
 class ReconstructionReport:
-    """A whole run; numbers of points and tracks are those of the largest model.
-
-    Attributes:
-        status: ``ok`` (all images in one model), ``partial``, ``doubtful`` (nothing that can
-            be trusted), or ``no_model``.
-        unregistered: image name to reason: unreadable, no features, no verified pair, not
-            registered (with its best pairs), taken out, or in another model.
-        models: all models, largest first, as written to sparse/0, sparse/1, ...
-        presets: of verification and of mapping: ``sparse``, ``colmap`` or ``custom``.
-        verification: options of two-view geometry.
-        mapping: the mapper and its options.
-        differs_from_colmap: for verification and mapping, what pycolmap was given that is not
-            COLMAP's default, by pycolmap's dotted keys.
-        pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
-            and ``none``; empty for other recipes.
-        contradicting_pairs: of these the verified ones that do not fit the largest model.
-        extended: names of the images of the model that was extended; empty where none was.
-        advice: what to try for the images that are missing.
-        guided: ``pairs`` that guided matching gave more inliers, and these inliers
-            ``matches_before`` and ``matches_after``; empty where no pair needed it.
-        cameras: for each its images, where its focal length is from, and its spread.
-    """
+    """A whole run; numbers of points and tracks are those of the largest model."""
 
     images_total: int
+    # image name to reason: unreadable, no features, no verified pair, not registered (with its best
+    # pairs), taken out, or in another model
     unregistered: dict[str, str]
-    models: tuple[ModelSummary, ...]
+    models: tuple[ModelSummary, ...]  # largest first, as written to sparse/0, sparse/1, ...
     num_verified_pairs: int
     num_pairs: int
     stages: tuple[StageReport, ...]
     recipe: str
     versions: dict[str, str]
-    presets: tuple[str, str]
-    verification: dict[str, Any]
-    mapping: dict[str, Any]
+    presets: tuple[str, str]  # of verification and of mapping: ``sparse``, ``colmap`` or ``custom``
+    verification: dict[str, Any]  # options of two-view geometry
+    mapping: dict[str, Any]  # the mapper and its options
+    # of verification and mapping what pycolmap was given that is not COLMAP's default, by its keys
     differs_from_colmap: dict[str, dict[str, Any]]
-    pair_levels: dict[str, int] = dataclasses.field(default_factory=dict)
-    contradicting_pairs: dict[str, int] = dataclasses.field(default_factory=dict)
-    extended: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
-    guided: dict[str, int] = dataclasses.field(default_factory=dict)
+    # that each level of an escalating recipe decided, by its rectifier, and ``none``; else empty
+    pair_levels: dict[str, int] = field(default_factory=dict)
+    # of these the verified ones that do not fit the largest model
+    contradicting_pairs: dict[str, int] = field(default_factory=dict)
+    extended: tuple[str, ...] = ()  # names of the images of the model that was extended, if any
+    advice: tuple[str, ...] = ()  # what to try for the images that are missing
+    # ``pairs`` that guided matching gave more inliers, and these inliers ``matches_before`` and
+    # ``matches_after``; empty where no pair needed it
+    guided: dict[str, int] = field(default_factory=dict)
+    # for each its images, where its focal length is from, and its spread
     cameras: tuple[dict[str, Any], ...] = ()
 
     @property
     def status(self) -> str:
-        """See the class docstring."""
+        """``ok`` (all images in one model), ``partial``, ``doubtful`` as a whole, ``no_model``."""
         if not self.models:
             return "no_model"
         if not self.models[0].is_trustworthy:
@@ -318,7 +274,7 @@ class ReconstructionReport:
             "contradicting_pairs": self.contradicting_pairs,
             "guided": self.guided,
             "cameras": list(self.cameras),
-            "stages": [dataclasses.asdict(stage) for stage in self.stages],
+            "stages": [asdict(stage) for stage in self.stages],
             "recipe": self.recipe,
             "preset": self.preset,
             "mapper": mapper,
@@ -343,9 +299,8 @@ class ReconstructionReport:
             lines += [f"            new {name}" for name in self.added]
         lines += _by_story(self.unregistered, "        not")
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
-        if counts := [
-            by_level(*item) for item in self.pair_levels.items() if item[0] != "none" and item[1]
-        ]:
+        decided = {level: count for level, count in self.pair_levels.items() if count}
+        if counts := [by_level(*item) for item in decided.items() if item[0] != "none"]:
             lines += [f"            {', '.join(counts)}"]
         if self.contradicting_pairs:
             counts = [by_level(*item) for item in self.contradicting_pairs.items()]

@@ -8,13 +8,10 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Adds up the seconds of named steps; while one runs inside another, only the inner counts.
-
-    Attributes:
-        seconds: by step; those named beforehand come first and may stay 0.
-    """
+    """Adds up the seconds of named steps; while one runs inside another, only the inner counts."""
 
     def __init__(self, *steps: str) -> None:
+        # by step; those named beforehand come first and may stay 0
         self.seconds: dict[str, float] = dict.fromkeys(steps, 0.0)
         self._within = 0.0
 

@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
+from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.project.feature_index import Entries, entries, forget
-from colmap_affrect.project.group_store import GroupStore, complete_groups
+from colmap_affrect.project.group_store import GroupStore, complete_groups, is_complete
 
 MAX_INT16 = 32767
 STATIONARY = "stationary_cells"
@@ -39,21 +40,13 @@ FINISHED = "finished_list"
 
 @dataclass(frozen=True)
 class PairMatches:
-    """Raw matches of one pair.
+    """Raw matches of one pair."""
 
-    Attributes:
-        names: the two image names, in the order of the columns.
-        indices: (M, 2) int64, strictly rising in column 0.
-        scores: (M,) float32 in [0, 1], larger is better.
-        num_keypoints1: number of features of the first image.
-        level: of escalation, whose features were looked at together with those of level 0.
-    """
-
-    names: tuple[str, str]
-    indices: NDArray[np.int64]
-    scores: NDArray[np.float32]
-    num_keypoints1: int
-    level: int = 0
+    names: tuple[str, str]  # the two image names, in the order of the columns
+    indices: Indices  # (M, 2) int64, strictly rising in column 0
+    scores: Singles  # (M,) float32 in [0, 1], larger is better
+    num_keypoints1: int  # number of features of the first image
+    level: int = 0  # of escalation, whose features were looked at together with those of level 0
 
 
 def _indexed(file: h5py.File) -> Entries:
@@ -65,7 +58,7 @@ def _indexed(file: h5py.File) -> Entries:
     return found
 
 
-def frame_datasets(lafs: NDArray[np.floating]) -> dict[str, NDArray[np.float32]]:
+def frame_datasets(lafs: Floats) -> dict[str, Singles]:
     """Return (N, 2, 3) frames, and their scales in sigmas and orientations in degrees."""
     stored = lafs.astype(np.float32)
     shapes = stored[:, :, :2].astype(np.float64)
@@ -131,7 +124,7 @@ class FeatureStore(GroupStore):
             group = self._group(file, name)
             size = tuple(group["image_size"][()].tolist())
             ends = group["level_ends"][()].tolist()
-            there = self._features(group, ends[-1])
+            there = self._features(group)
             first_id = int(there.rectification_ids.max(initial=0))
             ids = features.rectification_ids
             added = replace(features, rectification_ids=np.where(ids, ids + first_id, 0))
@@ -148,39 +141,35 @@ class FeatureStore(GroupStore):
         level_ends: list[int],
         content: str,
     ) -> None:
-        self._write(
-            file,
-            name,
-            {
-                "keypoints": features.keypoints.astype(np.float32),
-                "descriptors": features.descriptors.T.astype(np.float16),
-                "scores": features.responses,
-                "image_size": np.asarray(image_size),
-                **frame_datasets(features.lafs),
-                "rectification_ids": features.rectification_ids,
-                "level_ends": np.asarray(level_ends),
-            },
-            content=content,
-        )
+        datasets = {
+            "keypoints": features.keypoints.astype(np.float32),
+            "descriptors": features.descriptors.T.astype(np.float16),
+            "scores": features.responses,
+            "image_size": np.asarray(image_size),
+            **frame_datasets(features.lafs),
+            "rectification_ids": features.rectification_ids,
+            "level_ends": np.asarray(level_ends),
+        }
+        self._write(file, name, datasets, content=content)
 
     def read(self, name: str) -> LocalFeatures:
         """Read all features of one image; StoreError if they are missing or incomplete."""
         with self._open("r") as file:
-            group = self._group(file, name)
-            return self._features(group, group["level_ends"][()].tolist()[-1])
+            return self._features(self._group(file, name))
 
-    def level_indices(self, name: str, level: int, base: int = 0) -> NDArray[np.int64]:
+    def level_indices(self, name: str, level: int, base: int = 0) -> Indices:
         """Return the indices of the features of two levels, each once, in their order."""
         ends = [0, *self.level_ends(name)]
         return np.concatenate([np.arange(*ends[k : k + 2]) for k in sorted({base, level})])
 
     def _group(self, file: h5py.File, name: str) -> h5py.Group:
-        if name not in file or not file[name].attrs.get("complete", False):
+        if not is_complete(file, name):
             raise StoreError(f"{self.path}: no features of {name}; run extract first")
         return file[name]
 
     @staticmethod
-    def _features(group: h5py.Group, end: int) -> LocalFeatures:
+    def _features(group: h5py.Group) -> LocalFeatures:
+        end = group["level_ends"][-1]
         return LocalFeatures(
             group["lafs"][:end].astype(np.float64),
             group["scores"][:end],
@@ -208,7 +197,7 @@ class FeatureStore(GroupStore):
         """Return the (width, height) of each image in px."""
         return {name: size for name, (*_, size) in self._entries().items()}
 
-    def read_frames(self, name: str) -> NDArray[np.float32]:
+    def read_frames(self, name: str) -> Singles:
         """Read the (N, 2, 3) frames of one image."""
         with self._open("r") as file:
             return np.asarray(file[name]["lafs"][()])
@@ -251,13 +240,8 @@ class MatchStore(GroupStore):
         """Write a batch of pairs; record that a level was tried for others, which keep theirs."""
         with self._open("a") as file:
             for pair in pairs:
-                self._write(
-                    file,
-                    pair_key(*pair.names),
-                    hloc_matches(pair),
-                    level=pair.level,
-                    tried_level=pair.level,
-                )
+                key, level = pair_key(*pair.names), pair.level
+                self._write(file, key, hloc_matches(pair), level=level, tried_level=level)
             for names in tried:
                 file[pair_key(*names)].attrs["tried_level"] = tried_level
 
@@ -273,33 +257,25 @@ class MatchStore(GroupStore):
         with self._open("a") as file:
             file.attrs[FINISHED] = ""
             for key, group in list(complete_groups(file)):
-                if (
-                    key in keys
-                    or not names.isdisjoint(key.split("/"))
-                    or group.attrs.get("tried_level")
-                ):
+                is_asked = key in keys or not names.isdisjoint(key.split("/"))
+                if is_asked or group.attrs.get("tried_level"):
                     del file[key]
 
-    def stationary_cells(self) -> dict[tuple[int, int], NDArray[np.int64]]:
+    def stationary_cells(self) -> dict[tuple[int, int], Indices]:
         """Return the (N, 2) cells that never move by size of photographs (stages/stationary)."""
-        if not self.path.exists():
-            return {}
-        with self._open("r") as file:
-            known = json.loads(file.attrs.get(STATIONARY, "[]"))
+        known = json.loads(self._text(STATIONARY) or "[]")
         return {tuple(size): np.array(cells, np.int64).reshape(-1, 2) for size, cells in known}
 
-    def record_stationary_cells(self, cells: Mapping[tuple[int, int], NDArray[np.int64]]) -> None:
+    def record_stationary_cells(self, cells: Mapping[tuple[int, int], Indices]) -> None:
         """Keep the cells that never move."""
-        with self._open("a") as file:
-            file.attrs[STATIONARY] = json.dumps([(s, found.tolist()) for s, found in cells.items()])
+        self._record_text(STATIONARY, json.dumps([(s, c.tolist()) for s, c in cells.items()]))
 
-    def has(self, pairs: Sequence[tuple[str, str]]) -> NDArray[np.bool_]:
+    def has(self, pairs: Sequence[tuple[str, str]]) -> Bools:
         """Tell, as (N,) bools, which of N pairs are there and complete."""
         if not self.path.exists():
             return np.zeros(len(pairs), np.bool_)
         with self._open("r") as file:
-            keys = (pair_key(*pair) for pair in pairs)
-            there = (key in file and file[key].attrs.get("complete", False) for key in keys)
+            there = (is_complete(file, pair_key(*pair)) for pair in pairs)
             return np.fromiter(there, np.bool_, len(pairs))
 
     def num_pairs(self) -> int:
@@ -312,16 +288,11 @@ class MatchStore(GroupStore):
 
         Empty if a run has begun with another one since, None if nothing is known.
         """
-        if not self.path.exists():
-            return None
-        with self._open("r") as file:
-            found = file.attrs.get(FINISHED)
-            return None if found is None else str(found)
+        return self._text(FINISHED)
 
     def record_finished_list(self, digest: str) -> None:
         """Keep the digest of the list that is finished, empty while there is none."""
-        with self._open("a") as file:
-            file.attrs[FINISHED] = digest
+        self._record_text(FINISHED, digest)
 
     def levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
         """Return the level of escalation that the matches of each pair are from."""
@@ -340,7 +311,7 @@ class MatchStore(GroupStore):
         with self._open("r") as file:
             for name1, name2 in pairs:
                 key = pair_key(name1, name2)
-                if key not in file or not file[key].attrs.get("complete", False):
+                if not is_complete(file, key):
                     raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
                 matches0 = file[key]["matches0"][()].astype(np.int64)
                 rows = np.flatnonzero(matches0 >= 0)
@@ -355,19 +326,13 @@ class MatchStore(GroupStore):
 
 @dataclass(frozen=True)
 class GuidedPair:
-    """What guided matching found for a pair.
+    """What guided matching found for a pair."""
 
-    Attributes:
-        names: of the two images, in the order of the columns.
-        exact: (M, 2) inliers before; what adjusts models most accurately.
-        candidates: (K, 2) the same and guided matches, to verify.
-        num_inliers: of the geometry that was estimated from the candidates and took the place of
-            the one before; 0 where that stayed.
-    """
-
-    names: tuple[str, str]
-    exact: NDArray[np.int64]
-    candidates: NDArray[np.int64]
+    names: tuple[str, str]  # of the two images, in the order of the columns
+    exact: Indices  # (M, 2) inliers before; what adjusts models most accurately
+    candidates: Indices  # (K, 2) the same and guided matches, to verify
+    # of the geometry that was estimated from the candidates and took the place of the one before; 0
+    # where that stayed
     num_inliers: int
 
 
@@ -387,13 +352,16 @@ class GuidedStore(GroupStore):
 
     def read(self) -> list[GuidedPair]:
         """Read all pairs."""
-        found: list[GuidedPair] = []
         if not self.path.exists():
-            return found
+            return []
         with self._open("r") as file:
-            for _, group in sorted(complete_groups(file), key=lambda item: item[0]):
-                first, second = (str(name) for name in group.attrs["names"])
-                exact, candidates = group["exact"][()], group["candidates"][()]
-                count = int(group.attrs["num_inliers"])
-                found.append(GuidedPair((first, second), exact, candidates, count))
-        return found
+            return [
+                GuidedPair(
+                    (str(first), str(second)),
+                    group["exact"][()],
+                    group["candidates"][()],
+                    int(group.attrs["num_inliers"]),
+                )
+                for _, group in sorted(complete_groups(file), key=lambda item: item[0])
+                for first, second in [group.attrs["names"]]
+            ]

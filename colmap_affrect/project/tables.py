@@ -24,14 +24,8 @@ def read_table(
 ) -> list[tuple[str, dict[str, str]]]:
     """Return the rows of a CSV file, without empty cells, and for each the place to name.
 
-    Args:
-        path: of the file.
-        where: begins messages, such as ``--cameras-path FILE``.
-        columns: that it may have, in any order.
-        key: the column that it must have.
-
-    Raises:
-        OptionError: for a file that is no such table.
+    It may have the columns in any order, and must have ``key``: else OptionError, which begins
+    with ``where``, such as ``--cameras-path FILE``.
     """
     reader = csv.reader(read_lines(path, where), skipinitialspace=True)
     try:

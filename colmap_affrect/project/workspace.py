@@ -23,27 +23,20 @@ from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 
 logger = logging.getLogger(__name__)
 
-LOCAL = ("image_path", "image_list_path", "from_database", "cameras")
-"""Options that :meth:`Workspace.options_digest` leaves out: where files are, and cameras."""
+LOCAL = ("image_path", "image_list_path", "from_database", "cameras")  # not in digests of options
 PLACES = {
     "image_path", "image_list_path", "from_database", "cameras.cameras_path", "masks.path",
     "masks.camera_path", "depth.path", "match_list_path", "database",
 }  # fmt: skip
 """Options that say where files are: other places are no other options, what the files hold counts
 (:mod:`colmap_affrect.project.contents`). But none at all is another option."""
-GIVEN = "given"
-"""What stands in the place of such an option when options are compared."""
-INPUTS = "inputs.sha256"
-"""File in sparse/ that names the verified pairs, and the extended model, they were made from."""
+GIVEN = "given"  # what stands in the place of such an option when options are compared
+INPUTS = "inputs.sha256"  # in sparse/: digests of what it was made from
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
-COPY_STAGES = ("copy", "verify", "map")
-"""Of a folder in which another program's database is mapped."""
-BYTES_OF_MARK = 200
-"""At the beginning of our files, in which they tell what they are."""
-TEMPORARY_PREFIX = ".affrect-"
-"""Of folders for what is not complete yet."""
-FORMAT_VERSION = 6
-"""Of ``config.toml``: counts up when a stage records other options than before."""
+COPY_STAGES = ("copy", "verify", "map")  # of a folder in which another program's database is mapped
+BYTES_OF_MARK = 200  # at the beginning of our files, in which they tell what they are
+TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
+FORMAT_VERSION = 6  # of ``config.toml``: counts up when a stage records other options than before
 
 
 @lru_cache(maxsize=2)
@@ -62,36 +55,24 @@ class Workspace:
     others.
 
     A folder begins with ``extract``, or with ``copy`` of another program's database to be mapped.
-
-    Attributes:
-        users_database: database of the user that results go to instead of one in the folder;
-            never removed.
-        features: by image (HDF5).
-        pairs: list of the pairs to match (text).
-        matches: raw matches by pair (HDF5).
-        guided: what guided matching found, by pair (HDF5).
-        sparse: folder of the COLMAP models 0, 1, ...
-        aside: models that wait to be compared with those of guided matches.
-        snapshots: folder of what a mapping that was interrupted goes on from.
-        report: of the last run (JSON).
-        page: the same to look at (HTML).
-        cameras: what is known of the cameras of the database, and from where (JSON).
-        contents: digests of the files that were read (JSON).
-        depth: folder of the depth maps that a network made.
-        config: record of the options (TOML).
-        log: of all runs.
     """
 
     def __init__(self, path: Path, users_database: Path | None = None) -> None:
+        """Name the folder, and a database of the user in the place of one there; never removed."""
         self.path, self.users_database = path, users_database
         self.database = users_database or path / "database.db"
-        self.features, self.matches = path / "features.h5", path / "matches.h5"
-        self.guided, self.pairs = path / "guided.h5", path / "pairs.txt"
-        self.sparse, self.aside = path / "sparse", path / "sparse.aside"
-        self.snapshots, self.depth = path / "sparse.snapshots", path / "depth"
-        self.config, self.log = path / "config.toml", path / "run.log"
-        self.report, self.cameras = path / "report.json", path / "cameras.json"
-        self.contents, self.page = path / "contents.json", path / "report.html"
+        self.features = path / "features.h5"  # by image
+        self.matches = path / "matches.h5"  # raw ones by pair
+        self.guided = path / "guided.h5"  # what guided matching found, by pair
+        self.pairs = path / "pairs.txt"  # those to match
+        self.sparse = path / "sparse"  # folder of the COLMAP models 0, 1, ...
+        self.aside = path / "sparse.aside"  # models to be compared with those of guided matches
+        self.snapshots = path / "sparse.snapshots"  # from which an interrupted mapping goes on
+        self.depth = path / "depth"  # folder of the depth maps that a network made
+        self.config, self.log = path / "config.toml", path / "run.log"  # options; of all runs
+        self.report, self.page = path / "report.json", path / "report.html"  # of the last run
+        self.cameras = path / "cameras.json"  # what is known of the database's, and from where
+        self.contents = path / "contents.json"  # digests of the files that were read
 
     @classmethod
     def beside(cls, database_path: Path) -> Self:
@@ -113,9 +94,9 @@ class Workspace:
         record = self.recorded()
         later = STAGES[STAGES.index("verify") :]
         record["begun"] = [stage for stage in record["begun"] if stage not in later]
-        text = tomli_w.dumps({"format_version": FORMAT_VERSION, **record})
-        replace_text(path / self.config.name, text)
-        return Workspace(path)
+        made = Workspace(path)
+        made._write_record(record)
+        return made
 
     @contextmanager
     def locked(self) -> Iterator[Workspace]:
@@ -201,13 +182,15 @@ class Workspace:
             begun = [name for name in begun if STAGES.index(name) < STAGES.index(stage)]
             record = record if begun else {}
         if stage in begun:
-            difference = first_difference(
+            known, now = record.get("recipe"), recipe
+            other = known and now and known != now
+            if difference := first_difference(
                 placeless(record[stage], GIVEN), placeless(options, GIVEN)
-            )
-            if difference:
+            ):
+                why = f" (recipe {known!r} there, {now!r} now)" if other else ""
                 raise StaleStoreError(
-                    f"{self.path}: the {stage} stage was run there with {difference}"
-                    f"{_other_recipe(record.get('recipe'), recipe)}; {self._remedy}"
+                    f"{self.path}: the {stage} stage was run there with {difference}{why}; "
+                    f"{self._remedy}"
                 )
         begun = [name for name in STAGES if name in begun or name == stage]
         later = {name: dict(values) for name, values in (plan or {}).items() if name not in begun}
@@ -218,8 +201,7 @@ class Workspace:
 
     def _write_record(self, record: Mapping[str, Any]) -> None:
         ordered = {key: record[key] for key in ("recipe", "begun", *STAGES) if key in record}
-        text = tomli_w.dumps({"format_version": FORMAT_VERSION, **ordered})
-        replace_text(self.config, text)
+        replace_text(self.config, tomli_w.dumps({"format_version": FORMAT_VERSION, **ordered}))
 
     def rewind(self, why: str = "what it was made from has changed") -> None:
         """Remove the database and what was made from it, for inputs that have changed.
@@ -247,12 +229,11 @@ class Workspace:
         The digest stays the same when files are moved or photographs get other cameras.
         """
         record = self.recorded()
-        options = {
-            stage: {key: value for key, value in values.items() if key not in LOCAL}
-            for stage in stages
-            for values in (placeless(record.get(stage, {}), GIVEN),)
-        }
-        return digest_of(options)
+        chosen = {stage: placeless(record.get(stage, {}), GIVEN) for stage in stages}
+        for options in chosen.values():
+            for key in LOCAL:
+                options.pop(key, None)
+        return digest_of(chosen)
 
     def require(self, stage: str) -> dict[str, Any]:
         """Return the recorded options of an earlier stage; WorkspaceError when it was not run."""
@@ -262,8 +243,7 @@ class Workspace:
                 f"{self.path}: the {stage} stage has not been run there; run "
                 f"'colmap-affrect {stage}' with this --output-path first"
             )
-        options: dict[str, Any] = record[stage]
-        return options
+        return dict(record[stage])
 
     def _refuse_foreign_results(self, record: Mapping[str, Any], stage: str) -> None:
         begun = record.get("begun", [])
@@ -285,19 +265,16 @@ class Workspace:
 
     def _results(self, stage: str) -> list[Path]:
         """Return what a stage and those after it make."""
-        first = STAGES.index(stage)
-        outdated = [self.sparse, self.aside, self.snapshots, self.report, self.page]
-        if first <= STAGES.index("guide"):
-            outdated.append(self.guided)
-        if first <= STAGES.index("verify"):
-            outdated += [self.cameras, *database_files(self.database)]
-        if first <= STAGES.index("match"):
-            outdated.append(self.matches)
-        if first <= STAGES.index("pairs"):
-            outdated.append(self.pairs)
-        if first <= STAGES.index("extract"):
-            outdated += [self.features, self.contents]
-        return outdated
+        made = {
+            "map": [self.sparse, self.aside, self.snapshots, self.report, self.page],
+            "guide": [self.guided],
+            "verify": [self.cameras, *database_files(self.database)],
+            "match": [self.matches],
+            "pairs": [self.pairs],
+            "extract": [self.features, self.contents],
+        }
+        later = STAGES[STAGES.index(stage) :]
+        return [path for name, paths in made.items() if name in later for path in paths]
 
     @staticmethod
     def _remove(paths: Iterable[Path]) -> None:
@@ -325,11 +302,6 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
         yield workspace.path
 
 
-def _other_recipe(known: str | None, now: str) -> str:
-    """Say it when another recipe is why options differ."""
-    return f" (recipe {known!r} there, {now!r} now)" if known and now and known != now else ""
-
-
 def is_output_folder(path: Path) -> bool:
     """Tell whether this program has written its record or its log into a folder."""
     for name, mark in (("config.toml", b"format_version"), ("run.log", b"colmap-affrect")):
@@ -344,6 +316,12 @@ def database_files(path: Path) -> list[Path]:
     return [path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", "-journal"))]
 
 
+def remove_database(path: Path) -> None:
+    """Remove a database and the files beside it, if they are there."""
+    for file in database_files(path):
+        file.unlink(missing_ok=True)
+
+
 def placeless(options: Mapping[str, Any], there: str = "", prefix: str = "") -> dict[str, Any]:
     """Return options without places of files; ``there`` stands where one is given."""
     found = dict(options)
@@ -355,15 +333,12 @@ def placeless(options: Mapping[str, Any], there: str = "", prefix: str = "") -> 
     return found
 
 
-def _is_name(key: str) -> bool:
-    return key.rpartition(".")[2] == "name"
-
-
 def first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Say where options on record differ from those given now; empty if they do not."""
     old, new = flat(known), flat(now)
     # The name of a part first: with another one most other options differ too.
-    for key in sorted(old.keys() | new.keys(), key=lambda key: (not _is_name(key), key)):
+    keys = sorted(old.keys() | new.keys(), key=lambda key: (key.rpartition(".")[2] != "name", key))
+    for key in keys:
         if old.get(key) != new.get(key):
             return f"{key}={old.get(key)!r}, and it is {new.get(key)!r} now"
     return ""

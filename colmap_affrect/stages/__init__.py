@@ -1,5 +1,4 @@
 """The stages of a run: extract, pairs, match, verify, escalate, guide and map, one file each.
 
-They share ``context``; ``one_image`` is what is done for one photograph, ``one_pair`` what
-is done for one pair.
+They share ``context``; ``one_image`` and ``one_pair`` say what is done for one photograph or pair.
 """

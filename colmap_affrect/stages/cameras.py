@@ -35,10 +35,8 @@ logger = logging.getLogger(__name__)
 def choose_cameras(context: Context, *, may_share: bool = True) -> StageReport:
     """Hold a vote over cameras that nobody knows, unless it was held; verify pairs again by it.
 
-    Args:
-        context: with verified pairs.
-        may_share: whether cameras of images of one size may turn out to be the same, where
-            nothing is said of who shares one.
+    ``may_share``: cameras of images of one size may turn out to be the same, where nothing is said
+    of who shares one.
     """
     start = time.perf_counter()
     workspace = context.workspace
@@ -74,17 +72,8 @@ def hold_vote(
     """Vote on the cameras of a database whose pairs are verified, unless that was done.
 
     A killed one is gone on with: what was decided is written first, and putting it into the
-    database may be repeated.
-
-    Args:
-        database_path: its cameras change, and pairs are verified again with those that the pairs
-            know.
-        records_path: what is known of the cameras; brought up to date.
-        verification: options.
-        size_px: that photographs were shrunk to before extraction.
-        may_share: whether cameras of images of one size may turn out to be the same.
-        silent: pairs that do not vote.
-        progress: counts the pairs that vote.
+    database may be repeated. The cameras of the database change, and pairs are verified again with
+    those that the pairs know; the records are brought up to date. ``silent`` pairs do not vote.
     """
     records = read_camera_records(records_path)
     if needs_vote(records):

@@ -30,11 +30,7 @@ def source_files(path: Path) -> list[Path]:
 def refuse_other_photographs(
     workspace: Workspace, image_path: str, digests: Mapping[str, str]
 ) -> None:
-    """Refuse another folder of photographs unless it has some of those that were worked on.
-
-    Raises:
-        StaleStoreError: naming both folders.
-    """
+    """Refuse another folder of photographs unless it has some that were worked on."""
     before = (workspace.planned("extract") or {}).get("image_path", image_path)
     if before == image_path:
         return
@@ -58,20 +54,9 @@ def forget_changed(
     """Remove what was made from inputs that have changed since, so that it is made again.
 
     The changed images lose their features last: a run that is killed before finds them changed
-    again.
-
-    Args:
-        context: where the results are.
-        inputs: the photographs.
-        digests: of the content of each image now.
-        contents: the record of what files hold, which is brought up to date.
-        are_all: whether there are no other images than these.
-
-    Returns:
-        One line by the folder of the photographs; empty if nothing has changed.
-
-    Raises:
-        StaleStoreError: when the results are in a database of the user.
+    again. ``digests`` are of the content of each image now; ``contents`` are brought up to date;
+    ``are_all`` says that there are no other images. Returns one line by the folder of the
+    photographs, empty if nothing has changed. StaleStoreError for results in a user's database.
     """
     workspace, store = context.workspace, context.features
     known = store.contents()
@@ -100,11 +85,7 @@ def _told(names: Sequence[str], what: str) -> list[str]:
 
 
 def refuse_changed(context: Context, digests: Mapping[str, str]) -> None:
-    """Refuse to add to the features of photographs that have changed.
-
-    Raises:
-        StaleStoreError: naming the first.
-    """
+    """Refuse to add to the features of photographs that have changed; StaleStoreError."""
     known = context.features.contents()
     changed = _told([n for n in digests if known.get(n, "") not in ("", digests[n])], "changed")
     if changed:

@@ -21,21 +21,12 @@ def insecure_images(
 ) -> set[str]:
     """Return the images that mapping may well lose.
 
-    Args:
-        num_inliers: of each pair, 0 where it is not verified.
-        strong_num_inliers: an image needs a pair with as many.
-        weakly_connected: images that have little in common with two others; see
-            :func:`colmap_affrect.stages.escalate.weakly_connected_images`.
+    Those are in no pair with ``strong_num_inliers``, or are among those that have little in common
+    with two others. ``num_inliers`` of each pair is 0 where it is not verified.
     """
-    strong = {
-        name
-        for pair, count in num_inliers.items()
-        if count >= max(1, strong_num_inliers)
-        for name in pair
-    }
-    return {name for pair in num_inliers for name in pair if name not in strong}.union(
-        weakly_connected
-    )
+    strong = (pair for pair, count in num_inliers.items() if count >= max(1, strong_num_inliers))
+    names = {name for pair in num_inliers for name in pair}
+    return names.difference(*strong).union(weakly_connected)
 
 
 def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> list[set[T]]:
@@ -48,19 +39,12 @@ def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> l
 
 @dataclass(frozen=True)
 class ClimbingGraph:
-    """The pairs of a set as they are now.
+    """The pairs of a set as they are now."""
 
-    Attributes:
-        num_inliers: of each pair, 0 where it is not verified.
-        num_consistent: matches that confirm each other, of each pair that is not verified.
-        insecure: images that mapping may well lose.
-        stalled: pairs to which the last level that they climbed to brought nothing.
-    """
-
-    num_inliers: Mapping[Pair, int]
-    num_consistent: Mapping[Pair, int]
-    insecure: Set[str]
-    stalled: Set[Pair] = frozenset()
+    num_inliers: Mapping[Pair, int]  # of each pair, 0 where it is not verified
+    num_consistent: Mapping[Pair, int]  # that confirm each other; of each not verified
+    insecure: Set[str]  # images that mapping may well lose
+    stalled: Set[Pair] = frozenset()  # to which the last level brought nothing
 
     @cached_property
     def components(self) -> dict[str, int]:

@@ -16,23 +16,14 @@ from colmap_affrect.project.workspace import Workspace
 
 @dataclass(frozen=True)
 class Resources:
-    """What is needed from outside and does not change results.
+    """What is needed from outside and does not change results."""
 
-    Attributes:
-        weights_path: folder with the weights of networks; None searches the usual places.
-        device: ``auto``, ``cpu``, ``cuda``, ``cuda:1``, ``mps``; of networks and of matching.
-        depth_cache_path: folder that keeps the depth maps of a network; None keeps none.
-    """
-
-    weights_path: Path | None = None
-    device: str = "auto"
-    depth_cache_path: Path | None = None
+    weights_path: Path | None = None  # of networks; None searches the usual places
+    device: str = "auto"  # ``auto``, ``cpu``, ``cuda:1``, ``mps``; of networks and of matching
+    depth_cache_path: Path | None = None  # for the depth maps of a network; None keeps none
 
     def require_device(self, *, uses_network: bool = False) -> str:
-        """Return the device that is there, else raise DeviceError.
-
-        torch is loaded only where networks are used, or when a device is named.
-        """
+        """Return the device, if it is there; torch is loaded only to ask for one or use it."""
         if self.device in ("auto", "cpu") and not uses_network:
             return "cpu"
         from colmap_affrect.features.networks import resolve_device
@@ -52,20 +43,12 @@ def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) 
 
 @dataclass(frozen=True)
 class Context:
-    """Where a run works and with what; none of it changes a result.
+    """Where a run works and with what; none of it changes a result."""
 
-    Attributes:
-        workspace: the output folder.
-        resources: weights and device.
-        executor: where images and pairs are worked on, a cluster for one; by default in threads
-            of this process.
-        progress: where to show progress.
-    """
-
-    workspace: Workspace
-    resources: Resources = field(default_factory=Resources)
-    executor: Executor | None = None
-    progress: Progress = SILENT
+    workspace: Workspace  # the output folder
+    resources: Resources = field(default_factory=Resources)  # weights and device
+    executor: Executor | None = None  # for images and pairs, e.g. a cluster; None: threads here
+    progress: Progress = SILENT  # where to show progress
 
     @property
     def features(self) -> FeatureStore:

@@ -44,7 +44,10 @@ def copy_verified(
     digest, before = contents.digest(source_files(source)), contents.recorded("copy")
     if digest != before or not workspace.database.exists():
         refuse_unusable(source)
-    given = {"database": str(source.resolve()), "image_path": _absolute(image_path)}
+    given = {
+        "database": str(source.resolve()),
+        "image_path": str(image_path.resolve()) if image_path else "",
+    }
     workspace.record_options("copy", given, overwrite=overwrite)
     warnings = {}
     if digest != before:
@@ -85,13 +88,3 @@ def _other_sizes(database: Path, image_path: Path) -> dict[str, str]:
 def is_copy(workspace: Workspace) -> bool:
     """Tell whether a folder holds the copy of another program's database."""
     return "copy" in workspace.recorded().get("begun", [])
-
-
-def copied_image_path(workspace: Workspace) -> Path | None:
-    """Return the folder of the photographs of a copied database, None if it was not given."""
-    path = workspace.require("copy")["image_path"]
-    return Path(path) if path else None
-
-
-def _absolute(path: Path | None) -> str:
-    return str(path.resolve()) if path else ""

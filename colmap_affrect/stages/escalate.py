@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -32,12 +32,9 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.verification import (
-    PairVerifier,
-    verified_pairs,
-    verify,
-)
+from colmap_affrect.colmap.verification import PairVerifier, verified_pairs, verify
 from colmap_affrect.errors import ImageError
+from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.consistency import num_consistent_matches
 from colmap_affrect.mappers.pair_graph import MIN_SHARE
 from colmap_affrect.pairs.base import Pair
@@ -56,11 +53,14 @@ from colmap_affrect.stages.extract import (
     write_images_and_keypoints,
 )
 from colmap_affrect.stages.guide import restore_exact
-from colmap_affrect.stages.match import PAIRS_PER_WRITE, match_pairs, recorded_matching
+from colmap_affrect.stages.match import (
+    PAIRS_PER_WRITE,
+    match_pairs,
+    matched_at_level,
+    recorded_matching,
+)
 from colmap_affrect.stages.one_image import ImageExtractor
-from colmap_affrect.stages.one_pair import Matching, iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
-from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import (
     extracted_px,
     recorded_verification,
@@ -197,7 +197,6 @@ class Escalation:
     """Lets pairs of a workspace climb to a level, with the options on record."""
 
     def __init__(self, context: Context, options: EscalateOptions) -> None:
-        """Read what is on record."""
         self.context, self.options = context, options
         self.extraction = recorded_extraction(context.workspace)
         self.matching = recorded_matching(context.workspace)
@@ -266,9 +265,7 @@ class Escalation:
                 known[pair] = key, num_consistent_matches(*self._frames(pair, indices))
         return {pair: known[pair][1] for pair in pairs}
 
-    def _frames(
-        self, pair: Pair, indices: NDArray[np.integer]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _frames(self, pair: Pair, indices: NDArray[np.integer]) -> tuple[Singles, Singles]:
         first, second = (self.features.read_frames(name) for name in pair)
         return first[indices[:, 0]], second[indices[:, 1]]
 
@@ -290,7 +287,8 @@ class Escalation:
 
     def climb(self, pairs: Sequence[Pair], level: int) -> None:
         """Match pairs with the features of a level and keep what has more inliers."""
-        names = self._images_to_extend(pairs, level)
+        images = sorted({name for pair in pairs for name in pair})
+        names = [name for name in images if len(self.features.level_ends(name)) <= level]
         title, total = f"escalate, level {level}", len(names) + len(pairs)
         with self.context.progress.stage(title, total, "steps") as advance:
             self._extend(names, level, advance)
@@ -301,7 +299,9 @@ class Escalation:
     def write(self) -> None:
         """Bring the database up to what is stored."""
         write_images_and_keypoints(self.context)
-        self._replace_matches()
+        ids = colmap_database.image_ids(self.path)
+        if pairs := [pair for pair in self.pairs if pair[0] in ids and pair[1] in ids]:
+            _replace_matches(self.path, ids, self.matches.read(pairs))
         verify_new(self.context)
         self._unwritten = set()
 
@@ -316,30 +316,9 @@ class Escalation:
 
     def match_first_level(self, pairs: Sequence[Pair], path: Path) -> None:
         """Give pairs of a copy of the database the matches that they had before they climbed."""
-        ids = colmap_database.image_ids(path)
-        with closing(self._iterate_matches(pairs, 0)) as found_pairs:
-            found_matches = list(found_pairs)
-        with colmap_database.open_database(path) as database:
-            for found in found_matches:
-                first, second = (ids[name] for name in found.names)
-                colmap_database.replace_matches(database, first, second, found.indices)
+        found = list(matched_at_level(self.context, pairs, self.matching, 0))
+        _replace_matches(path, colmap_database.image_ids(path), found)
         verify(path, self.verification, extracted_px(self.context))
-
-    def _iterate_matches(
-        self, pairs: Sequence[Pair], level: int
-    ) -> Generator[PairMatches, None, None]:
-        chosen = self.extraction.levels[level]
-        options, extractor = chosen.matching or self.matching, chosen.features.name
-        resources, executor = self.context.resources, self.context.executor
-        matching = Matching(self.features, options, level, chosen.base, extractor, resources)
-        stationary = StationaryFilter(self.features, self.matches)
-        with closing(iterate_matches(pairs, matching, executor)) as found_pairs:
-            for found in found_pairs:
-                yield stationary.filtered(found)
-
-    def _images_to_extend(self, pairs: Sequence[Pair], level: int) -> list[str]:
-        names = sorted({name for pair in pairs for name in pair})
-        return [name for name in names if len(self.features.level_ends(name)) <= level]
 
     def _extend(self, names: Sequence[str], level: int, advance: Callable[[int], None]) -> None:
         """Add to images the features of all levels that they lack, up to this one."""
@@ -360,7 +339,7 @@ class Escalation:
                 if reached == level:
                     advance(1)
 
-    def measured(self, pair: Pair, indices: NDArray[np.integer]) -> NDArray[np.bool_]:
+    def measured(self, pair: Pair, indices: NDArray[np.integer]) -> Bools:
         """Return which of the (M, 2) matches of a pair are of frames that were measured singly."""
         kinds = np.array([level.features.has_shapes for level in self.extraction.levels])
         sides = []
@@ -384,7 +363,8 @@ class Escalation:
             better.clear()
 
         try:
-            with closing(self._iterate_matches(pairs, level)) as found_pairs:
+            matched = matched_at_level(self.context, pairs, self.matching, level)
+            with closing(matched) as found_pairs:
                 for found in found_pairs:
                     tried.append(found.names)
                     chosen, worth = self._judged(found, others.get(found.names), verifier)
@@ -398,7 +378,7 @@ class Escalation:
                 record()
 
     def _judged(
-        self, found: PairMatches, others: NDArray[np.int64] | None, verifier: PairVerifier
+        self, found: PairMatches, others: Indices | None, verifier: PairVerifier
     ) -> tuple[PairMatches, tuple[float, int]]:
         """Return what a pair may have at a level, and what that is worth beside what it has.
 
@@ -423,13 +403,11 @@ class Escalation:
             return united, (len(explained), 0)
         return found, (math.inf if is_measured else 0, 0)
 
-    def _inliers(self, found: PairMatches, verifier: PairVerifier) -> NDArray[np.int64]:
+    def _inliers(self, found: PairMatches, verifier: PairVerifier) -> Indices:
         first, second = (self.features.read_frames(name) for name in found.names)
         return verifier.inliers(found.names, (first, second), found.indices)
 
-    def _inliers_of_other_kind(
-        self, pairs: Sequence[Pair], level: int
-    ) -> dict[Pair, NDArray[np.int64]]:
+    def _inliers_of_other_kind(self, pairs: Sequence[Pair], level: int) -> dict[Pair, Indices]:
         """Return the (M, 2) inliers, of frames measured or not, that a level does not look for."""
         is_measured, todo = self.extraction.levels[level].features.has_shapes, set(pairs)
         found = {}
@@ -443,12 +421,10 @@ class Escalation:
                     found[pair] = others
         return found
 
-    def _replace_matches(self) -> None:
-        """Put matches into the database where they differ from the ones there."""
-        ids = colmap_database.image_ids(self.path)
-        pairs = [pair for pair in self.pairs if pair[0] in ids and pair[1] in ids]
-        if not pairs:
-            return
-        with colmap_database.open_database(self.path) as database:
-            for (first, second), found in zip(pairs, self.matches.read(pairs), strict=True):
-                colmap_database.replace_matches(database, ids[first], ids[second], found.indices)
+
+def _replace_matches(path: Path, ids: Mapping[str, int], matches: Iterable[PairMatches]) -> None:
+    """Put matches into a database where they differ from the ones there."""
+    with colmap_database.open_database(path) as database:
+        for found in matches:
+            first, second = (ids[name] for name in found.names)
+            colmap_database.replace_matches(database, first, second, found.indices)

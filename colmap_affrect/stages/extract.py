@@ -11,11 +11,10 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.camera_records import read_camera_records
-from colmap_affrect.colmap.checks import refuse_unusable
+from colmap_affrect.colmap.checks import CHECKS, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_without_features, read_names
 from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
-from colmap_affrect.colmap.problems import CHECKS, FATAL_FOR_IMAGES
 from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
 from colmap_affrect.features.weights import digests_by_name
 from colmap_affrect.images.photographs import (
@@ -100,10 +99,7 @@ class Inputs(Options):
         return Photographs(Path(self.image_path), self.masks)
 
     def names(self) -> list[str]:
-        """Return the images of the folder, of the list, or of the database.
-
-        With list and database they are those of the list.
-        """
+        """Return the images of the list, else of the database, else of the folder."""
         folder, listed = Path(self.image_path), Path(self.image_list_path)
         if not self.from_database:
             return list_images(folder, listed if self.image_list_path else None)
@@ -131,11 +127,7 @@ class Inputs(Options):
         return [file for path in given for file in source_files(path)]
 
     def check(self) -> None:
-        """Refuse cameras and masks that cannot be used.
-
-        Raises:
-            OptionError: naming the option.
-        """
+        """Refuse cameras and masks that cannot be used; OptionError names the option."""
         self.photographs.check()
         read_given_cameras(self.cameras)
         if self.from_database and self.cameras != CameraOptions():
@@ -145,12 +137,7 @@ class Inputs(Options):
             )
 
     def check_names(self, names: Sequence[str]) -> None:
-        """Refuse photographs that cannot be used together.
-
-        Raises:
-            StoreError: when two have the same key in hloc's files.
-            OptionError: when photographs cannot share the cameras that they should.
-        """
+        """Refuse photographs with the same key in hloc's files, or that cannot share cameras."""
         refuse_colliding_keys(names)
         if not self.from_database:
             self.initial_cameras.check(names)
@@ -182,15 +169,8 @@ def extract(
 
     An image that cannot be read is reported and passed over. One that cannot be rectified, for
     want of a depth map, is extracted as it is, with a warning. The options of later stages are
-    put on record too.
-
-    Args:
-        context: where the results go.
-        inputs: the photographs.
-        recipe: what to extract.
-        image_names: the images to look at now, in the place of a list on record.
-        later: options of later stages by name, beside those of the recipe.
-        overwrite: discard the results of this and later stages first.
+    put on record too: ``later``, by name, beside those of the recipe. ``image_names`` are looked at
+    in the place of a list on record; ``overwrite`` discards what is there, and later stages.
     """
     start = time.perf_counter()
     workspace, folder = context.workspace, Path(inputs.image_path)
@@ -216,24 +196,15 @@ def extract(
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
     failures = _extract_missing(context, inputs, extractor, missing, digests, warnings)
-    _require_some(folder, names, failures)
-    failures |= write_images_and_keypoints(context)
-    return StageReport(
-        "extract",
-        time.perf_counter() - start,
-        len(set(missing) - set(failures)),
-        len(done - set(failures)),
-        failures,
-        warnings,
-    )
-
-
-def _require_some(folder: Path, names: Sequence[str], failures: Mapping[str, str]) -> None:
     if len(failures) == len(names):
+        first = failures[names[0]]
         raise ImageError(
-            f"{folder}: none of the {len(names)} images can be used; the first: "
-            f"{failures[names[0]]}"
+            f"{folder}: none of the {len(names)} images can be used; the first: {first}"
         )
+    failures |= write_images_and_keypoints(context)
+    new, kept = set(missing) - failures.keys(), done - failures.keys()
+    wall_s = time.perf_counter() - start
+    return StageReport("extract", wall_s, len(new), len(kept), failures, warnings)
 
 
 def _passed_over(
@@ -335,21 +306,12 @@ def prepared_recipe(
 
 
 def extract_images(
-    context: Context,
-    inputs: Inputs,
-    extractor: ImageExtractor,
-    images: Sequence[tuple[str, int]],
+    context: Context, inputs: Inputs, extractor: ImageExtractor, images: Sequence[tuple[str, int]]
 ) -> Generator[ExtractedImage | ImageError, None, None]:
     """Yield the features of images, or why one cannot be used, in order.
 
-    Args:
-        context: says where to work; by default in as many threads as cores and memory allow.
-        inputs: where the images are.
-        extractor: prepared.
-        images: names and levels of escalation.
-
-    Raises:
-        ClusterError: when the workers do not see the depth maps.
+    ``images`` are names and levels of escalation. By default there are as many threads as cores and
+    memory allow. ClusterError when workers do not see the depth maps.
     """
     if not images:
         return

@@ -14,11 +14,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.connectivity import weakly_connected_images
@@ -30,11 +30,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import recorded_extraction
 from colmap_affrect.stages.match import PAIRS_PER_WRITE
-from colmap_affrect.stages.one_guided_pair import (
-    GuidedMatcher,
-    GuidedTask,
-    guided_task,
-)
+from colmap_affrect.stages.one_guided_pair import GuidedMatcher, GuidedTask, guided_task
 from colmap_affrect.stages.verify import (
     extracted_px,
     recorded_verification,
@@ -42,13 +38,9 @@ from colmap_affrect.stages.verify import (
     verify_new,
 )
 
-Matches = NDArray[np.int64]
-
-MIN_SHARE_KEPT = 0.8
-"""Of the inliers before, so many are still inliers of a geometry with guided matches."""
-
-IMAGES_IN_MEMORY = 40
-"""Of 13,000 features; pairs come in an order that reads these seldom."""
+Matches = Indices
+MIN_SHARE_KEPT = 0.8  # of the inliers before, in a geometry with guided matches
+IMAGES_IN_MEMORY = 40  # of 13,000 features; pairs come in an order that reads these seldom
 
 
 def recorded_guiding(workspace: Workspace) -> GuidedOptions:
@@ -66,17 +58,9 @@ def guide(
     """Match the verified pairs of some images again, guided by their geometry.
 
     A pair gets the geometry of its inliers and guided matches when that has more inliers than the
-    one before. Pairs that were guided are not guided again.
-
-    Args:
-        context: with verified pairs.
-        options: by default those on record.
-        images: whose pairs are guided; by default those of images with few features in tracks
-            through three images.
-        overwrite: undo what guided matching has done first.
-
-    Returns:
-        ``num_done`` counts the pairs that were matched again now.
+    one before. Pairs that were guided are not guided again, unless ``overwrite`` undoes that first.
+    By default ``options`` are those on record, and ``images`` those with few features in tracks
+    through three images. ``num_done`` counts the pairs that were matched again now.
     """
     start = time.perf_counter()
     workspace = context.workspace
@@ -102,12 +86,8 @@ def restore_exact(context: Context, pairs: Collection[Pair] | None = None) -> No
 
     They stay on record as tried, so that :func:`guide` leaves them alone.
     """
-    workspace = context.workspace
-    guided = [
-        pair
-        for pair in current(context)
-        if pair.num_inliers and (pairs is None or pair.names in pairs)
-    ]
+    workspace, guided = context.workspace, _gained(context)
+    guided = [pair for pair in guided if pairs is None or pair.names in pairs]
     if not guided:
         return
     ids = colmap_database.image_ids(workspace.database)
@@ -126,7 +106,7 @@ def exact_inliers(context: Context, guided: Iterable[GuidedPair]) -> dict[Pair, 
 
 def guided_matches(context: Context) -> dict[tuple[int, int], Matches]:
     """Return the inliers, by image ids, that only guided matching has found."""
-    guided = [pair for pair in current(context) if pair.num_inliers]
+    guided = _gained(context)
     if not guided:
         return {}
     verified = verified_inliers(context)
@@ -158,16 +138,19 @@ def current(context: Context) -> list[GuidedPair]:
     ]
 
 
+def _gained(context: Context) -> list[GuidedPair]:
+    return [pair for pair in current(context) if pair.num_inliers]
+
+
 def weak_images(exact: Mapping[Pair, Matches], min_num_tracks: int) -> set[str]:
     """Return the images with few features in tracks through three images, where there are three."""
-    if len({name for pair in exact for name in pair}) < 3:
-        return set()
-    return weakly_connected_images(exact, min_num_tracks)
+    num_images = len({name for pair in exact for name in pair})
+    return weakly_connected_images(exact, min_num_tracks) if num_images > 2 else set()
 
 
 def guided_counts(context: Context) -> dict[str, int]:
     """Return what the report says: pairs with more inliers, and these before and after."""
-    gained = [pair for pair in current(context) if pair.num_inliers]
+    gained = _gained(context)
     if not gained:
         return {}
     return {
@@ -181,7 +164,6 @@ class Guiding:
     """Guides the pairs of a workspace, with the options on record."""
 
     def __init__(self, context: Context, options: GuidedOptions) -> None:
-        """Read what is on record."""
         self.context, self.options = context, options
         self.path = context.workspace.database
         self.ids = colmap_database.image_ids(self.path)
@@ -196,11 +178,11 @@ class Guiding:
         """Return the pairs to guide, and how many are done."""
         known = current(self.context)
         exact = exact_inliers(self.context, known)
-        if images is None:
-            is_auto = self.options.enabled == "auto"
-            images = weak_images(exact, self.options.min_num_tracks) if is_auto else self.ids
         if self.options.enabled == "never":
             images = ()
+        elif images is None:
+            is_auto = self.options.enabled == "auto"
+            images = weak_images(exact, self.options.min_num_tracks) if is_auto else self.ids
         chosen = [pair for pair in exact if not set(pair).isdisjoint(images)]
         done = {pair.names for pair in known}
         return [pair for pair in chosen if pair not in done], sum(p in done for p in chosen)
@@ -213,16 +195,13 @@ class Guiding:
     ) -> None:
         """Match pairs again, batch by batch, and keep what has more inliers.
 
-        Args:
-            pairs: of images, the one with the lower id first.
-            advance: is told of each.
-            tasks: makes the tasks of a batch; by default from the geometries of verified pairs.
+        Of each pair the image with the lower id comes first. ``tasks`` makes the tasks of a batch,
+        by default from the geometries of verified pairs.
         """
         if not pairs:
             return
         tasks = tasks or self._tasks
-        features = self.context.features
-        executor = self.context.executor
+        features, executor = self.context.features, self.context.executor
         if executor is None or not executor.sees([features.path]):
             executor = Threads(available_cores())
         matcher = GuidedMatcher(features, self.options)
@@ -239,19 +218,15 @@ class Guiding:
         """Return what can be guided."""
         tasks = []
         with colmap_database.open_database(self.path) as database:
-            cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-            images = {image.name: image for image in database.read_all_images()}
+            cameras = colmap_database.cameras_of_images(database)
             for names in pairs:
-                first, second = (images[name] for name in names)
+                first, second = (self.ids[name] for name in names)
                 task = guided_task(
                     names,
-                    (cameras[first.camera_id], cameras[second.camera_id]),
-                    (
-                        database.read_keypoints(first.image_id),
-                        database.read_keypoints(second.image_id),
-                    ),
+                    (cameras[first], cameras[second]),
+                    (database.read_keypoints(first), database.read_keypoints(second)),
                     (self.scales[names[0]], self.scales[names[1]]),
-                    database.read_two_view_geometry(first.image_id, second.image_id),
+                    database.read_two_view_geometry(first, second),
                     self.options.band_px,
                 )
                 tasks.append(task)
@@ -274,8 +249,8 @@ class Guiding:
 
     def _configs(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
         """Return what kind of geometry the database has of each pair."""
+        ids = {pair: (self.ids[pair[0]], self.ids[pair[1]]) for pair in pairs}
         with colmap_database.open_database(self.path) as database:
-            ids = {pair: (self.ids[pair[0]], self.ids[pair[1]]) for pair in pairs}
             return {
                 pair: database.read_two_view_geometry(*ids[pair]).config
                 for pair in pairs
@@ -292,11 +267,7 @@ class Guiding:
                     database.write_two_view_geometry(first, second, geometry)
 
 
-def _is_better(
-    geometry: pycolmap.TwoViewGeometry,
-    pair: GuidedPair,
-    before: int | None,
-) -> bool:
+def _is_better(geometry: pycolmap.TwoViewGeometry, pair: GuidedPair, before: int | None) -> bool:
     """Tell whether a geometry has more inliers, and is still that of the exact matches.
 
     Where structure repeats, guided matches may outvote them: exact inliers then fall out, or the

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import undistorted
 from colmap_affrect.conventions import colmap_from_pixel
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.geometry.two_views import essential_matrix
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
@@ -26,22 +26,14 @@ from colmap_affrect.stages.guide import Guiding, current, recorded_guiding
 from colmap_affrect.stages.one_guided_pair import GuidedTask
 from colmap_affrect.stages.verify import verified_inliers
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class View:
-    """An image of a model.
+    """An image of a model."""
 
-    Attributes:
-        camera: its intrinsics.
-        pose: (3, 4), camera from world.
-        points: (N, 3) of the model that it sees.
-    """
-
-    camera: pycolmap.Camera
-    pose: Array
-    points: Array
+    camera: pycolmap.Camera  # its intrinsics
+    pose: Array  # (3, 4), camera from world
+    points: Array  # (N, 3) of the model that it sees
 
     @classmethod
     def of(cls, image: pycolmap.Image, model: pycolmap.Reconstruction) -> View:
@@ -76,14 +68,7 @@ def guide_by_model(context: Context, model: pycolmap.Reconstruction) -> StageRep
 
     A pair gets a two-view geometry when its guided matches verify. Images overlap when each sees as
     many points of the other as an image needs in tracks (``min_num_tracks``). Pairs that were
-    guided before are left alone.
-
-    Args:
-        context: with verified pairs.
-        model: of images of the workspace.
-
-    Returns:
-        ``num_done`` counts the pairs that were matched now.
+    guided before are left alone. ``num_done`` counts the pairs that were matched now.
     """
     start = time.perf_counter()
     context.workspace.require("verify")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
@@ -17,11 +17,7 @@ from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.features.weights import missing as missing_weights
-from colmap_affrect.mappers.attempts import (
-    LARGE_MODEL,
-    map_database,
-    read_models,
-)
+from colmap_affrect.mappers.attempts import LARGE_MODEL, map_database, read_models
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
@@ -32,7 +28,7 @@ from colmap_affrect.project.workspace import INPUTS, Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.climbing import connected_parts
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.copy import copied_image_path, is_copy
+from colmap_affrect.stages.copy import is_copy
 from colmap_affrect.stages.depth_lookup import depth_lookup
 from colmap_affrect.stages.escalate import first_level_database, measured_database, reject
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
@@ -42,34 +38,21 @@ from colmap_affrect.stages.verify import recorded_verification
 
 logger = logging.getLogger(__name__)
 
-NUM_BEST_PAIRS = 3
-"""Pairs that are named for each image that was not registered."""
-
-STRONGER_RECIPE, LEARNED_RECIPE = "on-demand", "on-demand-learned"
-"""Advised where photographs are missing; the second needs weights."""
+NUM_BEST_PAIRS = 3  # pairs that are named for each image that was not registered
+STRONGER_RECIPE, LEARNED_RECIPE = "on-demand", "on-demand-learned"  # advised; one needs weights
 
 TOO_FEW = "more photographs: two that can be read and show the same from two places make a model"
 """Advised where nothing else would help."""
 
 
 def map_images(
-    context: Context,
-    mapper: Mapper,
-    extend: Extension | None = None,
-    *,
-    overwrite: bool = False,
+    context: Context, mapper: Mapper, extend: Extension | None = None, *, overwrite: bool = False
 ) -> tuple[StageReport, list[ModelSummary]]:
     """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
 
-    Args:
-        context: with verified pairs.
-        mapper: with its options.
-        extend: the model that images are registered into; None begins anew.
-        overwrite: discard the models that are there.
-
-    Raises:
-        MappingError: when the model cannot be extended with these images.
-        StaleStoreError: when the models that are there extend another one.
+    Images are registered into the model of ``extend``, or else begin anew; ``overwrite`` discards
+    the models that are there. MappingError when the model cannot be extended with these images,
+    StaleStoreError when the models that are there extend another one.
     """
     start = time.perf_counter()
     workspace = context.workspace
@@ -139,9 +122,8 @@ def _inputs(workspace: Workspace, extend: Extension | None) -> str:
 
 def image_path_of(workspace: Workspace) -> Path | None:
     """Return the folder of the photographs, None where another program's database names none."""
-    if is_copy(workspace):
-        return copied_image_path(workspace)
-    return Path(Inputs.recorded(workspace).image_path)
+    path = workspace.require("copy" if is_copy(workspace) else "extract")["image_path"]
+    return Path(path) if path else None
 
 
 def image_names(workspace: Workspace) -> list[str]:
@@ -180,9 +162,7 @@ def _map(
 
     Learned matching verifies sides of a building that look the same as one. Its pairs have no say
     where the others register as many images without them; those that contradict are rejected.
-
-    Returns:
-        The models, and how many pairs were rejected.
+    Returns the models, and how many pairs were rejected.
     """
     sparse = context.workspace.sparse
     if task.extend or is_copy(context.workspace):
@@ -268,9 +248,7 @@ def unregistered(
     registered = set(models[0].registered_names) if models else set()
     taken_out = models[0].taken_out if models else {}
     reasons = {}
-    for name in names:
-        if name in registered:
-            continue
+    for name in [name for name in names if name not in registered]:
         if name in elsewhere:
             reasons[name] = elsewhere[name]
         elif name not in num_keypoints or name not in ids:
@@ -287,24 +265,18 @@ def unregistered(
     return reasons
 
 
-def _verified_by_name(workspace: Workspace) -> dict[str, dict[str, int]]:
+def _verified_by_name(workspace: Workspace) -> Mapping[str, dict[str, int]]:
     """Return for each image of a verified pair its partners, and how many inliers they share."""
     found: defaultdict[str, dict[str, int]] = defaultdict(dict)
     for (first, second), count in num_verified_inliers(workspace).items():
         found[first][second] = found[second][first] = count
-    return dict(found)
+    return found
 
 
 def advice(
     context: Context, missing: Collection[str], models: Sequence[ModelSummary]
 ) -> tuple[str, ...]:
-    """Say what may help when images are missing or the model is doubtful, best first.
-
-    Args:
-        context: of a run that has been mapped.
-        missing: images that are not in the largest model.
-        models: all models, largest first.
-    """
+    """Say what may help when images are missing or the largest model is doubtful, best first."""
     is_doubtful = bool(models and (models[0].doubtful or models[0].doubts))
     if not missing and not is_doubtful:
         return ()
@@ -382,10 +354,7 @@ def contradicting_pairs(context: Context) -> dict[str, int]:
 def images_in_need(context: Context, sparse_path: Path, min_num_tracks: int) -> set[str]:
     """Return the images that are not in the largest model, or there see few of its points.
 
-    Args:
-        context: after mapping.
-        sparse_path: folder of the models.
-        min_num_tracks: an image that sees fewer points of three images or more is in need.
+    Few are less than ``min_num_tracks`` that three images or more see.
     """
     names = set(colmap_database.image_ids(context.workspace.database))
     path = sparse_path / "0"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 
 import numpy as np
@@ -26,13 +26,10 @@ from colmap_affrect.stages.stationary import StationaryFilter
 logger = logging.getLogger(__name__)
 
 PAIRS_PER_WRITE = 64
-
-SECONDS_PER_WRITE = 30.0
-"""Pairs of a network take seconds each: what is found is stored before there are so many."""
+SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
 
 
-WEIGHTS = "weights"
-"""Of the record, beside the options: file name to sha256."""
+WEIGHTS = "weights"  # of the record, beside the options: file name to sha256
 
 
 def recorded_matching(workspace: Workspace) -> MatcherOptions:
@@ -79,22 +76,14 @@ def match(
 
 
 def match_pairs(
-    context: Context,
-    pairs: Sequence[Pair],
-    options: MatcherOptions,
-    advance: Callable[[int], None],
+    context: Context, pairs: Sequence[Pair], options: MatcherOptions, advance: Callable[[int], None]
 ) -> None:
     """Match pairs by the features that every image has, and store them batch by batch."""
-    extractor = recorded_extraction(context.workspace).features.name
-    matching = Matching(context.features, options, extractor=extractor, resources=context.resources)
-    matches = context.matches
-    stationary = StationaryFilter(context.features, matches)
-    batch: list[PairMatches] = []
-    written = time.monotonic()
+    matches, batch, written = context.matches, list[PairMatches](), time.monotonic()
     try:
-        with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
+        with closing(matched_at_level(context, pairs, options, 0)) as found_pairs:
             for found in found_pairs:
-                batch.append(stationary.filtered(found))
+                batch.append(found)
                 advance(1)
                 is_due = time.monotonic() - written > SECONDS_PER_WRITE
                 if len(batch) == PAIRS_PER_WRITE or is_due:
@@ -103,6 +92,19 @@ def match_pairs(
     finally:
         if batch:
             matches.write(batch)
+
+
+def matched_at_level(
+    context: Context, pairs: Sequence[Pair], options: MatcherOptions, level: int
+) -> Generator[PairMatches, None, None]:
+    """Match pairs with the features of a level, by default with these options; what moves stays."""
+    features, chosen = context.features, recorded_extraction(context.workspace).levels[level]
+    options, extractor = chosen.matching or options, chosen.features.name
+    matching = Matching(features, options, level, chosen.base, extractor, context.resources)
+    stationary = StationaryFilter(features, context.matches)
+    with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
+        for found in found_pairs:
+            yield stationary.filtered(found)
 
 
 def write_matches(context: Context, pairs: Sequence[Pair]) -> None:

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.two_views import epipolar_pair, homography_of
+from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.matchers.guided import (
     BANDS_OF_HOMOGRAPHY,
     EpipolarGuide,
@@ -23,29 +23,19 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.stores import FeatureStore, GuidedPair
 from colmap_affrect.stages.one_pair import ImageCache
 
-MIN_OFF_PLANE = 20
-"""Fewer inliers off a plane may be accidental, as many as verification asks of a pair."""
-
-Points = NDArray[np.float64]
+MIN_OFF_PLANE = 20  # fewer inliers off a plane may be accidental
+Points = Array
 
 
 @dataclass(frozen=True)
 class GuidedTask:
-    """One pair to match again.
+    """One pair to match again."""
 
-    Attributes:
-        names: of the two images.
-        matrix: (3, 3) fundamental matrix, or a homography of image 2 from image 1.
-        is_homography: which of both.
-        points: of each image the (N, 2) keypoints in the pixels that the matrix holds in.
-        inliers: (M, 2) of the geometry.
-    """
-
-    names: Pair
-    matrix: NDArray[np.float64]
-    is_homography: bool
-    points: tuple[Points, Points]
-    inliers: NDArray[np.int64]
+    names: Pair  # of the two images
+    matrix: Array  # (3, 3) fundamental matrix, or a homography of image 2 from image 1
+    is_homography: bool  # which of both
+    points: tuple[Points, Points]  # (N, 2) keypoints in the pixels of the matrix
+    inliers: Indices  # (M, 2) of the geometry
 
     def __str__(self) -> str:
         return " and ".join(self.names)
@@ -66,7 +56,7 @@ class GuidedTask:
 def guided_task(
     names: Pair,
     cameras: tuple[pycolmap.Camera, pycolmap.Camera],
-    keypoints: tuple[NDArray[np.floating], NDArray[np.floating]],
+    keypoints: tuple[Floats, Floats],
     scales: tuple[float, float],
     geometry: pycolmap.TwoViewGeometry,
     band_px: float,
@@ -91,23 +81,12 @@ def guided_task(
     return task.scaled(scales)
 
 
-@dataclass(frozen=True)
-class _Descriptors:
-    descriptors: NDArray[np.float32]
-    shapes: NDArray[np.float64]
-
-    @property
-    def nbytes(self) -> int:
-        return self.descriptors.nbytes + self.shapes.nbytes
-
-
 class GuidedMatcher:
     """Matches pairs again, with the features that it keeps of some images."""
 
     def __init__(self, store: FeatureStore, options: GuidedOptions) -> None:
-        """Name the features."""
         self._store, self._options = store, options
-        self._images = ImageCache(self._read)
+        self._images = ImageCache(self._read, lambda arrays: sum(x.nbytes for x in arrays))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return GuidedMatcher, (self._store, self._options)
@@ -115,13 +94,15 @@ class GuidedMatcher:
     def __call__(self, task: GuidedTask) -> GuidedPair:
         """Return the inliers of a pair and its guided matches."""
         first, second = (
-            GuidableImage(image.descriptors, points, image.shapes)
-            for image, points in zip(map(self._images.get, task.names), task.points, strict=True)
+            GuidableImage(descriptors, points, shapes)
+            for points, (descriptors, shapes) in zip(
+                task.points, map(self._images.get, task.names), strict=True
+            )
         )
         guide = task.guide(self._options.band_px)
         both = guided_matches(first, second, guide, self._options, task.inliers)
         return GuidedPair(task.names, task.inliers, both, 0)
 
-    def _read(self, name: str) -> _Descriptors:
+    def _read(self, name: str) -> tuple[Singles, Array]:
         features = self._store.read(name)
-        return _Descriptors(features.descriptors, features.lafs[:, :, :2])
+        return features.descriptors, features.lafs[:, :, :2]

@@ -16,7 +16,6 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import camera_matrix, resized_from_original
 from colmap_affrect.data import (
@@ -31,6 +30,7 @@ from colmap_affrect.errors import DepthError, ImageError
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
 from colmap_affrect.features.weights import file_sha256, resolve
 from colmap_affrect.geometry.affine import transform_frames
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
 from colmap_affrect.images.masks import shrink_mask
 from colmap_affrect.images.photographs import Photographs
@@ -47,51 +47,31 @@ from colmap_affrect.rectifiers.base import RECTIFIERS, CoverOptions, Rectifier, 
 from colmap_affrect.rectifiers.execute import extract_rectified
 from colmap_affrect.stages.context import Resources, require_same_files
 
-MIN_RECTIFIABLE_PX = 32
-"""Images with a shorter side are not rectified: no block would see its surroundings."""
-
+MIN_RECTIFIABLE_PX = 32  # shorter side; else no block would see its surroundings
 MEMORY_IS_FULL = "extracted on the CPU, the memory of the GPU is full"
 
 
 @dataclass(frozen=True)
 class ExtractedImage:
-    """Features of one image file.
+    """Features of one image file."""
 
-    Attributes:
-        features: frames in px of the stored image.
-        image_size: (width, height) of the stored image in px.
-        warning: why it was not rectified though it was to be, or not on the GPU; empty if all
-            went well.
-        stretched: whether its contrast was low and was stretched.
-    """
-
-    features: LocalFeatures
-    image_size: tuple[int, int]
-    warning: str = ""
-    stretched: bool = False
+    features: LocalFeatures  # frames in px of the stored image
+    image_size: tuple[int, int]  # (width, height) of the stored image in px
+    warning: str = ""  # why it was not rectified, or not on the GPU; empty if all went well
+    stretched: bool = False  # whether its contrast was low and was stretched
 
 
 @dataclass(frozen=True)
 class ImageTask:
-    """One photograph to extract.
+    """One photograph to extract."""
 
-    Attributes:
-        photographs: where it and its masks are.
-        name: of the photograph.
-        level: of escalation: 0 for the features that every image gets; above that, only those
-            that the rectifier of this level adds.
-        intrinsics: (3, 3) camera matrix in pixel-centre px of the stored image; by default
-            COLMAP's guess of a focal length of 1.2 times the longer side.
-        camera_size: (width, height) of its camera, if it has one already.
-        sent: content of its files by absolute path; None where they are read.
-    """
-
-    photographs: Photographs
-    name: str
-    level: int = 0
-    intrinsics: NDArray[np.float64] | None = None
-    camera_size: tuple[int, int] | None = None
-    sent: Mapping[Path, bytes] | None = None
+    photographs: Photographs  # where it and its masks are
+    name: str  # of the photograph
+    level: int = 0  # of escalation: above 0 only the features that its rectifier adds
+    # (3, 3) camera matrix in pixel-centre px of the stored image; by default COLMAP's guess
+    intrinsics: Array | None = None
+    camera_size: tuple[int, int] | None = None  # (width, height) of its camera, if any
+    sent: Mapping[Path, bytes] | None = None  # its files by absolute path; None to read them
 
     def __str__(self) -> str:
         return self.name
@@ -127,21 +107,14 @@ class ImageExtractor:
 
     It may work on several images at once, in threads. In another process (pickled) it is prepared
     there anew, with the weights and the device found there.
-
-    Attributes:
-        options: of the recipe.
-        extractors: detector and descriptor of each level, that of every image first.
-        rectifiers: of each level.
-        weights: files of the networks by key.
-        resources: that it was prepared with.
-        network_lock: held while networks run, which take one image at a time.
     """
 
-    options: ExtractionOptions
-    extractors: tuple[FeatureExtractor, ...]
-    rectifiers: tuple[Rectifier, ...]
-    weights: Mapping[str, Path] = field(default_factory=dict)
-    resources: Resources = field(default_factory=Resources)
+    options: ExtractionOptions  # of the recipe
+    extractors: tuple[FeatureExtractor, ...]  # of each level, that of every image first
+    rectifiers: tuple[Rectifier, ...]  # of each level
+    weights: Mapping[str, Path] = field(default_factory=dict)  # files of the networks by key
+    resources: Resources = field(default_factory=Resources)  # that it was prepared with
+    # held while networks run, which take one image at a time
     network_lock: AbstractContextManager[Any] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -164,12 +137,12 @@ class ImageExtractor:
                 )
         except ImageError as error:
             return error
-        if task.camera_size and task.camera_size != found.image_size:
-            (width, height), expected = found.image_size, task.camera_size
+        size, expected = found.image_size, task.camera_size
+        if expected and expected != size:
             return ImageError(
-                f"{task.photographs.folder / task.name}: is {width} x {height} px, and its camera "
-                f"in the database {expected[0]} x {expected[1]} px; give the images that the "
-                "database is of"
+                f"{task.photographs.folder / task.name}: is {size[0]} x {size[1]} px, and its "
+                f"camera in the database {expected[0]} x {expected[1]} px; give the images that "
+                "the database is of"
             )
         return found
 
@@ -177,7 +150,7 @@ class ImageExtractor:
         self,
         path: Path,
         name: str = "",
-        intrinsics: NDArray[np.float64] | None = None,
+        intrinsics: Array | None = None,
         level: int = 0,
         mask: Mask | None = None,
     ) -> ExtractedImage:
@@ -196,16 +169,14 @@ class ImageExtractor:
             )
         features = found.features
         if photograph.size != original_size:
-            original_from_resized = np.linalg.inv(
-                resized_from_original(original_size, photograph.size)
-            )
-            features = features.with_frames(transform_frames(original_from_resized, features.lafs))
+            resized = resized_from_original(original_size, photograph.size)
+            frames = transform_frames(np.linalg.inv(resized), features.lafs)
+            features = features.with_frames(frames)
         keep = features.inside(original_size)
         if mask is not None:
             keep &= in_mask(mask, features.keypoints)
-        return ExtractedImage(
-            features.select(keep), original_size, found.warning, photograph.stretched
-        )
+        kept = features.select(keep)
+        return ExtractedImage(kept, original_size, found.warning, photograph.stretched)
 
     def extract(self, photograph: Photograph, level: int = 0) -> ExtractedImage:
         """Plan and execute; frames are in px of the photograph at the size of processing."""
@@ -225,7 +196,7 @@ class ImageExtractor:
         self,
         path: Path,
         name: str = "",
-        intrinsics: NDArray[np.float64] | None = None,
+        intrinsics: Array | None = None,
         mask: Mask | None = None,
         level: int = 0,
     ) -> tuple[Photograph, tuple[int, int]]:
@@ -301,10 +272,8 @@ def num_images_at_once(extractor: ImageExtractor) -> int:
     They take at most half of the memory there is. With networks at most two: one is read while
     the networks run on the other.
     """
-    num_bytes = max(
-        level.features.bytes_per_px * level.max_image_size_px**2
-        for level in extractor.options.levels
-    )
+    levels = extractor.options.levels
+    num_bytes = max(x.features.bytes_per_px * x.max_image_size_px**2 for x in levels)
     most = 2 if extractor.options.uses_networks else available_cores()
     return min(most, max(1, available_memory_bytes() // 2 // num_bytes))
 
@@ -338,10 +307,8 @@ def prepare(
     weights = resolve(options.weights, resources.weights_path, progress=progress)
     device = resources.require_device(uses_network=options.uses_networks)
     network = NetworkContext(weights, device)
-    levels = options.levels
-    extractors = {
-        features: EXTRACTORS.make(features, network) for features in {x.features for x in levels}
-    }
+    extractor = cache(lambda features: EXTRACTORS.make(features, network))
+    extractors = tuple(extractor(level.features) for level in options.levels)
     depth = None
     if options.uses_depth:
         depth_context = DepthContext(resources.depth_cache_path, network.device)
@@ -350,15 +317,13 @@ def prepare(
             depth.require_some(image_names)
     shapes = cache(lambda source, features: SHAPES.make(source, network, features))
     rectifiers = []
-    for level in levels:
-        item = level.rectifier
-        source = None
+    for level in options.levels:
+        item, source = level.rectifier, None
         if isinstance(item, CoverOptions):
             source = shapes(item.shape_source, level.features)
         inputs = RectifierInputs(source, depth if item.uses_depth else None)
         rectifiers.append(RECTIFIERS.make(item, inputs))
-    of_levels = tuple(extractors[level.features] for level in levels)
-    return ImageExtractor(options, of_levels, tuple(rectifiers), weights, resources)
+    return ImageExtractor(options, extractors, tuple(rectifiers), weights, resources)
 
 
 def _prepared_elsewhere(

@@ -10,13 +10,12 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from colmap_affrect.data import LocalFeatures
 from colmap_affrect.features.weights import file_sha256, resolve
+from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.matchers.base import (
     MATCHERS,
     ImageFeatures,
@@ -30,36 +29,22 @@ from colmap_affrect.parallel.executor import Executor, Threads, available_cores
 from colmap_affrect.project.stores import FeatureStore, PairMatches
 from colmap_affrect.stages.context import Resources, require_same_files
 
-CACHE_BYTES = 1 << 29
-"""Memory that prepared images may take in a process."""
-
-BYTES_PER_FEATURE = 870
-"""Of a feature ready for matching, with descriptors of 128 and coarse ones."""
+CACHE_BYTES = 1 << 29  # memory that prepared images may take in a process
+BYTES_PER_FEATURE = 870  # of a feature ready for matching, with descriptors of 128 and coarse ones
 
 
 @dataclass(frozen=True)
 class Matching:
-    """What is matched, how, and with what.
+    """What is matched, how, and with what."""
 
-    Attributes:
-        store: of the features.
-        options: of the matcher.
-        level: of escalation: its features, together with those of its base.
-        base: level that has the features of the images themselves.
-        extractor: name of the feature extractor; empty for another program's.
-        resources: weights and device.
-        max_num_features: of each image, those of the largest responses; None for all.
-        num_similarities: about how many pairs of features there will be to compare.
-    """
-
-    store: FeatureStore
-    options: MatcherOptions
-    level: int = 0
-    base: int = 0
-    extractor: str = ""
-    resources: Resources = field(default_factory=Resources)
-    max_num_features: int | None = None
-    num_similarities: float = 0
+    store: FeatureStore  # of the features
+    options: MatcherOptions  # of the matcher
+    level: int = 0  # of escalation: its features, together with those of its base
+    base: int = 0  # level that has the features of the images themselves
+    extractor: str = ""  # name of the feature extractor; empty for another program's
+    resources: Resources = field(default_factory=Resources)  # weights and device
+    max_num_features: int | None = None  # of each image, by response; None for all
+    num_similarities: float = 0  # about how many pairs of features there will be to compare
 
 
 def iterate_matches(
@@ -89,39 +74,26 @@ def iterate_matches(
 
 @dataclass(frozen=True)
 class StoredFeatures:
-    """The features of an image that are matched.
+    """The features of an image that are matched."""
 
-    Attributes:
-        image: the features.
-        indices: (N,) int64 that they have in the store.
-    """
-
-    image: ImageFeatures
-    indices: NDArray[np.int64]
+    image: ImageFeatures  # the features
+    indices: Indices  # (N,) int64 that they have in the store
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Send what the store holds, in its precision."""
-        image, features = self.image, self.image.features
-        arrays = (
-            features.lafs.astype(np.float32),
-            features.responses,
-            features.descriptors.astype(np.float16),
-            features.rectification_ids,
-        )
-        return _received, (arrays, image.image_size, image.extractor, self.indices)
+        return _received, (_of_types(self.image, np.float32, np.float16), self.indices)
 
 
-def _received(
-    arrays: tuple[NDArray[Any], ...],
-    image_size: tuple[int, int],
-    extractor: str,
-    indices: NDArray[np.int64],
-) -> StoredFeatures:
-    lafs, responses, descriptors, ids = arrays
-    features = LocalFeatures(
-        lafs.astype(np.float64), responses, descriptors.astype(np.float32), ids
-    )
-    return StoredFeatures(ImageFeatures(features, image_size, extractor), indices)
+def _received(image: ImageFeatures, indices: Indices) -> StoredFeatures:
+    return StoredFeatures(_of_types(image, np.float64, np.float32), indices)
+
+
+def _of_types(
+    image: ImageFeatures, lafs: type[np.floating[Any]], descriptors: type[np.floating[Any]]
+) -> ImageFeatures:
+    old = image.features
+    frames, rows = old.lafs.astype(lafs), old.descriptors.astype(descriptors)
+    return replace(image, features=replace(old, lafs=frames, descriptors=rows))
 
 
 @dataclass(frozen=True)
@@ -137,44 +109,22 @@ class PairTask:
 
 @dataclass(frozen=True)
 class PreparedImage:
-    """An image ready for matching.
+    """An image ready for matching."""
 
-    Attributes:
-        content: what the matcher made of it.
-        frames: (N, 2, 3) local affine frames in pixel-centre px.
-        indices: (N,) int64 that its features have in the store.
-    """
-
-    content: Any
-    frames: NDArray[np.floating]
-    indices: NDArray[np.int64]
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of what the matcher made."""
-        return int(self.content.nbytes)
+    content: Any  # what the matcher made of it
+    frames: Floats  # (N, 2, 3) local affine frames in pixel-centre px
+    indices: Indices  # (N,) int64 that its features have in the store
 
 
-class HasBytes(Protocol):
-    """What says how much memory it takes."""
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of all arrays."""
-
-
-Content = TypeVar("Content", bound=HasBytes)
+Content = TypeVar("Content")
 
 
 class ImageCache(Generic[Content]):
-    """Keeps what is made of images, as many as ``CACHE_BYTES`` hold.
+    """Keeps what is made of images, those used last, as many as ``CACHE_BYTES`` hold."""
 
-    Those not used for longest are dropped first.
-    """
-
-    def __init__(self, make: Callable[[str], Content]) -> None:
-        """Say how to make what is missing, of the name of an image."""
-        self._make, self._lock = make, threading.Lock()
+    def __init__(self, make: Callable[[str], Content], nbytes: Callable[[Content], int]) -> None:
+        """Say how to make what is missing, of the name of an image, and what memory it takes."""
+        self._make, self._nbytes, self._lock = make, nbytes, threading.Lock()
         self._images: OrderedDict[str, Content] = OrderedDict()
 
     def get(self, name: str) -> Content:
@@ -183,27 +133,25 @@ class ImageCache(Generic[Content]):
             if name not in self._images:
                 self._images[name] = self._make(name)
             self._images.move_to_end(name)
-            nbytes = sum(image.nbytes for image in self._images.values())
+            nbytes = sum(map(self._nbytes, self._images.values()))
             while nbytes > CACHE_BYTES and len(self._images) > 1:
-                nbytes -= self._images.popitem(last=False)[1].nbytes
+                nbytes -= self._nbytes(self._images.popitem(last=False)[1])
             return self._images[name]
 
 
 class CachedMatcher:
-    """Matches pairs, and keeps the images that it has prepared (:class:`ImageCache`).
-
-    A copy in another process starts with none.
-    """
+    """Matches pairs, and keeps the images that it has prepared; a copy elsewhere has none."""
 
     def __init__(self, matching: Matching) -> None:
-        """Build the matcher."""
         options, resources = matching.options, matching.resources
         options.require_extractor(matching.extractor)
         self._matching = matching
         self._weights = resolve(options.weights, resources.weights_path)
         context = MatcherContext(self._weights, resources.device, matching.num_similarities)
         self._matcher = MATCHERS.make(options, context)
-        self._images = ImageCache(lambda name: self._prepare(self.read(name)))
+        self._images = ImageCache(
+            lambda name: self._prepare(self.read(name)), lambda image: int(image.content.nbytes)
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         digests = {key: file_sha256(path) for key, path in self._weights.items()}

@@ -41,9 +41,8 @@ def expected_num_pairs(options: PairOptions, num_images: int) -> int:
         with suppress(OSError), Path(options.match_list_path).open("rb") as lines:
             return sum(1 for _ in lines)
         return 0
-    return (
-        every if "exhaustive" in options.methods else min(every, num_images * options.num_neighbors)
-    )
+    is_every = "exhaustive" in options.methods
+    return every if is_every else min(every, num_images * options.num_neighbors)
 
 
 def choose_pairs(
@@ -127,7 +126,7 @@ def _similar_pairs(context: Context, options: PairOptions, there: Collection[Pai
         strongest = CachedMatcher(matching)
 
         def match(pair: Pair) -> Matches:
-            return strongest.match(strongest.prepared(pair[0]), strongest.prepared(pair[1]))
+            return strongest.match(*map(strongest.prepared, pair))
 
         pairs += low_resolution_pairs(names, match, options.num_neighbors, progress)
     return set(pairs)

@@ -5,9 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
-
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.verification import (
     ExtractedPx,
@@ -15,6 +12,7 @@ from colmap_affrect.colmap.verification import (
     inlier_matches,
     verify,
 )
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
@@ -36,10 +34,8 @@ def verify_matches(
 ) -> StageReport:
     """Estimate the two-view geometries of all matched pairs.
 
-    Args:
-        context: with raw matches.
-        options: thresholds and seed; by default those on record.
-        overwrite: discard the results of this and later stages first.
+    ``options`` are by default those on record; ``overwrite`` discards what is there, and later
+    stages.
     """
     start = time.perf_counter()
     workspace = context.workspace
@@ -54,7 +50,7 @@ def verify_matches(
     return StageReport("verify", time.perf_counter() - start, todo, len(pairs) - todo)
 
 
-def verified_inliers(context: Context) -> dict[Pair, NDArray[np.int64]]:
+def verified_inliers(context: Context) -> dict[Pair, Indices]:
     """Return the (M, 2) features of each verified pair that are inliers."""
     path = context.workspace.database
     names = {number: name for name, number in colmap_database.image_ids(path).items()}

@@ -175,3 +175,10 @@ def test_existing_target_is_not_overwritten(database_path: Path, tmp_path: Path)
         with pytest.raises(DatabaseError, match="exists already"):
             copy(database_path, tmp_path / "there.db")
     assert (tmp_path / "there.db").read_text() == "precious"
+
+
+def test_leftovers_of_a_killed_copy_go(database_path: Path, tmp_path: Path) -> None:
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        (tmp_path / f"copy.db.new{suffix}").write_bytes(b"left")
+    copy_database(database_path, tmp_path / "copy.db")
+    assert [path.name for path in tmp_path.glob("copy.db*")] == ["copy.db"]

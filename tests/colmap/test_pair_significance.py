@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database, unverified_pairs, write_matches
-from colmap_affrect.colmap.pair_significance import telling_shapes
 from colmap_affrect.colmap.verification import (
     PairVerifier,
     Side,
     VerificationOptions,
     estimate_geometry,
     max_error_px,
+    telling_shapes,
     two_view_options,
     verified_pairs,
     verify,

@@ -80,8 +80,8 @@ def test_store_of_other_options_is_refused(tmp_path):
     pair = PairMatches(("a", "b"), np.array([[0, 1]]), np.ones(1, np.float32), 2)
     MatchStore(path, "digest of old options").write([pair])
     with pytest.raises(StaleStoreError, match="other options"):
-        MatchStore(path, "digest of new options").complete(["a/b"])
-    assert MatchStore(path, "digest of old options").complete(["a/b"]) == {"a/b"}
+        MatchStore(path, "digest of new options").has([("a", "b")])
+    assert MatchStore(path, "digest of old options").has([("a", "b")]).all()
 
 
 @pytest.mark.parametrize("count", [0, 1, 40_000])
@@ -269,7 +269,7 @@ def test_read_of_a_pair_without_matches_says_what_to_run(matches: MatchStore, go
             del file["b.png/z.png"]
         else:
             del file["b.png/z.png"].attrs["complete"]
-    assert matches.complete(["a.png/z.png", "b.png/z.png"]) == {"a.png/z.png"}
+    assert matches.has([("a.png", "z.png"), ("b.png", "z.png")]).tolist() == [True, False]
     with pytest.raises(StoreError, match=r"no matches of b\.png, z\.png; run match"):
         list(matches.read([("a.png", "z.png"), ("b.png", "z.png")]))
 

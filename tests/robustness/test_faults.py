@@ -140,7 +140,7 @@ def test_matches_that_do_not_fit_on_the_disk(disturbed: Disturbed) -> None:
         assert disturbed.call(*command, *out).code == 0
     with file_size_limit(10_000):
         assert_says_what_to_do(disturbed.call("match", *out), disturbed.workspace.matches)
-    assert MatchStore(disturbed.workspace.matches).names() == []
+    assert MatchStore(disturbed.workspace.matches).num_pairs() == 0
     disturbed.assert_finishes()
 
 

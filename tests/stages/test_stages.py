@@ -340,7 +340,7 @@ def test_options_survive_stage_by_stage(
     assert workspace.require("match")["max_ratio"] == 0.8
     assert workspace.require("map")["init_min_num_inliers"] == 40
     digest = workspace.options_digest("extract", "match")
-    assert MatchStore(workspace.matches, digest).complete([pair_key(*NAMES[:2])])
+    assert MatchStore(workspace.matches, digest).has([tuple(NAMES[:2])])
     changed = call("match", "--output-path", out, "--set", "matching.max_ratio=0.7", "--overwrite")
     assert changed.code == 0
     assert workspace.require("match")["max_ratio"] == 0.7
