@@ -261,7 +261,7 @@ class Escalation:
         known = self._consistent
         for pair, indices in matches.items():
             key = indices.tobytes()
-            if known.get(pair, (b"", 0))[0] != key:
+            if pair not in known or known[pair][0] != key:
                 known[pair] = key, num_consistent_matches(*self._frames(pair, indices))
         return {pair: known[pair][1] for pair in pairs}
 

@@ -77,8 +77,8 @@ def map_images(
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models, num_rejected = _map(context, mapper, task, advance)
-    is_whole = _num_registered(models) >= min(num_images, LARGE_MODEL)
-    if not is_copy(workspace) and not (is_whole and models[0].is_trustworthy):
+    is_large = _num_registered(models) >= LARGE_MODEL
+    if not is_copy(workspace) and not is_large and _rank(models) < (True, num_images):
         models = _or_first_level(context, mapper, task, models)
     warnings = {}
     if num_rejected:

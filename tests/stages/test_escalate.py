@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from command import Call
 from numpy.testing import assert_array_equal
+from PIL import Image
 from results import database_content
 
 from colmap_affrect.colmap.database import image_ids, open_database
@@ -453,6 +454,16 @@ def test_overwrite_climbs_anew_to_the_same_result(
     report = escalate(workspace, overwrite=True)
     assert report.num_done == climbed[1].num_done
     same_state(workspace, climbed[0])
+
+
+def test_photographs_without_a_feature_climb_nowhere(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in NAMES[:2]:
+        Image.new("L", (320, 240)).save(photos / name)
+    workspace = verified(photos, tmp_path / "out", "on-demand")
+    escalate(workspace)
+    assert set(Context(workspace).features.num_keypoints().values()) == {0}
 
 
 def test_recipe_without_levels_has_nothing_to_climb(plain: Workspace, tmp_path: Path) -> None:
