@@ -130,19 +130,21 @@ def adjust(
     constant_cameras: Collection[int],
 ) -> None:
     """Adjust a model, of which some cameras stay, and take out what does not fit."""
-    config = config_of(model)
-    for camera_id in constant_cameras:
-        config.set_constant_cam_intrinsics(camera_id)
+    config = config_of(model, constant_cameras)
     for _ in range(NUM_ROUNDS):
         pycolmap.create_default_bundle_adjuster(options, config, model).solve()
         pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
     model.update_point_3d_errors()
 
 
-def config_of(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfig:
-    """Return the adjustment of all images of a model."""
+def config_of(
+    model: pycolmap.Reconstruction, constant_cameras: Collection[int]
+) -> pycolmap.BundleAdjustmentConfig:
+    """Return the adjustment of all images of a model, of which some cameras stay."""
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
+    for camera_id in constant_cameras:
+        config.set_constant_cam_intrinsics(int(camera_id))
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     return config

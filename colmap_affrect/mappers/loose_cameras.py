@@ -7,46 +7,46 @@ errors and small variances, and poses are off by tens of degrees.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import cast
+
+import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.last_adjustment import config_of, robust_options
 
-FACTORS = 1.25, 0.8
-"""Other focal lengths that are tried: poses are off by more than 5 degrees then."""
+FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
 
 MIN_GROWTH = 1.07
-"""Of the error of adjustment with another focal length. Models of good photographs grow by 0.5 to 4
-times, long lenses around a small object by a tenth; what bends to anything by 0.05 at most."""
+"""Of the error of adjustment, with another focal length. In models of good photographs it grows by
+0.4 to 3 times, for long lenses around a small object by a tenth, where anything fits by 0.05."""
 
-MAX_NUM_POINTS, MAX_NUM_IMAGES = 2_000, 100
-"""Points looked at, every n-th; so many tell a focal length or never do. Larger models are not
-looked at: they have enough points of three images."""
+MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once
+MAX_NUM_POINTS, MAX_NUM_IMAGES = 2_000, 100  # looked at; larger models have points of many images
 
 
 def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str, ...]:
-    """Return the images whose cameras neither anybody nor the points of the model know, sorted.
+    """Return the images whose focal length neither anybody nor the points of the model know, sorted.
 
-    The model stays as it is: a copy with some of its points is adjusted, with the focal lengths
-    that it has, and with longer and with shorter ones of all unknown cameras at once.
+    A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
+    focal length of each camera that nobody knows, while all else may move.
     """
-    unknown = {key for key, record in task.cameras.items() if record.source in ("guess", "pairs")}
     images = [model.images[image_id] for image_id in model.reg_image_ids()]
-    loose = sorted(image.name for image in images if image.camera_id in unknown)
-    if not loose or len(images) > MAX_NUM_IMAGES or model.num_points3D() == 0:
+    unknown = sorted(
+        key
+        for key in {image.camera_id for image in images} & task.cameras.keys()
+        if task.cameras[key].source in ("guess", "pairs")
+    )
+    if not unknown or len(images) > MAX_NUM_IMAGES or model.num_points3D() == 0:
         return ()
     sparse = _with_fewer_points(model)
-    least = _adjusted(sparse, focals_free=True)
-    for factor in FACTORS:
-        other = pycolmap.Reconstruction(sparse)
-        for key in unknown & set(other.cameras):
-            camera = other.cameras[key]
-            for index in camera.focal_length_idxs():
-                camera.params[index] *= factor
-        if _adjusted(other, focals_free=False) < MIN_GROWTH * least:
-            return tuple(loose)
-    return ()
+    most = MIN_GROWTH * _error(sparse)
+    loose: set[int] = set()
+    for keys in np.array_split(unknown, min(len(unknown), MAX_NUM_TRIALS)):
+        if any(_error(_scaled(sparse, keys, factor), keys) < most for factor in FACTORS):
+            loose.update(keys.tolist())
+    return tuple(sorted(image.name for image in images if image.camera_id in loose))
 
 
 def _with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -60,10 +60,21 @@ def _with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstructio
     return copy
 
 
-def _adjusted(model: pycolmap.Reconstruction, *, focals_free: bool) -> float:
-    """Adjust a model; return the error that is left."""
-    options = robust_options()
-    options.refine_focal_length = focals_free
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config_of(model), model)
+def _scaled(
+    model: pycolmap.Reconstruction, cameras: Collection[int], factor: float
+) -> pycolmap.Reconstruction:
+    """Return a copy with other focal lengths of some cameras."""
+    copy = pycolmap.Reconstruction(model)
+    for key in cameras:
+        camera = copy.cameras[key]
+        for index in camera.focal_length_idxs():
+            camera.params[index] *= factor
+    return copy
+
+
+def _error(model: pycolmap.Reconstruction, constant_cameras: Collection[int] = ()) -> float:
+    """Adjust a model, of which some cameras stay; return the error that is left."""
+    config = config_of(model, constant_cameras)
+    adjuster = pycolmap.create_default_bundle_adjuster(robust_options(), config, model)
     summary = cast("pycolmap.CeresBundleAdjustmentSummary", adjuster.solve())
     return float(summary.ceres_summary.final_cost)
