@@ -300,16 +300,15 @@ def _match(
     verification_options: GivenVerification,
     device: pycolmap.Device | str,
     token: Token,
-    *,
-    random_seed: int | None = None,
-    weights_path: PathLike | None = None,
-    progress: Progress = SILENT,
+    **ours: Unpack[Ours],
 ) -> Reports:
     """Match pairs and do what pycolmap's options ask for besides."""
-    verification = translate.verification_options(verification_options, random_seed)
+    if unknown := ours.keys() - Ours.__annotations__.keys():
+        raise TypeError(f"unexpected keyword argument {min(unknown)!r}")
+    verification = translate.verification_options(verification_options, ours.get("random_seed"))
     matching, asked = translate.matching_options(matching_options)
-    shown = _Cancellable(progress, token)
-    with _context(database_path, device, asked, weights_path, shown) as context:
+    shown = _Cancellable(ours.get("progress", SILENT), token)
+    with _context(database_path, device, asked, ours.get("weights_path"), shown) as context:
         context.workspace.require("extract")
         write_images_and_keypoints(context)
         known = set(context.features.names())

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Mapping
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import num_long_tracks, seen_points
 from colmap_affrect.colmap.verification import inlier_matches
-from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 from colmap_affrect.project.report import Arrival
 
 MIN_THREE_VIEW_POINTS = 12
@@ -36,6 +37,15 @@ def arrivals(model: MappedModel, task: MappingTask) -> dict[str, Arrival]:
         name: bridged.get(name, Arrival("guided" if image_id in guided else "tracks"))
         for image_id, name in sorted(names.items(), key=lambda item: item[1])
     }
+
+
+def bridges_of(known: Mapping[str, Arrival]) -> tuple[Bridge, ...]:
+    """Return the bridges by which images came in, one for each image."""
+    return tuple(
+        Bridge((item.by, name), (name,), item.num_agreeing, item.num_ratios, item.scale_error_frac)
+        for name, item in known.items()
+        if item.how == "bridged"
+    )
 
 
 def _tied_by_guided_matches(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:

@@ -12,7 +12,7 @@ from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import num_long_tracks, registered_names, write_model
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.errors import StoreError
-from colmap_affrect.mappers.arrivals import arrivals
+from colmap_affrect.mappers.arrivals import arrivals, bridges_of
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.doubts import find_doubts, without_impossible
 from colmap_affrect.mappers.existing import require_extends
@@ -74,14 +74,12 @@ def map_database(
         best = _best_attempt(mapper, task, sparse_path, partial, next_image)
         if not task.extend and _adjust_weak(mapper, task, best):
             best = sorted(_possible(best, task), key=_size, reverse=True)
-        if best and not task.extend:
-            best[0] = replace(best[0], loose=loose_images(best[0].reconstruction, task))
-        shutil.rmtree(sparse_path, ignore_errors=True)
         summaries = []
         for index, model in enumerate(best):
             write_model(model.reconstruction, partial / str(index))
-            summaries.append(summarize(model, task))
+            summaries.append(summarize(model, task, is_largest=index == 0))
             write_summary(summaries[-1], partial / str(index))
+        shutil.rmtree(sparse_path, ignore_errors=True)
         partial.rename(sparse_path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -226,7 +224,7 @@ def better(
 def read_models(sparse_path: Path, task: MappingTask) -> list[ModelSummary]:
     """Return the summaries of the models that :func:`map_database` wrote for a task.
 
-    A model that was changed since is judged anew.
+    A model that somebody has changed since is judged anew; how it came about is still known.
     """
     folders = sorted(
         (p for p in sparse_path.iterdir() if p.name.isdigit()), key=lambda p: int(p.name)
@@ -239,14 +237,24 @@ def _judged_anew(folder: Path, task: MappingTask) -> ModelSummary:
         registered_names(folder)  # pycolmap's reader may never end on a damaged file
     except StoreError as error:
         raise StoreError(f"{error}; run map again with --overwrite") from error
-    summary = summarize(MappedModel(pycolmap.Reconstruction(folder)), task)
+    model, before = MappedModel(pycolmap.Reconstruction(folder)), read_summary(folder, of_any=True)
+    if before:
+        model = replace(
+            model,
+            bridges=bridges_of(before.arrivals),
+            taken_out=before.taken_out,
+            rival_focals_px=before.rival_focals_px,
+        )
+    summary = summarize(model, task, is_largest=folder.name == "0")
     write_summary(summary, folder)
     return summary
 
 
-def summarize(mapped: MappedModel, task: MappingTask) -> ModelSummary:
+def summarize(mapped: MappedModel, task: MappingTask, *, is_largest: bool) -> ModelSummary:
     """Count what a model holds, and judge it."""
-    model, doubts = mapped.reconstruction, find_doubts(mapped, task)
+    model = mapped.reconstruction
+    loose = loose_images(model, task) if is_largest and not task.extend else ()
+    doubts = find_doubts(mapped, task, loose)
     return ModelSummary(
         registered_names=tuple(
             sorted(model.images[image_id].name for image_id in model.reg_image_ids())

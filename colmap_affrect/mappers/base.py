@@ -135,14 +135,12 @@ class MappedModel:
         bridges: in the order in which they were made.
         taken_out: images that were certainly wrong and had to leave, with the reason.
         rival_focals_px: see :class:`~colmap_affrect.project.report.ModelSummary`.
-        loose: images whose points do not tell the focal length.
     """
 
     reconstruction: pycolmap.Reconstruction
     bridges: tuple[Bridge, ...] = ()
     taken_out: Mapping[str, str] = field(default_factory=dict)
     rival_focals_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    loose: tuple[str, ...] = ()
 
 
 class Mapper(Protocol):

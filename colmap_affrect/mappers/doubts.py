@@ -6,7 +6,7 @@ Doubts have two degrees: what is certainly wrong leaves the model, the rest is t
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from math import ceil
@@ -83,15 +83,16 @@ class Doubts:
     impossible: tuple[str, ...] = ()
 
 
-def find_doubts(model: MappedModel, task: MappingTask) -> Doubts:
+def find_doubts(model: MappedModel, task: MappingTask, loose: Collection[str] = ()) -> Doubts:
     """Look for everything that is wrong with a model or may be.
 
     Args:
         model: with all its images, also of bridges.
         task: what it was made from.
+        loose: images whose points do not tell the focal length.
     """
     graph = graph_of(task)
-    images = _image_doubts(model, graph, task)
+    images = _image_doubts(model, graph, task, loose)
     return replace(images, model=tuple(_model_doubts(model, graph)))
 
 
@@ -129,7 +130,9 @@ def _side(camera: pycolmap.Camera) -> int:
     return max(camera.width, camera.height)
 
 
-def _image_doubts(model: MappedModel, graph: PairGraph, task: MappingTask) -> Doubts:
+def _image_doubts(
+    model: MappedModel, graph: PairGraph, task: MappingTask, loose: Collection[str] = ()
+) -> Doubts:
     """Judge the images one by one."""
     reconstruction = model.reconstruction
     registered = set(reconstruction.reg_image_ids())
@@ -155,7 +158,7 @@ def _image_doubts(model: MappedModel, graph: PairGraph, task: MappingTask) -> Do
             ),
             *_place_doubts(near[image_id], len(registered) - 1),
             *_bridge_doubts(bridges.get(image.name)),
-            *_focal_doubts(image.name in model.loose),
+            *_focal_doubts(image.name in loose),
         ]
         if found:
             reasons[image.name] = "; ".join(text for text, _ in found)

@@ -27,7 +27,7 @@ MAX_NUM_POINTS, MAX_NUM_IMAGES = 2_000, 100  # looked at; larger models have poi
 
 
 def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str, ...]:
-    """Return the images whose focal length neither anybody nor the points of the model know, sorted.
+    """Return the images whose focal length neither anybody nor the points know, sorted.
 
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
     focal length of each camera that nobody knows, while all else may move.
@@ -40,11 +40,13 @@ def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str
     )
     if not unknown or len(images) > MAX_NUM_IMAGES or model.num_points3D() == 0:
         return ()
+    fixed = {key for key, record in task.cameras.items() if record.is_fixed} & set(model.cameras)
     sparse = _with_fewer_points(model)
-    most = MIN_GROWTH * _error(sparse)
+    most = MIN_GROWTH * _error(sparse, fixed)
     loose: set[int] = set()
     for keys in np.array_split(unknown, min(len(unknown), MAX_NUM_TRIALS)):
-        if any(_error(_scaled(sparse, keys, factor), keys) < most for factor in FACTORS):
+        held = fixed.union(keys.tolist())
+        if any(_error(_scaled(sparse, keys, factor), held) < most for factor in FACTORS):
             loose.update(keys.tolist())
     return tuple(sorted(image.name for image in images if image.camera_id in loose))
 
@@ -72,9 +74,9 @@ def _scaled(
     return copy
 
 
-def _error(model: pycolmap.Reconstruction, constant_cameras: Collection[int] = ()) -> float:
-    """Adjust a model, of which some cameras stay; return the error that is left."""
+def _error(model: pycolmap.Reconstruction, constant_cameras: Collection[int]) -> float:
+    """Adjust a model, of which some cameras stay; return the error, infinite if that fails."""
     config = config_of(model, constant_cameras)
     adjuster = pycolmap.create_default_bundle_adjuster(robust_options(), config, model)
     summary = cast("pycolmap.CeresBundleAdjustmentSummary", adjuster.solve())
-    return float(summary.ceres_summary.final_cost)
+    return summary.ceres_summary.final_cost if summary.is_solution_usable() else np.inf

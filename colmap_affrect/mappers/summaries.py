@@ -34,11 +34,11 @@ def write_summary(summary: ModelSummary, folder: Path) -> None:
     replace_text(folder / FILE_NAME, text + "\n")
 
 
-def read_summary(folder: Path) -> ModelSummary | None:
-    """Return the summary of the model in a folder; None if it is damaged or of another model."""
+def read_summary(folder: Path, *, of_any: bool = False) -> ModelSummary | None:
+    """Return the summary in a folder; None if damaged or, unless ``of_any``, of another model."""
     try:
         kept = _KEPT.validate_json((folder / FILE_NAME).read_bytes())
-        return kept.summary if kept.model == _digest(folder) else None
+        return kept.summary if of_any or kept.model == _digest(folder) else None
     except (OSError, ValidationError):
         return None
 

@@ -136,10 +136,10 @@ def image_names(workspace: Workspace) -> list[str]:
 def _or_first_level(
     context: Context, mapper: Mapper, task: MappingTask, models: list[ModelSummary]
 ) -> list[ModelSummary]:
-    """Keep the models of the pairs as they were before they climbed, where those have more images.
+    """Keep the models of the pairs as they were before they climbed, where those are better.
 
-    So escalation never loses an image; but a model that is doubtful does not take the place of one
-    that is not.
+    Of two that are both doubtful, or both not, that is the one with more images, so escalation
+    never loses one; what is not doubtful takes the place of what is, however large that may be.
     """
     with first_level_database(context) as path:
         least = _num_registered(models) if models and models[0].is_trustworthy else 0
@@ -284,7 +284,8 @@ def advice(
     if sum(map(bool, colmap_database.keypoint_counts(workspace.database).values())) < 2:
         return (TOO_FEW,)
     texts = []
-    if models and models[0].rival_focals_px:
+    has_cameras = is_copy(workspace) or Inputs.recorded(workspace).from_database
+    if models and models[0].rival_focals_px and not has_cameras:
         texts.append(
             "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
             "several focal lengths fit"

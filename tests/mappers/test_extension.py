@@ -13,7 +13,7 @@ from mapping_tasks import NOTHING_KNOWN, task_with_given_cameras
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import MappingError, OptionError, StoreError
-from colmap_affrect.mappers import incremental, snapshots
+from colmap_affrect.mappers import attempts, incremental, snapshots
 from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing
@@ -122,6 +122,21 @@ def test_old_poses_and_cameras_stay_to_the_bit(
         assert cameras(model)[name] == cameras(old)[name]
     assert model.num_points3D() > 150
     assert sorted(p.name for p in tmp_path.iterdir()) == ["old", "sparse"]
+
+
+def test_the_model_that_is_extended_stays_until_all_is_judged(
+    database: Path, old: pycolmap.Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    (tmp_path / "sparse").mkdir()
+    existing = read_existing(Extension(written(old, tmp_path / "sparse" / "0")), database)
+    monkeypatch.setattr(attempts, "summarize", stop)
+    with pytest.raises(KeyboardInterrupt):
+        extended(database, existing, tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["sparse"]
+    assert poses(pycolmap.Reconstruction(tmp_path / "sparse" / "0")).keys() == poses(old).keys()
 
 
 def test_old_poses_may_move_and_stay_in_their_frame(

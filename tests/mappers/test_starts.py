@@ -14,7 +14,7 @@ from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers import starts as module
-from colmap_affrect.mappers.attempts import MAX_HOLDING_ATTEMPTS, map_database
+from colmap_affrect.mappers.attempts import MAX_HOLDING_ATTEMPTS, map_database, read_models
 from colmap_affrect.mappers.base import MAPPERS, Bridge, MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.mappers.starts import (
@@ -226,13 +226,24 @@ def test_images_that_the_last_adjustment_leaves_without_points_are_taken_out(
             model.delete_observation(image.image_id, index)
 
     monkeypatch.setattr(attempts, "adjust_last", lose_points)
-    bridge = Bridge(("a", "b"), ("b",), 20, 20, 0.01)
+    name = scene[1].images[min(scene[1].reg_image_ids())].name
+    bridge = Bridge(("a", name), (name,), 20, 20, 0.01)
     mapper = Recorder(lambda _: [replace(m, bridges=(bridge,)) for m in without(scene, 0)])
     mapped(scene, tmp_path, mapper, records(scene, KNOWN))
     model = read_summary(tmp_path / "sparse" / "0")
     assert model
     assert len(model.registered_names) == NUM_IMAGES - 1
     assert list(model.taken_out.values()) == ["only 3 points hold it"]
+
+    folder = tmp_path / "sparse" / "0"
+    changed = pycolmap.Reconstruction(folder)
+    changed.cameras[1].focal_length *= 1.0001
+    changed.write(folder)
+    task = MappingTask(scene[0], None, cameras=records(scene, KNOWN))
+    (again,) = read_models(tmp_path / "sparse", task)
+    assert again.focals_px != model.focals_px
+    assert (again.taken_out, again.arrivals) == (model.taken_out, model.arrivals)
+    assert read_summary(folder) == again
 
 
 def test_large_models_are_mapped_once(
