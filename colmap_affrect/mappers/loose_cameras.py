@@ -27,7 +27,7 @@ MAX_NUM_POINTS, MAX_NUM_IMAGES = 2_000, 100  # looked at; larger models have poi
 
 
 def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str, ...]:
-    """Return the images whose focal length neither anybody nor the points of the model know, sorted.
+    """Return the images, sorted, whose focal length neither anybody nor the model's points know.
 
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
     focal length of each camera that nobody knows, while all else may move.
