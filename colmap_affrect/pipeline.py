@@ -79,19 +79,30 @@ def holds_vote(focal_vote: FocalVote, mapping: MapperOptions, *, is_others: bool
 
 @dataclass(frozen=True, kw_only=True)
 class InputOptions:
-    """What runs and comparisons of methods both depend on, beside images and recipes."""
+    """What runs and comparisons of methods both depend on, beside images and recipes.
 
-    cameras: CameraOptions = field(default_factory=CameraOptions)  # how images share cameras
-    masks: MaskOptions = field(default_factory=MaskOptions)  # where features may be
-    pairs: PairOptions = field(default_factory=PairOptions)  # how the pairs to match are chosen
-    # thresholds of two-view geometry
+    Attributes:
+        cameras: how images share cameras.
+        masks: where features may be.
+        pairs: how the pairs to match are chosen.
+        verification: thresholds of two-view geometry.
+        mapping: mapper and its options.
+        image_list_path: list of the images to use; None for all below the folder.
+        from_database: COLMAP database whose images, cameras, rigs, frames and pose priors are
+            used; it stays as it is.
+        resources: weights and device of networks.
+        focal_vote: whether verified pairs vote on cameras that nobody knows.
+    """
+
+    cameras: CameraOptions = field(default_factory=CameraOptions)
+    masks: MaskOptions = field(default_factory=MaskOptions)
+    pairs: PairOptions = field(default_factory=PairOptions)
     verification: VerificationOptions = field(default_factory=VerificationOptions)
-    mapping: MapperOptions = field(default_factory=SparseOptions)  # mapper and its options
-    image_list_path: Path | None = None  # list of the images to use; None for all below the folder
-    # COLMAP database whose images, cameras, rigs, frames and pose priors are used; it stays as is
+    mapping: MapperOptions = field(default_factory=SparseOptions)
+    image_list_path: Path | None = None
     from_database: Path | None = None
-    resources: Resources = field(default_factory=Resources)  # weights and device of networks
-    focal_vote: FocalVote = "auto"  # whether verified pairs vote on cameras that nobody knows
+    resources: Resources = field(default_factory=Resources)
+    focal_vote: FocalVote = "auto"
 
     @property
     def holds_vote(self) -> bool:
@@ -111,12 +122,20 @@ class InputOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(InputOptions):
-    """Everything a run depends on beside its images and its output folder."""
+    """Everything a run depends on beside its images and its output folder.
 
-    # options of extraction and matching
+    The other attributes are those of :class:`InputOptions`.
+
+    Attributes:
+        recipe: options of extraction and matching.
+        database_descriptors: also write descriptors into the database, as COLMAP's matchers
+            need them.
+        extend: register the photographs into this model instead of beginning one.
+    """
+
     recipe: Recipe = field(default_factory=lambda: load_recipe("default"))
-    database_descriptors: bool = False  # written too, for COLMAP's matchers
-    extend: Extension | None = None  # model that the photographs are registered into, if any
+    database_descriptors: bool = False
+    extend: Extension | None = None
 
     def forecast(self, num_images: int) -> Forecast:
         """Return what so many images will take."""
@@ -143,14 +162,19 @@ def run(
     Args:
         image_path: folder of the photographs, searched with its sub-folders.
         output_path: folder for all results, made if missing.
-        options: of all stages.
+        options: see :class:`RunOptions`.
         executor: where images and pairs are worked on, a cluster for one
-            (:func:`colmap_affrect.parallel.cluster.connected`); by default in threads here.
+            (:func:`colmap_affrect.parallel.cluster.connected`); by default in threads of this
+            process.
         overwrite: discard results that are there.
-        page: write ``report.html`` beside ``report.json``, whose content is returned.
+        page: also write ``report.html``.
         progress: where to show progress.
 
-    AffrectError is raised for anything that the caller can mend; what is done stays.
+    Returns:
+        The report that is also written to ``report.json``.
+
+    Raises:
+        AffrectError: for anything that the caller can mend; what is done stays.
     """
     options = options or RunOptions()
     mapper = MAPPERS.make(options.mapping)
@@ -207,10 +231,14 @@ def map_from_database(
         extend: register the images into this model instead of beginning one.
         check_cameras: let the pairs vote on cameras whose focal length is no prior.
         overwrite: discard results that are there.
-        page: write ``report.html`` beside ``report.json``, whose content is returned.
+        page: also write ``report.html``.
         progress: where to show progress.
 
-    AffrectError is raised for anything that the caller can mend; what is done stays.
+    Returns:
+        The report that is also written to ``report.json``.
+
+    Raises:
+        AffrectError: for anything that the caller can mend; what is done stays.
     """
     mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
     schema_version(database_path)  # refuses what is no database before anything is made

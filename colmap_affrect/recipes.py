@@ -152,16 +152,24 @@ class RecipeOptions(ExtractionOptions):
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a recipe decides, resolved once."""
+    """What a recipe decides, resolved once.
 
-    name: str  # its name, or the path it was read from
-    summary: str = ""  # one line for people
-    # everything that decides the features of an image
+    Attributes:
+        name: its name, or the path it was read from.
+        summary: one line for people.
+        extraction: everything that decides the features of an image.
+        matching: the matcher.
+        escalate: which pairs climb.
+        guided: guided matching.
+        mapping: the mapper's ``name`` and options that differ from the preset.
+    """
+
+    name: str
+    summary: str = ""
     extraction: ExtractionOptions = field(default_factory=ExtractionOptions)
-    matching: MatcherOptions = field(default_factory=NearestOptions)  # the matcher
-    escalate: EscalateOptions = field(default_factory=EscalateOptions)  # which pairs climb
-    guided: GuidedOptions = field(default_factory=GuidedOptions)  # guided matching
-    # the mapper's ``name`` and options that differ from the preset
+    matching: MatcherOptions = field(default_factory=NearestOptions)
+    escalate: EscalateOptions = field(default_factory=EscalateOptions)
+    guided: GuidedOptions = field(default_factory=GuidedOptions)
     mapping: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod

@@ -33,17 +33,30 @@ MAX_LINES = 5  # groups of cameras that are logged
 
 @dataclass(frozen=True)
 class CameraRecord:
-    """One camera of the database."""
+    """One camera of the database.
 
-    names: tuple[str, ...]  # of its images, sorted
-    source: Source  # of the focal length
-    focal_px: float  # in px of the stored file; the mean of two
-    low_px: float | None = None  # lower end of what it may be, None where nothing says so
-    high_px: float | None = None  # upper end
-    why: str = ""  # what was decided and for what reason, one clause
-    size: tuple[int, int] = (0, 0)  # (width, height) of its images in px
-    given: tuple[Given, ...] = ()  # what of the intrinsics is the user's, to be left as it is
-    may_be_shared: bool = False  # pairs do not tell whether such images share a camera
+    Attributes:
+        names: of its images, sorted.
+        source: of the focal length.
+        focal_px: in px of the stored file; the mean of two.
+        low_px: lower end of what the focal length may be, None where nothing says so.
+        high_px: upper end.
+        why: what was decided and for what reason, one clause.
+        size: (width, height) of its images in px.
+        given: what of the intrinsics is the user's, to be left as it is.
+        may_be_shared: the pairs do not tell whether other such images of this size have the same
+            camera.
+    """
+
+    names: tuple[str, ...]
+    source: Source
+    focal_px: float
+    low_px: float | None = None
+    high_px: float | None = None
+    why: str = ""
+    size: tuple[int, int] = (0, 0)
+    given: tuple[Given, ...] = ()
+    may_be_shared: bool = False
 
     def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
         """Return the entry of ``report.json``, with the focal length that a model ended with."""

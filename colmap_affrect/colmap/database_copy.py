@@ -26,7 +26,7 @@ FIRST_TYPED_SCHEMA = 4_000_000  # descriptors have a type since COLMAP 4.0
 
 
 def schema_version(path: Path) -> int:
-    """Return the version of a database's tables, e.g. 4020100 for COLMAP 4.2.1."""
+    """Return the version of the tables, e.g. 4020100 for COLMAP 4.2.1; DatabaseError if none."""
     with open_read_only(path) as connection:
         return int(connection.execute("PRAGMA user_version").fetchone()[0])
 

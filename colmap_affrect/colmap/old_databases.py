@@ -28,7 +28,8 @@ MAPPER_OPTIONS = (
 )
 """Our preset for few photographs: by its defaults ``colmap mapper`` finds less, or nothing."""
 
-LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)  # of cameras
+# COLMAP 3.8 has camera models up to this number
+LAST_MODEL = int(pycolmap.CameraModelId.THIN_PRISM_FISHEYE)
 METRIC = pycolmap.PosePriorCoordinateSystem.CARTESIAN
 
 TABLES = f"""

@@ -51,7 +51,7 @@ class PoseScores:
 
     @property
     def median_direction_error_deg(self) -> float | None:
-        """Of their translations; None without pairs."""
+        """Of the translations of the pairs of registered images; None without pairs."""
         return median(d for _, d in self.pair_errors_deg.values()) if self.pair_errors_deg else None
 
     def to_mapping(self) -> dict[str, Any]:

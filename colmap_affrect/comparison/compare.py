@@ -56,6 +56,8 @@ NUM_DIGITS = 16
 class CompareOptions(InputOptions):
     """Everything a comparison depends on beside its images and its output folder.
 
+    The other attributes are those of :class:`~colmap_affrect.pipeline.InputOptions`.
+
     Attributes:
         methods: names of methods as the command line takes them, or methods; None for those that
             need no weights, and learned ones whose weights are there.

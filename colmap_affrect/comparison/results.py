@@ -68,6 +68,7 @@ class SeedResult:
         mean_track_length: images per point.
         mean_observations: observed points per registered image.
         num_observations: observed points of each image of the largest model.
+        pair_inliers: verified pairs and their numbers of inliers.
         scores: against ground truth; None where there is none.
         wall_s: seconds of ``verify`` and ``map``.
         doubtful: images of the largest model that cannot be trusted, with the reason.
@@ -251,7 +252,13 @@ def in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Several methods on one set of photographs, sorted by name, and what all methods had."""
+    """Several methods on one set of photographs.
+
+    Attributes:
+        image_names: all images given, sorted.
+        num_pairs: pairs that were to be matched.
+        settings: cameras, masks, pair list, preset and mapper that all methods had.
+    """
 
     image_names: tuple[str, ...]
     image_path: str

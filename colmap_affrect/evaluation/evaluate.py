@@ -100,7 +100,7 @@ class EvaluateOptions:
 
     Attributes:
         recipes: by name as the command line takes them, or as methods.
-        baseline: label of the recipe that the others are tested against.
+        baseline: label of the recipe that the others are tested against; None for none.
         max_num_keypoints: of each image so many of its strongest features are matched; None: all.
         random_seed: of the estimators and the statistics.
     """

@@ -107,9 +107,11 @@ class RecipeResult:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Results of several recipes on one dataset; titles are those of the protocol.
+    """Results of several recipes on one dataset.
 
     Attributes:
+        error_title: what the errors are, with the unit.
+        category_title: what the categories are; empty without.
         settings: everything that decides scores.
         baseline: label of the recipe that the others are tested against; empty for none.
         notes: what is missing or odd in the dataset.

@@ -18,7 +18,7 @@ Points = NDArray[np.floating]
 Matrix = NDArray[np.float64]
 
 MIN_HOMOGRAPHY_MATCHES, MIN_FUNDAMENTAL_MATCHES, MIN_POSE_MATCHES = 4, 8, 6
-"""Five points leave several essential matrices, none of which another match supports."""
+"""Of poses six: five leave several essential matrices, none of which another match supports."""
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,15 @@ PATCH_SIZE_PX = 32  # side of the patches that all networks take
 
 @dataclass(frozen=True)
 class NetworkContext:
-    """What networks run with."""
+    """What networks run with.
 
-    # files by key, found beforehand (:mod:`colmap_affrect.features.weights`)
+    Attributes:
+        weights: files by key, found beforehand (:mod:`colmap_affrect.features.weights`).
+        device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``.
+    """
+
     weights: Mapping[str, Path] = field(default_factory=dict)
-    device: str = "cpu"  # ``cpu``, ``cuda``, ``cuda:1``, ``mps``
+    device: str = "cpu"
 
 
 class NetworkOptions(PartOptions):
@@ -54,9 +58,13 @@ class FeatureOptions(NetworkOptions):
 
 
 class FeatureExtractor(Protocol):
-    """Detection and description; called with its ``Options`` and a :class:`NetworkContext`."""
+    """Detection and description; called with its ``Options`` and a :class:`NetworkContext`.
 
-    descriptor_size: int  # D, also of an image without features
+    Attributes:
+        descriptor_size: D, also of an image without features.
+    """
+
+    descriptor_size: int
 
     def detect(self, view: View) -> LocalFeatures:
         """Return features of one view, frames in its px; descriptors may be (N, 0) still."""

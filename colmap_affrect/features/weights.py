@@ -141,9 +141,11 @@ WEIGHT_FILES: dict[str, WeightFile] = {
 def resolve(
     keys: Iterable[str], weights_path: Path | None = None, *, progress: Progress = SILENT
 ) -> dict[str, Path]:
-    """Find files of weights, in this folder first, or download them into torch's cache, by key.
+    """Find files of weights, or download them into torch's cache; return their paths by key.
 
-    One WeightsError for all that are nowhere, or if an installed file is not the published one.
+    They are looked for in ``weights_path`` first. Raises one WeightsError for all files that are
+    missing and cannot be downloaded, or for one of an installed distribution that is not the
+    published one.
     """
     if weights_path is not None and not weights_path.is_dir():
         raise WeightsError(f"--weights {weights_path}: not a folder")

@@ -104,6 +104,10 @@ def scale_by_planes(
 
     The inverse depth of a plane is affine in the image: it is fitted to the known depths around
     each place and taken where they lie on a plane that is certain enough there.
+
+    The arguments are those of :func:`scale_between`: places and radius in px, depths in any units,
+    whose ratio is the scale. But a place counts only with ``NUM_ON_PLANE`` known ones within the
+    radius, which may be several times as large. None where no place counts.
     """
     if not len(known[0]) or not len(places[0]):
         return None

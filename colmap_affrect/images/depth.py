@@ -44,7 +44,7 @@ class DepthSource(Protocol):
     """Depth maps of photographs; called with its ``Options`` and a :class:`DepthContext`."""
 
     def depth(self, photograph: Photograph) -> Singles:
-        """Return (h, w) z-depth > 0, NaN where unknown, of any resolution over the whole image.
+        """Return (h, w) float32 z-depth > 0, NaN where unknown, of any size over the whole image.
 
         Raises DepthError when there is no usable map.
         """
@@ -55,11 +55,15 @@ class DepthSource(Protocol):
 
 @dataclass(frozen=True)
 class DepthContext:
-    """What depth sources work with."""
+    """What depth sources work with.
 
-    # folder that keeps the predictions of a network; None keeps none
+    Attributes:
+        cache_path: folder that keeps the predictions of a network; None keeps none.
+        device: where a network runs: ``cpu``, ``cuda``, ``cuda:1``, ``mps``.
+    """
+
     cache_path: Path | None = None
-    device: str = "cpu"  # where a network runs: ``cpu``, ``cuda``, ``cuda:1``, ``mps``
+    device: str = "cpu"
 
 
 class DepthOptions(PartOptions):
@@ -159,7 +163,10 @@ class DepthFiles:
             )
 
     def depth(self, photograph: Photograph) -> Singles:
-        """Read the (h, w) z-depth of a photograph, NaN where unknown; DepthError without."""
+        """Read the (h, w) float32 z-depth of a photograph, NaN where it is unknown.
+
+        Raises DepthError if there is none, or it is damaged or not of this photograph.
+        """
         path = self._options.file(photograph.name)
         if path is None:
             raise DepthError(
@@ -221,7 +228,11 @@ class MonocularDepth:
                 self._load()
 
     def depth(self, photograph: Photograph) -> Singles:
-        """Predict (h, w) z-depth of a photograph, NaN where unknown; DepthError if that fails."""
+        """Predict the (h, w) float32 z-depth of a photograph, NaN where it is unknown.
+
+        Raises DepthError if the network cannot be loaded or predicts no depth, ImageError if the
+        photograph cannot be read.
+        """
         prediction = self._prediction(photograph)
         kind = "inverse" if self._kind == "z" and prediction.inverse else self._kind
         values = prediction.values

@@ -28,27 +28,36 @@ SHOWN = 12  # residuals that the summary lists, the largest first
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """What a model is aligned to; exactly one of the first three, or distances."""
+    """What a model is aligned to; exactly one of the first three, or distances.
 
-    gps_database: Path | None = None  # COLMAP database that has positions of the photographs by GPS
-    # CSV of where photographs were taken: name and x, y, z in metres, or latitude, longitude,
-    # altitude
+    Attributes:
+        gps_database: COLMAP database that has positions of the photographs by GPS.
+        positions_path: CSV of where photographs were taken: name and x, y, z in metres, or
+            latitude, longitude, altitude.
+        points_path: CSV of points marked in photographs: point, image, px, py, and for control
+            points x, y, z in one row or more of each.
+        distances: two names, of photographs or of marked points, and their distance in metres.
+    """
+
+    gps_database: Path | None = None
     positions_path: Path | None = None
-    # CSV of points marked in photographs: point, image, px, py, and for control points x, y, z in
-    # one row or more of each
     points_path: Path | None = None
-    # two names, of photographs or of marked points, and their distance
     distances: tuple[tuple[str, str, float], ...] = ()
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """What was done."""
+    """What was done.
 
-    scale: float  # metres for a unit of the model as it was
-    # how far each position, point or distance is off after it, metres
+    Attributes:
+        scale: metres for a unit of the model as it was.
+        residuals: how far each position, point or distance is off after it, metres.
+        georeference: where the model is on earth, if that is known.
+    """
+
+    scale: float
     residuals: Mapping[str, float]
-    georeference: Georeference | None = None  # where the model is on earth, if that is known
+    georeference: Georeference | None = None
 
     def summary(self) -> str:
         """Return a few lines."""
@@ -63,9 +72,17 @@ class Alignment:
 
 
 def align(model_path: Path, output_path: Path, reference: Reference) -> Alignment:
-    """Write a model of COLMAP in metres, to a new folder; the old one stays as it is.
+    """Write a model in metres; the old one stays as it is.
 
     Positions and control points give scale, rotation and place, distances the scale alone.
+
+    Args:
+        model_path: folder of a COLMAP model.
+        output_path: folder of the new model, which must not exist.
+        reference: what to align to.
+
+    Raises:
+        AffrectError: when the reference is unreadable, or leaves open how the model lies.
     """
     if output_path.exists():
         raise OptionError(f"{output_path}: exists, and is left as it is; use another folder")

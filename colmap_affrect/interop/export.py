@@ -62,11 +62,20 @@ class Source:
 def export(
     model_path: Path, output_path: Path, formats: Sequence[str], *, image_path: Path | None = None
 ) -> dict[str, Path]:
-    """Write a COLMAP model in some of ``FORMATS``; return what was written, by format.
+    """Write a model in some formats.
 
-    The folder for the files is made if it is missing; nothing in it is overwritten. Photographs,
-    to be undistorted, are by default where the run that made the model has them on record. Raises
-    AffrectError when a format cannot hold the model, or a file exists; nothing is written then.
+    Args:
+        model_path: folder of a COLMAP model.
+        output_path: folder for the files, made if missing; nothing in it is overwritten.
+        formats: keys of ``FORMATS``.
+        image_path: folder of the photographs, for undistorted ones; by default as the run
+            that made the model has it on record.
+
+    Returns:
+        What was written, by format.
+
+    Raises:
+        AffrectError: when a format cannot hold the model, or a file exists; nothing is written.
     """
     for name in formats:
         if name not in FORMATS:

@@ -20,11 +20,17 @@ FILE_NAME = "georeference.json"
 
 @dataclass(frozen=True)
 class Georeference:
-    """A model in metres, its x, y, z pointing east, north and up, and its origin (WGS 84)."""
+    """A model in metres whose x, y, z point east, north and up, and where its origin is (WGS 84).
 
-    latitude: float  # of the origin, degrees
-    longitude: float  # of the origin, degrees
-    altitude: float  # of the origin, metres above the ellipsoid, or as GPS has it
+    Attributes:
+        latitude: of the origin, degrees.
+        longitude: of the origin, degrees.
+        altitude: of the origin, metres above the ellipsoid, or as GPS has it.
+    """
+
+    latitude: float
+    longitude: float
+    altitude: float
 
     @classmethod
     def middle_of(cls, positions: ArrayLike) -> Self:

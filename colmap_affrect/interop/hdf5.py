@@ -56,17 +56,24 @@ PIXEL_ORIGINS = ("center", "corner")
 
 @dataclass(frozen=True)
 class InterchangeReport:
-    """What was imported or exported."""
+    """What was imported or exported.
 
-    action: str  # ``imported`` or ``exported``
-    layout: str  # of the files, ``hloc`` or ``dim``
-    num_images: int  # images in the database or the file, those without features included
+    Attributes:
+        action: ``imported`` or ``exported``.
+        layout: of the files, ``hloc`` or ``dim``.
+        num_images: images in the database or the file, those without features included.
+        num_verified: pairs with a two-view geometry; None where no verification was asked for.
+        notes: what was left out, chosen or lost, one line each.
+    """
+
+    action: str
+    layout: str
+    num_images: int
     num_keypoints: int
     num_pairs: int
     num_matches: int
-    # pairs with a two-view geometry; None where no verification was asked for
     num_verified: int | None
-    notes: tuple[str, ...]  # what was left out, chosen or lost, one line each
+    notes: tuple[str, ...]
 
     def summary(self) -> str:
         """Return a line of numbers, and one for each note."""

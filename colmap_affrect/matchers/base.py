@@ -35,33 +35,52 @@ class MatcherOptions(NetworkOptions):
     frames of scans, watermarks."""
 
     def require_extractor(self, extractor: str) -> None:
-        """Raise OptionError for an extractor whose features cannot be matched; none for no name."""
+        """Raise OptionError for a feature extractor whose features cannot be matched.
+
+        An empty name is that of another program, and passes.
+        """
 
 
 @dataclass(frozen=True)
 class MatcherContext(NetworkContext):
-    """What a matcher works with."""
+    """What a matcher works with.
 
-    device: str = "auto"  # as given, also ``auto``
-    num_similarities: float = 0  # about how many pairs of features there will be to compare in all
+    Attributes:
+        weights: files by key, found beforehand (:mod:`colmap_affrect.features.weights`).
+        device: as given, also ``auto``.
+        num_similarities: about how many pairs of features there will be to compare in all.
+    """
+
+    device: str = "auto"
+    num_similarities: float = 0
 
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """What a matcher is given of an image."""
+    """What a matcher is given of an image.
 
-    # frames, scores (``responses``), descriptors and the warps they come from
+    Attributes:
+        features: frames, scores (``responses``), descriptors and the warps they come from.
+        image_size: (width, height) of the stored image in px.
+        extractor: name of the feature extractor.
+    """
+
     features: LocalFeatures
-    image_size: tuple[int, int]  # (width, height) of the stored image in px
-    extractor: str  # name of the feature extractor
+    image_size: tuple[int, int]
+    extractor: str
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Matches of two images before geometric verification."""
+    """Matches of two images before geometric verification.
 
-    indices: Indices  # (M, 2) int64 features of image 1 and 2, strictly rising in column 0
-    scores: Singles  # (M,) float32 in [0, 1], larger is better
+    Attributes:
+        indices: (M, 2) int64 features of image 1 and 2, strictly rising in column 0.
+        scores: (M,) float32 in [0, 1], larger is better.
+    """
+
+    indices: Indices
+    scores: Singles
 
 
 ROUNDING = np.float32(1e-6)  # similarities that near to 1 are equal: two copies have ratio 1
@@ -77,7 +96,10 @@ class Matcher(Protocol):
     """Matches pairs of images; called with its ``Options`` and a :class:`MatcherContext`."""
 
     def prepare(self, image: ImageFeatures) -> Any:
-        """Return what :meth:`match` needs of an image, made once, with its memory as ``nbytes``."""
+        """Return what :meth:`match` needs of an image, made once for all of its pairs.
+
+        It has an attribute ``nbytes``, the memory that it takes.
+        """
 
     def match(self, first: Any, second: Any) -> Matches:
         """Match two prepared images. Either may have no features."""

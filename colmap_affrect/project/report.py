@@ -79,14 +79,23 @@ def _no_formula(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class StageReport:
-    """One stage of a run."""
+    """One stage of a run.
 
-    name: str  # extract, pairs, match, verify, escalate, guide or map
-    wall_s: float  # seconds
-    num_done: int  # images, pairs or models made now
-    num_kept: int = 0  # those found done already
-    failures: dict[str, str] = field(default_factory=dict)  # image name to reason
-    warnings: dict[str, str] = field(default_factory=dict)  # name to what went less well than asked
+    Attributes:
+        name: extract, pairs, match, verify, cameras, escalate, guide or map.
+        wall_s: seconds.
+        num_done: images, pairs, cameras or models made now.
+        num_kept: those found done already.
+        failures: image name to reason.
+        warnings: image name to what went less well than asked for.
+    """
+
+    name: str
+    wall_s: float
+    num_done: int
+    num_kept: int = 0
+    failures: dict[str, str] = field(default_factory=dict)
+    warnings: dict[str, str] = field(default_factory=dict)
 
     def summary(self) -> str:
         """Return one line."""
@@ -98,15 +107,22 @@ class StageReport:
 
 @dataclass(frozen=True)
 class Arrival:
-    """How an image came into a model."""
+    """How an image came into a model.
 
-    # by ``tracks`` through three images, by tracks that ``guided`` matching made, or ``bridged``:
-    # by one verified pair whose scale comes from neighbouring depths
+    Attributes:
+        how: by ``tracks`` through three images, by tracks that ``guided`` matching made, or
+            ``bridged``: by one verified pair whose scale comes from neighbouring depths.
+        by: of a bridge, the image that had been there; other fields are of bridges too.
+        num_agreeing: depths that agree on the scale.
+        num_ratios: depths compared.
+        scale_error_frac: standard error of the scale.
+    """
+
     how: str
-    by: str = ""  # of a bridge, the image that had been there; other fields are of bridges too
-    num_agreeing: int = 0  # depths that agree on the scale
-    num_ratios: int = 0  # depths compared
-    scale_error_frac: float = 0.0  # standard error of the scale
+    by: str = ""
+    num_agreeing: int = 0
+    num_ratios: int = 0
+    scale_error_frac: float = 0.0
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what ``report.json`` holds."""
@@ -122,18 +138,27 @@ class Arrival:
 
 @dataclass(frozen=True)
 class ModelSummary:
-    """One COLMAP model; the error is the mean over observations in px."""
+    """One COLMAP model; the error is the mean over observations in px.
+
+    Attributes:
+        doubtful: images whose pose or camera is doubtful, with the reason.
+        doubts: reasons to doubt the model as a whole.
+        arrivals: how each image came in.
+        taken_out: images that were certainly wrong, with the reason.
+        focals_px: focal length of each image's camera.
+        rival_focals_px: lowest and highest of models that agree as well with the pairs, of images
+            for which these differ.
+    """
 
     registered_names: tuple[str, ...]
     num_points3D: int
     mean_track_length: float
     mean_reprojection_error_px: float
-    doubtful: dict[str, str] = field(default_factory=dict)  # in pose or camera: name to reason
-    doubts: tuple[str, ...] = ()  # reasons to doubt the model as a whole
-    arrivals: dict[str, Arrival] = field(default_factory=dict)  # how each image came in
-    taken_out: dict[str, str] = field(default_factory=dict)  # certainly wrong: name to reason
-    focals_px: dict[str, float] = field(default_factory=dict)  # of each image's camera
-    # lowest and highest of models that agree as well with the pairs, of images where these differ
+    doubtful: dict[str, str] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
+    arrivals: dict[str, Arrival] = field(default_factory=dict)
+    taken_out: dict[str, str] = field(default_factory=dict)
+    focals_px: dict[str, float] = field(default_factory=dict)
     rival_focals_px: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -164,38 +189,49 @@ class ModelSummary:
 
 @dataclass(frozen=True)
 class ReconstructionReport:
-    """A whole run; numbers of points and tracks are those of the largest model."""
+    """A whole run; numbers of points and tracks are those of the largest model.
+
+    Attributes:
+        unregistered: image name to reason: unreadable, no features, no verified pair, not
+            registered (with its best pairs), taken out, or in another model.
+        models: all models, largest first, as written to sparse/0, sparse/1, ...
+        presets: of verification and of mapping: ``sparse``, ``colmap`` or ``custom``.
+        verification: options of two-view geometry.
+        mapping: the mapper and its options.
+        differs_from_colmap: for verification and mapping, what pycolmap was given that is not
+            COLMAP's default, by pycolmap's dotted keys.
+        pair_levels: pairs that each level of an escalating recipe decided, by its rectifier,
+            and ``none``; empty for other recipes.
+        contradicting_pairs: of these the verified ones that do not fit the largest model.
+        extended: names of the images of the model that was extended; empty where none was.
+        advice: what to try for the images that are missing.
+        guided: ``pairs`` that guided matching gave more inliers, and these inliers
+            ``matches_before`` and ``matches_after``; empty where no pair needed it.
+        cameras: for each its images, where its focal length is from, and its spread.
+    """
 
     images_total: int
-    # image name to reason: unreadable, no features, no verified pair, not registered (with its best
-    # pairs), taken out, or in another model
     unregistered: dict[str, str]
-    models: tuple[ModelSummary, ...]  # largest first, as written to sparse/0, sparse/1, ...
+    models: tuple[ModelSummary, ...]
     num_verified_pairs: int
     num_pairs: int
     stages: tuple[StageReport, ...]
     recipe: str
     versions: dict[str, str]
-    presets: tuple[str, str]  # of verification and of mapping: ``sparse``, ``colmap`` or ``custom``
-    verification: dict[str, Any]  # options of two-view geometry
-    mapping: dict[str, Any]  # the mapper and its options
-    # of verification and mapping what pycolmap was given that is not COLMAP's default, by its keys
+    presets: tuple[str, str]
+    verification: dict[str, Any]
+    mapping: dict[str, Any]
     differs_from_colmap: dict[str, dict[str, Any]]
-    # that each level of an escalating recipe decided, by its rectifier, and ``none``; else empty
     pair_levels: dict[str, int] = field(default_factory=dict)
-    # of these the verified ones that do not fit the largest model
     contradicting_pairs: dict[str, int] = field(default_factory=dict)
-    extended: tuple[str, ...] = ()  # names of the images of the model that was extended, if any
-    advice: tuple[str, ...] = ()  # what to try for the images that are missing
-    # ``pairs`` that guided matching gave more inliers, and these inliers ``matches_before`` and
-    # ``matches_after``; empty where no pair needed it
+    extended: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
     guided: dict[str, int] = field(default_factory=dict)
-    # for each its images, where its focal length is from, and its spread
     cameras: tuple[dict[str, Any], ...] = ()
 
     @property
     def status(self) -> str:
-        """``ok`` (all images in one model), ``partial``, ``doubtful`` as a whole, ``no_model``."""
+        """``ok`` (all in one model), ``partial``, ``doubtful`` (no two to trust), ``no_model``."""
         if not self.models:
             return "no_model"
         if not self.models[0].is_trustworthy:

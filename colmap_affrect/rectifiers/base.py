@@ -31,7 +31,12 @@ class Rectifier(Protocol):
 
 @dataclass(frozen=True)
 class RectifierInputs:
-    """What a rectifier may read beside the photograph; None for what its options do not ask for."""
+    """What a rectifier may read beside the photograph.
+
+    Attributes:
+        shapes: the source that its options name; None if they name none.
+        depth: None when the recipe needs no depth.
+    """
 
     shapes: ShapeSource | None = None
     depth: DepthSource | None = None

@@ -23,7 +23,12 @@ As the authors chose it."""
 
 @dataclass(frozen=True)
 class Region:
-    """Part of an image: an (h, w) mask cropped to it, and the (x, y) pixel where this begins."""
+    """Part of an image.
+
+    Attributes:
+        mask: (h, w) bool, cropped to the part.
+        origin: (x, y) image pixel of the mask's first pixel.
+    """
 
     mask: Mask
     origin: tuple[int, int]

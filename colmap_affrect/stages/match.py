@@ -97,7 +97,10 @@ def match_pairs(
 def matched_at_level(
     context: Context, pairs: Sequence[Pair], options: MatcherOptions, level: int
 ) -> Generator[PairMatches, None, None]:
-    """Match pairs with the features of a level, by default with these options; what moves stays."""
+    """Match pairs by the features of a level, and leave out what never moves.
+
+    ``options`` count where the level has none of its own.
+    """
     features, chosen = context.features, recorded_extraction(context.workspace).levels[level]
     options, extractor = chosen.matching or options, chosen.features.name
     matching = Matching(features, options, level, chosen.base, extractor, context.resources)
