@@ -30,5 +30,12 @@ def test_portraits_are_registered(tmp_path: Path, call: Call) -> None:
         *("run", "--image-path", PORTRAITS, "--image-list-path", listed, "--recipe", RECIPE),
         *("--output-path", tmp_path / "out", "--json", "-q"),
     )
-    assert ended.code == 0
+    assert ended.code == 3  # nothing tells the focal length of a lens so long
     assert len(ended.report["registered_names"]) == NUM_PORTRAITS
+    assert all("any focal length" in why for why in ended.report["doubtful"].values())
+    known = call(
+        *("run", "--image-path", PORTRAITS, "--image-list-path", listed, "--recipe", RECIPE),
+        *("--output-path", tmp_path / "known", "--focal-length-px", "1000", "--json", "-q"),
+    )
+    assert known.code == 0
+    assert len(known.report["registered_names"]) == NUM_PORTRAITS

@@ -14,7 +14,7 @@ from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.arrivals import arrivals, bridges_of
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
-from colmap_affrect.mappers.doubts import find_doubts, without_impossible
+from colmap_affrect.mappers.doubts import FOCAL_DOUBT, find_doubts, without_impossible
 from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.last_adjustment import MIN_NUM_TRACKS, adjust_last
 from colmap_affrect.mappers.loose_cameras import loose_images
@@ -268,4 +268,5 @@ def summarize(mapped: MappedModel, task: MappingTask, *, is_largest: bool) -> Mo
         taken_out=dict(mapped.taken_out),
         focals_px=focals_px(model),
         rival_focals_px=dict(mapped.rival_focals_px),
+        loose=tuple(name for name, why in doubts.images.items() if why == FOCAL_DOUBT),
     )

@@ -61,6 +61,8 @@ MIN_BASELINE_DEG = 1.0
 """Between two cameras, as their points see them. Rotations are right within a tenth of a degree at
 best, which moves centres by as much: the direction between nearer ones is off by 5 degrees then."""
 
+FOCAL_DOUBT = "any focal length fits, and where it stands depends on that"
+
 MAX_PAIRS_FOR_PARALLAX, MAX_POINTS_FOR_ANGLES = 100, 2000
 """Pairs and points looked at; more change no share."""
 
@@ -212,7 +214,7 @@ def _bridge_doubts(bridge: Bridge | None) -> Iterator[tuple[str, bool]]:
 
 def _focal_doubts(is_loose: bool) -> Iterator[tuple[str, bool]]:
     if is_loose:
-        yield "any focal length fits, and where it stands depends on that", False
+        yield FOCAL_DOUBT, False
 
 
 def _model_doubts(model: MappedModel, graph: PairGraph) -> Iterator[str]:

@@ -142,6 +142,7 @@ class ModelSummary:
 
     Attributes:
         doubtful: images whose pose or camera is doubtful, with the reason.
+        loose: of these the ones that nothing speaks against but that any focal length fits.
         doubts: reasons to doubt the model as a whole.
         arrivals: how each image came in.
         taken_out: images that were certainly wrong, with the reason.
@@ -160,11 +161,18 @@ class ModelSummary:
     taken_out: dict[str, str] = field(default_factory=dict)
     focals_px: dict[str, float] = field(default_factory=dict)
     rival_focals_px: dict[str, tuple[float, float]] = field(default_factory=dict)
+    loose: tuple[str, ...] = ()
 
     @property
     def is_trustworthy(self) -> bool:
-        """Whether two images or more are left that nothing speaks against."""
+        """Whether two images or more are left that are not doubtful."""
         return not self.doubts and len(self.registered_names) - len(self.doubtful) > 1
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether two images or more are left that nothing speaks against."""
+        num_contradicted = len(self.doubtful) - len(self.loose)
+        return not self.doubts and len(self.registered_names) - num_contradicted > 1
 
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""

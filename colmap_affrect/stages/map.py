@@ -138,11 +138,11 @@ def _or_first_level(
 ) -> list[ModelSummary]:
     """Keep the models of the pairs as they were before they climbed, where those are better.
 
-    Of two that are both doubtful, or both not, that is the one with more images, so escalation
-    never loses one; what is not doubtful takes the place of what is, however large that may be.
+    Of two that are both contradicted, or both not, that is the one with more images, so escalation
+    never loses one; what is not takes the place of what is, however large that may be.
     """
     with first_level_database(context) as path:
-        least = _num_registered(models) if models and models[0].is_trustworthy else 0
+        least = _num_registered(models) if models and models[0].is_consistent else 0
         if path is None or _num_tied(context, path) <= least:
             return models
         sparse = path.with_name("sparse")
@@ -175,7 +175,7 @@ def _map(
         first = path.with_name("sparse")
         models = map_database(mapper, replace(task, database_path=path), first, advance)
         num = _num_registered(models)
-        if num < MIN_SHARE * num_tied or not models[0].is_trustworthy:
+        if num < MIN_SHARE * num_tied or not models[0].is_consistent:
             return map_database(mapper, task, sparse, _ignore), 0
         if num < num_tied:
             others = map_database(mapper, task, sparse, _ignore)
@@ -212,7 +212,7 @@ def _num_registered(models: Sequence[ModelSummary]) -> int:
 
 
 def _rank(models: Sequence[ModelSummary]) -> tuple[bool, int]:
-    return bool(models) and models[0].is_trustworthy, _num_registered(models)
+    return bool(models) and models[0].is_consistent, _num_registered(models)
 
 
 def _ignore(_: int) -> None:
