@@ -35,12 +35,16 @@ def _some(lines: Iterable[str]) -> list[str]:
     return shown
 
 
-def _by_story(stories: Mapping[str, str], start: str) -> list[str]:
-    """Return a line for each of the first few stories, with the images that it is true of."""
+def by_story(stories: Mapping[str, str]) -> list[str]:
+    """Return a line for each story, with the images that it is true of."""
     names = defaultdict(list)
     for name, story in stories.items():
         names[story].append(name)
-    return _some(f"{start:12}{such_as(same, MAX_LINES)}: {story}" for story, same in names.items())
+    return [f"{such_as(same, MAX_LINES)}: {story}" for story, same in names.items()]
+
+
+def _by_story(stories: Mapping[str, str], start: str) -> list[str]:
+    return _some(f"{start:12}{line}" for line in by_story(stories))
 
 
 def by_level(level: str, count: int) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 from colmap_affrect.options import flat
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.report import MAX_LINES, ModelSummary, ReconstructionReport
+from colmap_affrect.project.report import MAX_LINES, ModelSummary, ReconstructionReport, by_story
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report import view_graph
 from colmap_affrect.report.page import TEMPLATES, write_page
@@ -136,7 +136,7 @@ def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
     """Return what cannot be trusted, the model as a whole first."""
     texts = [] if report.models else _why_no_model(report)
     texts += [f"The whole model: {why}." for why in model.doubts]
-    texts += [f"{name}: {why}" for name, why in model.doubtful.items()]
+    texts += by_story(model.doubtful)
     texts += [
         f"{name}: focal lengths from {low:.0f} to {high:.0f} px fit as well"
         for name, (low, high) in model.rival_focals_px.items()

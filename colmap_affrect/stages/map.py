@@ -285,7 +285,7 @@ def advice(
         return (TOO_FEW,)
     texts = []
     has_cameras = is_copy(workspace) or Inputs.recorded(workspace).from_database
-    if models and models[0].rival_focals_px and not has_cameras:
+    if models and (models[0].rival_focals_px or models[0].loose) and not has_cameras:
         texts.append(
             "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
             "several focal lengths fit"
