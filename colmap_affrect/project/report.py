@@ -43,10 +43,6 @@ def by_story(stories: Mapping[str, str]) -> list[str]:
     return [f"{such_as(same, MAX_LINES)}: {story}" for story, same in names.items()]
 
 
-def _by_story(stories: Mapping[str, str], start: str) -> list[str]:
-    return _some(f"{start:12}{line}" for line in by_story(stories))
-
-
 def by_level(level: str, count: int) -> str:
     """Say how many pairs a level of a recipe decided, by the name of its rectifier."""
     if level in ("identity", "none"):
@@ -178,19 +174,24 @@ class ModelSummary:
         num_contradicted = len(self.doubtful) - len(self.loose)
         return not self.doubts and len(self.registered_names) - num_contradicted > 1
 
+    def rival_lines(self) -> list[str]:
+        """Say which focal lengths fit as well as those of the model."""
+        return by_story(
+            {
+                name: f"focal lengths from {low:.0f} to {high:.0f} px fit as well"
+                for name, (low, high) in self.rival_focals_px.items()
+            }
+        )
+
     def summary_lines(self) -> list[str]:
         """Return what a summary says of the largest model."""
-        rivals = {
-            name: f"focal lengths from {low:.0f} to {high:.0f} px fit as well"
-            for name, (low, high) in self.rival_focals_px.items()
-        }
-        lines = _by_story(rivals, "")
+        lines = _some(f"            {line}" for line in self.rival_lines())
         lines += _some(
             f"came in     {name} {item.text()}"
             for name, item in self.arrivals.items()
             if item.how != "tracks"
         )
-        lines += _by_story(self.doubtful, "doubtful")
+        lines += _some(f"doubtful    {line}" for line in by_story(self.doubtful))
         lines += [f"doubtful    the whole model: {why}" for why in self.doubts]
         return [
             *lines,
@@ -345,7 +346,7 @@ class ReconstructionReport:
         if self.extended:
             lines += [f"extended    {len(self.extended)} were there, {len(self.added)} came in"]
             lines += [f"            new {name}" for name in self.added]
-        lines += _by_story(self.unregistered, "        not")
+        lines += _some(f"        not {line}" for line in by_story(self.unregistered))
         lines += [f"pairs       {self.num_verified_pairs} of {self.num_pairs} verified"]
         decided = {level: count for level, count in self.pair_levels.items() if count}
         if counts := [by_level(*item) for item in decided.items() if item[0] != "none"]:

@@ -136,11 +136,7 @@ def _doubts(report: ReconstructionReport, model: ModelSummary) -> list[str]:
     """Return what cannot be trusted, the model as a whole first."""
     texts = [] if report.models else _why_no_model(report)
     texts += [f"The whole model: {why}." for why in model.doubts]
-    texts += by_story(model.doubtful)
-    texts += [
-        f"{name}: focal lengths from {low:.0f} to {high:.0f} px fit as well"
-        for name, (low, high) in model.rival_focals_px.items()
-    ]
+    texts += [*by_story(model.doubtful), *model.rival_lines()]
     if report.contradicting_pairs:
         total = sum(report.contradicting_pairs.values())
         texts.append(f"The model contradicts {total} of the verified pairs.")

@@ -47,8 +47,7 @@ def ring(views_per_point: int) -> pycolmap.Reconstruction:
     return model
 
 
-def task_of(**changes: object) -> MappingTask:
-    record = replace(UNKNOWN, **changes)  # type: ignore[arg-type]
+def task_of(record: CameraRecord = UNKNOWN) -> MappingTask:
     return MappingTask(Path("database.db"), None, cameras={1: record})
 
 
@@ -64,6 +63,6 @@ def test_views_of_one_thing_from_around_tell_focal_lengths_by_points_of_many_ima
 
 def test_what_is_known_need_not_be_told_by_points() -> None:
     model = ring(2)
-    assert loose_images(model, task_of(source="exif")) == ()
+    assert loose_images(model, task_of(replace(UNKNOWN, source="exif"))) == ()
     assert loose_images(model, replace(task_of(), cameras={})) == ()
     assert loose_images(pycolmap.Reconstruction(), task_of()) == ()
