@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,6 +21,10 @@ MIN_STEP = 1.15
 
 MIN_SHARE_OF_RIVAL = 0.97
 """Of the best attempt's agreement with the pairs; attempts that come so near are as good as it."""
+
+USUAL_LENSES = 0.7, 2.4
+"""Longer sides: 24 and 85 mm of small film. What pairs that do not tell a focal length well say of
+it may leave out the truth, but they are hardly needed to leave out others."""
 
 MAX_EXCESS = 1.5
 """How far beyond its interval a focal length may be refined; a camera that few points see goes
@@ -46,8 +50,9 @@ def starts(task: MappingTask) -> list[Start]:
     """Return where to start from: as the task is, and where cameras are unknown from elsewhere.
 
     That is: with one camera for images of one size that may share one, first of all since it is
-    the simplest; without distortion; and from focal lengths halfway to both ends of what the pairs
-    allow, for all unknown cameras at once.
+    the simplest; without distortion; from focal lengths halfway to both ends of what the pairs
+    allow, for all unknown cameras at once; and from a long lens, which mapping that starts from a
+    short one hardly ever ends with.
     """
     unknown = {
         key: record
@@ -60,8 +65,13 @@ def starts(task: MappingTask) -> list[Start]:
     shared = _shared(task.cameras)
     if shared:
         found.insert(0, Start(records=shared, distortion_held=True))
-    for side in ("low_px", "high_px"):
-        moved = dict(_halfway(unknown, side))
+    ends = [_halfway(unknown, side) for side in ("low_px", "high_px")]
+    for focals in [*ends, {key: _usual(record)[1] for key, record in unknown.items()}]:
+        moved = {
+            key: focal
+            for key, focal in focals.items()
+            if max(focal, unknown[key].focal_px) > MIN_STEP * min(focal, unknown[key].focal_px)
+        }
         if moved:
             found.append(Start(moved, distortion_held=True))
     return found
@@ -84,13 +94,15 @@ def _shared(records: Mapping[int, CameraRecord]) -> dict[int, CameraRecord]:
     return merged if len(merged) < len(records) else {}
 
 
-def _halfway(records: Mapping[int, CameraRecord], side: str) -> Iterator[tuple[int, float]]:
-    for key, record in records.items():
-        end = getattr(record, side)
-        if end:
-            focal = float((record.focal_px * end) ** 0.5)
-            if max(focal, record.focal_px) > MIN_STEP * min(focal, record.focal_px):
-                yield key, focal
+def _halfway(records: Mapping[int, CameraRecord], side: str) -> dict[int, float]:
+    ends = ((key, record.focal_px, getattr(record, side)) for key, record in records.items())
+    return {key: float((focal * end) ** 0.5) for key, focal, end in ends if end}
+
+
+def _usual(record: CameraRecord) -> tuple[float, float]:
+    """Return the focal lengths in px that usual lenses have."""
+    longer = max(record.size)
+    return USUAL_LENSES[0] * longer, USUAL_LENSES[1] * longer
 
 
 def started(task: MappingTask, start: Start, path: Path) -> MappingTask:
@@ -155,4 +167,8 @@ def is_within(focal_px: float, record: CameraRecord) -> bool:
     """Tell whether a focal length agrees with what is on record of it; so does any without."""
     if record.low_px is None or record.high_px is None:
         return True
-    return record.low_px / MAX_EXCESS <= focal_px <= record.high_px * MAX_EXCESS
+    low, high = record.low_px, record.high_px
+    if record.source == "guess":
+        usual = _usual(record)
+        low, high = min(low, usual[0]), max(high, usual[1])
+    return low / MAX_EXCESS <= focal_px <= high * MAX_EXCESS

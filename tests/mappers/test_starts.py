@@ -66,12 +66,12 @@ def test_vague_cameras_start_from_both_sides_and_known_ones_from_what_is_known()
     wider = replace(VAGUE, focal_px=900.0, low_px=900.0, high_px=1600.0)
     no_vote = replace(VAGUE, low_px=None, high_px=None)
     task = task_of({1: VAGUE, 2: KNOWN, 3: wider, 4: no_vote})
-    first, straight, low, high = starts(task)
+    first, straight, low, high, long = starts(task)
     assert (first, straight) == (Start(), Start(distortion_held=True))
     assert low.focals_px == {1: pytest.approx(500.0 * 2**0.5)}
     assert high.focals_px == {1: pytest.approx(1000.0 * 2**0.5), 3: pytest.approx(1200.0)}
-    assert low.distortion_held
-    assert high.distortion_held
+    assert long.focals_px == {key: pytest.approx(2.4 * 1024) for key in (1, 3)}
+    assert all(start.distortion_held for start in (low, high, long))
     assert starts(task_of({2: KNOWN, 4: no_vote})) == [Start()]
     assert starts(task_of({})) == [Start()]
 
@@ -101,7 +101,13 @@ def test_cameras_far_beyond_their_interval_ran_away(
     assert is_within(low / MAX_EXCESS, KNOWN)
     assert not is_within(0.99 * low / MAX_EXCESS, KNOWN)
     assert is_within(1e9, replace(KNOWN, low_px=None))
-    cameras = {1: KNOWN, 2: replace(KNOWN, low_px=300.0, high_px=400.0), 99: VAGUE}
+    guess = replace(KNOWN, source="guess", low_px=300.0, high_px=400.0)
+    assert is_within(2.4 * 1024 * MAX_EXCESS, guess)
+    assert not is_within(2.41 * 1024 * MAX_EXCESS, guess)
+    assert is_within(300.0 / MAX_EXCESS, guess)
+    assert is_within(0.7 * 1024 / MAX_EXCESS, replace(guess, low_px=900.0))
+    assert is_within(3000.0 * MAX_EXCESS, replace(guess, high_px=3000.0))
+    cameras = {1: KNOWN, 2: replace(KNOWN, low_px=300.0, high_px=400.0), 3: guess, 99: VAGUE}
     assert runaways(scene[1], replace(task_of(cameras))) == {2}
 
 
@@ -155,7 +161,7 @@ def test_unknown_cameras_are_started_from_all_sides_unless_all_images_are_tied_w
     mapper = Recorder(lambda _: without(scene, 0))
     mapped(scene, tmp_path, mapper, cameras)
     assert [focals[1] for focals in mapper.focals] == pytest.approx(
-        [1280.0, 1280.0, 707.1, 1414.2], abs=0.1
+        [1280.0, 1280.0, 707.1, 1414.2, 2457.6], abs=0.1
     )
     assert {focals[0] for focals in mapper.focals} == {TRUE_FOCAL}
     known = Recorder(lambda _: without(scene, 0), num=3)
@@ -178,7 +184,7 @@ def test_focal_lengths_that_pairs_cannot_tell_apart_are_kept_beside_the_model(
 ) -> None:
     monkeypatch.setattr(attempts, "MIN_NUM_TRACKS", 1_000)
     monkeypatch.setattr(module, "MIN_SHARE_OF_RIVAL", 0.0)
-    focals = iter([1280.0, 1360.0, 1150.0, 1200.0])
+    focals = iter([1280.0, 1360.0, 1150.0, 1200.0, 1250.0])
     mapper = Recorder(lambda _: without(scene, 0, c2=next(focals)))
     cameras = {**records(scene, replace(KNOWN, focal_px=TRUE_FOCAL)), 2: VAGUE}
     mapped(scene, tmp_path, mapper, cameras)
@@ -244,6 +250,27 @@ def test_images_that_the_last_adjustment_leaves_without_points_are_taken_out(
     assert again.focals_px != model.focals_px
     assert (again.taken_out, again.arrivals) == (model.taken_out, model.arrivals)
     assert read_summary(folder) == again
+
+
+@pytest.mark.parametrize("growth", [1.01, 1.5])
+def test_an_adjustment_after_which_pairs_disagree_is_not_kept(
+    scene: tuple[Path, pycolmap.Reconstruction],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    growth: float,
+) -> None:
+    def move(model: pycolmap.Reconstruction, *_: object, **__: object) -> None:
+        for camera in model.cameras.values():
+            camera.focal_length *= growth
+
+    monkeypatch.setattr(attempts, "adjust_last", move)
+    bridge = Bridge(("a", "b"), ("b",), 20, 20, 0.01)
+    mapper = Recorder(lambda _: [replace(m, bridges=(bridge,)) for m in without(scene, 0)])
+    mapped(scene, tmp_path, mapper, records(scene, replace(KNOWN, focal_px=TRUE_FOCAL)))
+    read = read_summary(tmp_path / "sparse" / "0")
+    assert read
+    kept = growth if growth < 1.1 else 1.0
+    assert list(read.focals_px.values()) == pytest.approx(NUM_IMAGES * [kept * TRUE_FOCAL])
 
 
 def test_large_models_are_mapped_once(
