@@ -64,13 +64,17 @@ def _some(points: Array) -> Array:
     return points[:: -(-len(points) // MAX_NUM_POINTS)] if len(points) else points
 
 
-def mirrored_share(points1: Floats, points2: Floats, size: Size) -> float:
-    """Return the share of all keypoints of image 1 that a mirrored copy of it, image 2, has too.
+def mirrored_share(points1: Floats, points2: Floats, sizes: tuple[Size, Size]) -> float:
+    """Return the share of the keypoints of an image that a mirrored copy, of any size, has too.
 
-    Beyond what chance brings, which of dense keypoints is most: as a share of what it leaves.
+    Of the image with fewer of them, as a smaller copy keeps not all. Beyond what chance brings,
+    which of dense keypoints is most: as a share of what it leaves.
     """
+    if len(points2) < len(points1):
+        points1, points2, sizes = points2, points1, sizes[::-1]
+    size = sizes[0]
     row = size[0] + 4
-    taken = np.unique(_cells(points2, row))
+    taken = np.unique(_cells(points2 * np.divide(size, sizes[1]), row))
     neighbors = np.array([y * row + x for y in (-1, 0, 1) for x in (-1, 0, 1)])
     shares = [0.0]
     for axis in (0, 1) if len(points1) else ():

@@ -145,30 +145,60 @@ def test_camera_that_only_turned(tmp_path: Path) -> None:
     assert doubt.startswith("no parallax: the camera only turned")
 
 
-def test_mirrored_copies(tmp_path: Path) -> None:
-    model, task = scene(tmp_path)
+def add_mirrored_copy(model: MappedModel, task: MappingTask, share_right: float = 1.0) -> list[str]:
+    """Let one image have the keypoints of a smaller mirrored copy of another, beside its own.
+
+    Of its own only a share stays right. Returns the names of the other and of the copy.
+    """
     image = last(model)
     with open_database(task.database_path) as database:
-        database_pairs = inlier_matches(task.database_path, 1)
-        other = next(ids[0] for ids in database_pairs if ids[1] == image.image_id)
-        points = database.read_keypoints(image.image_id)
-        points[:, 0] = image.camera.width - points[:, 0]
-        old = database.read_keypoints(other)
-        database.update_keypoints(other, np.vstack([points, old])[: max(len(points), len(old))])
-    assert any("mirrored copies" in text for text in find_doubts(model, task).model)
+        pairs = inlier_matches(task.database_path, 1)
+        other = next(ids[0] for ids in pairs if ids[1] == image.image_id)
+        copy = model.reconstruction.images[other]
+        camera = copy.camera
+        points = 0.75 * database.read_keypoints(image.image_id)[:, :2]
+        camera.width, camera.height = int(0.75 * camera.width), int(0.75 * camera.height)
+        database.update_camera(camera)
+        points[:, 0] = camera.width - points[:, 0]
+        old = database.read_keypoints(other)[:, :2]
+        old[int(share_right * len(old)) :] += 40.0 * np.array([1.0, -0.6])
+        database.update_keypoints(other, np.vstack([old, points, old]))
+    return [image.name, copy.name]
+
+
+def test_mirrored_copies_that_the_others_support_alike(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    names = " and ".join(sorted(add_mirrored_copy(model, task)))
+    doubts = find_doubts(model, task)
+    assert doubts.model == (f"{names} are mirrored copies of one photograph",)
+    assert doubts.impossible == ()
+
+
+def test_mirrored_copy_leaves_and_the_photograph_stays(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    photograph, copy = add_mirrored_copy(model, task, share_right=0.55)
+    kept = without_impossible(model, task)
+    assert kept is not None
+    assert list(kept.taken_out) == [copy]
+    assert f"a mirrored copy of {photograph}" in kept.taken_out[copy]
+    doubts = find_doubts(kept, task)
+    assert (doubts.images, doubts.model) == ({}, ())
 
 
 def test_dense_keypoints_are_no_mirrored_copies() -> None:
-    rng, size = np.random.default_rng(2), (320, 240)
+    rng, size, smaller = np.random.default_rng(2), (320, 240), (256, 192)
     few, many, others = (rng.uniform(0, size, (number, 2)) for number in (900, 12000, 12000))
-    assert mirrored_share(many, others, size) < 0.3
-    assert mirrored_share(many, many, size) < 0.3
+    assert mirrored_share(many, others, (size, size)) < 0.3
+    assert mirrored_share(many, many, (size, size)) < 0.3
     for axis in (0, 1):
         copies = [points.copy() for points in (few, many)]
         for points in copies:
             points[:, axis] = size[axis] - points[:, axis]
-        assert mirrored_share(few, copies[0], size) > 0.9
-        assert mirrored_share(many, copies[1], size) > 0.9
+        assert mirrored_share(few, copies[0], (size, size)) > 0.9
+        assert mirrored_share(many, copies[1], (size, size)) > 0.9
+        fewer = 0.8 * copies[0][:500]
+        assert mirrored_share(few, fewer, (size, smaller)) > 0.9
+        assert mirrored_share(fewer, few, (smaller, size)) > 0.9
 
 
 def test_views_from_nearly_one_place(tmp_path: Path) -> None:
