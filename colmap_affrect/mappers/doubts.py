@@ -9,8 +9,6 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import islice
-from math import ceil
 from typing import cast
 
 import numpy as np
@@ -50,9 +48,10 @@ MAX_ERROR = 0.003
 MAX_SCALE_ERROR_FRAC = 0.1
 """Of a bridged image: beyond, its distance is a guess."""
 
-MIN_SHARE_STILL, MIN_SHARE_OF_STILL_PAIRS = 0.8, 0.9
-"""A rotation explains nearly all matches of views from one place, and at most two thirds of those
-of flat ground from a kite. Some steps of a walk look still; not nearly all pairs do."""
+MIN_SHARE_STILL = 0.8
+"""Of the matches of all pairs, each counted by the root of its inliers. A rotation explains nearly
+all of those of views from one place, except of some wrong pairs, and at most two thirds of those of
+flat ground from a kite. Some steps of a walk look still; not nearly all pairs do."""
 
 MIN_SHARE_MIRRORED = 0.5
 """Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
@@ -133,11 +132,6 @@ def without_impossible(model: MappedModel, task: MappingTask) -> MappedModel | N
 def _camera(image: pycolmap.Image) -> pycolmap.Camera:
     """Return the camera, which registered images always have."""
     return cast("pycolmap.Camera", image.camera)
-
-
-def _size(image: pycolmap.Image) -> Size:
-    camera = _camera(image)
-    return camera.width, camera.height
 
 
 def _side(camera: pycolmap.Camera) -> int:
@@ -247,18 +241,7 @@ def _model_doubts(model: MappedModel, graph: PairGraph) -> Iterator[str]:
     angles = [wide for of_image in _angles_deg(reconstruction).values() for _, wide in of_image]
     registered = set(reconstruction.reg_image_ids())
     some = _some(graph.pairs_inside(registered))
-    shown = {pair.ids: tuple(reconstruction.images[i] for i in pair.ids) for pair in some}
-    sizes = {ids: (_size(first), _size(second)) for ids, (first, second) in shown.items()}
-    moving = (
-        pair
-        for pair in some
-        if rotation_share(
-            *graph.points(pair), sizes[pair.ids], MAX_ERROR * max(map(max, sizes[pair.ids]))
-        )
-        < MIN_SHARE_STILL
-    )
-    max_num_moving = len(some) - ceil(MIN_SHARE_OF_STILL_PAIRS * len(some))
-    if some and next(islice(moving, max_num_moving, None), None) is None:
+    if _are_still(some, graph):
         yield (
             "no parallax: the camera only turned or zoomed, or the photographs are copies or "
             "crops of one another"
@@ -276,6 +259,23 @@ def _model_doubts(model: MappedModel, graph: PairGraph) -> Iterator[str]:
             yield f"only {num_ties} points are seen by three photographs"
 
 
+def _are_still(pairs: Sequence[VerifiedPair], graph: PairGraph) -> bool:
+    """Tell whether a camera that only turned, or zoomed, explains nearly all matches of pairs."""
+    left = (1.0 - MIN_SHARE_STILL) * sum(pair.weight for pair in pairs)
+    for pair in pairs:
+        sizes = _sizes(graph, pair.ids)
+        share = rotation_share(*graph.points(pair), sizes, MAX_ERROR * max(map(max, sizes)))
+        left -= (1.0 - share) * pair.weight
+        if left < 0.0:
+            return False
+    return bool(pairs)
+
+
+def _sizes(graph: PairGraph, ids: Ids) -> tuple[Size, Size]:
+    first, second = (graph.cameras[image_id] for image_id in ids)
+    return (first.width, first.height), (second.width, second.height)
+
+
 def _some(pairs: Sequence[VerifiedPair]) -> Sequence[VerifiedPair]:
     return pairs[:: max(1, len(pairs) // MAX_PAIRS_FOR_PARALLAX)]
 
@@ -285,8 +285,8 @@ def _mirrored_pairs(graph: PairGraph) -> tuple[Ids, ...]:
     """Return the pairs whose images are mirrored copies of one another, once for all attempts."""
 
     def share(first: int, second: int) -> float:
-        size1, size2 = ((c.width, c.height) for c in (graph.cameras[first], graph.cameras[second]))
-        return mirrored_share(graph.keypoints[first], graph.keypoints[second], (size1, size2))
+        keypoints = graph.keypoints[first], graph.keypoints[second]
+        return mirrored_share(*keypoints, _sizes(graph, (first, second)))
 
     return tuple(pair.ids for pair in _some(graph.pairs) if share(*pair.ids) >= MIN_SHARE_MIRRORED)
 

@@ -125,8 +125,22 @@ def write_keypoints(model: MappedModel, task: MappingTask, points_of: object) ->
             database.update_keypoints(image_id, points.astype(np.float32))
 
 
-def test_camera_that_only_turned(tmp_path: Path) -> None:
+def mismatch_one_pair(task: MappingTask, num: int) -> None:
+    """Let a few matches of one pair be the only ones, and wrong."""
+    ids = min(inlier_matches(task.database_path, 1))
+    with open_database(task.database_path) as database:
+        geometry = database.read_two_view_geometry(*ids)
+        matches = np.array(geometry.inlier_matches)
+        matches[:, 1] = np.roll(matches[:, 1], 7)
+        geometry.inlier_matches = matches[:num]
+        database.update_two_view_geometry(*ids, geometry)
+
+
+@pytest.mark.parametrize("has_wrong_pair", [False, True])
+def test_camera_that_only_turned(tmp_path: Path, *, has_wrong_pair: bool) -> None:
     model, task = scene(tmp_path)
+    if has_wrong_pair:
+        mismatch_one_pair(task, 20)
     first = model.reconstruction.images[min(model.reconstruction.reg_image_ids())]
     pose, rng = first.cam_from_world(), np.random.default_rng(3)
 
