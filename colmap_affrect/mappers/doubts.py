@@ -5,7 +5,7 @@ Doubts have two degrees: what is certainly wrong leaves the model, the rest is t
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -58,8 +58,8 @@ MIN_SHARE_MIRRORED = 0.5
 images a tenth by chance."""
 
 MAX_SUPPORT_OF_COPY = 2 / 3
-"""Of the matches of the photograph itself. A single mirrored copy has what is symmetric in common
-with the others, half of that at most; in a set that is mirrored as a whole both have the same."""
+"""Of the matches of the photograph itself. A mirrored copy has only what is symmetric in common
+with the others, half of that at most."""
 
 MIN_WIDE_ANGLE_DEG, MIN_SHARE_WIDE = 3.0, 0.1
 """Points under smaller angles only have no depth to speak of (COLMAP drops those below 1.5)."""
@@ -294,16 +294,19 @@ def _mirrored_pairs(graph: PairGraph) -> tuple[Ids, ...]:
 def _originals(graph: PairGraph, agreeing_of: Mapping[Ids, float]) -> dict[int, int]:
     """Return the original of each mirrored copy, where the other images tell which one it is.
 
-    No model holds both, and the photograph is the one that more of their matches agree with.
+    No model holds both, and the photograph is the one that more of their matches agree with. Images
+    that have a mirrored copy themselves do not count: they may be copies that hold each other.
     """
-    support: Counter[int] = Counter()
-    mirrored = [ids for ids in _mirrored_pairs(graph) if ids in agreeing_of]
-    for ids in agreeing_of.keys() - set(mirrored):
-        support.update(dict.fromkeys(ids, agreeing_of[ids]))
+    mirrored = _mirrored_pairs(graph)
+    unclear = {image_id for ids in mirrored for image_id in ids}
+    support: defaultdict[int, float] = defaultdict(float)
+    for (first, second), agreeing in agreeing_of.items():
+        support[first] += 0.0 if second in unclear else agreeing
+        support[second] += 0.0 if first in unclear else agreeing
     found = {}
     for ids in mirrored:
         copy, original = sorted(ids, key=lambda image_id: support[image_id])
-        if support[copy] < MAX_SUPPORT_OF_COPY * support[original]:
+        if ids in agreeing_of and support[copy] < MAX_SUPPORT_OF_COPY * support[original]:
             found[copy] = original
     return found
 

@@ -159,30 +159,29 @@ def test_camera_that_only_turned(tmp_path: Path, *, has_wrong_pair: bool) -> Non
     assert doubt.startswith("no parallax: the camera only turned")
 
 
-def add_mirrored_copy(model: MappedModel, task: MappingTask, share_right: float = 1.0) -> list[str]:
-    """Let one image have the keypoints of a smaller mirrored copy of another, beside its own.
+def add_mirrored_copy(
+    model: MappedModel, task: MappingTask, ids: tuple[int, int], share_right: float = 1.0
+) -> list[str]:
+    """Let image ``ids[1]`` have the keypoints of a smaller mirrored copy of the other, too.
 
-    Of its own only a share stays right. Returns the names of the other and of the copy.
+    Of its own only a share stays right. Returns the names of both.
     """
-    image = last(model)
+    image, copy = (model.reconstruction.images[image_id] for image_id in ids)
+    camera = copy.camera
     with open_database(task.database_path) as database:
-        pairs = inlier_matches(task.database_path, 1)
-        other = next(ids[0] for ids in pairs if ids[1] == image.image_id)
-        copy = model.reconstruction.images[other]
-        camera = copy.camera
         points = 0.75 * database.read_keypoints(image.image_id)[:, :2]
         camera.width, camera.height = int(0.75 * camera.width), int(0.75 * camera.height)
         database.update_camera(camera)
         points[:, 0] = camera.width - points[:, 0]
-        old = database.read_keypoints(other)[:, :2]
+        old = database.read_keypoints(copy.image_id)[:, :2]
         old[int(share_right * len(old)) :] += 40.0 * np.array([1.0, -0.6])
-        database.update_keypoints(other, np.vstack([old, points, old]))
+        database.update_keypoints(copy.image_id, np.vstack([old, points, old]))
     return [image.name, copy.name]
 
 
 def test_mirrored_copies_that_the_others_support_alike(tmp_path: Path) -> None:
     model, task = scene(tmp_path)
-    names = " and ".join(sorted(add_mirrored_copy(model, task)))
+    names = " and ".join(sorted(add_mirrored_copy(model, task, (4, 1))))
     doubts = find_doubts(model, task)
     assert doubts.model == (f"{names} are mirrored copies of one photograph",)
     assert doubts.impossible == ()
@@ -190,13 +189,24 @@ def test_mirrored_copies_that_the_others_support_alike(tmp_path: Path) -> None:
 
 def test_mirrored_copy_leaves_and_the_photograph_stays(tmp_path: Path) -> None:
     model, task = scene(tmp_path)
-    photograph, copy = add_mirrored_copy(model, task, share_right=0.55)
+    photograph, copy = add_mirrored_copy(model, task, (4, 1), share_right=0.55)
     kept = without_impossible(model, task)
     assert kept is not None
     assert list(kept.taken_out) == [copy]
     assert f"a mirrored copy of {photograph}" in kept.taken_out[copy]
     doubts = find_doubts(kept, task)
     assert (doubts.images, doubts.model) == ({}, ())
+
+
+def test_copies_of_a_set_that_is_mirrored_as_a_whole_do_not_tell_of_each_other(
+    tmp_path: Path,
+) -> None:
+    model, task = scene(tmp_path)
+    add_mirrored_copy(model, task, (4, 1), share_right=0.55)
+    add_mirrored_copy(model, task, (3, 2))
+    doubts = find_doubts(model, task)
+    assert doubts.impossible == ()
+    assert any("mirrored copies" in text for text in doubts.model)
 
 
 def test_dense_keypoints_are_no_mirrored_copies() -> None:
