@@ -20,7 +20,11 @@ MAX_NUM_POINTS = 500  # enough to measure a share to two per cent
 MIN_DEPTH = 1e-3  # of a turned ray of length 1; what is behind lands far outside of the image
 DISPLACEMENT_PX = np.array([13.0, 7.0])  # so moved, keypoints meet others by chance only
 MIN_FREE_SHARE = 0.1  # where keypoints are so dense that chance leaves less, nothing can be told
-MAX_ITERATIONS = 3  # least squares are repeated without outliers; a verified pair has few of them
+NUM_STARTS = 30
+"""Rotations of two matches each, of which least squares begin with the best. A strip that two views
+have in common tells their rotation badly, and where things repeat a quarter of its matches may be
+wrong, which have more weight then than the strip."""
+MAX_ITERATIONS = 3  # least squares are repeated without outliers
 
 
 def rotation_share(points1: Array, points2: Array, sizes: tuple[Size, Size], error: float) -> float:
@@ -43,15 +47,27 @@ def rotation_share(points1: Array, points2: Array, sizes: tuple[Size, Size], err
 def _share_of(points1: Array, points2: Array, focal: float, zoom: float, error: float) -> float:
     """Return the share of matches within ``error`` px of the best rotation."""
     rays1, rays2 = _rays(points1 / focal), _rays(points2 / (focal * zoom))
-    kept, errors = np.ones(len(rays1), bool), np.zeros(len(rays1))
+
+    def errors_of(rotations: Array) -> Array:
+        turned = rays1 @ np.swapaxes(rotations, -1, -2)
+        depths = np.maximum(turned[..., 2:], MIN_DEPTH)
+        moved = turned[..., :2] / depths * focal * zoom - points2
+        return np.asarray(np.linalg.norm(moved, axis=-1))
+
+    picked = np.random.default_rng(0).integers(len(rays1), size=(NUM_STARTS, 2))
+    started = errors_of(_rotations(rays1[picked], rays2[picked]))
+    errors = started[np.median(started, axis=1).argmin()]
     for _ in range(MAX_ITERATIONS):
-        left, _, right = np.linalg.svd(rays2[kept].T @ rays1[kept])
-        rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-        turned = rays1 @ rotation.T
-        depths = np.maximum(turned[:, 2:], MIN_DEPTH)
-        errors = np.linalg.norm(turned[:, :2] / depths * focal * zoom - points2, axis=1)
         kept = errors <= max(error, float(np.median(errors)))
+        errors = errors_of(_rotations(rays1[kept], rays2[kept]))
     return float((errors <= error).mean())
+
+
+def _rotations(rays1: Array, rays2: Array) -> Array:
+    """Return the (..., 3, 3) rotations that turn (..., N, 3) rays best into others."""
+    left, _, right = np.linalg.svd(np.swapaxes(rays2, -1, -2) @ rays1)
+    left[..., 2] *= np.linalg.det(left @ right)[..., None]
+    return np.asarray(left @ right)
 
 
 def _rays(points: Array) -> Array:
@@ -64,13 +80,17 @@ def _some(points: Array) -> Array:
     return points[:: -(-len(points) // MAX_NUM_POINTS)] if len(points) else points
 
 
-def mirrored_share(points1: Floats, points2: Floats, size: Size) -> float:
-    """Return the share of all keypoints of image 1 that a mirrored copy of it, image 2, has too.
+def mirrored_share(points1: Floats, points2: Floats, sizes: tuple[Size, Size]) -> float:
+    """Return the share of the keypoints of an image that a mirrored copy, of any size, has too.
 
-    Beyond what chance brings, which of dense keypoints is most: as a share of what it leaves.
+    Of the image with fewer of them, as a smaller copy keeps not all. Beyond what chance brings,
+    which of dense keypoints is most: as a share of what it leaves.
     """
+    if len(points2) < len(points1):
+        points1, points2, sizes = points2, points1, sizes[::-1]
+    size = sizes[0]
     row = size[0] + 4
-    taken = np.unique(_cells(points2, row))
+    taken = np.unique(_cells(points2 * np.divide(size, sizes[1]), row))
     neighbors = np.array([y * row + x for y in (-1, 0, 1) for x in (-1, 0, 1)])
     shares = [0.0]
     for axis in (0, 1) if len(points1) else ():

@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
-from math import ceil
+from functools import lru_cache
 from typing import cast
 
 import numpy as np
@@ -19,7 +18,13 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
 from colmap_affrect.mappers.arrivals import MIN_THREE_VIEW_POINTS
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
-from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of, graph_of, poses_of
+from colmap_affrect.mappers.pair_graph import (
+    PairGraph,
+    VerifiedPair,
+    cameras_of,
+    graph_of,
+    poses_of,
+)
 
 FOCAL_LENGTHS = (0.3, 10.0)
 """Longer sides: 120 and 6 degrees, beyond all lenses of photographs that anybody reconstructs."""
@@ -43,12 +48,18 @@ MAX_ERROR = 0.003
 MAX_SCALE_ERROR_FRAC = 0.1
 """Of a bridged image: beyond, its distance is a guess."""
 
-MIN_SHARE_STILL, MIN_SHARE_OF_STILL_PAIRS = 0.8, 0.9
-"""A rotation explains nearly all matches of views from one place, and at most two thirds of those
-of flat ground from a kite. Some steps of a walk look still; not nearly all pairs do."""
+MIN_SHARE_STILL = 0.8
+"""Of the matches of all pairs, each counted by the root of its inliers. A rotation explains nearly
+all of those of views from one place, except of some wrong pairs, and at most two thirds of those of
+flat ground from a kite. Some steps of a walk look still; not nearly all pairs do."""
 
 MIN_SHARE_MIRRORED = 0.5
-"""Mirrored copies have nearly all keypoints in common, other images a tenth by chance."""
+"""Mirrored copies have nearly all keypoints in common, two thirds where the copy is smaller, other
+images a tenth by chance."""
+
+MAX_SUPPORT_OF_COPY = 2 / 3
+"""Of the matches of the photograph itself. A mirrored copy has only what is symmetric in common
+with the others, half of that at most."""
 
 MIN_WIDE_ANGLE_DEG, MIN_SHARE_WIDE = 3.0, 0.1
 """Points under smaller angles only have no depth to speak of (COLMAP drops those below 1.5)."""
@@ -123,11 +134,6 @@ def _camera(image: pycolmap.Image) -> pycolmap.Camera:
     return cast("pycolmap.Camera", image.camera)
 
 
-def _size(image: pycolmap.Image) -> Size:
-    camera = _camera(image)
-    return camera.width, camera.height
-
-
 def _side(camera: pycolmap.Camera) -> int:
     return max(camera.width, camera.height)
 
@@ -142,10 +148,13 @@ def _image_doubts(
     poses, cameras = poses_of(reconstruction), cameras_of(reconstruction)
     given = {key for key, record in task.cameras.items() if record.is_fixed}
     totals = {image_id: np.zeros(2) for image_id in registered}
+    agreeing_of: dict[Ids, float] = {}
     for pair in graph.pairs_inside(registered):
         count = len(pair.matches)
+        agreeing_of[pair.ids] = count * graph.agreement(pair, poses, cameras)
         for image_id in pair.ids:
-            totals[image_id] += count * graph.agreement(pair, poses, cameras), count
+            totals[image_id] += agreeing_of[pair.ids], count
+    originals = _originals(graph, agreeing_of)
     reasons: dict[str, str] = {}
     angles, near = _angles_deg(reconstruction), _images_nearby(reconstruction)
     impossible: list[tuple[float, int, str]] = []
@@ -159,6 +168,7 @@ def _image_doubts(
                 image.num_points3D, agreement, [next_deg for next_deg, _ in angles[image_id]]
             ),
             *_place_doubts(near[image_id], len(registered) - 1),
+            *_copy_doubts(graph.names.get(originals.get(image_id, -1))),
             *_bridge_doubts(bridges.get(image.name)),
             *_focal_doubts(image.name in loose),
         ]
@@ -203,6 +213,11 @@ def _place_doubts(nearby: Sequence[str], num_others: int) -> Iterator[tuple[str,
         yield f"{place}: the directions between them are uncertain", False
 
 
+def _copy_doubts(original: str | None) -> Iterator[tuple[str, bool]]:
+    if original:
+        yield f"a mirrored copy of {original}", True
+
+
 def _bridge_doubts(bridge: Bridge | None) -> Iterator[tuple[str, bool]]:
     if bridge and not bridge.scale_error_frac <= MAX_SCALE_ERROR_FRAC:
         error = f"{bridge.scale_error_frac:.0%}"
@@ -224,37 +239,76 @@ def _model_doubts(model: MappedModel, graph: PairGraph) -> Iterator[str]:
     if num_images < 3 <= num_given:
         yield f"only {num_images} of {num_given} photographs, which no third one confirms"
     angles = [wide for of_image in _angles_deg(reconstruction).values() for _, wide in of_image]
-    pairs = graph.pairs_inside(set(reconstruction.reg_image_ids()))
-    some = pairs[:: max(1, len(pairs) // MAX_PAIRS_FOR_PARALLAX)]
-    shown = {pair.ids: tuple(reconstruction.images[i] for i in pair.ids) for pair in some}
-    sizes = {ids: (_size(first), _size(second)) for ids, (first, second) in shown.items()}
-    moving = (
-        pair
-        for pair in some
-        if rotation_share(
-            *graph.points(pair), sizes[pair.ids], MAX_ERROR * max(map(max, sizes[pair.ids]))
-        )
-        < MIN_SHARE_STILL
-    )
-    max_num_moving = len(some) - ceil(MIN_SHARE_OF_STILL_PAIRS * len(some))
-    if some and next(islice(moving, max_num_moving, None), None) is None:
+    registered = set(reconstruction.reg_image_ids())
+    some = _some(graph.pairs_inside(registered))
+    if _are_still(some, graph):
         yield (
             "no parallax: the camera only turned or zoomed, or the photographs are copies or "
             "crops of one another"
         )
     elif np.mean(np.array(angles or [0.0]) >= MIN_WIDE_ANGLE_DEG) < MIN_SHARE_WIDE:
         yield f"hardly any parallax: rays are less than {MIN_WIDE_ANGLE_DEG:g} degrees apart"
-    for ids in shown:
-        same = sizes[ids][0] == sizes[ids][1]
-        keypoints = (graph.keypoints[ids[0]], graph.keypoints[ids[1]])
-        if same and mirrored_share(*keypoints, sizes[ids][0]) >= MIN_SHARE_MIRRORED:
-            first, second = sorted(image.name for image in shown[ids])
-            yield f"{first} and {second} are mirrored copies of one photograph"
+    for first, second in _mirrored_pairs(graph):
+        if {first, second} <= registered:
+            names = " and ".join(sorted((graph.names[first], graph.names[second])))
+            yield f"{names} are mirrored copies of one photograph"
             break
     if num_images > 2 and not model.bridges:
         num_ties = sum(p.track.length() > 2 for p in reconstruction.points3D.values())
         if num_ties < MIN_THREE_VIEW_POINTS:
             yield f"only {num_ties} points are seen by three photographs"
+
+
+def _are_still(pairs: Sequence[VerifiedPair], graph: PairGraph) -> bool:
+    """Tell whether a camera that only turned, or zoomed, explains nearly all matches of pairs."""
+    left = (1.0 - MIN_SHARE_STILL) * sum(pair.weight for pair in pairs)
+    for pair in pairs:
+        sizes = _sizes(graph, pair.ids)
+        share = rotation_share(*graph.points(pair), sizes, MAX_ERROR * max(map(max, sizes)))
+        left -= (1.0 - share) * pair.weight
+        if left < 0.0:
+            return False
+    return bool(pairs)
+
+
+def _sizes(graph: PairGraph, ids: Ids) -> tuple[Size, Size]:
+    first, second = (graph.cameras[image_id] for image_id in ids)
+    return (first.width, first.height), (second.width, second.height)
+
+
+def _some(pairs: Sequence[VerifiedPair]) -> Sequence[VerifiedPair]:
+    return pairs[:: max(1, len(pairs) // MAX_PAIRS_FOR_PARALLAX)]
+
+
+@lru_cache(maxsize=1)
+def _mirrored_pairs(graph: PairGraph) -> tuple[Ids, ...]:
+    """Return the pairs whose images are mirrored copies of one another, once for all attempts."""
+
+    def share(first: int, second: int) -> float:
+        keypoints = graph.keypoints[first], graph.keypoints[second]
+        return mirrored_share(*keypoints, _sizes(graph, (first, second)))
+
+    return tuple(pair.ids for pair in _some(graph.pairs) if share(*pair.ids) >= MIN_SHARE_MIRRORED)
+
+
+def _originals(graph: PairGraph, agreeing_of: Mapping[Ids, float]) -> dict[int, int]:
+    """Return the original of each mirrored copy, where the other images tell which one it is.
+
+    No model holds both, and the photograph is the one that more of their matches agree with. Images
+    that have a mirrored copy themselves do not count: they may be copies that hold each other.
+    """
+    mirrored = _mirrored_pairs(graph)
+    unclear = {image_id for ids in mirrored for image_id in ids}
+    support: defaultdict[int, float] = defaultdict(float)
+    for (first, second), agreeing in agreeing_of.items():
+        support[first] += 0.0 if second in unclear else agreeing
+        support[second] += 0.0 if first in unclear else agreeing
+    found = {}
+    for ids in mirrored:
+        copy, original = sorted(ids, key=lambda image_id: support[image_id])
+        if ids in agreeing_of and support[copy] < MAX_SUPPORT_OF_COPY * support[original]:
+            found[copy] = original
+    return found
 
 
 def _images_nearby(model: pycolmap.Reconstruction) -> dict[int, list[str]]:

@@ -125,8 +125,22 @@ def write_keypoints(model: MappedModel, task: MappingTask, points_of: object) ->
             database.update_keypoints(image_id, points.astype(np.float32))
 
 
-def test_camera_that_only_turned(tmp_path: Path) -> None:
+def mismatch_one_pair(task: MappingTask, num: int) -> None:
+    """Let a few matches of one pair be the only ones, and wrong."""
+    ids = min(inlier_matches(task.database_path, 1))
+    with open_database(task.database_path) as database:
+        geometry = database.read_two_view_geometry(*ids)
+        matches = np.array(geometry.inlier_matches)
+        matches[:, 1] = np.roll(matches[:, 1], 7)
+        geometry.inlier_matches = matches[:num]
+        database.update_two_view_geometry(*ids, geometry)
+
+
+@pytest.mark.parametrize("has_wrong_pair", [False, True])
+def test_camera_that_only_turned(tmp_path: Path, *, has_wrong_pair: bool) -> None:
     model, task = scene(tmp_path)
+    if has_wrong_pair:
+        mismatch_one_pair(task, 20)
     first = model.reconstruction.images[min(model.reconstruction.reg_image_ids())]
     pose, rng = first.cam_from_world(), np.random.default_rng(3)
 
@@ -145,30 +159,70 @@ def test_camera_that_only_turned(tmp_path: Path) -> None:
     assert doubt.startswith("no parallax: the camera only turned")
 
 
-def test_mirrored_copies(tmp_path: Path) -> None:
-    model, task = scene(tmp_path)
-    image = last(model)
+def add_mirrored_copy(
+    model: MappedModel, task: MappingTask, ids: tuple[int, int], share_right: float = 1.0
+) -> list[str]:
+    """Let image ``ids[1]`` have the keypoints of a smaller mirrored copy of the other, too.
+
+    Of its own only a share stays right. Returns the names of both.
+    """
+    image, copy = (model.reconstruction.images[image_id] for image_id in ids)
+    camera = copy.camera
     with open_database(task.database_path) as database:
-        database_pairs = inlier_matches(task.database_path, 1)
-        other = next(ids[0] for ids in database_pairs if ids[1] == image.image_id)
-        points = database.read_keypoints(image.image_id)
-        points[:, 0] = image.camera.width - points[:, 0]
-        old = database.read_keypoints(other)
-        database.update_keypoints(other, np.vstack([points, old])[: max(len(points), len(old))])
-    assert any("mirrored copies" in text for text in find_doubts(model, task).model)
+        points = 0.75 * database.read_keypoints(image.image_id)[:, :2]
+        camera.width, camera.height = int(0.75 * camera.width), int(0.75 * camera.height)
+        database.update_camera(camera)
+        points[:, 0] = camera.width - points[:, 0]
+        old = database.read_keypoints(copy.image_id)[:, :2]
+        old[int(share_right * len(old)) :] += 40.0 * np.array([1.0, -0.6])
+        database.update_keypoints(copy.image_id, np.vstack([old, points, old]))
+    return [image.name, copy.name]
+
+
+def test_mirrored_copies_that_the_others_support_alike(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    names = " and ".join(sorted(add_mirrored_copy(model, task, (4, 1))))
+    doubts = find_doubts(model, task)
+    assert doubts.model == (f"{names} are mirrored copies of one photograph",)
+    assert doubts.impossible == ()
+
+
+def test_mirrored_copy_leaves_and_the_photograph_stays(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    photograph, copy = add_mirrored_copy(model, task, (4, 1), share_right=0.55)
+    kept = without_impossible(model, task)
+    assert kept is not None
+    assert list(kept.taken_out) == [copy]
+    assert f"a mirrored copy of {photograph}" in kept.taken_out[copy]
+    doubts = find_doubts(kept, task)
+    assert (doubts.images, doubts.model) == ({}, ())
+
+
+def test_copies_of_a_set_that_is_mirrored_as_a_whole_do_not_tell_of_each_other(
+    tmp_path: Path,
+) -> None:
+    model, task = scene(tmp_path)
+    add_mirrored_copy(model, task, (4, 1), share_right=0.55)
+    add_mirrored_copy(model, task, (3, 2))
+    doubts = find_doubts(model, task)
+    assert doubts.impossible == ()
+    assert any("mirrored copies" in text for text in doubts.model)
 
 
 def test_dense_keypoints_are_no_mirrored_copies() -> None:
-    rng, size = np.random.default_rng(2), (320, 240)
+    rng, size, smaller = np.random.default_rng(2), (320, 240), (256, 192)
     few, many, others = (rng.uniform(0, size, (number, 2)) for number in (900, 12000, 12000))
-    assert mirrored_share(many, others, size) < 0.3
-    assert mirrored_share(many, many, size) < 0.3
+    assert mirrored_share(many, others, (size, size)) < 0.3
+    assert mirrored_share(many, many, (size, size)) < 0.3
     for axis in (0, 1):
         copies = [points.copy() for points in (few, many)]
         for points in copies:
             points[:, axis] = size[axis] - points[:, axis]
-        assert mirrored_share(few, copies[0], size) > 0.9
-        assert mirrored_share(many, copies[1], size) > 0.9
+        assert mirrored_share(few, copies[0], (size, size)) > 0.9
+        assert mirrored_share(many, copies[1], (size, size)) > 0.9
+        fewer = 0.8 * copies[0][:500]
+        assert mirrored_share(few, fewer, (size, smaller)) > 0.9
+        assert mirrored_share(fewer, few, (smaller, size)) > 0.9
 
 
 def test_views_from_nearly_one_place(tmp_path: Path) -> None:

@@ -67,7 +67,8 @@ ROWS: list[tuple[str, str, tuple[str, ...]]] = [
         "models are judged for run, map and compare alike; doubts are in summary, report and exit "
         "code, with what to try",
         (
-            f"{DOUBTS}::test_mirrored_copies",
+            f"{DOUBTS}::test_mirrored_copies_that_the_others_support_alike",
+            f"{DOUBTS}::test_mirrored_copy_leaves_and_the_photograph_stays",
             f"{DOUBTS}::test_camera_that_only_turned",
             f"{DOUBTS}::test_images_that_few_points_hold",
             f"{DOUBTS}::test_two_of_more_photographs_are_no_model",
