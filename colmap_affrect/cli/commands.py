@@ -110,7 +110,8 @@ def escalate(options: argparse.Namespace) -> None:
         report = escalate(context, chosen, overwrite=options.overwrite)
         levels = pair_levels(context)
     show(report.summary())
-    show(", ".join(by_level(*item) for item in levels.items()))
+    if levels:
+        show(", ".join(by_level(*item) for item in levels.items()))
 
 
 def guide(options: argparse.Namespace) -> None:
@@ -345,11 +346,11 @@ def _next_steps(report: ReconstructionReport, out: Path) -> list[str]:
     commands: list[list[object]] = []
     if report.models:
         look = ["colmap", "gui", "--import_path", model, "--database_path", out / "database.db"]
-        commands += [
-            look + (["--image_path", photos] if photos else []),
-            ["colmap-affrect", "export", "--model-path", model, "--output-path", out / "export"],
-        ]
-    if report.unregistered and report.num_pairs and photos:
+        commands.append(look + (["--image_path", photos] if photos else []))
+    if report.status in ("ok", "partial"):
+        where = ["--model-path", model, "--output-path", out / "export"]
+        commands.append(["colmap-affrect", "export", *where])
+    if report.unregistered.keys() - report.failures and report.num_pairs and photos:
         where = ["--image-path", photos, "--output-path", out / "compare"]
         commands.append(["colmap-affrect", "compare", *where])
     lines = [f"results     {out}" + (f", to look at: {page}" if page.exists() else "")]

@@ -33,6 +33,8 @@ def record(options: argparse.Namespace) -> dict[str, Any]:
         if not options.image_path:
             raise OptionError("--image-path: give the folder of the photographs, or --config FILE")
         return {}
+    if not path.is_file():
+        raise OptionError(f"--config {path}: no such file; give the config.toml of a run")
     workspace = Workspace(path.parent)
     workspace.config = path
     try:

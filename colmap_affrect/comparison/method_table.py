@@ -1,4 +1,4 @@
-"""The table of methods on the page: a column for each that finished, a row for each figure."""
+"""The table of methods on the page: the methods that finished, and figures of each."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from colmap_affrect.comparison.method_table import (
     summary_rows,
 )
 from colmap_affrect.comparison.results import Comparison, MethodResult
-from colmap_affrect.comparison.verdict import cautions, changes, headline
+from colmap_affrect.comparison.verdict import cautions, changes, headline, wrong_poses
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.options import flat
 from colmap_affrect.pairs.base import Pair
@@ -70,6 +70,7 @@ def write_page(
         "changes": changes(comparison),
         "cautions": cautions(comparison),
         "bars": _bars(columns, comparison),
+        "has_wrong_poses": bool(wrong_poses(comparison)),
         "columns": columns,
         "column_of": {column.name: column for column in columns},
         "failed": [method for method in comparison.methods if method.failed],

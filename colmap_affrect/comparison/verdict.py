@@ -6,6 +6,7 @@ Gains are counted in photographs registered, or registered correctly where there
 from __future__ import annotations
 
 import itertools
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -168,7 +169,9 @@ def _change_text(method: MethodResult, reference: MethodResult) -> str:
             parts.append(f"{abs(change.mean):.1f} {'more' if change.mean > 0 else 'fewer'} on "
                          "average over the seeds")  # fmt: skip
     times = f"{_seconds(method.total_s)} s against {_seconds(reference.total_s)} s"
-    cost = f", in {change.time_ratio:.1f} times the time ({times})" if change.time_ratio else ""
+    ratio = f"{change.time_ratio:.1f}"
+    speed = "about the same time" if ratio == "1.0" else f"{ratio} times the time"
+    cost = f", in {speed} ({times})" if change.time_ratio else ""
     return f"{method.name} against {reference.name}: {', '.join(parts)}{cost}."
 
 
@@ -211,17 +214,28 @@ def failures(comparison: Comparison) -> list[str]:
 
 
 def doubts(comparison: Comparison) -> list[str]:
-    """Name what cannot be trusted in the models of most seeds, whatever ground truth says."""
-    texts = []
+    """Name what cannot be trusted in the models of most seeds, whatever ground truth says.
+
+    Methods in which the same is doubtful are named together.
+    """
+    methods = defaultdict(list)
     for method in comparison.finished:
-        reasons = {name: why for seed in method.seeds for name, why in seed.doubtful.items()}
-        usual = in_most([list(seed.doubtful) for seed in method.seeds])
-        if usual:
-            some = [f"{name} ({reasons[name]})" for name in sorted(usual)]
-            texts.append(f"Doubtful: in {method.name} {_listed(some)}.")
-        for why in sorted(in_most([seed.doubts for seed in method.seeds])):
-            texts.append(f"Doubtful: the model of {method.name}, {why}.")
-    return texts
+        for text in _doubts_of(method):
+            methods[text].append(method.name)
+    return [f"Doubtful in {_listed(names)}: {text}." for text, names in methods.items()]
+
+
+def _doubts_of(method: MethodResult) -> list[str]:
+    """Return each reason once, with all photographs that it is true of."""
+    reasons = {name: why for seed in method.seeds for name, why in seed.doubtful.items()}
+    names = defaultdict(list)
+    for name in sorted(in_most([list(seed.doubtful) for seed in method.seeds])):
+        names[reasons[name]].append(name)
+    of_model = sorted(in_most([seed.doubts for seed in method.seeds]))
+    return [
+        *(f"{_listed(same)} ({why})" for why, same in names.items()),
+        *(f"the whole model ({why})" for why in of_model),
+    ]
 
 
 def unstable_poses(comparison: Comparison) -> list[str]:

@@ -25,7 +25,8 @@ from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
 
-from colmap_affrect.errors import WeightsError
+from colmap_affrect.errors import OptionError, WeightsError
+from colmap_affrect.options import suggestion
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.contents import sha256_of
 
@@ -180,7 +181,7 @@ def fetch(
     keys, target = list(keys), folder or cache_folder()
     for key in keys:
         if key not in WEIGHT_FILES:
-            raise WeightsError(f"unknown weights '{key}' (known: {', '.join(WEIGHT_FILES)})")
+            raise OptionError(f"unknown weights '{key}'{suggestion(key, WEIGHT_FILES)}")
     paths = {key: target / WEIGHT_FILES[key].file_name for key in keys}
     for key in [key for key, path in paths.items() if not path.is_file()]:
         installed = _checked_installed(key)

@@ -62,13 +62,15 @@ class Alignment:
     def summary(self) -> str:
         """Return a few lines."""
         largest = sorted(self.residuals.items(), key=lambda item: -item[1])
-        shown = [f"            {name} {value:.3g}" for name, value in largest[:SHOWN]]
-        return "\n".join([
-            f"scale       {self.scale:.6g} metres for a unit of the old model",
+        lines = [f"scale       {self.scale:.6g} metres for a unit of the old model"]
+        if len(largest) == 1:  # a single distance is met exactly
+            return lines[0]
+        lines += [
             f"off         {median(self.residuals.values()):.3g} m in the median of "
             f"{len(largest)}, {largest[0][1]:.3g} m at most",
-            *(shown if len(largest) > 1 else []),
-        ])  # fmt: skip
+            *(f"            {name} {value:.3g}" for name, value in largest[:SHOWN]),
+        ]
+        return "\n".join(lines)
 
 
 def align(model_path: Path, output_path: Path, reference: Reference) -> Alignment:

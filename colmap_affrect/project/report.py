@@ -356,10 +356,8 @@ class ReconstructionReport:
             lines += [f"            the model contradicts {', '.join(counts)}"]
         if self.guided:
             before, after = self.guided["matches_before"], self.guided["matches_after"]
-            lines += [
-                f"guided      {self.guided['pairs']} pairs matched again: {after} inliers, "
-                f"{before} before"
-            ]
+            pairs = f"{self.guided['pairs']} pair{'s' if self.guided['pairs'] != 1 else ''}"
+            lines += [f"guided      {pairs} matched again: {after} inliers, {before} before"]
         if self.cameras:
             sources = Counter(str(camera["source"]) for camera in self.cameras).most_common()
             texts = [f"{count} {SOURCES.get(source, source)}" for source, count in sources]

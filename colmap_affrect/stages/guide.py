@@ -31,6 +31,7 @@ from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import recorded_extraction
 from colmap_affrect.stages.match import PAIRS_PER_WRITE
 from colmap_affrect.stages.one_guided_pair import GuidedMatcher, GuidedTask, guided_task
+from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import (
     extracted_px,
     recorded_verification,
@@ -205,12 +206,14 @@ class Guiding:
         if executor is None or not executor.sees([features.path]):
             executor = Threads(available_cores())
         matcher = GuidedMatcher(features, self.options)
+        stationary = StationaryFilter(features, self.context.matches)
         ordered = ordered_for_reuse(pairs, IMAGES_IN_MEMORY)
         for begin in range(0, len(ordered), PAIRS_PER_WRITE):
             batch = ordered[begin : begin + PAIRS_PER_WRITE]
             found = []
             for pair in executor.map(matcher, tasks(batch), [features.path]):
-                found.append(pair)
+                left = stationary.left(pair.names, pair.candidates)
+                found.append(replace(pair, candidates=pair.candidates[left]))
                 advance(1)
             self._keep(found)
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.data import Mask
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.images.masks import grown
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
@@ -78,18 +79,22 @@ class StationaryFilter:
         return self._features.image_sizes()
 
     def filtered(self, found: PairMatches) -> PairMatches:
-        """Return the matches of a pair without those that never move.
+        """Return the matches of a pair without those that never move."""
+        left = self.left(found.names, found.indices)
+        return replace(found, indices=found.indices[left], scores=found.scores[left])
 
-        Nor those from one place where nothing moves to another, as of equal letters of a caption;
+    def left(self, names: Pair, indices: Indices) -> Mask:
+        """Tell which (M, 2) matches of a pair are not left out.
+
+        Those from one place where nothing moves to another are, as of equal letters of a caption;
         what never moves is looked for beside these places too, since what is faint matches less.
         """
-        size = self._common_size(found.names) if self._places else None
+        size = self._common_size(names) if self._places else None
         if size is None or size not in self._places:
-            return found
-        still, first, second = self._still(found, size)
+            return np.ones(len(indices), bool)
+        still, first, second = self._still(names, indices, size)
         places = self._places[size]
-        left = ~(still & _at(grown(places, 1), first) | _at(places, first) & _at(places, second))
-        return replace(found, indices=found.indices[left], scores=found.scores[left])
+        return ~(still & _at(grown(places, 1), first) | _at(places, first) & _at(places, second))
 
     def learn(self, pairs: Sequence[Pair]) -> str:
         """Look for places in all matches, and drop those there; return a line, empty if none.
@@ -127,7 +132,7 @@ class StationaryFilter:
         for found in self._matches.read(alike):
             size = self._sizes[found.names[0]]
             of_size = evidence.setdefault(size, _Evidence.empty(size))
-            still, cells, _ = self._still(found, size)
+            still, cells, _ = self._still(found.names, found.indices, size)
             of_size.matched[tuple(np.unique(cells, axis=0).T[::-1])] += 1
             for column, row in np.unique(cells[still], axis=0).tolist():
                 of_size.still[row, column] += 1
@@ -135,12 +140,10 @@ class StationaryFilter:
         return {size: np.argwhere(e.places())[:, ::-1] for size, e in evidence.items()}
 
     def _still(
-        self, found: PairMatches, size: Size
+        self, names: Pair, indices: Indices, size: Size
     ) -> tuple[Mask, NDArray[np.int64], NDArray[np.int64]]:
         """Tell which matches do not move; also the (M, 2) cells, column and row, of both ends."""
-        first, second = (
-            self._points(name)[found.indices[:, side]] for side, name in enumerate(found.names)
-        )
+        first, second = (self._points(name)[indices[:, side]] for side, name in enumerate(names))
         motion = np.linalg.norm(second - first, axis=1)
         return motion <= MAX_MOTION_FRAC * max(size), _cells(first, size), _cells(second, size)
 

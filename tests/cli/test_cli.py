@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -238,7 +239,7 @@ def test_inspect_draws_a_sheet_and_writes_the_plan(tmp_path: Path, call: Call) -
         (["--recipe", "defalt"], 2, "did you mean 'default'"),
         (["--pairs", "vocab"], 2, "vocab"),
         (["--camera-params", "1,2"], 2, "SIMPLE_RADIAL needs 4 values"),
-        (["--config", "none.toml"], 2, "none.toml: has no options of a run"),
+        (["--config", "none.toml"], 2, "none.toml: no such file"),
     ],
 )
 def test_what_is_missing_is_said_before_any_image_is_read(
@@ -273,6 +274,23 @@ def test_typo_in_a_config_is_refused(
     assert done.code == 2
     meant = f"unknown '{new.strip('[')}' (did you mean '{old.strip('[')}'?)"
     assert meant in done.stderr[0]
+
+
+def test_unknown_weights_are_wrong_usage(call: Call) -> None:
+    done = call("weights", "fetch", "afnet")
+    assert (done.code, done.stdout) == (2, "")
+    assert done.stderr == ["error: unknown weights 'afnet' (did you mean 'affnet'?)"]
+
+
+def test_damaged_photograph_is_no_reason_to_compare_methods(
+    photos: Path, tmp_path: Path, call: Call
+) -> None:
+    folder = shutil.copytree(photos, tmp_path / "photos")
+    (folder / "damaged.png").write_bytes(b"no image")
+    done = call("run", *on_photographs(folder, tmp_path / "out"), "--no-page")
+    assert "damaged.png: unreadable" in done.stdout
+    assert "colmap-affrect export" in done.stdout
+    assert "colmap-affrect compare" not in done.stdout
 
 
 def test_what_is_printed_may_end_early() -> None:
@@ -370,8 +388,10 @@ def test_model_that_nobody_can_trust_ends_with_3(
 ) -> None:
     doubts = Doubts(model=("no parallax",))
     monkeypatch.setattr(attempts, "find_doubts", lambda *_: doubts)
-    assert main(["map", "--output-path", str(verified), "--overwrite", "--quiet"]) == 3
+    assert main(["map", "--output-path", str(verified), "--overwrite"]) == 3
     printed = capfd.readouterr()
+    assert "colmap gui" in printed.out
+    assert "colmap-affrect export" not in printed.out
     assert "doubtful    the whole model: no parallax\n" in printed.out
     assert printed.err.splitlines()[-1].startswith("error: nothing in the model can be trusted;")
     assert json.loads((verified / "report.json").read_text())["status"] == "doubtful"

@@ -298,6 +298,19 @@ def test_what_is_missing_is_said_in_its_place(tmp_path: Path) -> None:
     assert "No method finished" in page.text
 
 
+def test_bars_of_wrong_poses_are_explained_where_there_are_any(
+    page: Page, comparison: Comparison, tmp_path: Path
+) -> None:
+    explanation = "The orange rest of a bar"
+    assert explanation not in page.text
+    sift = comparison.finished[0]
+    seeds = [
+        replace(s, scores=s.scores and replace(s.scores, correct_names=())) for s in sift.seeds
+    ]
+    wrong = replace(comparison, methods=(replace(sift, seeds=tuple(seeds)),))
+    assert explanation in write_page(wrong, tmp_path).read_text(encoding="utf-8")
+
+
 def test_lost_models_and_databases_are_said_in_their_place(
     comparison: Comparison, tmp_path: Path
 ) -> None:

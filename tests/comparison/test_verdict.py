@@ -147,12 +147,22 @@ def test_doubts_of_most_seeds_are_told():
     doubtful = replace(default("abcd"), seeds=(*seeds, seed_result("abcd", 2)))
     texts = rules.doubts(comparison(SIFT, doubtful))
     assert texts == [
-        "Doubtful: in default d (only 9 points hold it).",
-        "Doubtful: the model of default, no parallax.",
+        "Doubtful in default: d (only 9 points hold it).",
+        "Doubtful in default: the whole model (no parallax).",
     ]
     assert doubtful.span("num_doubtful").max == 4
     seldom = replace(default("abcd"), seeds=(seeds[0], seed_result("abcd", 2)))
     assert rules.doubts(comparison(SIFT, seldom)) == []
+
+
+def test_equal_doubts_are_told_once():
+    loose = dict.fromkeys("cd", "any focal length fits")
+    first, second = (
+        replace(method(name, "abcd"), seeds=(replace(seed_result("abcd", 0), doubtful=loose),))
+        for name in ("sift", "default")
+    )
+    texts = rules.doubts(comparison(first, second))
+    assert texts == ["Doubtful in sift and default: c and d (any focal length fits)."]
 
 
 def test_poses_that_change_with_the_seed_are_doubtful():

@@ -18,7 +18,7 @@ import pytest
 import torch
 from command import Call
 
-from colmap_affrect.errors import WeightsError
+from colmap_affrect.errors import OptionError, WeightsError
 from colmap_affrect.features import weights
 from colmap_affrect.features.affnet_hardnet import AffNetHardNetOptions
 from colmap_affrect.features.weights import (
@@ -247,7 +247,7 @@ def test_fetch_fills_a_folder_and_leaves_what_it_finds(
     paths = fetch(["hardnet", "tfeat"], tmp_path)
     assert [path.read_bytes() for path in paths.values()] == [b"old", b"new"]
     assert {path.parent for path in paths.values()} == {tmp_path}
-    with pytest.raises(WeightsError, match=r"unknown weights 'hardnett' \(known: affnet, orinet"):
+    with pytest.raises(OptionError, match=r"unknown weights 'hardnett' \(did you mean 'hardnet'"):
         fetch(["affnet", "hardnett"], tmp_path)
     assert len(list(tmp_path.glob("*.p*"))) == 2  # nothing was asked for
 

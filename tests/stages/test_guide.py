@@ -39,6 +39,7 @@ from colmap_affrect.stages.guide_by_model import guide_by_model
 from colmap_affrect.stages.map import agreement, map_images
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
+from colmap_affrect.stages.stationary import NUM_CELLS
 from colmap_affrect.stages.verify import verified_inliers, verify_matches
 
 ALWAYS = GuidedOptions(enabled="always")
@@ -131,6 +132,15 @@ def test_only_images_in_need(context: Context) -> None:
     assert {pair.names for pair in context.guided.read()} == {p for p in every if NAMES[1] in p}
     report = guide(context, images=NAMES[:2])
     assert (report.num_done, report.num_kept) == (2, 3)
+
+
+def test_captions_are_not_found_again(context: Context) -> None:
+    """Here they are said to be everywhere."""
+    everywhere = np.indices((NUM_CELLS, NUM_CELLS)).reshape(2, -1).T
+    sizes = set(context.features.image_sizes().values())
+    context.matches.record_stationary_cells(dict.fromkeys(sizes, everywhere))
+    assert guide(context, ALWAYS).num_done == 6
+    assert guided_counts(context) == {}
 
 
 def test_never(context: Context) -> None:
