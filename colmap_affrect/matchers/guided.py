@@ -12,7 +12,7 @@ features of image 2 that any of its members may match.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
@@ -33,6 +33,13 @@ MIN_AGREEING = 0.5
 """Of a right pair at least this share of the inliers has frames that agree with the geometry, and
 of a wrong one whose inliers are accidental far less; guiding would make such a pair look proven."""
 
+BANDS_BESIDE = 6.0
+MAX_ACCIDENTAL = 0.5
+"""Guided matches count where so many bands beside the geometry no more than this share of them is
+found: those are accidental. Where things repeat, and near the places of a homography that most of
+the scene does not lie on, they are as many."""
+
+TINY = np.finfo(float).tiny
 ANGLE_ROUNDING = 1e-9  # far below any band, far above the error of angles in a pencil of lines
 BANDS_OF_HOMOGRAPHY = 2.0  # radius round the place of a homography: planes are never quite plane
 
@@ -81,7 +88,9 @@ class GuidableImage:
 class Guide(Protocol):
     """What the geometry of a pair says about matches of its features."""
 
-    model: PairModel
+    @property
+    def model(self) -> PairModel:
+        """The geometry."""
 
     def groups(self) -> Iterator[tuple[Indices, Indices]]:
         """Yield features of image 1, each once, and all of image 2 that any of these may match."""
@@ -89,13 +98,17 @@ class Guide(Protocol):
     def allowed(self, rows: Indices, columns: Indices) -> Bools:
         """Tell which of (R,) and (C,) features may match, (R, C)."""
 
+    def beside(self) -> Sequence[Guide]:
+        """Return the geometry with image 2 moved away, so that in one of them nothing is right."""
+
 
 class EpipolarGuide:
     """Matches lie within a band around epipolar lines (Sampson's distance)."""
 
     def __init__(self, fundamental: Array, points1: Array, points2: Array, band_px: float) -> None:
         """Bring both images to unit size, which keeps angles around far epipoles apart."""
-        self.model: PairModel = EpipolarModel(fundamental, (points1, points2))
+        self.model: EpipolarModel = EpipolarModel(fundamental, (points1, points2))
+        self._band_px = band_px
         finite = [points[np.isfinite(points).all(axis=1)] for points in (points1, points2)]
         size = max([1.0, *(float(np.ptp(p, axis=0).max()) for p in finite if len(p))])
         to_pixels, unit = [], []
@@ -121,9 +134,8 @@ class EpipolarGuide:
         u, s, vt = np.linalg.svd(matrix)
         along1 = homogeneous(unit[0]) @ vt[:2].T * s[:2]
         along2 = self._homogeneous2 @ u[:, :2]
-        tiny = np.finfo(float).tiny
         inverse1, inverse2 = (
-            1.0 / np.maximum(np.linalg.norm(a, axis=1), tiny) for a in (along1, along2)
+            1.0 / np.maximum(np.linalg.norm(a, axis=1), TINY) for a in (along1, along2)
         )
         self._angles1 = np.arctan2(along1[:, 0], -along1[:, 1]) % np.pi
         self._angles2 = np.arctan2(along2[:, 1], along2[:, 0]) % np.pi
@@ -147,13 +159,22 @@ class EpipolarGuide:
         squares = self._squares2[rows, None] + self._squares1[columns]
         return np.asarray(residuals**2 <= self._band**2 * squares)
 
+    def beside(self) -> list[EpipolarGuide]:
+        """See :class:`Guide`; image 2 moves across most epipolar lines."""
+        points1, points2 = self.model.points
+        normals = self._lines2[:, :2] / np.sqrt(np.maximum(self._squares2, TINY))[:, None]
+        normals = normals[np.isfinite(normals).all(axis=1)]
+        across = np.linalg.eigh(normals.T @ normals)[1][:, 1]
+        moved = points2 + BANDS_BESIDE * self._band_px * across
+        return [EpipolarGuide(self.model.fundamental, points1, moved, self._band_px)]
+
 
 class HomographyGuide:
     """Matches lie near the places that a homography gives: of planes, and without a baseline."""
 
     def __init__(self, homography: Array, points1: Array, points2: Array, band_px: float) -> None:
-        self._points2 = points2
-        self.model: PairModel = HomographyModel(homography, (points1, points2))
+        self._points2, self._band_px = points2, band_px
+        self.model: HomographyModel = HomographyModel(homography, (points1, points2))
         with np.errstate(divide="ignore", invalid="ignore"):
             self._places = project(homography, points1)
         self._radius = BANDS_OF_HOMOGRAPHY * band_px
@@ -178,6 +199,15 @@ class HomographyGuide:
     def allowed(self, rows: Indices, columns: Indices) -> Bools:
         """See :class:`Guide`."""
         return _within(self._places[rows], self._points2[columns], self._radius)
+
+    def beside(self) -> list[HomographyGuide]:
+        """See :class:`Guide`; what lies before or behind the plane is along one direction only."""
+        points1, points2 = self.model.points
+        steps = BANDS_BESIDE * self._band_px * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+        return [
+            HomographyGuide(self.model.matrix, points1, points2 + step, self._band_px)
+            for step in steps
+        ]
 
 
 @dataclass(frozen=True)
@@ -255,23 +285,44 @@ def guided_matches(
 
     They rise by features of image 1. The inliers, which the geometry was estimated from, stay;
     guided matches that disagree with one of them are left out, and all where the frames of the
-    inliers, or else of the guided matches, do not agree with the geometry (:data:`MIN_AGREEING`).
+    inliers, or else of the guided matches, do not agree with the geometry (:data:`MIN_AGREEING`),
+    or where beside it there are too many as well (:data:`MAX_ACCIDENTAL`).
     Frames are not asked where an image has none that could tell
     (:attr:`GuidableImage.has_directions`); there nothing is found without inliers.
     """
+    has_directions = first.has_directions and second.has_directions
+    if not (has_directions or len(inliers)):
+        return inliers
     found = nearest_allowed(first, second, guide, options)
-    if not (first.has_directions and second.has_directions):
-        found = found[: len(found) if len(inliers) else 0]
-    else:
+    trusted = inliers if len(inliers) else found
+
+    def agrees(guide: Guide, matches: Indices) -> Bools:
+        if not has_directions:
+            return np.ones(len(matches), bool)
         shapes = np.asarray(first.shapes), np.asarray(second.shapes)
-        trusted = inliers if len(inliers) else found
-        agreeing = frame_angles_deg(guide, shapes, trusted, trusted) <= options.max_angle_deg
-        if len(trusted) and agreeing.mean() < MIN_AGREEING:
-            return inliers
-        found = found[frame_angles_deg(guide, shapes, found, trusted) <= options.max_angle_deg]
+        return frame_angles_deg(guide, shapes, matches, trusted) <= options.max_angle_deg
+
+    if len(trusted) and agrees(guide, trusted).mean() < MIN_AGREEING:
+        return inliers
+    found = found[agrees(guide, found)]
+    limit = MAX_ACCIDENTAL * len(found)
+    for beside in guide.beside():
+        accidental = nearest_allowed(first, second, beside, options)
+        accidental = accidental[agrees(beside, accidental)]
+        if len(_without(accidental, found)) <= limit:
+            break
+    else:
+        return inliers
     free = ~(np.isin(found[:, 0], inliers[:, 0]) | np.isin(found[:, 1], inliers[:, 1]))
     both = np.concatenate([inliers, found[free]])
     return np.asarray(both[np.argsort(both[:, 0], kind="stable")])
+
+
+def _without(matches: Indices, others: Indices) -> Indices:
+    """Return the (M, 2) matches that are not among others, in both of which features are unique."""
+    partner = dict(others.tolist())
+    is_other = [partner.get(row) != column for row, column in matches.tolist()]
+    return np.asarray(matches[np.array(is_other, bool)])
 
 
 def nearest_allowed(

@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.matchers import guided as module
 from colmap_affrect.matchers.guided import (
     EpipolarGuide,
     GuidableImage,
@@ -220,3 +221,29 @@ def test_inliers_stay_and_matches_are_one_to_one() -> None:
     found = guided_matches(first, second, guides[0], OPTIONS, inliers)
     assert {*map(tuple, inliers)} <= {*map(tuple, found)}
     assert len(found) == 200 == len(np.unique(found[:, 0])) == len(np.unique(found[:, 1]))
+
+
+@pytest.mark.parametrize("kind", [0, 1], ids=["epipolar", "homography"])
+def test_beside_a_geometry_its_own_matches_are_not_found(kind: int) -> None:
+    first, second, guides = plane_pair()
+    assert len(nearest_allowed(first, second, guides[kind], OPTIONS)) == 200
+    for beside in guides[kind].beside():
+        assert not len(nearest_allowed(first, second, beside, OPTIONS))
+        moved = beside.model.points[1] - second.points
+        assert np.ptp(moved, axis=0) == pytest.approx(0.0, abs=1e-9)
+        assert np.linalg.norm(moved[0]) == pytest.approx(18.0)
+
+
+@pytest.mark.parametrize("kind", [0, 1], ids=["epipolar", "homography"])
+def test_where_as_much_is_found_beside_a_geometry_nothing_is_proven(
+    kind: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = random_images(4, (2000, 2500))
+    geometries = [
+        EpipolarGuide(fundamental((1, 0.2, 0.1)), first.points, second.points, 6.0),
+        HomographyGuide(HOMOGRAPHY, first.points, second.points, 6.0),
+    ]
+    inliers = np.array([[3, 7], [9, 1]])
+    assert_array_equal(guided_matches(first, second, geometries[kind], OPTIONS, inliers), inliers)
+    monkeypatch.setattr(module, "MAX_ACCIDENTAL", 2.0)
+    assert len(guided_matches(first, second, geometries[kind], OPTIONS, inliers)) > 20
