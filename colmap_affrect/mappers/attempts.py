@@ -21,7 +21,6 @@ from colmap_affrect.mappers.loose_cameras import loose_images
 from colmap_affrect.mappers.pair_graph import graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.mappers.starts import (
-    MIN_SHARE_OF_RIVAL,
     Start,
     focals_px,
     rival_focals_px,
@@ -73,8 +72,8 @@ def map_database(
         shutil.rmtree(old, ignore_errors=True)
     try:
         best = _best_attempt(mapper, task, sparse_path, partial, next_image)
-        if not task.extend:
-            best = _adjusted(mapper, task, best)
+        if not task.extend and _adjust_weak(mapper, task, best):
+            best = sorted(_possible(best, task), key=_size, reverse=True)
         summaries = []
         for index, model in enumerate(best):
             write_model(model.reconstruction, partial / str(index))
@@ -192,26 +191,20 @@ def _possible(models: list[MappedModel], task: MappingTask) -> list[MappedModel]
     return [model for model in (without_impossible(each, task) for each in models) if model]
 
 
-def _adjusted(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -> list[MappedModel]:
-    """Return models, largest first, those adjusted once more that guided matches or bridges hold.
+def _adjust_weak(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -> bool:
+    """Adjust models that guided matches or bridges hold; others stay as COLMAP made them.
 
-    Others stay as COLMAP made them, and so do those that the verified pairs agree with less when
-    they are adjusted: cameras that few points see go anywhere.
+    Returns:
+        Whether there were any.
     """
-    if not any(task.guided or model.bridges for model in models):
-        return models
-    verified, graph, found = inlier_matches(task.database_path, 1), graph_of(task), []
-    for model in models:
-        before = model.reconstruction
-        constant = task.constant_cameras(mapper.options) | runaways(before, task)
+    weak = [model for model in models if task.guided or model.bridges]
+    verified = inlier_matches(task.database_path, 1) if weak else {}
+    for model in weak:
+        constant = task.constant_cameras(mapper.options) | runaways(model.reconstruction, task)
         if task.keeps_focal_lengths(mapper.options):
-            constant = set(before.cameras)
-        after = pycolmap.Reconstruction(before)
-        if task.guided or model.bridges:
-            adjust_last(after, verified, task.guided, constant_cameras=constant)
-        is_worse = graph.score_of(after) < MIN_SHARE_OF_RIVAL * graph.score_of(before)
-        found.append(model if is_worse else replace(model, reconstruction=after))
-    return sorted(_possible(found, task), key=_size, reverse=True)
+            constant = set(model.reconstruction.cameras)
+        adjust_last(model.reconstruction, verified, task.guided, constant_cameras=constant)
+    return bool(weak)
 
 
 def _size(model: MappedModel) -> tuple[int, int]:

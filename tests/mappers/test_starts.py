@@ -252,27 +252,6 @@ def test_images_that_the_last_adjustment_leaves_without_points_are_taken_out(
     assert read_summary(folder) == again
 
 
-@pytest.mark.parametrize("growth", [1.01, 1.5])
-def test_an_adjustment_after_which_pairs_disagree_is_not_kept(
-    scene: tuple[Path, pycolmap.Reconstruction],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    growth: float,
-) -> None:
-    def move(model: pycolmap.Reconstruction, *_: object, **__: object) -> None:
-        for camera in model.cameras.values():
-            camera.focal_length *= growth
-
-    monkeypatch.setattr(attempts, "adjust_last", move)
-    bridge = Bridge(("a", "b"), ("b",), 20, 20, 0.01)
-    mapper = Recorder(lambda _: [replace(m, bridges=(bridge,)) for m in without(scene, 0)])
-    mapped(scene, tmp_path, mapper, records(scene, replace(KNOWN, focal_px=TRUE_FOCAL)))
-    read = read_summary(tmp_path / "sparse" / "0")
-    assert read
-    kept = growth if growth < 1.1 else 1.0
-    assert list(read.focals_px.values()) == pytest.approx(NUM_IMAGES * [kept * TRUE_FOCAL])
-
-
 def test_large_models_are_mapped_once(
     scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
