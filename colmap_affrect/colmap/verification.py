@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
+import networkx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,6 +40,7 @@ from colmap_affrect.options import MAX_SEED, PresetOptions, within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
 logger = logging.getLogger(__name__)
+T = TypeVar("T", int, str)
 
 PAIRS_PER_WRITE = 200  # a killed run loses at most as many
 NUM_CACHED_IMAGES = 256  # as COLMAP keeps: 80 MB of 13,000 keypoints each
@@ -374,6 +376,19 @@ def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], in
         for pair_id, count in zip(pair_ids, counts, strict=True)
         if count >= min_num_inliers
     }
+
+
+def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> list[set[T]]:
+    """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
+    graph: networkx.Graph[T] = networkx.Graph()
+    graph.add_nodes_from(images)
+    graph.add_edges_from(pairs)
+    return sorted(networkx.connected_components(graph), key=lambda part: (-len(part), min(part)))
+
+
+def num_tied(path: Path, min_num_inliers: int) -> int:
+    """Return how many images verified pairs connect at most."""
+    return max(map(len, connected_parts(verified_pairs(path, min_num_inliers))), default=0)
 
 
 def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], Indices]:

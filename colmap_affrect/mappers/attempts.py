@@ -10,7 +10,7 @@ from pathlib import Path
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.model_files import num_long_tracks, registered_names, write_model
-from colmap_affrect.colmap.verification import inlier_matches
+from colmap_affrect.colmap.verification import inlier_matches, num_tied
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.arrivals import arrivals, bridges_of
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
@@ -18,7 +18,7 @@ from colmap_affrect.mappers.doubts import FOCAL_DOUBT, find_doubts, without_impo
 from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.last_adjustment import MIN_NUM_TRACKS, adjust_last
 from colmap_affrect.mappers.loose_cameras import loose_images
-from colmap_affrect.mappers.pair_graph import graph_of
+from colmap_affrect.mappers.pair_graph import MIN_NUM_MATCHES, graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.mappers.starts import (
     Start,
@@ -109,7 +109,7 @@ def _best_attempt(
             next_image(news)
 
     with with_snapshots(task, mapper.options, snapshots_of(sparse_path), num_images) as kept:
-        attempts = _Attempts(mapper, kept, num_images)
+        attempts = _Attempts(mapper, kept, num_tied(task.database_path, MIN_NUM_MATCHES))
         while attempts.go_on(best):
             raw = partial / "raw"
             raw.mkdir(parents=True)
@@ -127,7 +127,8 @@ def _best_attempt(
 class _Attempts:
     """Which attempts there are: with several seeds, and from several focal lengths.
 
-    One that has all images, each with enough points of three images, is the last.
+    One that has all images that verified pairs connect, each with enough points of three images, is
+    the last.
     Cameras that ran away in the last one are held in those that follow.
     """
 

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Iterable, Mapping, Set
+from collections.abc import Collection, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
 
-import networkx
-
+from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.recipes import EscalateOptions
-
-T = TypeVar("T", int, str)
 
 
 def insecure_images(
@@ -27,14 +23,6 @@ def insecure_images(
     strong = (pair for pair, count in num_inliers.items() if count >= max(1, strong_num_inliers))
     names = {name for pair in num_inliers for name in pair}
     return names.difference(*strong).union(weakly_connected)
-
-
-def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> list[set[T]]:
-    """Return the images that pairs connect, largest part first; of ``images`` also lone ones."""
-    graph: networkx.Graph[T] = networkx.Graph()
-    graph.add_nodes_from(images)
-    graph.add_edges_from(pairs)
-    return sorted(networkx.connected_components(graph), key=lambda part: (-len(part), min(part)))
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,12 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.verification import PairVerifier, verified_pairs, verify
+from colmap_affrect.colmap.verification import (
+    PairVerifier,
+    connected_parts,
+    verified_pairs,
+    verify,
+)
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.consistency import num_consistent_matches
@@ -43,7 +48,7 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace, temporary_folder
 from colmap_affrect.recipes import EscalateOptions
-from colmap_affrect.stages.climbing import ClimbingGraph, connected_parts, insecure_images
+from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import (
     Inputs,

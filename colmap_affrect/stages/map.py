@@ -14,7 +14,7 @@ from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.model_files import num_long_tracks
-from colmap_affrect.colmap.verification import verified_pairs
+from colmap_affrect.colmap.verification import num_tied, verified_pairs
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.features.weights import missing as missing_weights
 from colmap_affrect.mappers.attempts import LARGE_MODEL, map_database, read_models
@@ -26,7 +26,6 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import INPUTS, Workspace
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.climbing import connected_parts
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import is_copy
 from colmap_affrect.stages.depth_lookup import depth_lookup
@@ -143,7 +142,7 @@ def _or_first_level(
     """
     with first_level_database(context) as path:
         least = _num_registered(models) if models and models[0].is_consistent else 0
-        if path is None or _num_tied(context, path) <= least:
+        if path is None or num_tied(path, _min_num_inliers(context.workspace)) <= least:
             return models
         sparse = path.with_name("sparse")
         firsts = map_database(mapper, replace(task, database_path=path), sparse, _ignore)
@@ -171,13 +170,13 @@ def _map(
         if not found:
             return map_database(mapper, task, sparse, advance), 0
         path, doubted = found
-        num_tied = _num_tied(context, context.workspace.database)
+        num_images = num_tied(context.workspace.database, _min_num_inliers(context.workspace))
         first = path.with_name("sparse")
         models = map_database(mapper, replace(task, database_path=path), first, advance)
         num = _num_registered(models)
-        if num < MIN_SHARE * num_tied or not models[0].is_consistent:
+        if num < MIN_SHARE * num_images or not models[0].is_consistent:
             return map_database(mapper, task, sparse, _ignore), 0
-        if num < num_tied:
+        if num < num_images:
             others = map_database(mapper, task, sparse, _ignore)
             if _rank(others) > _rank(models):
                 return others, 0
@@ -189,12 +188,6 @@ def _map(
         rmtree(sparse, ignore_errors=True)
         first.rename(sparse)
     return models, len(rejected)
-
-
-def _num_tied(context: Context, path: Path) -> int:
-    """Return how many images the verified pairs of a database connect at most."""
-    parts = connected_parts(verified_pairs(path, _min_num_inliers(context.workspace)))
-    return max(map(len, parts), default=0)
 
 
 def _contradicting(graph: PairGraph, model: pycolmap.Reconstruction) -> set[frozenset[str]]:

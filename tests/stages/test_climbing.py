@@ -6,8 +6,9 @@ import dataclasses
 
 import pytest
 
+from colmap_affrect.colmap.verification import connected_parts
 from colmap_affrect.recipes import EscalateOptions
-from colmap_affrect.stages.climbing import ClimbingGraph, connected_parts, insecure_images
+from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images
 
 PROMISING = EscalateOptions().min_num_consistent
 BEST_ONE = EscalateOptions(num_best_pairs=1)

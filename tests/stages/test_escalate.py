@@ -336,7 +336,7 @@ def test_the_model_before_the_climb_is_kept_where_it_has_more_images(
         names = tuple(NAMES[: 3 if is_first_level else num_escalated])
         return [ModelSummary(names, 10, 2.0, 0.5, doubts=doubts if is_first_level else ())]
 
-    monkeypatch.setattr(map_stage, "connected_parts", lambda _: [{1, 2, 3}])
+    monkeypatch.setattr(map_stage, "num_tied", lambda *_: 3)
     monkeypatch.setattr(map_stage, "map_database", map_database)
     with workspace.locked():
         mapper = MAPPERS.make(IncrementalOptions())
