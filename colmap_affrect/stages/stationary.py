@@ -86,15 +86,15 @@ class StationaryFilter:
     def left(self, names: Pair, indices: Indices) -> Mask:
         """Tell which (M, 2) matches of a pair are not left out.
 
-        Those from one place where nothing moves to another are, as of equal letters of a caption;
-        what never moves is looked for beside these places too, since what is faint matches less.
+        Those are from a place where nothing moves to one, also another one, as of equal letters of a
+        caption; and from beside such places, since what is faint matches less.
         """
         size = self._common_size(names) if self._places else None
         if size is None or size not in self._places:
             return np.ones(len(indices), bool)
-        still, first, second = self._still(names, indices, size)
-        places = self._places[size]
-        return ~(still & _at(grown(places, 1), first) | _at(places, first) & _at(places, second))
+        _, first, second = self._still(names, indices, size)
+        near = grown(self._places[size], 1)
+        return ~(_at(near, first) & _at(near, second))
 
     def learn(self, pairs: Sequence[Pair]) -> str:
         """Look for places in all matches, and drop those there; return a line, empty if none.
