@@ -86,8 +86,8 @@ class StationaryFilter:
     def left(self, names: Pair, indices: Indices) -> Mask:
         """Tell which (M, 2) matches of a pair are not left out.
 
-        Those go from a place where nothing moves to one, also to another one, as of equal letters of
-        a caption; or from beside such places, since what is faint matches less.
+        Those go from where nothing moves to where nothing does, as of equal letters of a caption;
+        beside such places as well, since what is faint matches less.
         """
         size = self._common_size(names) if self._places else None
         if size is None or size not in self._places:
