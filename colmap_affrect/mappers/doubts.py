@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
 from colmap_affrect.mappers.arrivals import MIN_THREE_VIEW_POINTS
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
@@ -174,7 +175,7 @@ def _image_doubts(
             *_place_doubts(near[image_id], len(registered) - 1),
             *_copy_doubts(graph.names.get(originals.get(image_id, -1))),
             *_bridge_doubts(bridges.get(image.name)),
-            *_focal_doubts(image.name in loose),
+            *_focal_doubts(task.cameras.get(image.camera_id), is_loose=image.name in loose),
         ]
         if found:
             reasons[image.name] = "; ".join(text for text, _ in found)
@@ -251,7 +252,12 @@ def _bridge_doubts(bridge: Bridge | None) -> Iterator[tuple[str, bool]]:
         yield f"bridged by {bridge.pair[0]}, where only {some} depths agree on the scale", False
 
 
-def _focal_doubts(is_loose: bool) -> Iterator[tuple[str, bool]]:
+def _focal_doubts(record: CameraRecord | None, *, is_loose: bool) -> Iterator[tuple[str, bool]]:
+    if record and record.is_contradicted:
+        yield (
+            f"the verified pairs contradict the given focal length, {record.focal_px:.0f} px",
+            False,
+        )
     if is_loose:
         yield FOCAL_DOUBT, False
 

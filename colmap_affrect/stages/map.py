@@ -289,6 +289,9 @@ def advice(
         return ()
     is_contradicted = bool(models and (models[0].doubts or models[0].num_contradicted))
     texts = []
+    if any(record.is_contradicted for record in read_camera_records(workspace.cameras).values()):
+        texts.append("run again without the given focal lengths, or with others: pairs contradict "
+                     "them")  # fmt: skip
     has_cameras = is_copy(workspace) or Inputs.recorded(workspace).from_database
     if models and (models[0].rival_focals_px or models[0].loose) and not has_cameras:
         texts.append(

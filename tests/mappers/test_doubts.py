@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from mapping_tasks import task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.geometry.parallax import mirrored_share
@@ -289,6 +291,15 @@ def test_images_whose_points_do_not_tell_their_focal_length(tmp_path: Path) -> N
     assert list(doubts.images) == [name]
     assert "any focal length fits" in doubts.images[name]
     assert doubts.impossible == ()
+
+
+def test_given_focal_length_that_the_pairs_contradict(tmp_path: Path) -> None:
+    model, task = scene(tmp_path)
+    image = last(model)
+    record = CameraRecord((image.name,), "given", 720.4, given=("focal",), is_contradicted=True)
+    doubts = find_doubts(model, replace(task, cameras={image.camera_id: record}))
+    text = "the verified pairs contradict the given focal length, 720 px"
+    assert (doubts.images, doubts.impossible) == ({image.name: text}, ())
 
 
 def test_tracks_of_two_views_tie_nothing_unless_images_are_bridged(tmp_path: Path) -> None:
