@@ -8,7 +8,7 @@ class AffrectError(Exception):
 
 
 class OptionError(AffrectError, ValueError):
-    """An option is unknown, has a value out of range, or contradicts another one."""
+    """An option is unknown, out of range, contradicts another one, or names what is not there."""
 
 
 class ImageError(AffrectError):

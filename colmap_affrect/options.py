@@ -72,7 +72,9 @@ class Options(BaseModel):
     @classmethod
     def _problem(cls, error: ErrorDetails) -> str:
         """Say in one line what pydantic found."""
-        place, given = ".".join(map(str, error["loc"])), error["input"]
+        *outer, last = error["loc"] or ("",)
+        places = outer if isinstance(last, int) else [*outer, last]  # a list, not which of it
+        place, given = ".".join(map(str, places)), error["input"]
         context = error.get("ctx", {})
         match error["type"]:
             case "extra_forbidden":

@@ -333,7 +333,9 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
     if report.status == "doubtful":
         why = "nothing in the model can be trusted"
     if why:
-        show(f"error: {why}; see {options.output_path / 'report.json'}", file=sys.stderr)
+        workspace = Workspace(options.output_path)
+        where = workspace.page if workspace.page.exists() else workspace.report
+        show(f"error: {why}; see {where}", file=sys.stderr)
         return EXIT_NO_MODEL
     return _exit_code(report.failures, options)
 

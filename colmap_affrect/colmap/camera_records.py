@@ -46,6 +46,8 @@ class CameraRecord:
         given: what of the intrinsics is the user's, to be left as it is.
         may_be_shared: the pairs do not tell whether other such images of this size have the same
             camera.
+        is_contradicted: whether the verified pairs contradict a focal length that the user gave;
+            None where they were not asked.
     """
 
     names: tuple[str, ...]
@@ -57,6 +59,7 @@ class CameraRecord:
     size: tuple[int, int] = (0, 0)
     given: tuple[Given, ...] = ()
     may_be_shared: bool = False
+    is_contradicted: bool | None = None
 
     def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
         """Return the entry of ``report.json``, with the focal length that a model ended with."""

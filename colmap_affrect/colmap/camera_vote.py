@@ -18,8 +18,9 @@ from colmap_affrect.colmap.database import cameras_of_images, open_database
 from colmap_affrect.colmap.two_views import PLANAR
 from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES, ExtractedPx, of_pair
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.geometry.focal_evidence import MatchedPair
+from colmap_affrect.geometry.focal_evidence import MatchedPair, log_evidence
 from colmap_affrect.geometry.focal_vote import (
+    FOCALS,
     Ballot,
     FocalEstimate,
     ballot,
@@ -33,7 +34,10 @@ MIN_NUM_INLIERS = 20  # of a pair that votes: few more than a fundamental matrix
 MATCH_ERROR_PX = 0.5  # least error of matches, px of the photograph as features were extracted
 MAX_PAIRS_OF_IMAGE = 4  # the strongest pairs of each image vote
 MAX_PAIRS_OF_DECISION = 24  # pairs that are asked whether images of one size share a camera
-MIN_LOG_EVIDENCE = 3.0  # for one camera against many: twenty to one
+MIN_LOG_EVIDENCE = 3.0  # for one camera against many, or against a focal length: twenty to one
+MAX_BEND = 0.05  # longer sides; votes allow for as much distortion (DISTORTION_SIGMA)
+MIN_NUM_PAIRS = 5  # that are asked whether they contradict what is known
+FOCAL_STEP = 4  # every 4th candidate is tried then
 UNDECIDED = "pairs do not tell whether images of this size share a camera"
 MAX_SPREAD = 1.4  # ratio of the ends of an interval that counts as knowledge
 
@@ -154,6 +158,34 @@ def _ballots(
     return ballots
 
 
+def contradicted_cameras(
+    pairs: Sequence[VotingPair], focals: Mapping[int, float]
+) -> frozenset[int]:
+    """Return the cameras whose focal length (longer sides) half of their pairs or more contradict.
+
+    None unless most of all pairs do, and there are some: single pairs may be wrong themselves.
+    """
+    asked = [pair for pair in pairs if focals.keys() >= set(pair.cameras)][:MAX_PAIRS_OF_DECISION]
+    verdicts = list(map_ordered(lambda pair: _contradicts(pair, focals), asked, available_cores()))
+    if len(asked) < MIN_NUM_PAIRS or 2 * sum(verdicts) <= len(asked):
+        return frozenset()
+    of_camera: dict[int, list[bool]] = defaultdict(list)
+    for pair, verdict in zip(asked, verdicts, strict=True):
+        for camera in set(pair.cameras):
+            of_camera[camera].append(verdict)
+    return frozenset(key for key, own in of_camera.items() if 2 * sum(own) >= len(own))
+
+
+def _contradicts(pair: VotingPair, focals: Mapping[int, float]) -> bool:
+    """Tell whether some focal lengths are twenty times as likely as those that are known."""
+    firsts = seconds = FOCALS[::FOCAL_STEP]
+    if pair.cameras[0] != pair.cameras[1]:
+        firsts, seconds = (side.ravel() for side in np.meshgrid(firsts, seconds))
+    known = [focals[camera] for camera in pair.cameras]
+    evidence = log_evidence(pair.matched, np.append(known[0], firsts), np.append(known[1], seconds))
+    return bool(evidence.max() - evidence[0] >= MIN_LOG_EVIDENCE)
+
+
 def needs_vote(records: Mapping[int, CameraRecord]) -> bool:
     """Tell whether there are cameras that nobody knows and no vote was held for."""
     return any(item.source == "guess" and item.low_px is None for item in records.values())
@@ -182,11 +214,13 @@ def voting_pairs(
     unknown: Collection[int],
     extracted_px: ExtractedPx,
     silent: Collection[tuple[str, str]] = (),
+    *,
+    only_straight: bool = False,
 ) -> list[VotingPair]:
     """Read the verified pairs that can say something about cameras, strongest first.
 
     ``unknown`` are the ids of the cameras that are asked for, ``silent`` pairs of image names that
-    are not asked.
+    are not asked. With ``only_straight`` pairs of lenses that bend lines much are left out.
     """
     with open_database(path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
@@ -202,6 +236,7 @@ def voting_pairs(
             and geometry.config not in PLANAR
             and any(cameras[image_id].camera_id in unknown for image_id in pair)
             and frozenset(names[image_id] for image_id in pair) not in left_out
+            and not (only_straight and any(bends_much(cameras[image_id]) for image_id in pair))
         ]
         useful.sort(key=lambda item: (-len(item[1].inlier_matches), item[0]))
         chosen, num = [], Counter[int]()
@@ -224,6 +259,16 @@ def voting_pairs(
             )
             for pair, geometry in chosen
         ]
+
+
+def bends_much(camera: pycolmap.Camera) -> bool:
+    """Tell whether a corner is much off where a lens without distortion has it."""
+    corner = np.array([camera.width, camera.height], np.float64)
+    center = [camera.principal_point_x, camera.principal_point_y]
+    ray, focal = camera.cam_from_img(corner), camera.mean_focal_length()
+    if ray is None:
+        return True
+    return bool(np.linalg.norm(ray * focal - (corner - center)) > MAX_BEND * corner.max())
 
 
 def _voting_pair(

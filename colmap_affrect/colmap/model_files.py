@@ -90,15 +90,15 @@ def read_given_model(
     folder: Path, option: str = "", error_class: type[AffrectError] = OptionError
 ) -> pycolmap.Reconstruction:
     """Read a model that the user gives, text or binary; an error names the option it came by."""
+    wanted = "give the folder that holds cameras, images and points3D as .bin or .txt"
+    if not folder.is_dir():
+        raise OptionError(f"{option}{folder}: no such folder; {wanted}")
     if all((folder / name).exists() for name in RECORDS):
         registered_names(folder)  # pycolmap's reader may never end on a damaged file
     try:
         return pycolmap.Reconstruction(folder)
     except (RuntimeError, ValueError) as error:
-        raise error_class(
-            f"{option}{folder}: not a COLMAP model; give the folder that holds cameras, images and "
-            f"points3D as .bin or .txt ({' '.join(str(error).split())})"
-        ) from error
+        raise error_class(f"{option}{folder}: not a COLMAP model; {wanted}") from error
 
 
 def _require_written(folder: Path) -> None:

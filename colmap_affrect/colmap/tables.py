@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.errors import DatabaseError
+from colmap_affrect.errors import DatabaseError, OptionError
 
 TABLES = {"cameras", "images", "keypoints", "matches"}  # of all versions of COLMAP
 HOT_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins one of unfinished changes
@@ -27,7 +27,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     SQLite then makes no files beside it, so that its folder may be read-only.
     """
     if not path.is_file():
-        raise DatabaseError(f"{path}: no such file; give a COLMAP database")
+        raise OptionError(f"{path}: no such file; give a COLMAP database")
     wal, journal = (path.with_name(path.name + suffix) for suffix in ("-wal", "-journal"))
     mode = "mode=ro" if wal.exists() or journal.exists() else "immutable=1"
     address = f"{path.resolve().as_uri()}?{mode}"
@@ -100,9 +100,10 @@ class Tables:
         features = sum(rows for rows, _ in self.keypoints.values())
         raw = sum(count > 0 for count in self.matches.values())
         verified = sum(count > 0 for count, _ in self.geometries.values())
+        images, cameras = len(self.names), len(self.cameras)
         return (
-            f"{len(self.names)} images, {len(self.cameras)} cameras, {features} keypoints, "
-            f"{raw} matched and {verified} verified pairs"
+            f"{images} image{'s' * (images != 1)}, {cameras} camera{'s' * (cameras != 1)}, "
+            f"{features} keypoints, {raw} matched and {verified} verified pairs"
         )
 
 

@@ -200,7 +200,8 @@ class Mark(Node):
     """What one method does with one photograph.
 
     Attributes:
-        is_doubtful: registered in poses that contradict those of other seeds or methods.
+        is_doubtful: registered in poses that contradict those of other seeds, or of most other
+            methods.
         is_only: usually registered by no other method.
     """
 
@@ -233,11 +234,14 @@ def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
     usually_registered = [column.method.usually_registered for column in columns]
     only = comparison.only_registered_by if len(columns) > 1 else {}
     registered_by_none = set(comparison.registered_by_none)
+    placed = [column.method.seeds[0].registered_names for column in columns]
     cards = []
     for number, name in enumerate(comparison.image_names, 1):
         truth, alone = name in with_truth, only.get(name)
+        num_others = sum(name in names for names in placed) - 1
         marks = tuple(
-            _mark(c, number, name, has_truth=truth, is_only=alone == c.name) for c in columns
+            _mark(c, number, name, num_others, has_truth=truth, is_only=alone == c.name)
+            for c in columns
         )
         tests = {
             "all": True,
@@ -252,7 +256,13 @@ def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
     return cards
 
 
-def _mark(column: Column, number: int, name: str, *, has_truth: bool, is_only: bool) -> Mark:
+def _mark(
+    column: Column, number: int, name: str, num_others: int, *, has_truth: bool, is_only: bool
+) -> Mark:
+    """Mark what a method does with a photograph that some other methods place, too.
+
+    It is doubtful in a method that contradicts most of these, not in all that one contradicts.
+    """
     method, seeds = column.method, column.method.seeds
     registering = [seed for seed in seeds if name in seed.registered_names]
     correct = [s for s in registering if s.scores is not None and name in s.scores.correct_names]
@@ -269,6 +279,7 @@ def _mark(column: Column, number: int, name: str, *, has_truth: bool, is_only: b
         text += ", correctly"
     is_unstable = name in method.unstable_names
     others = [other for other, names in method.disagreements.items() if name in names]
+    is_odd = 2 * len(others) > max(0, num_others)
     if is_unstable:
         text += ", in poses that contradict each other from seed to seed"
     if others:
@@ -280,7 +291,7 @@ def _mark(column: Column, number: int, name: str, *, has_truth: bool, is_only: b
         is_wrong,
         f"{column.name}: {text}",
         column=column,
-        is_doubtful=is_unstable or bool(others),
+        is_doubtful=is_unstable or is_odd,
         is_only=is_only,
     )
 

@@ -41,6 +41,8 @@ def diagnose(
         image_path = None
     if path is not None and path.is_dir():
         examine_folder(findings, path, image_path)
+    elif path is not None and not path.exists():
+        findings.add("not-there", path)
     elif path is not None:
         examine_database(findings, path, image_path)
     _examine_installation(findings, weights_path)

@@ -181,7 +181,7 @@ def examined_copy(
             copy_as_it_is(path, copy)
         except DatabaseError as error:
             message = without_path(path, error).replace(str(copy), "a temporary file")
-            findings.add("no-database" if path.exists() else "not-there", path, error=message)
+            findings.add("no-database", path, error=message)
             yield None
             return
         if version < newest:

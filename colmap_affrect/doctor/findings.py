@@ -43,7 +43,7 @@ TEXTS: dict[str, Check] = CHECKS | {
     "no-weights": ("note", "not found: {missing}",
         "run 'colmap-affrect weights fetch' before using learned features without network"),
     # a database as a whole
-    "not-there": ("error", "{error}", "give a COLMAP database or an output folder"),
+    "not-there": ("error", "no such file or folder", "give a COLMAP database or an output folder"),
     "no-database": ("error", "{error}",
         "give a COLMAP database or an output folder of colmap-affrect; of a damaged database, "
         f"{RECOVER}"),

@@ -134,7 +134,7 @@ def evaluate(
     chosen = make_protocol(protocol) if isinstance(protocol, str) else protocol
     methods = _methods(options)
     if not dataset_path.is_dir():
-        raise EvaluationError(f"{dataset_path}: no such folder; give the folder of the dataset")
+        raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
     with Workspace(output_path).locked():
         dataset = _loaded(chosen, dataset_path, progress)
         settings = {

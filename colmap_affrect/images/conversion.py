@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image, UnidentifiedImageError
 
-from colmap_affrect.errors import ImageError
+from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.images.headers import pages
 from colmap_affrect.images.photographs import TIFF_SUFFIXES, photograph_files
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format
@@ -47,13 +47,17 @@ def convert_images(
     """Fill a folder with the photographs of another one, all in formats that COLMAP reads.
 
     Pages of a file become a file each, ``scan.tif-page2.png``. EXIF, its orientation too, stays.
-    What is there already is not made again. Raises ImageError when there are no photographs, or
-    the new folder is inside the old one.
+    What is there already is not made again. Raises ImageError when there are no photographs,
+    OptionError when their folder is not there, or the new one is inside it.
     """
     if image_path.is_file():
-        raise ImageError(f"{image_path}: is a file; give the folder that it is in")
+        raise OptionError(f"{image_path}: is a file; give the folder that it is in")
+    if not image_path.is_dir():
+        raise OptionError(f"{image_path}: no such folder; give the folder of the photographs")
+    if output_path.resolve() == image_path.resolve():
+        raise OptionError(f"{output_path}: is the folder of the photographs; give another one")
     if output_path.resolve().is_relative_to(image_path.resolve()):
-        raise ImageError(f"{output_path}: is inside {image_path}; give a folder beside it")
+        raise OptionError(f"{output_path}: is inside {image_path}; give a folder beside it")
     with suppress(ImportError):  # of the extra "heic"
         from pillow_heif import register_heif_opener
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.data import Photograph
-from colmap_affrect.errors import DepthError, WorkspaceError
+from colmap_affrect.errors import DepthError, OptionError, WorkspaceError
 from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Singles
 from colmap_affrect.images.depth_files import SUFFIXES, UnusableMap, read_map
 from colmap_affrect.images.headers import header_size
@@ -155,7 +155,7 @@ class DepthFiles:
     def require_some(self, names: Sequence[str]) -> None:
         """Check, before any image is processed, that at least one has a map; else DepthError."""
         if not self._path.is_dir():
-            raise DepthError(f"{self._path}: no such folder; give the folder of the depth maps")
+            raise OptionError(f"{self._path}: no such folder; give the folder of the depth maps")
         if not any(self._options.file(name) for name in names):
             raise DepthError(
                 f"{self._path}: holds no depth map of any of the {len(names)} images; "

@@ -133,12 +133,13 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     """Return the sorted names, relative to ``image_path``, of all images or of those listed.
 
     Folders are searched through; hidden ones and files of other formats are passed over (see
-    :func:`left_out`). ImageError when there are none, or a listed one is missing.
+    :func:`left_out`). OptionError when there is no such folder or list, ImageError when it holds
+    none, or a listed one is missing.
     """
     if image_path.is_file():
-        raise ImageError(f"{image_path}: is a file; give the folder that it is in")
+        raise OptionError(f"{image_path}: is a file; give the folder that it is in")
     if not image_path.is_dir():
-        raise ImageError(f"{image_path}: no such folder; give the folder of the photographs")
+        raise OptionError(f"{image_path}: no such folder; give the folder of the photographs")
     if image_list_path is not None:
         return _listed_images(image_path, image_list_path)
     files = _visible_files(image_path)
@@ -218,7 +219,9 @@ def _odd(name: str) -> str:
 def _listed_images(image_path: Path, image_list_path: Path) -> list[str]:
     try:
         lines = image_list_path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise OptionError(f"{image_list_path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
         raise ImageError(f"{image_list_path}: cannot be read ({error})") from error
     listed = [
         line if _is_below(image_path, line) else line.strip()  # a name may begin with a space or #

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap.checks import is_unsafe
-from colmap_affrect.errors import StoreError
+from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.images.photographs import refuse_colliding_keys
 from colmap_affrect.pairs.base import Pair
@@ -96,7 +96,7 @@ class Source:
 def _opened(path: Path) -> Iterator[Source]:
     """Open a file for reading; links and data that lead out of it are refused."""
     if not path.is_file():
-        raise StoreError(f"{path}: no such file")
+        raise OptionError(f"{path}: no such file")
     try:
         file = h5py.File(path, "r")
     except BlockingIOError as error:

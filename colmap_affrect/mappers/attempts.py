@@ -14,7 +14,12 @@ from colmap_affrect.colmap.verification import inlier_matches, num_tied
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.arrivals import arrivals, bridges_of
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
-from colmap_affrect.mappers.doubts import FOCAL_DOUBT, find_doubts, without_impossible
+from colmap_affrect.mappers.doubts import (
+    FOCAL_DOUBT,
+    MIRRORED_COPY,
+    find_doubts,
+    without_impossible,
+)
 from colmap_affrect.mappers.existing import require_extends
 from colmap_affrect.mappers.last_adjustment import MIN_NUM_TRACKS, adjust_last
 from colmap_affrect.mappers.loose_cameras import loose_images
@@ -152,7 +157,7 @@ class _Attempts:
             return True
         if self._done >= self._limit:
             return False
-        if not best or _size(best[0])[0] < min(self._num_images, LARGE_MODEL):
+        if not best or _num_settled(best[0]) < min(self._num_images, LARGE_MODEL):
             return True
         return self._done < len(self._starts) and not _is_well_tied(best[0].reconstruction)
 
@@ -179,6 +184,12 @@ class _Attempts:
         found = self._mapper.map(task, output_path, seed, show)
         self._ran = runaways(max(found, key=_size).reconstruction, self._task) if found else set()
         return found
+
+
+def _num_settled(model: MappedModel) -> int:
+    """Return how many images are registered, or are copies that belong nowhere."""
+    copies = [why for why in model.taken_out.values() if MIRRORED_COPY in why]
+    return _size(model)[0] + len(copies)
 
 
 def _is_well_tied(model: pycolmap.Reconstruction) -> bool:

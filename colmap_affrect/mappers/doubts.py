@@ -5,7 +5,7 @@ Doubts have two degrees: what is certainly wrong leaves the model, the rest is t
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
 from colmap_affrect.mappers.arrivals import MIN_THREE_VIEW_POINTS
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
@@ -68,11 +69,16 @@ MAX_ANGLE_DEG = 90.0
 """To the next image. Surfaces are then tilted by 45 degrees in one of both at least: single matches
 survive that, not most of an image; repeated and symmetric structures look so."""
 
+NUM_CONFIRMING = 2
+"""Images with enough points under smaller angles. One pair always agrees with itself; two confirm
+an image, whatever else it sees from the other side."""
+
 MIN_BASELINE_DEG = 1.0
 """Between two cameras, as their points see them. Rotations are right within a tenth of a degree at
 best, which moves centres by as much: the direction between nearer ones is off by 5 degrees then."""
 
-FOCAL_DOUBT = "any focal length fits, and where it stands depends on that"
+FOCAL_DOUBT = "any focal length fits, and the place of the camera depends on that"
+MIRRORED_COPY = "mirrored copy of"
 
 MAX_PAIRS_FOR_PARALLAX, MAX_POINTS_FOR_ANGLES = 100, 2000
 """Pairs and points looked at; more change no share."""
@@ -164,13 +170,12 @@ def _image_doubts(
         agreement = agreeing / total if total else 1.0
         found = [
             *([] if image.camera_id in given else _camera_doubts(_camera(image))),
-            *_support_doubts(
-                image.num_points3D, agreement, [next_deg for next_deg, _ in angles[image_id]]
-            ),
+            *_support_doubts(image.num_points3D, agreement),
+            *_angle_doubts(reconstruction, image, [nearest for nearest, _ in angles[image_id]]),
             *_place_doubts(near[image_id], len(registered) - 1),
             *_copy_doubts(graph.names.get(originals.get(image_id, -1))),
             *_bridge_doubts(bridges.get(image.name)),
-            *_focal_doubts(image.name in loose),
+            *_focal_doubts(task.cameras.get(image.camera_id), is_loose=image.name in loose),
         ]
         if found:
             reasons[image.name] = "; ".join(text for text, _ in found)
@@ -185,24 +190,44 @@ def _camera_doubts(camera: pycolmap.Camera) -> Iterator[tuple[str, bool]]:
     focal = camera.mean_focal_length() / _side(camera)
     if not FOCAL_LENGTHS[0] <= focal <= FOCAL_LENGTHS[1]:
         low, high = IMPOSSIBLE_FOCAL_LENGTHS
-        yield f"its focal length is {focal:.3g} longer sides", not low <= focal <= high
+        view_deg = 2.0 * np.rad2deg(np.arctan(0.5 / focal))
+        text = f"the focal length is {camera.mean_focal_length():.0f} px, a view of "
+        yield f"{text}{view_deg:.3g} degrees", not low <= focal <= high
     elif camera.has_bogus_params(*IMPOSSIBLE_FOCAL_LENGTHS, MAX_DISTORTION):
         wrong = camera.has_bogus_params(*IMPOSSIBLE_FOCAL_LENGTHS, IMPOSSIBLE_DISTORTION)
-        yield "the distortion of its lens is extreme", wrong
+        yield "the distortion of the lens is extreme", wrong
 
 
-def _support_doubts(
-    num: int, agreement: float, angles: Sequence[float]
-) -> Iterator[tuple[str, bool]]:
-    """Doubt what few points hold, what pairs disagree with, and points seen from all sides."""
+def _support_doubts(num: int, agreement: float) -> Iterator[tuple[str, bool]]:
+    """Doubt what few points hold, and what pairs disagree with."""
     if num < MIN_OBSERVATIONS:
-        yield f"only {num} points hold it", num < TOO_FEW_OBSERVATIONS
+        yield f"held by only {num} points", num < TOO_FEW_OBSERVATIONS
     if agreement < MIN_AGREEMENT:
-        text = f"only {agreement:.0%} of the matches of its verified pairs agree with its pose"
+        text = f"only {agreement:.0%} of the matches of verified pairs agree with the pose"
         yield text, agreement < NO_AGREEMENT
-    if len(angles) >= TOO_FEW_OBSERVATIONS and np.median(angles) > MAX_ANGLE_DEG:
+
+
+def _angle_doubts(
+    model: pycolmap.Reconstruction, image: pycolmap.Image, angles: Sequence[float]
+) -> Iterator[tuple[str, bool]]:
+    """Doubt images whose points other images see from the other side, unless two confirm it."""
+    if len(angles) < TOO_FEW_OBSERVATIONS or np.median(angles) <= MAX_ANGLE_DEG:
+        return
+    if _num_confirming(model, image) < NUM_CONFIRMING:
         apart = f"{np.median(angles):.0f} degrees apart"
-        yield f"most of its points are seen from directions {apart}", False
+        yield f"most points are seen from directions {apart}", False
+
+
+def _num_confirming(model: pycolmap.Reconstruction, image: pycolmap.Image) -> int:
+    """Return how many images see enough points of an image from not too different directions."""
+    own, counts = image.projection_center(), Counter[int]()
+    for observed in image.get_observation_points2D():
+        point = model.point3D(observed.point3D_id)
+        ray = own - point.xyz
+        for other in {element.image_id for element in point.track.elements} - {image.image_id}:
+            other_ray = model.images[other].projection_center() - point.xyz
+            counts[other] += bool(ray @ other_ray > 0.0)  # less than MAX_ANGLE_DEG apart
+    return sum(count >= MIN_OBSERVATIONS for count in counts.values())
 
 
 def _place_doubts(nearby: Sequence[str], num_others: int) -> Iterator[tuple[str, bool]]:
@@ -215,7 +240,7 @@ def _place_doubts(nearby: Sequence[str], num_others: int) -> Iterator[tuple[str,
 
 def _copy_doubts(original: str | None) -> Iterator[tuple[str, bool]]:
     if original:
-        yield f"a mirrored copy of {original}", True
+        yield f"{MIRRORED_COPY} {original}", True
 
 
 def _bridge_doubts(bridge: Bridge | None) -> Iterator[tuple[str, bool]]:
@@ -227,7 +252,12 @@ def _bridge_doubts(bridge: Bridge | None) -> Iterator[tuple[str, bool]]:
         yield f"bridged by {bridge.pair[0]}, where only {some} depths agree on the scale", False
 
 
-def _focal_doubts(is_loose: bool) -> Iterator[tuple[str, bool]]:
+def _focal_doubts(record: CameraRecord | None, *, is_loose: bool) -> Iterator[tuple[str, bool]]:
+    if record and record.is_contradicted:
+        yield (
+            f"the verified pairs contradict the given focal length, {record.focal_px:.0f} px",
+            False,
+        )
     if is_loose:
         yield FOCAL_DOUBT, False
 

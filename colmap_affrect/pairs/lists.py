@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap.database import nearest_positions
-from colmap_affrect.errors import PairListError
+from colmap_affrect.errors import OptionError, PairListError
 from colmap_affrect.geometry.arrays import Indices, Singles
 from colmap_affrect.pairs.base import Pair, PairList, PairOptions
 from colmap_affrect.project.atomic_files import replace_lines
@@ -158,7 +158,9 @@ def read_pairs(path: Path, names: Sequence[str]) -> PairList:
     try:
         with path.open(encoding="utf-8-sig") as file:
             found = np.fromiter(codes(file), np.int64)
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
         raise PairListError(f"{path}: cannot be read ({error})") from error
     if problems:
         more = len(problems) - MAX_NAMES_IN_MESSAGE

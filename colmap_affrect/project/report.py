@@ -171,8 +171,12 @@ class ModelSummary:
     @property
     def is_consistent(self) -> bool:
         """Whether two images or more are left that nothing speaks against."""
-        num_contradicted = len(self.doubtful) - len(self.loose)
-        return not self.doubts and len(self.registered_names) - num_contradicted > 1
+        return not self.doubts and len(self.registered_names) - self.num_contradicted > 1
+
+    @property
+    def num_contradicted(self) -> int:
+        """Number of images that something speaks against."""
+        return len(self.doubtful) - len(self.loose)
 
     def rival_lines(self) -> list[str]:
         """Say which focal lengths fit as well as those of the model."""

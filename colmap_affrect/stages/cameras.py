@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
 from colmap_affrect.colmap.camera_records import (
@@ -15,6 +16,7 @@ from colmap_affrect.colmap.camera_records import (
 from colmap_affrect.colmap.camera_vote import (
     CameraVote,
     apply_records,
+    contradicted_cameras,
     forget_votes,
     needs_vote,
     voting_pairs,
@@ -74,6 +76,7 @@ def hold_vote(
     A killed one is gone on with: what was decided is written first, and putting it into the
     database may be repeated. The cameras of the database change, and pairs are verified again with
     those that the pairs know; the records are brought up to date. ``silent`` pairs do not vote.
+    Focal lengths that the user gave stay, whatever pairs say; it is put on record.
     """
     records = read_camera_records(records_path)
     if needs_vote(records):
@@ -88,3 +91,13 @@ def hold_vote(
     if any(record.low_px is not None for record in records.values()):
         apply_records(database_path, records)
         verify(database_path, verification, size_px)
+    given = {
+        key: record.focal_px / max(record.size)
+        for key, record in records.items()
+        if "focal" in record.given and record.focal_px > 0.0 and record.is_contradicted is None
+    }
+    if given:
+        pairs = voting_pairs(database_path, given, size_px, silent, only_straight=True)
+        found = contradicted_cameras(pairs, given)
+        records |= {key: replace(records[key], is_contradicted=key in found) for key in given}
+        write_camera_records(records_path, records)

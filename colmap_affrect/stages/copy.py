@@ -11,7 +11,7 @@ from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_with_frames
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
-from colmap_affrect.errors import DatabaseError
+from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
@@ -39,7 +39,7 @@ def copy_verified(
     start = time.perf_counter()
     workspace = context.workspace
     if image_path and not image_path.is_dir():
-        raise DatabaseError(f"--image-path {image_path}: no such folder")
+        raise OptionError(f"--image-path {image_path}: no such folder")
     contents = Contents(workspace.contents)
     digest, before = contents.digest(source_files(source)), contents.recorded("copy")
     if digest != before or not workspace.database.exists():

@@ -274,9 +274,17 @@ def advice(
     if not missing and not is_doubtful:
         return ()
     workspace = context.workspace
-    if sum(map(bool, colmap_database.keypoint_counts(workspace.database).values())) < 2:
+    num_keypoints = colmap_database.keypoint_counts(workspace.database)
+    if sum(map(bool, num_keypoints.values())) < 2:
         return (TOO_FEW,)
+    missing = [name for name in missing if name in num_keypoints]  # nothing helps unreadable ones
+    if not missing and not is_doubtful:
+        return ()
+    is_contradicted = bool(models and (models[0].doubts or models[0].num_contradicted))
     texts = []
+    if any(record.is_contradicted for record in read_camera_records(workspace.cameras).values()):
+        texts.append("run again without the given focal lengths, or with others: pairs contradict "
+                     "them")  # fmt: skip
     has_cameras = is_copy(workspace) or Inputs.recorded(workspace).from_database
     if models and (models[0].rival_focals_px or models[0].loose) and not has_cameras:
         texts.append(
@@ -292,9 +300,10 @@ def advice(
             texts.append("run again with --camera-mode single, if one camera took all: their size "
                          "is the same")  # fmt: skip
         masks = Inputs.recorded(workspace).masks
-        if not (masks.path or masks.camera_path):
+        if (missing or is_contradicted) and not (masks.path or masks.camera_path):
             texts.append(
-                "run again with --mask-path, if things move, repeat or are written on them"
+                "run again with --mask-path, if things move, repeat or are written on the "
+                "photographs"
             )
     if missing:
         texts += [] if is_copy(workspace) else _other_recipes(context)
@@ -305,7 +314,10 @@ def advice(
 def _other_recipes(context: Context) -> list[str]:
     recipe, texts = context.workspace.recipe(), []
     if recipe not in (STRONGER_RECIPE, LEARNED_RECIPE):
-        texts.append(f"run again with --recipe {STRONGER_RECIPE}, which tries more warps for those")
+        texts.append(
+            f"run again with --recipe {STRONGER_RECIPE}, which tries more warps for the missing "
+            "photographs"
+        )
     if recipe != LEARNED_RECIPE:
         weights = load_recipe(LEARNED_RECIPE).weights
         gone = missing_weights(weights, context.resources.weights_path)

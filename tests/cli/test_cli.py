@@ -147,7 +147,7 @@ def test_failure_prints_one_line_and_leaves_the_traceback_in_the_log(
 ) -> None:
     arguments = ["run", "--image-path", tmp_path / "none", "--output-path", tmp_path / "out"]
     done = call(*arguments)
-    assert (done.code, done.stdout) == (1, "")
+    assert (done.code, done.stdout) == (2, "")
     assert done.stderr == [
         f"error: {tmp_path / 'none'}: no such folder; give the folder of the photographs"
     ]
@@ -156,7 +156,7 @@ def test_failure_prints_one_line_and_leaves_the_traceback_in_the_log(
     call(*arguments)
     log = (tmp_path / "out" / "run.log").read_text()
     assert "Traceback" in log
-    assert "ImageError" in log
+    assert "OptionError" in log
 
 
 def test_page_is_written_unless_it_is_left_out(verified: Path, call: Call) -> None:
@@ -234,10 +234,13 @@ def test_inspect_draws_a_sheet_and_writes_the_plan(tmp_path: Path, call: Call) -
         (["--device", "gpu"], 1, "--device gpu: not one of auto, cpu, cuda"),
         (["--recipe", "depth-planes-recommended"], 2, "give --depth-path FOLDER, or --depth-mod"),
         (["--recipe", "depth-planes"], 2, "give --depth-path FOLDER, or --depth-model"),
-        (["--recipe", "depth-planes-recommended", "--depth-path", "nowhere"], 1, "nowhere"),
-        (["--recipe", "dense-affnet", "--weights", "nowhere"], 1, "nowhere: not a folder"),
+        (["--recipe", "depth-planes-recommended", "--depth-path", "nowhere"], 2, "nowhere"),
+        (["--recipe", "dense-affnet", "--weights", "nowhere"], 2, "nowhere: not a folder"),
         (["--recipe", "defalt"], 2, "did you mean 'default'"),
-        (["--pairs", "vocab"], 2, "vocab"),
+        (["--pairs", "vocab"], 2, "pairs: methods='vocab' is not one of"),
+        (["--image-list-path", "none.txt"], 2, "none.txt: cannot be read (No such file"),
+        (["--from-database", "none.db"], 2, "none.db: no such file"),
+        (["--extend", "none"], 2, "--extend none: no such folder; give"),
         (["--camera-params", "1,2"], 2, "SIMPLE_RADIAL needs 4 values"),
         (["--config", "none.toml"], 2, "none.toml: no such file"),
     ],

@@ -97,6 +97,41 @@ def content(path: Path) -> tuple[Any, ...]:
     return cameras, rigs, frames, images, list(pairs), verified
 
 
+def with_given(path: Path, focal_px: float, *distortion: float) -> None:
+    """Give all cameras a focal length and perhaps a distortion, as the user may."""
+    records_path = path.with_name("cameras.json")
+    with open_database(path) as database:
+        for camera in database.read_all_cameras():
+            model, center = "RADIAL" if distortion else "SIMPLE_PINHOLE", camera.params[1:3]
+            camera.model = getattr(pycolmap.CameraModelId, model)
+            camera.params = [focal_px, *center, *distortion]
+            camera.has_prior_focal_length = True
+            database.update_camera(camera)
+    verify(path, VERIFICATION)
+    given = {
+        key: replace(record, source="given", focal_px=focal_px, given=("focal", "distortion"))
+        for key, record in read_camera_records(records_path).items()
+    }
+    write_camera_records(records_path, given)
+
+
+@pytest.mark.parametrize(
+    ("focal", "distortion", "expected"),
+    [(FOCAL, (), False), (0.5 * FOCAL, (), True), (0.5 * FOCAL, (0.4, 0.1), False)],
+)
+def test_given_focal_length_that_most_pairs_contradict(
+    tmp_path: Path, focal: float, distortion: tuple[float, ...], *, expected: bool
+) -> None:
+    path = write(tmp_path / "database.db", [FOCAL] * 4, [WIDE] * 4)
+    with_given(path, 1000.0 * focal, *distortion)
+    records = vote(path)
+    assert {record.is_contradicted for record in records.values()} == {expected}
+    assert {record.focal_px for record in records.values()} == {1000.0 * focal}
+    before = path.with_name("cameras.json").stat().st_mtime_ns
+    assert vote(path) == records
+    assert path.with_name("cameras.json").stat().st_mtime_ns == before
+
+
 def test_scans_of_one_camera_get_one_and_its_focal_length(scans: Path, voted: Path) -> None:
     """A turned scan shares the focal length, not the camera: its sides are swapped."""
     records = read_camera_records(voted.with_name("cameras.json"))

@@ -98,7 +98,7 @@ def new_matches(first: int, second: int, table: str = "matches") -> Statement:
 def test_healthy_database_has_no_problem(database_path: Path) -> None:
     tables, problems = check_database(database_path)
     assert problems == {}
-    assert tables.summary() == ("3 images, 1 cameras, 21 keypoints, 3 matched and 3 verified pairs")
+    assert tables.summary() == ("3 images, 1 camera, 21 keypoints, 3 matched and 3 verified pairs")
     assert tables.num_keypoints() == dict(zip(NAMES, NUM_KEYPOINTS, strict=True))
     assert tables.matched_pairs() == {
         ("a.png", "b c.png"), ("a.png", "side/č.png"), ("b c.png", "side/č.png"),

@@ -20,7 +20,7 @@ from colmap_affrect.colmap.database_copy import (
     schema_version,
 )
 from colmap_affrect.colmap.initial_cameras import import_images
-from colmap_affrect.errors import DatabaseError
+from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 
 COLMAP_3_8 = """
@@ -164,7 +164,7 @@ def test_what_is_no_database_is_one_clear_line(
     if content is not None:
         path.write_bytes(content)
     for copy in (copy_database, copy_without_features):
-        with pytest.raises(DatabaseError, match=message):
+        with pytest.raises(OptionError if content is None else DatabaseError, match=message):
             copy(path, tmp_path / "copy.db")
     assert {item.name for item in tmp_path.iterdir()} <= {"x.db"}
 

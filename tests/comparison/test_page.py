@@ -15,7 +15,8 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.comparison.page import choose_pairs, plot_pairs, write_page
+from colmap_affrect.comparison.method_table import columns_of
+from colmap_affrect.comparison.page import cards_of, choose_pairs, plot_pairs, write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.verdict import verdict
 from colmap_affrect.report.match_plots import PLOT_HEIGHT
@@ -158,6 +159,23 @@ def test_marks_say_what_each_method_does_with_a_photograph(page: Page) -> None:
     groups = " ".join(page.values("li", "data-groups")).split()
     expected = {"all": 6, "seeds": 1, "wrong": 1, "none": 2}  # "usually" differ: not with half
     assert {group: groups.count(group) for group in set(groups)} == expected
+
+
+def test_of_methods_that_contradict_each_other_the_odd_one_is_marked(
+    comparison: Comparison,
+) -> None:
+    name, (sift, _, default) = NAMES[0], comparison.methods
+    odd = replace(default, name="odd", disagreements={"sift": (name,), "default": (name,)})
+    others = [replace(each, disagreements={"odd": (name,)}) for each in (sift, default)]
+
+    def marked(*methods: MethodResult) -> list[str]:
+        columns = columns_of(replace(comparison, methods=methods))
+        cards = cards_of(columns, comparison)
+        return [mark.column.name for card in cards for mark in card.marks if mark.is_doubtful]
+
+    assert marked(odd, *others) == ["odd"]
+    two = replace(odd, disagreements={"sift": (name,)}), others[0]
+    assert sorted(marked(*two)) == ["odd", "sift"]
 
 
 def test_names_of_images_are_never_markup(page: Page) -> None:

@@ -142,12 +142,12 @@ def test_seeds_that_disagree_are_named():
 
 
 def test_doubts_of_most_seeds_are_told():
-    few = {"doubtful": {"d": "only 9 points hold it"}, "doubts": ("no parallax",)}
+    few = {"doubtful": {"d": "held by only 9 points"}, "doubts": ("no parallax",)}
     seeds = [replace(seed_result("abcd", seed), **few) for seed in (0, 1)]
     doubtful = replace(default("abcd"), seeds=(*seeds, seed_result("abcd", 2)))
     texts = rules.doubts(comparison(SIFT, doubtful))
     assert texts == [
-        "Doubtful in default: d (only 9 points hold it).",
+        "Doubtful in default: d (held by only 9 points).",
         "Doubtful in default: the whole model (no parallax).",
     ]
     assert doubtful.span("num_doubtful").max == 4

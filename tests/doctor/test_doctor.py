@@ -90,7 +90,7 @@ def test_healthy_run_has_no_findings_and_stays_as_it_is(folders: Folders) -> Non
     for text in (
         "stages on record: extract, pairs, match, verify, guide, map; recipe default",
         "features.h5: features of 3 images",
-        "3 images, 1 cameras",
+        "3 images, 1 camera",
         "matches of 3 pairs of 3",
         "sparse: models of 3 images",
     ):
@@ -280,6 +280,12 @@ def test_photographs_of_another_size_are_errors(folders: Folders) -> None:
     assert found.what == "images whose file cannot be read (1): a.png"
     (found,) = findings(folders.database, folders.photos / "none")
     assert (found.where, found.what) == (str(folders.photos / "none"), "no such folder")
+
+
+def test_path_that_is_not_there(tmp_path: Path) -> None:
+    (found,) = findings(tmp_path / "none.db")
+    assert found.what == "no such file or folder"
+    assert found.advice == "give a COLMAP database or an output folder"
 
 
 def test_folder_in_use_is_left_alone(folders: Folders) -> None:

@@ -360,7 +360,7 @@ def test_command_prints_tables_and_errors_are_one_line(dataset: Path, tmp_path: 
     row = next(line for line in ended.stdout.splitlines() if line.startswith("unrectified-roo"))
     assert row.split()[1:7] == ["3"] * 6
     missing = run_in_process_of_its_own(*common, "--dataset-path", tmp_path / "nowhere")
-    assert missing.code == 1
+    assert missing.code == 2
     assert missing.errors == [
         f"error: {tmp_path / 'nowhere'}: no such folder; give the folder of the dataset"
     ]

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image, TiffImagePlugin
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import ImageError
+from colmap_affrect.errors import OptionError
 from colmap_affrect.images.conversion import convert_images
 from colmap_affrect.images.reading import decode
 
@@ -78,8 +78,12 @@ def test_what_is_there_is_not_made_again(scans: Path, tmp_path: Path) -> None:
 
 
 def test_new_folder_inside_the_old_one_is_refused(scans: Path) -> None:
-    with pytest.raises(ImageError, match="give a folder beside it"):
+    with pytest.raises(OptionError, match="give a folder beside it"):
         convert_images(scans, scans / "png")
+    with pytest.raises(OptionError, match="is the folder of the photographs"):
+        convert_images(scans, scans)
+    with pytest.raises(OptionError, match="nowhere: no such folder"):
+        convert_images(scans / "nowhere", scans)
 
 
 def test_whatever_pillow_raises_of_a_damaged_file_the_others_are_converted(

@@ -20,7 +20,7 @@ from synthetic import write_image
 
 from colmap_affrect.colmap.poses import read_poses
 from colmap_affrect.data import Photograph
-from colmap_affrect.errors import DepthError
+from colmap_affrect.errors import DepthError, OptionError
 from colmap_affrect.images.depth import DepthFiles, DepthFilesOptions
 from colmap_affrect.images.reading import read_gray
 
@@ -294,7 +294,7 @@ def test_one_percent_of_the_map_must_be_known(tmp_path):
 
 
 def test_require_some_needs_a_map_of_one_image(tmp_path):
-    with pytest.raises(DepthError, match="no such folder"):
+    with pytest.raises(OptionError, match="no such folder"):
         source(tmp_path / "nowhere").require_some(["a.jpg"])
     write_map(tmp_path / "side" / "č d.npy", asymmetric_map())
     with pytest.raises(DepthError, match=r"any of the 2 images; looked for a\.jpg\.\* and a\.\*"):

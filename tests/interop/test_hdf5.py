@@ -342,7 +342,8 @@ def test_each_fault_is_one_clear_line_and_no_database(files: Files, case: str) -
     if case == "rows beyond the end":
         write_h5(files.features, {"a.png": dim_group(3), "b c.png": dim_group(3)})
     spoil(files)
-    with pytest.raises(StoreError, match=message) as error:
+    kind = OptionError if case == "features missing" else StoreError
+    with pytest.raises(kind, match=message) as error:
         files.import_all()
     one_line(error)
     assert not [path for path in files.folder.iterdir() if "import" in path.name]

@@ -218,7 +218,7 @@ def test_wrong_database_is_refused_and_no_half_file_stays(
     database.close()
     with pytest.raises(DatabaseError, match=r"a\.png has 2 keypoints and 3 descriptors"):
         export_h5(*targets, database_path=tmp_path / "rows.db")
-    with pytest.raises(DatabaseError, match="no such file"):
+    with pytest.raises(OptionError, match="no such file"):
         export_h5(*targets, database_path=tmp_path / "none.db")
     assert {path.suffix for path in tmp_path.iterdir()} == {".db"}
 

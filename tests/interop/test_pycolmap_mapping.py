@@ -229,8 +229,8 @@ def test_databases_that_cannot_be_mapped_are_one_clear_line(tmp_path: Path) -> N
         database.clear_matches()
     with pytest.raises(DatabaseError, match=r"any\.db: has no matches; match its images first"):
         colmap_affrect.map_from_database(path, tmp_path / "out")
-    with pytest.raises(DatabaseError, match="no such file"):
+    with pytest.raises(OptionError, match="no such file"):
         colmap_affrect.map_from_database(tmp_path / "no.db", tmp_path / "none")
     assert not (tmp_path / "none").exists()
-    with pytest.raises(DatabaseError, match="nowhere: no such folder"):
+    with pytest.raises(OptionError, match="nowhere: no such folder"):
         colmap_affrect.map_from_database(path, tmp_path / "x", image_path=tmp_path / "nowhere")

@@ -25,6 +25,7 @@ from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper
+from colmap_affrect.mappers.doubts import MIRRORED_COPY
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions, map_globally
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
 from colmap_affrect.matchers.guided import GuidedOptions
@@ -185,6 +186,22 @@ def test_mapping_is_tried_again_while_images_are_missing_in_a_small_model(
     monkeypatch.setattr(attempts, "LARGE_MODEL", large)
     reconstruct(path, mapper)
     assert given == seeds
+
+
+def test_mirrored_copy_that_was_taken_out_is_not_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synthesize(tmp_path / "database.db", 4)
+    model, given = synthesize(tmp_path / "model.db", 3), []
+
+    def map_some(_: object, __: Path, seed: int, ___: object) -> list[MappedModel]:
+        given.append(seed)
+        return [MappedModel(model, taken_out={"d.png": f"{MIRRORED_COPY} a.png"})]
+
+    mapper = mapper_of("incremental")
+    monkeypatch.setattr(mapper, "map", map_some)
+    reconstruct(tmp_path / "database.db", mapper)
+    assert given == [SEED]
 
 
 @pytest.mark.long

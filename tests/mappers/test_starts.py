@@ -239,7 +239,7 @@ def test_images_that_the_last_adjustment_leaves_without_points_are_taken_out(
     model = read_summary(tmp_path / "sparse" / "0")
     assert model
     assert len(model.registered_names) == NUM_IMAGES - 1
-    assert list(model.taken_out.values()) == ["only 3 points hold it"]
+    assert list(model.taken_out.values()) == ["held by only 3 points"]
 
     folder = tmp_path / "sparse" / "0"
     changed = pycolmap.Reconstruction(folder)

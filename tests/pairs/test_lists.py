@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from colmap_affrect.errors import PairListError
+from colmap_affrect.errors import OptionError, PairListError
 from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.pairs.lists import (
     exhaustive_pairs,
@@ -201,7 +201,8 @@ def test_read_pairs_of_an_unreadable_file_is_refused(
 ) -> None:
     if content:
         pair_list.write_bytes(content)
-    with pytest.raises(PairListError, match=r"list of pairs\.txt: cannot be read"):
+    kind = PairListError if content else OptionError
+    with pytest.raises(kind, match=r"list of pairs\.txt: cannot be read"):
         read_pairs(pair_list, NAMES)
 
 

@@ -48,7 +48,7 @@ REPORT = ReconstructionReport(
     ),
 )
 
-SHAKY = replace(LARGE, doubtful={"a.png": "only 9 points hold it"})
+SHAKY = replace(LARGE, doubtful={"a.png": "held by only 9 points"})
 TURNED = replace(LARGE, doubts=("no parallax",))
 EMPTY = replace(REPORT, models=(), unregistered={"a.png": "no verified pair"}, images_total=1)
 
@@ -163,7 +163,7 @@ def test_a_model_whose_focal_length_anything_fits_is_consistent_and_not_trustwor
 
 def test_summary_says_what_cannot_be_trusted() -> None:
     text = replace(REPORT, models=(replace(SHAKY, doubts=TURNED.doubts),)).summary()
-    assert "doubtful    a.png: only 9 points hold it\n" in text
+    assert "doubtful    a.png: held by only 9 points\n" in text
     assert "doubtful    the whole model: no parallax\n" in text
 
 

@@ -41,6 +41,7 @@ def test_unreadable_image_is_reported_and_the_run_goes_on(
     assert "not broken.jpg: unreadable" in stdout
     report = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
     assert report["unregistered"] == {"broken.jpg": "unreadable"}
+    assert report["advice"] == []
     assert report["status"] == "partial"
     code, _, stderr = call(*arguments, "--max-failures", 1)
     assert code == 0
@@ -84,7 +85,7 @@ def test_one_image_ends_without_a_model(tmp_path: Path, call: Call) -> None:
         "run", "--image-path", tmp_path / "photos", "--output-path", out, *FAST, "-q"
     )
     assert code == 3
-    assert stderr == [f"error: one image cannot make a model; see {out / 'report.json'}"]
+    assert stderr == [f"error: one image cannot make a model; see {out / 'report.html'}"]
     assert "registered  0 of 1 images" in stdout
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert (report["status"], report["num_models"], report["num_pairs"]) == ("no_model", 0, 0)
@@ -100,7 +101,7 @@ def test_images_without_overlap_end_without_a_model(tmp_path: Path, call: Call) 
     code, _, stderr = call("run", "--image-path", tmp_path, "--output-path", tmp_path / "o", "-q")
     assert code == 3
     why = "no model was found: no pair of images is verified"
-    assert stderr == [f"error: {why}; see {tmp_path / 'o' / 'report.json'}"]
+    assert stderr == [f"error: {why}; see {tmp_path / 'o' / 'report.html'}"]
 
 
 def test_bad_input_is_one_clear_line_and_writes_no_results(

@@ -97,7 +97,7 @@ def test_features_of_somebody_else_lead_nowhere(tmp_path: Path, call: Call) -> N
 
 def test_message_cannot_steer_the_terminal(tmp_path: Path, call: Call) -> None:
     ended = call("run", "--image-path", tmp_path / "\x1b[31m\nred", "--output-path", tmp_path / "o")
-    assert (ended.code, len(ended.stderr)) == (1, 1)
+    assert (ended.code, len(ended.stderr)) == (2, 1)
     assert "\\u001b[31m\\u000ared: no such folder" in ended.stderr[0]
 
 

@@ -139,7 +139,7 @@ def test_depth_is_asked_for_before_any_image_is_read(tmp_path):
     for settings, error, message in [
         ([], OptionError, "rectifier depth-planes needs depth maps: give --depth-path"),
         ([f"depth.path='{depth}'"], DepthError, str(depth)),
-        ([f"depth.path='{tmp_path / 'nowhere'}'"], DepthError, "nowhere"),
+        ([f"depth.path='{tmp_path / 'nowhere'}'"], OptionError, "nowhere"),
     ]:
         recipe = load_recipe("depth-planes-recommended", [*DEPTH, *settings])
         workspace = Workspace(tmp_path / "out")

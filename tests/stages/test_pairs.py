@@ -125,7 +125,7 @@ def test_other_options_than_before_are_refused(rooms: Workspace, call: Call) -> 
 def test_wrong_way_to_choose_pairs_is_one_clear_line(rooms: Workspace, call: Call) -> None:
     ended = call("pairs", "--output-path", rooms.path, "--pairs", "sequense")
     assert ended.code == 2
-    assert ended.errors[0].startswith("error: pairs: methods.0='sequense' is not one of 'exh")
+    assert ended.errors[0].startswith("error: pairs: methods='sequense' is not one of 'exh")
 
 
 def test_run_chooses_pairs_as_asked(
@@ -209,7 +209,7 @@ def test_many_images_get_a_hint(
     ("values", "named"),
     [
         ({"methods": ("retrival",)}, "'retrival' is not one of 'exhaustive', 'retrieval'"),
-        ({"methods": ("gps", "")}, "methods.1='' is not one of"),
+        ({"methods": ("gps", "")}, "methods='' is not one of"),
         ({"methods": ()}, "methods"),
         ({"num_neighbors": 0}, "num_neighbors=0"),
         ({"max_distance_m": -1.0}, "max_distance_m=-1.0"),

@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -23,6 +24,7 @@ from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.mappers.doubts import FOCAL_DOUBT
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.matchers import nearest
 from colmap_affrect.pipeline import RunOptions, run
@@ -31,6 +33,7 @@ from colmap_affrect.project.stores import FeatureStore, MatchStore, pair_key
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.map import advice
 from colmap_affrect.stages.verify import verify_matches
 
 CAMERAS = CameraOptions(mode="single", model="PINHOLE", params=INTRINSICS)
@@ -183,6 +186,19 @@ def test_stage_commands_do_exactly_what_run_does(
     assert database_content(made.database) == database_content(expected.database)
     reports = [json.loads(space.report.read_text(encoding="utf-8")) for space in (made, expected)]
     assert without_times(reports[0]) == without_times(reports[1])
+
+
+def test_advice_is_about_what_is_wrong(finished: tuple[Workspace, ReconstructionReport]) -> None:
+    workspace, report = finished
+    context, (model, *_) = Context(workspace), report.models
+    assert advice(context, ["unreadable.png"], [model]) == ()
+    loose = replace(model, doubtful={NAMES[0]: FOCAL_DOUBT}, loose=(NAMES[0],))
+    assert not any("--mask-path" in text for text in advice(context, [], [loose]))
+    masks = "run again with --mask-path, if things move, repeat or are written on the photographs"
+    contradicted = replace(loose, loose=())
+    assert masks in advice(context, ["unreadable.png"], [contradicted])
+    assert masks in advice(context, [NAMES[0]], [model])
+    assert advice(context, [NAMES[0]], [loose])[-1].startswith("more photographs between")
 
 
 def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
