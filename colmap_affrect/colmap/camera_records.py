@@ -47,7 +47,7 @@ class CameraRecord:
         may_be_shared: the pairs do not tell whether other such images of this size have the same
             camera.
         is_contradicted: whether the verified pairs contradict a focal length that the user gave;
-            None where they were not asked.
+            None before they have been asked.
     """
 
     names: tuple[str, ...]

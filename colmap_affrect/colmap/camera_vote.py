@@ -163,14 +163,19 @@ def contradicted_cameras(
 ) -> frozenset[int]:
     """Return the cameras whose focal length (longer sides) half of their pairs or more contradict.
 
-    None unless most of all pairs do, and there are some: single pairs may be wrong themselves.
+    None unless most of the strongest pairs do, and there are some: single pairs may be wrong
+    themselves.
     """
-    asked = [pair for pair in pairs if focals.keys() >= set(pair.cameras)][:MAX_PAIRS_OF_DECISION]
-    verdicts = list(map_ordered(lambda pair: _contradicts(pair, focals), asked, available_cores()))
-    if len(asked) < MIN_NUM_PAIRS or 2 * sum(verdicts) <= len(asked):
+
+    def ask(some: Sequence[VotingPair]) -> list[bool]:
+        return list(map_ordered(lambda pair: _contradicts(pair, focals), some, available_cores()))
+
+    asked = [pair for pair in pairs if focals.keys() >= set(pair.cameras)]
+    verdicts = ask(asked[:MAX_PAIRS_OF_DECISION])
+    if len(asked) < MIN_NUM_PAIRS or 2 * sum(verdicts) <= len(verdicts):
         return frozenset()
     of_camera: dict[int, list[bool]] = defaultdict(list)
-    for pair, verdict in zip(asked, verdicts, strict=True):
+    for pair, verdict in zip(asked, verdicts + ask(asked[MAX_PAIRS_OF_DECISION:]), strict=True):
         for camera in set(pair.cameras):
             of_camera[camera].append(verdict)
     return frozenset(key for key, own in of_camera.items() if 2 * sum(own) >= len(own))

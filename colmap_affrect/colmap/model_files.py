@@ -98,7 +98,8 @@ def read_given_model(
     try:
         return pycolmap.Reconstruction(folder)
     except (RuntimeError, ValueError) as error:
-        raise error_class(f"{option}{folder}: not a COLMAP model; {wanted}") from error
+        reason = " ".join(str(error).split())
+        raise error_class(f"{option}{folder}: not a COLMAP model; {wanted} ({reason})") from error
 
 
 def _require_written(folder: Path) -> None:

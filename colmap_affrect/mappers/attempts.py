@@ -51,9 +51,9 @@ def map_database(
 ) -> list[ModelSummary]:
     """Map a verified database and write the models to ``sparse_path``/0, /1, ..., largest first.
 
-    While images are missing and the model is not large, it is tried again with another seed, as
-    often as the mapper's options allow, and the attempt that agrees best with the verified pairs is
-    kept. Images that are certainly wrong are taken out first
+    While images that verified pairs connect are missing and the model is not large, it is tried
+    again with another seed, as often as the mapper's options allow, and the attempt that agrees
+    best with the verified pairs is kept. Images that are certainly wrong are taken out first
     (:mod:`colmap_affrect.mappers.doubts`). ``sparse_path`` appears only once all models are
     written. A model is extended once, and what was in ``sparse_path``, perhaps this model, stays
     there until then.

@@ -83,6 +83,8 @@ MIRRORED_COPY = "mirrored copy of"
 MAX_PAIRS_FOR_PARALLAX, MAX_POINTS_FOR_ANGLES = 100, 2000
 """Pairs and points looked at; more change no share."""
 
+MAX_PAIRS_FOR_COPIES = 1000  # looked at, all of 45 photographs; of more some copies are missed
+
 Points = NDArray[np.float64]
 Ids = tuple[int, int]
 
@@ -270,7 +272,7 @@ def _model_doubts(model: MappedModel, graph: PairGraph) -> Iterator[str]:
         yield f"only {num_images} of {num_given} photographs, which no third one confirms"
     angles = [wide for of_image in _angles_deg(reconstruction).values() for _, wide in of_image]
     registered = set(reconstruction.reg_image_ids())
-    some = _some(graph.pairs_inside(registered))
+    some = _some(graph.pairs_inside(registered), MAX_PAIRS_FOR_PARALLAX)
     if _are_still(some, graph):
         yield (
             "no parallax: the camera only turned or zoomed, or the photographs are copies or "
@@ -306,19 +308,20 @@ def _sizes(graph: PairGraph, ids: Ids) -> tuple[Size, Size]:
     return (first.width, first.height), (second.width, second.height)
 
 
-def _some(pairs: Sequence[VerifiedPair]) -> Sequence[VerifiedPair]:
-    return pairs[:: max(1, len(pairs) // MAX_PAIRS_FOR_PARALLAX)]
+def _some(pairs: Sequence[VerifiedPair], most: int) -> Sequence[VerifiedPair]:
+    return pairs[:: max(1, -(-len(pairs) // most))]
 
 
 @lru_cache(maxsize=1)
 def _mirrored_pairs(graph: PairGraph) -> tuple[Ids, ...]:
-    """Return the pairs whose images are mirrored copies of one another, once for all attempts."""
+    """Return the pairs whose images are mirrored copies of one another."""
 
     def share(first: int, second: int) -> float:
         keypoints = graph.keypoints[first], graph.keypoints[second]
         return mirrored_share(*keypoints, _sizes(graph, (first, second)))
 
-    return tuple(pair.ids for pair in _some(graph.pairs) if share(*pair.ids) >= MIN_SHARE_MIRRORED)
+    looked_at = _some(graph.pairs, MAX_PAIRS_FOR_COPIES)
+    return tuple(pair.ids for pair in looked_at if share(*pair.ids) >= MIN_SHARE_MIRRORED)
 
 
 def _originals(graph: PairGraph, agreeing_of: Mapping[Ids, float]) -> dict[int, int]:

@@ -31,8 +31,8 @@ class MatcherOptions(NetworkOptions):
     """Base of the options of all matchers."""
 
     filter_stationary_matches: bool = True
-    """Leave out matches that do not move where those of other pairs do not either: captions,
-    frames of scans, watermarks."""
+    """Leave out matches that do not move where those of other pairs do not either, and those from
+    one such place to another: captions, frames of scans, watermarks."""
 
     def require_extractor(self, extractor: str) -> None:
         """Raise OptionError for a feature extractor whose features cannot be matched.

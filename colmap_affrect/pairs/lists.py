@@ -138,8 +138,8 @@ def read_pairs(path: Path, names: Sequence[str]) -> PairList:
 
     Names may be separated by spaces, a tab or a comma, and may contain spaces. Empty lines and
     lines that begin with # are skipped; pairs given twice, in either order, count once; pairs of an
-    image with itself are dropped. The pairs are sorted. Raises PairListError when the file is
-    unreadable or a name is not among ``names``.
+    image with itself are dropped. The pairs are sorted. Raises OptionError when there is no
+    such file, PairListError when it is unreadable or a name is not among ``names``.
     """
     ordered = sorted(set(names))
     number = {name: index for index, name in enumerate(ordered)}

@@ -94,9 +94,9 @@ def hold_vote(
     given = {
         key: record.focal_px / max(record.size)
         for key, record in records.items()
-        if "focal" in record.given and record.focal_px > 0.0 and record.is_contradicted is None
+        if "focal" in record.given and record.focal_px > 0.0
     }
-    if given:
+    if any(records[key].is_contradicted is None for key in given):
         pairs = voting_pairs(database_path, given, size_px, silent, only_straight=True)
         found = contradicted_cameras(pairs, given)
         records |= {key: replace(records[key], is_contradicted=key in found) for key in given}

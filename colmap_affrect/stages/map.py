@@ -280,7 +280,7 @@ def advice(
     missing = [name for name in missing if name in num_keypoints]  # nothing helps unreadable ones
     if not missing and not is_doubtful:
         return ()
-    is_contradicted = bool(models and (models[0].doubts or models[0].num_contradicted))
+    is_inconsistent = bool(models and (models[0].doubts or models[0].num_contradicted))
     texts = []
     if any(record.is_contradicted for record in read_camera_records(workspace.cameras).values()):
         texts.append("run again without the given focal lengths, or with others: pairs contradict "
@@ -300,7 +300,7 @@ def advice(
             texts.append("run again with --camera-mode single, if one camera took all: their size "
                          "is the same")  # fmt: skip
         masks = Inputs.recorded(workspace).masks
-        if (missing or is_contradicted) and not (masks.path or masks.camera_path):
+        if (missing or is_inconsistent) and not (masks.path or masks.camera_path):
             texts.append(
                 "run again with --mask-path, if things move, repeat or are written on the "
                 "photographs"

@@ -34,6 +34,9 @@ MIN_SHARE = 0.5
 """Of the pairs that have a match in a cell."""
 MAX_SHARE_OF_PHOTOGRAPH = 0.5
 """Where more of what is matched never moves it is the camera that stands still."""
+MAX_SHARE_BESIDE = 0.2
+"""Of all cells. Matches from beside one place to beside another are left out only where these cells
+are so few: one in 25 of the scene's goes with them then, and of a watermark all over, all would."""
 
 Size = tuple[int, int]
 
@@ -79,22 +82,24 @@ class StationaryFilter:
         return self._features.image_sizes()
 
     def filtered(self, found: PairMatches) -> PairMatches:
-        """Return the matches of a pair without those that never move."""
+        """Return the matches of a pair without those of captions, frames and watermarks."""
         left = self.left(found.names, found.indices)
         return replace(found, indices=found.indices[left], scores=found.scores[left])
 
     def left(self, names: Pair, indices: Indices) -> Mask:
-        """Tell which (M, 2) matches of a pair are not left out.
+        """Tell which (M, 2) matches of a pair are kept.
 
-        Those go from where nothing moves to where nothing does, as of equal letters of a caption;
-        beside such places as well, since what is faint matches less.
+        Left out is what does not move at a place where nothing does, or beside it, since what is
+        faint matches less; and what goes from one such place to another, as of equal letters.
         """
         size = self._common_size(names) if self._places else None
         if size is None or size not in self._places:
             return np.ones(len(indices), bool)
-        _, first, second = self._still(names, indices, size)
-        near = grown(self._places[size], 1)
-        return ~(_at(near, first) & _at(near, second))
+        still, first, second = self._still(names, indices, size)
+        places = self._places[size]
+        near = grown(places, 1)
+        both = near if near.mean() <= MAX_SHARE_BESIDE else places
+        return ~(still & _at(near, first) | _at(both, first) & _at(both, second))
 
     def learn(self, pairs: Sequence[Pair]) -> str:
         """Look for places in all matches, and drop those there; return a line, empty if none.

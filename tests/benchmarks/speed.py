@@ -36,6 +36,7 @@ from colmap_affrect.colmap.verification import VerificationOptions, verified_pai
 from colmap_affrect.comparison.methods import SIFT, SIFT_AFFINE_DSP, Method, parse_method
 from colmap_affrect.comparison.sift import extract_sift, match_sift
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.recipes import Recipe
@@ -104,7 +105,11 @@ def run_recipe(
     list_path = folder / "names.txt"
     list_path.write_text("\n".join(names) + "\n", encoding="utf-8")
     options = RunOptions(
-        recipe=recipe, image_list_path=list_path, resources=resources, random_seed=SEED
+        recipe=recipe,
+        image_list_path=list_path,
+        resources=resources,
+        verification=VerificationOptions(random_seed=SEED),
+        mapping=SparseOptions(random_seed=SEED),
     )
     report = run(image_path, folder, options)
     row: Row = {f"{stage.name}_s": stage.wall_s for stage in report.stages}

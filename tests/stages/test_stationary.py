@@ -60,6 +60,18 @@ def test_caption_is_left_out_and_what_moves_stays(tmp_path: Path) -> None:
     assert StationaryFilter(features, matches).learn(pairs) == ""
 
 
+def test_of_a_watermark_all_over_only_what_does_not_move_is_left_out(tmp_path: Path) -> None:
+    marks = np.stack(np.meshgrid(np.arange(30, 960, 60), np.arange(30, 640, 60)), -1).reshape(-1, 2)
+    scene = np.random.default_rng(4).uniform((0, 0), SIZE, (3, 4000, 2))
+    points = [np.concatenate([marks + 0.1 * k, scene[k]]) for k in range(3)]
+    features, matches, pairs = stores(tmp_path, points)
+    assert StationaryFilter(features, matches).learn(pairs)
+    for found in matches.read(pairs):
+        is_mark = found.indices[:, 0] < len(marks)
+        assert not is_mark.any()
+        assert np.count_nonzero(~is_mark) > 0.95 * 4000
+
+
 def test_pair_that_is_matched_later_is_filtered_by_what_is_known(tmp_path: Path) -> None:
     features, matches, pairs = stores(tmp_path, scans(4))
     given = next(matches.read(pairs))
