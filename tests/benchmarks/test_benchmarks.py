@@ -29,6 +29,16 @@ def test_benchmark_starts(script: str) -> None:
     )
 
 
+@pytest.mark.long
+def test_speed_is_measured(tmp_path: Path) -> None:
+    result = tmp_path / "speed.json"
+    command = [sys.executable, "tests/benchmarks/speed.py", "--sections", "commands"]
+    command += ["--image-path", "sample_scenes/courtyard/images", "--num-images", "2"]
+    command += ["--num-rounds", "1", "--methods", "sift", "unrectified-rootsift"]
+    subprocess.run([*command, "--output-path", result], check=True, capture_output=True, cwd=ROOT)
+    assert '"extract_s"' in result.read_text()
+
+
 def test_functions_whose_time_is_taken_exist() -> None:
     for name in STAGES:
         assert callable(pkgutil.resolve_name(name))
