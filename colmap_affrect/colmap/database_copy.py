@@ -26,7 +26,7 @@ FIRST_TYPED_SCHEMA = 4_000_000  # descriptors have a type since COLMAP 4.0
 
 
 def schema_version(path: Path) -> int:
-    """Return the version of the tables, e.g. 4020100 for COLMAP 4.2.1; DatabaseError if none."""
+    """Return the version of the tables, e.g. 4020100 for COLMAP 4.2.1; OptionError if no file."""
     with open_read_only(path) as connection:
         return int(connection.execute("PRAGMA user_version").fetchone()[0])
 
@@ -54,7 +54,8 @@ def newest_schema_version() -> int:
 def copy_as_it_is(source: Path, target: Path) -> None:
     """Copy a database as it is now, including its write-ahead log, with the schema that it has.
 
-    Raises DatabaseError unless it is an intact one of a COLMAP that is not newer than pycolmap.
+    Raises OptionError when there is none, DatabaseError unless it is an intact one of a COLMAP that
+    is not newer than pycolmap.
     """
     version, newest = schema_version(source), newest_schema_version()
     if version > newest:

@@ -146,7 +146,7 @@ def resolve(
 
     They are looked for in ``weights_path`` first. Raises one WeightsError for all files that are
     missing and cannot be downloaded, or for one of an installed distribution that is not the
-    published one.
+    published one; OptionError when there is no such folder.
     """
     if weights_path is not None and not weights_path.is_dir():
         raise OptionError(f"--weights {weights_path}: not a folder")
@@ -176,7 +176,8 @@ def fetch(
 ) -> dict[str, Path]:
     """Get files into a folder, torch's cache by default; those already there stay.
 
-    Installed files are copied where a folder is given. WeightsError for what cannot be had.
+    Installed files are copied where a folder is given. OptionError for unknown keys, WeightsError
+    for what cannot be had.
     """
     keys, target = list(keys), folder or cache_folder()
     for key in keys:

@@ -153,7 +153,10 @@ class DepthFiles:
         self._path = Path(options.path)
 
     def require_some(self, names: Sequence[str]) -> None:
-        """Check, before any image is processed, that at least one has a map; else DepthError."""
+        """Check, before any image is processed, that at least one has a map; else DepthError.
+
+        OptionError where there is no folder.
+        """
         if not self._path.is_dir():
             raise OptionError(f"{self._path}: no such folder; give the folder of the depth maps")
         if not any(self._options.file(name) for name in names):

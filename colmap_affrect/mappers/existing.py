@@ -174,6 +174,7 @@ def existing_names(model_path: Path, known: Collection[str]) -> list[str]:
         known: names of the photographs; all of the model must be among them.
 
     Raises:
+        OptionError: when there is no such folder.
         MappingError: when it is no model, or has images that are not known.
     """
     model = read_given_model(model_path, "--extend ", MappingError)
@@ -184,6 +185,7 @@ def read_existing(extension: Extension, database_path: Path) -> ExistingModel:
     """Read a model and give it the ids and keypoints of a database.
 
     Raises:
+        OptionError: when there is no such folder.
         MappingError: when it is no model, or does not fit the database.
     """
     old, path = (
