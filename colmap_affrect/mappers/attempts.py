@@ -198,18 +198,30 @@ def _is_well_tied(model: pycolmap.Reconstruction) -> bool:
     return all(counts[image_id] >= MIN_NUM_TRACKS for image_id in model.reg_image_ids())
 
 
+def _has_unknown_cameras(model: MappedModel, task: MappingTask) -> bool:
+    images = model.reconstruction.images.values()
+    used = {image.camera_id for image in images if image.has_pose}
+    return any(task.cameras[key].source == "guess" for key in used & task.cameras.keys())
+
+
 def _possible(models: list[MappedModel], task: MappingTask) -> list[MappedModel]:
     """Return models without the images that are certainly wrong."""
     return [model for model in (without_impossible(each, task) for each in models) if model]
 
 
 def _adjust_weak(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -> bool:
-    """Adjust models that guided matches or bridges hold; others stay as COLMAP made them.
+    """Adjust models that guided matches or bridges hold, or whose cameras nobody knows.
+
+    Others stay as COLMAP made them.
 
     Returns:
         Whether there were any.
     """
-    weak = [model for model in models if task.guided or model.bridges]
+    weak = [
+        model
+        for model in models
+        if task.guided or model.bridges or _has_unknown_cameras(model, task)
+    ]
     verified = inlier_matches(task.database_path, 1) if weak else {}
     for model in weak:
         constant = task.constant_cameras(mapper.options) | runaways(model.reconstruction, task)

@@ -1,7 +1,9 @@
-"""The last adjustment of a model that guided matches or bridges have brought together.
+"""The last adjustment of models that guided matches or bridges have brought together, or whose
+cameras nobody knows.
 
 Guided matches are less exact than others. They register images and tie them together, but where
-exact matches suffice to hold images these alone say where they stand.
+exact matches suffice to hold images these alone say where they stand. Where nobody knows the cameras
+COLMAP stops on the way, and takes distortions for focal lengths.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping
 from itertools import combinations
+from typing import cast
 
 import networkx as nx
 import numpy as np
@@ -30,6 +33,14 @@ LOSS_SCALE_PX = 0.5
 
 NUM_ROUNDS = 3
 """Adjustments, with what does not fit taken out after each."""
+
+MAX_NUM_ITERATIONS = 300
+"""Where nobody knows the cameras and few points are seen by three images, focal lengths move slowly
+and far: 100 end on the way."""
+
+MIN_GROWTH_WITHOUT_DISTORTION = 1.07
+"""Of the error of adjustment, with lenses that do not distort; less, and the points do not tell the
+distortion. It then takes up what belongs to focal lengths."""
 
 MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
 """What fits, as for COLMAP's mappers."""
@@ -69,8 +80,34 @@ def adjust_last(
     for image_id, index in zip(dropped >> 32, dropped & 0xFFFFFFFF, strict=True):
         if model.images[image_id].points2D[index].has_point3D():
             model.delete_observation(image_id, index)
-    adjust(model, robust_options(), constant_cameras)
+    options = robust_options()
+    free = set(model.cameras) - set(constant_cameras)
+    if free and not _tells_distortion(model, constant_cameras):
+        _straighten(model, free)
+        options.refine_extra_params = False
+    adjust(model, options, constant_cameras)
     return len(dropped)
+
+
+def _tells_distortion(model: pycolmap.Reconstruction, constant_cameras: Collection[int]) -> bool:
+    """Tell whether the points say how much the lenses distort that may be refined."""
+    distorted, straight = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
+    _straighten(straight, set(straight.cameras) - set(constant_cameras))
+    options = robust_options()
+    options.refine_extra_params = False
+    most = MIN_GROWTH_WITHOUT_DISTORTION * solve(distorted, constant_cameras)
+    return solve(straight, constant_cameras, options) > most
+
+
+def _straighten(model: pycolmap.Reconstruction, cameras: Collection[int]) -> None:
+    """Let some cameras not distort."""
+    for key in cameras:
+        camera = model.cameras[key]
+        new = pycolmap.Camera.create_from_model_id(
+            key, camera.model, camera.mean_focal_length(), camera.width, camera.height
+        )
+        for index in camera.extra_params_idxs():
+            camera.params[index] = new.params[index]
 
 
 def robust_options() -> pycolmap.BundleAdjustmentOptions:
@@ -79,6 +116,7 @@ def robust_options() -> pycolmap.BundleAdjustmentOptions:
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = LOSS_SCALE_PX
     options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.max_num_iterations = MAX_NUM_ITERATIONS
     return options
 
 
@@ -130,21 +168,33 @@ def adjust(
     constant_cameras: Collection[int],
 ) -> None:
     """Adjust a model, of which some cameras stay, and take out what does not fit."""
-    config = config_of(model, constant_cameras)
     for _ in range(NUM_ROUNDS):
-        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+        solve(model, constant_cameras, options)
         pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
     model.update_point_3d_errors()
 
 
-def config_of(
-    model: pycolmap.Reconstruction, constant_cameras: Collection[int]
-) -> pycolmap.BundleAdjustmentConfig:
-    """Return the adjustment of all images of a model, of which some cameras stay."""
+def solve(
+    model: pycolmap.Reconstruction,
+    constant_cameras: Collection[int],
+    options: pycolmap.BundleAdjustmentOptions | None = None,
+) -> float:
+    """Adjust all images of a model, of which some cameras stay.
+
+    Args:
+        model: changed in place.
+        constant_cameras: ids of cameras whose parameters stay as they are.
+        options: by default :func:`robust_options`.
+
+    Returns:
+        The error in the unit of the loss, infinite if the adjustment fails.
+    """
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
     for camera_id in constant_cameras:
         config.set_constant_cam_intrinsics(int(camera_id))
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    return config
+    adjuster = pycolmap.create_default_bundle_adjuster(options or robust_options(), config, model)
+    summary = cast("pycolmap.CeresBundleAdjustmentSummary", adjuster.solve())
+    return summary.ceres_summary.final_cost if summary.is_solution_usable() else np.inf

@@ -8,13 +8,12 @@ errors and small variances, and poses are off by tens of degrees.
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import cast
 
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.base import MappingTask
-from colmap_affrect.mappers.last_adjustment import config_of, robust_options
+from colmap_affrect.mappers.last_adjustment import solve
 
 FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
 
@@ -42,11 +41,11 @@ def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str
         return ()
     fixed = {key for key, record in task.cameras.items() if record.is_fixed} & set(model.cameras)
     sparse = _with_fewer_points(model)
-    most = MIN_GROWTH * _error(sparse, fixed)
+    most = MIN_GROWTH * solve(sparse, fixed)
     loose: set[int] = set()
     for keys in np.array_split(unknown, min(len(unknown), MAX_NUM_TRIALS)):
         held = fixed.union(keys.tolist())
-        if any(_error(_scaled(sparse, keys, factor), held) < most for factor in FACTORS):
+        if any(solve(_scaled(sparse, keys, factor), held) < most for factor in FACTORS):
             loose.update(keys.tolist())
     return tuple(sorted(image.name for image in images if image.camera_id in loose))
 
@@ -72,11 +71,3 @@ def _scaled(
         for index in camera.focal_length_idxs():
             camera.params[index] *= factor
     return copy
-
-
-def _error(model: pycolmap.Reconstruction, constant_cameras: Collection[int]) -> float:
-    """Adjust a model, of which some cameras stay; return the error, infinite if that fails."""
-    config = config_of(model, constant_cameras)
-    adjuster = pycolmap.create_default_bundle_adjuster(robust_options(), config, model)
-    summary = cast("pycolmap.CeresBundleAdjustmentSummary", adjuster.solve())
-    return summary.ceres_summary.final_cost if summary.is_solution_usable() else np.inf

@@ -1,4 +1,4 @@
-"""The last adjustment of models that guided matches hold: what goes, what stays, what moves."""
+"""The last adjustment of models: what goes, what stays, what moves."""
 
 from __future__ import annotations
 
@@ -105,6 +105,20 @@ def test_constant_cameras_stay_and_no_others(
     adjust_last(model, verified, {}, constant_cameras=constant)
     same = {i for i, camera in model.cameras.items() if np.array_equal(camera.params, before[i])}
     assert same == set(constant)
+
+
+@pytest.mark.parametrize(("true", "start"), [(0.0, 0.03), (0.3, 0.2)])
+def test_lenses_do_not_distort_unless_points_tell_so(true: float, start: float) -> None:
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=LAST)
+    pycolmap.set_random_seed(1)
+    options.camera_params = [1280.0, 512.0, 384.0, true]
+    model = pycolmap.synthesize_dataset(options)
+    pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), model)
+    for camera in model.cameras.values():
+        camera.params[3] = start
+    adjust_last(model, {}, {})
+    ends = [camera.params[3] for camera in model.cameras.values()]
+    assert ends == ([0.0] if true == 0.0 else pytest.approx([true], abs=0.05))
 
 
 def track(point: int, *images: int) -> list[list[int]]:
