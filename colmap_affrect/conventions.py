@@ -14,8 +14,6 @@
    and hloc). COLMAP's affine shape maps the unit circle to one sigma.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

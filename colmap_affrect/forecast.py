@@ -1,7 +1,5 @@
 """How long a whole run takes, roughly: from what its first images and pairs have taken."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

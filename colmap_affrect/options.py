@@ -7,8 +7,6 @@ source, depth source, rectifier, matcher, mapper) is a class with its options cl
 entry point, in another one.
 """
 
-from __future__ import annotations
-
 import ast
 import difflib
 import hashlib

@@ -87,7 +87,6 @@ class _Told:
         return text
 
     def end(self) -> None:
-        """The stage is over."""
         if self._forecast:
             self._forecast.end()
 

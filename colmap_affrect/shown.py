@@ -1,7 +1,5 @@
 """One filter for everything that is shown: names come out of files, and may be made to mislead."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 MAX_NAMES = 3

@@ -143,7 +143,6 @@ class _OneLine(logging.Formatter):
     """Shows a message in one line, whatever names are in it; a traceback keeps its lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        """Return the line."""
         return one_line(super().formatMessage(record))
 
 

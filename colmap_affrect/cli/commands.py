@@ -341,7 +341,6 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
 
 
 def _next_steps(report: ReconstructionReport, out: Path) -> list[str]:
-    """Say where things are, and commands for what comes next."""
     copied, begun = (Workspace(out).planned(stage) or {} for stage in ("copy", "extract"))
     photos = copied.get("image_path") or begun.get("image_path")
     model, page = out / "sparse" / "0", out / "report.html"

@@ -3,8 +3,6 @@
 COLMAP's database has one flag for a focal length, that somebody knows it. Here is who.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Everything is checked before it is written: pycolmap stores wrong dtypes silentl
 index out of range would later end the Python process.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os

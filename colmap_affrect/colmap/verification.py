@@ -5,8 +5,6 @@ local map from image 1 to image 2. It must carry the epipolar direction of image
 2. The epipolar geometry of a plane is arbitrary; there the map must turn as the homography does.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -320,7 +318,6 @@ def _write(
     done: list[tuple[tuple[int, int], pycolmap.TwoViewGeometry]],
     advance: Callable[[int], None] | None,
 ) -> None:
-    """Write geometries and forget them."""
     with pycolmap.DatabaseTransaction(database):
         for ids, geometry in done:
             database.write_two_view_geometry(*ids, geometry)

@@ -1,7 +1,5 @@
 """The table of methods on the page: the methods that finished, and figures of each."""
 
-from __future__ import annotations
-
 import itertools
 import string
 from collections.abc import Callable, Iterable, Sequence
@@ -120,8 +118,6 @@ def _model_rows(methods: Sequence[MethodResult], comparison: Comparison) -> list
 
 
 def _score_rows(methods: Sequence[MethodResult]) -> list[Row]:
-    """Return the rows that only ground truth fills."""
-
     def scored(
         key: str, title: str, digits: int, better: Better, value: Callable[[PoseScores], Any]
     ) -> Row:

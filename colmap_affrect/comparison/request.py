@@ -5,8 +5,6 @@ images and pairs. ``methods/NAME/`` is a workspace with the features and raw mat
 and ``methods/NAME/seed-K/`` has the two-view geometries and models of one seed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self

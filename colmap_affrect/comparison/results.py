@@ -4,8 +4,6 @@ Everything derived (means, who registers what alone) is computed here from the r
 seeds, so that terminal, page, JSON and CSV cannot disagree.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -239,7 +237,6 @@ KEPT_OF_FAILED = ("summary", "failures", "options", "folder")
 
 
 def _plain(result: SeedResult | MethodResult) -> dict[str, Any]:
-    """Return the fields of a result as plain values for JSON."""
     values: dict[str, Any] = TypeAdapter(type(result)).dump_python(result, by_alias=True)
     return values
 

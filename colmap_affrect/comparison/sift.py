@@ -1,7 +1,5 @@
 """COLMAP's SIFT through pycolmap, on the images and pairs of a database that has no features."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path

@@ -3,12 +3,11 @@
 Gains are counted in photographs registered, or registered correctly where there is ground truth.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 from colmap_affrect.comparison.results import Comparison, MethodResult, Span, in_most
 
@@ -67,7 +66,7 @@ class Change:
     time_ratio: float
 
     @classmethod
-    def between(cls, method: MethodResult, reference: MethodResult) -> Change:
+    def between(cls, method: MethodResult, reference: MethodResult) -> Self:
         """Compare a method with a reference; both have finished."""
         ours, others = method.usually_correct, reference.usually_correct
         ratio = method.total_s / reference.total_s if reference.total_s else 0.0
@@ -130,7 +129,6 @@ def headline(comparison: Comparison) -> list[str]:
 
 
 def _without_rectification(comparison: Comparison, best: MethodResult) -> str:
-    """Say when the best method owes nothing to its warps."""
     if not is_rectified(best):
         return " Rectification is not needed for that."
     as_good = [

@@ -34,12 +34,7 @@ from colmap_affrect.colmap.verification import (
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP
 from colmap_affrect.comparison.request import Request
 from colmap_affrect.comparison.results import MethodResult, SeedResult
-from colmap_affrect.comparison.sift import (
-    describe_options,
-    extract_sift,
-    match_sift,
-    rename_images,
-)
+from colmap_affrect.comparison.sift import describe_options, extract_sift, match_sift, rename_images
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
@@ -117,7 +112,6 @@ def compute(request: Request, progress: Progress) -> None:
 
 
 def _match_sift(request: Request, costs: _Costs, progress: Progress, *, affine: bool) -> None:
-    """Put SIFT features and their matches into the database of the method."""
     path, base = request.folder / "database.db", request.layout.database
     if not path.exists():
         copy_database(base, path)
@@ -141,7 +135,6 @@ def _match_sift(request: Request, costs: _Costs, progress: Progress, *, affine: 
 
 
 def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Progress) -> None:
-    """Put our features and their matches into the workspace of the method."""
     context = Context(Workspace(request.folder), request.resources, progress=progress)
     inputs = Inputs.of(
         request.image_path,
@@ -163,7 +156,6 @@ def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Pro
 
 
 def _count_features(database_path: Path) -> tuple[dict[str, int], dict[Pair, int]]:
-    """Return the keypoints of the images that have some, and the raw matches of the pairs."""
     with open_database(database_path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
         keypoints = {
@@ -253,7 +245,6 @@ def _vote(
     size_px: ExtractedPx = None,
     silent: Collection[Pair] = (),
 ) -> None:
-    """Let the pairs vote on cameras if they are to do that."""
     if request.focal_vote:
         paths, may_share = (workspace.database, workspace.cameras), request.may_share
         hold_vote(*paths, verification, size_px, may_share=may_share, silent=silent)
@@ -266,7 +257,6 @@ class _Costs:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read what was written to a file, if it exists."""
         self._path = path
         known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         self.wall_s: dict[str, float] = known.get("wall_s", {})
@@ -275,7 +265,6 @@ class _Costs:
         self._earlier_peak = int(known.get("peak_memory_bytes", 0))
 
     def stage(self, name: str, work: Callable[[], object]) -> None:
-        """Do and measure some work, unless it is finished."""
         if name in self._finished:
             return
         ended, start, before = threading.Event(), time.perf_counter(), self.wall_s.get(name, 0.0)
@@ -304,7 +293,6 @@ class _Costs:
         return max(self._earlier_peak, peak_memory_bytes(), children)
 
     def save(self) -> None:
-        """Write everything to the file."""
         values = {
             "wall_s": self.wall_s,
             "failures": self.failures,
@@ -323,7 +311,6 @@ class _Reported(Progress):
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        """See :class:`Progress`."""
         _tell(self._parent, stage=name, total=total, unit=unit)
         yield lambda count: _tell(self._parent, advance=count)
         _tell(self._parent, end=name)
@@ -338,7 +325,6 @@ class _OfSeed(Progress):
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        """See :class:`Progress`."""
         with self._progress.stage(f"{name}, seed {self._seed}", total, unit) as advance:
             yield advance
 

@@ -1,7 +1,5 @@
 """Examines a COLMAP database, in a copy: its tables, and whether pairs agree with its cameras."""
 
-from __future__ import annotations
-
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -95,7 +93,6 @@ class _Examination:
     pairs: Sequence[VotingPair]
 
     def add(self, kind: str, items: Sequence[str]) -> None:
-        """Add a finding if there are any cameras or images that it concerns."""
         if items:
             self.findings.add(kind, self.path, items)
 

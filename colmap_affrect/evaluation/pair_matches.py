@@ -13,18 +13,14 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import colmap_keypoints
-from colmap_affrect.colmap.verification import (
-    Side,
-    VerificationOptions,
-    estimate_geometry,
-)
+from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
 from colmap_affrect.conventions import DEFAULT_FOCAL_RATIO
 from colmap_affrect.evaluation.protocol import EvaluationPair
 from colmap_affrect.evaluation.recipe_features import RecipeFeatures
+from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
 from colmap_affrect.recipes import Recipe
@@ -51,7 +47,7 @@ class MatchedPair:
     """
 
     pair: EvaluationPair
-    points: tuple[NDArray[np.float64], NDArray[np.float64]]
+    points: tuple[Array, Array]
     num_keypoints: tuple[int, int]
     level: str
     num_levels: int
@@ -158,7 +154,7 @@ class PairMatcher:
 
 
 def verified_inliers(
-    frames: tuple[NDArray[np.floating], NDArray[np.floating]],
+    frames: tuple[Floats, Floats],
     sizes: tuple[tuple[int, int], tuple[int, int]],
     extracted_px: int | None = None,
 ) -> int:

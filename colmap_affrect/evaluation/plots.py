@@ -1,7 +1,5 @@
 """Plots of an evaluation, with the axes of the paper's figures."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Iterator
@@ -56,7 +54,6 @@ def _figure(height_in: float = SIZE_IN[1]) -> Figure:
 
 
 def _published(evaluation: Evaluation) -> Iterator[tuple[PublishedRow, dict[str, Any]]]:
-    """Yield the paper's rows with their style, in other colours than the recipes if there are."""
     for number, row in enumerate(evaluation.published, len(evaluation.recipes)):
         label = f"paper: {row.method} ({row.table})"
         yield row, dict(color=f"C{number}", label=label, **PAPER_STYLE)

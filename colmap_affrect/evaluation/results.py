@@ -1,7 +1,5 @@
 """What an evaluation found: as JSON and CSV for programs, as tables for people."""
 
-from __future__ import annotations
-
 import json
 import math
 import textwrap
@@ -201,7 +199,6 @@ def _score_table(evaluation: Evaluation, title: str, columns: Sequence[str]) -> 
 
 
 def _published_rows(published: Iterable[PublishedRow], columns: Sequence[str]) -> list[list[str]]:
-    """Return the paper's rows that have some of the columns."""
     return [
         [f"paper: {row.method} ({row.table})", *_cells(row.values, columns)]
         for row in published
@@ -235,7 +232,6 @@ def complexity_columns(recipe: RecipeResult) -> dict[str, float]:
 
 
 def _cost_table(evaluation: Evaluation) -> str:
-    """Return complexity per image, as the paper's table, and seconds by step."""
     columns = list(complexity_columns(evaluation.recipes[0]))
     head = ["per image (match, estimate: per pair)", *columns, *(f"{step} [s]" for step in STEPS)]
     rows = []

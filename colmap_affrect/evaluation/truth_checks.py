@@ -7,15 +7,12 @@ matches of plain features: of every homography and of marked correspondences, an
 pairs where the truth is of poses.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap.poses import Pose, relative_pose
 from colmap_affrect.conventions import is_inside
@@ -36,6 +33,7 @@ from colmap_affrect.evaluation.two_views import (
     sampson_distances,
     symmetric_epipolar_distances,
 )
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.images.warping import warp
 from colmap_affrect.matchers.nearest import (
@@ -89,7 +87,7 @@ POSE_MISTAKES: dict[str, Callable[[Pose], Pose]] = {
 """What turns a pose that was stored in a wrong way into the right one."""
 
 
-def rotation_fault(rotation: NDArray[np.float64]) -> str:
+def rotation_fault(rotation: Array) -> str:
     """Tell why a (3, 3) matrix is not a rotation; empty if it is one.
 
     >>> rotation_fault(2.0 * np.eye(3))
@@ -256,7 +254,6 @@ def pose_contradictions(pairs: Sequence[EvaluationPair]) -> list[str]:
 
 
 def _small_features(paths: Iterable[Path]) -> Iterator[MatchableImage | None]:
-    """Yield the plain features of shrunk images; None of those that cannot be read."""
     recipe = load_recipe(CHECK_RECIPE, [f"max_image_size_px={CHECK_IMAGE_SIZE_PX}"])
     extractor = prepare(recipe.extraction)
 

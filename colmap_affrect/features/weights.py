@@ -10,8 +10,6 @@ Files keep their upstream names. They are looked for, before any image is touche
 and else downloaded into that cache. torch and kornia are loaded only when they are needed.
 """
 
-from __future__ import annotations
-
 import os
 import pickle
 import shutil
@@ -331,7 +329,6 @@ def _checked_installed(key: str) -> Path | None:
 
 
 def _download(key: str, folder: Path, progress: Progress) -> Path:
-    """Download a file from the first of its addresses that has it."""
     published = WEIGHT_FILES[key]
     target = folder / published.file_name
     failures = []

@@ -1,7 +1,5 @@
 """Affine maps from tilt coordinates, and local affine frames."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

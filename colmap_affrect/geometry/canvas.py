@@ -1,7 +1,5 @@
 """Canvases of rectifying warps: where the warped region lies and how large it is."""
 
-from __future__ import annotations
-
 from math import sqrt
 
 import numpy as np

@@ -8,8 +8,6 @@ All points are (N, 2) px of any one convention, the one of the fundamental matri
 ``x2^T F x1 = 0``; shapes are the (N, 2, 2) linear parts of frames, in the same axes.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from colmap_affrect.geometry.affine import adjugates

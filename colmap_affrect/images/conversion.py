@@ -1,7 +1,5 @@
 """Photographs in formats that COLMAP cannot read, as PNG: JPEG 2000, WebP, AVIF, HEIC, pages."""
 
-from __future__ import annotations
-
 import io
 import shutil
 from collections.abc import Iterator, Sequence
@@ -76,7 +74,6 @@ def convert_images(
 
 
 def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> None:
-    """Convert or copy one file."""
     suffix = PurePosixPath(name).suffix.lower()
     numbers = pages(path) if suffix in TIFF_SUFFIXES else [0]
     as_it_is = suffix in IMAGE_SUFFIXES and not foreign_format(path) and numbers == [0]

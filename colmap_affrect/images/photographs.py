@@ -1,7 +1,5 @@
 """The photographs of a run: which there are, how they share cameras, and their masks."""
 
-from __future__ import annotations
-
 import os
 import posixpath
 import unicodedata

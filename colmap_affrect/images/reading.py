@@ -1,7 +1,5 @@
 """Reading of image files and encoding of pictures, through OpenCV."""
 
-from __future__ import annotations
-
 import math
 import re
 import struct

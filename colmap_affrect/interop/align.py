@@ -1,7 +1,5 @@
 """Give a COLMAP model its scale and place: by positions, control points, or known distances."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Where on earth a model is: beside COLMAP's files, which have no place for that."""
 
-from __future__ import annotations
-
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Self

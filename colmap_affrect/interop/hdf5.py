@@ -4,8 +4,6 @@ The layouts that are read and written are in :mod:`.hdf5_layouts`. Names must be
 in the folder, and every value is checked before it reaches COLMAP.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -310,7 +308,6 @@ class _WorkspaceContent:
         self.notes: list[str] = []
 
     def features(self, name: str) -> tuple[tuple[int, int], Datasets]:
-        """Return the (width, height) of an image and its datasets as in hloc's layout."""
         found = self._features.read(name)
         data: Datasets = {
             "keypoints": found.keypoints.astype(np.float32),
@@ -320,7 +317,6 @@ class _WorkspaceContent:
         return self._sizes[name], data | frame_datasets(found.lafs)
 
     def matches(self) -> Iterator[PairMatches]:
-        """Yield the raw matches of all pairs."""
         return self._matches.read(self._pairs) if self._pairs else iter(())
 
 

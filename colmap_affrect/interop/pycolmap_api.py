@@ -8,8 +8,6 @@ options) is kept in a folder beside it, ``x.affrect`` for ``x.db``: it makes the
 where an earlier call stopped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -361,7 +359,6 @@ class _Cancellable(Progress):
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        """See :meth:`Progress.stage`."""
         self._check(0)
         with self._shown.stage(name, total, unit) as advance:
 

@@ -9,8 +9,6 @@ that the matches are those of exact similarities.
 torch is loaded here, when there is enough to match to pay for that.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -266,7 +264,6 @@ def _part(
 
 
 def _joined(parts: list[ShortList]) -> ShortList:
-    """Put the lists of consecutive rows together."""
     begins = np.cumsum([0, *(len(part.rows) for part in parts)])
     moved = (replace(p, entry_rows=p.entry_rows + b) for p, b in zip(parts, begins, strict=False))
     none = np.zeros(0, np.int64)

@@ -1,7 +1,5 @@
 """Which images verified pairs tie to others well enough for mapping."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

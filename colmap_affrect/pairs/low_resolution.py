@@ -1,7 +1,5 @@
 """Pairs of photographs whose strongest features match."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np

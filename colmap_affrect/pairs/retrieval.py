@@ -7,8 +7,6 @@ roots, so that neither repeated structures nor single words decide (Arandjelovic
 about VLAD, 2013). What all images have in common is subtracted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 
 import cv2

@@ -4,8 +4,6 @@ An :class:`Executor` says where: in threads of this process (:class:`Threads`), 
 a cluster (:mod:`colmap_affrect.parallel.cluster`). Results do not depend on it.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

@@ -1,7 +1,5 @@
 """OpenCV's own threads, shared among those of this process."""
 
-from __future__ import annotations
-
 from threading import Lock
 
 import cv2

@@ -1,7 +1,5 @@
 """Files that change as a whole or not at all, also when the program is killed or the disk full."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import io

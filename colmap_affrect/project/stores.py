@@ -15,8 +15,6 @@ written in between appears as a whole (:mod:`colmap_affrect.project.atomic_files
 the attribute ``complete``, of another program, does not count.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -74,7 +72,6 @@ class FeatureStore(GroupStore):
     kind = "features"
 
     def _entries(self) -> Entries:
-        """Return the complete groups."""
         if not self.path.exists():
             return {}
         with self._open("r") as file:

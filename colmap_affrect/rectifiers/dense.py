@@ -3,8 +3,6 @@
 The paper's DenseAffNet (Sec. 3) with an exchangeable shape source.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 import numpy as np

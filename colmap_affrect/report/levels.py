@@ -1,13 +1,10 @@
 """One level of a recipe carried out on one photograph, with all that is decided on the way."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.data import (
     GrayImage,
@@ -19,6 +16,7 @@ from colmap_affrect.data import (
     View,
 )
 from colmap_affrect.features.base import FeatureExtractor, ShapeSource
+from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.images.depth import DepthSource
 from colmap_affrect.project.stopwatch import Stopwatch
 from colmap_affrect.rectifiers.base import RectifierOptions
@@ -54,7 +52,7 @@ class InspectedLevel:
     found: Mapping[int, LocalFeatures]
     features: LocalFeatures
     shapes: ShapeSamples | None
-    depth: NDArray[np.floating] | None
+    depth: Floats | None
     seconds: Mapping[str, float]
 
     def kept_of(self, rectification_id: int) -> LocalFeatures:
@@ -130,7 +128,7 @@ class _Recorder(TimedFeatures):
 
 def _read_again(
     extractor: ImageExtractor, photograph: Photograph, number: int, *, with_depth: bool
-) -> tuple[ShapeSamples | None, NDArray[np.floating] | None]:
+) -> tuple[ShapeSamples | None, Floats | None]:
     """Read the shapes and the depth map that the rectifier of a level has read; None for none."""
     is_asked = min(photograph.size) >= MIN_RECTIFIABLE_PX
     rectifier = extractor.rectifiers[number] if is_asked else None

@@ -1,16 +1,15 @@
 """Verified pairs drawn with their inliers, the two photographs side by side, as parts of a page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.errors import AffrectError
+from colmap_affrect.geometry.arrays import Array, Bools
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.report.pictures import Picture
@@ -29,7 +28,7 @@ class SideBySide:
     widths: tuple[float, float]
 
     @classmethod
-    def of(cls, names: Pair, pictures: Mapping[str, Picture]) -> SideBySide:
+    def of(cls, names: Pair, pictures: Mapping[str, Picture]) -> Self:
         """Put the pictures of a pair side by side."""
         first, second = (PLOT_HEIGHT * pictures[n].width / pictures[n].height for n in names)
         return cls(names, (first, second))
@@ -86,7 +85,7 @@ def plot_inliers(
 
 def _read_inliers(
     pairs: Sequence[Pair], database_path: Path, features_path: Path
-) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
+) -> list[tuple[Array, Bools]]:
     """Read the inliers of pairs.
 
     For each pair: (M, 2, 2) ends of its inliers, (x, y) in both images as shares of their sides,
@@ -114,9 +113,7 @@ def _read_inliers(
     return found
 
 
-def _plot(
-    num_inliers: int, shown: SideBySide, ends: NDArray[np.float64], from_warps: NDArray[np.bool_]
-) -> MatchPlot:
+def _plot(num_inliers: int, shown: SideBySide, ends: Array, from_warps: Bools) -> MatchPlot:
     points = ends * [[shown.widths[0], PLOT_HEIGHT], [shown.widths[1], PLOT_HEIGHT]]
     points[:, 1, 0] += shown.second_left
     every = max(1, -(-len(points) // MAX_NUM_LINES))

@@ -1,7 +1,5 @@
 """Photographs as small pictures that are part of a page."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass

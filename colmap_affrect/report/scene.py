@@ -1,11 +1,9 @@
 """Cameras and points of models, in one frame, to be drawn in a page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import registered_names
 from colmap_affrect.errors import AffrectError
+from colmap_affrect.geometry.arrays import Bytes
 from colmap_affrect.report.pictures import base64_text
 
 Array = NDArray[np.float64]
@@ -83,9 +82,9 @@ class Model:
     axes: Array
     half_sizes: Array
     points: Array
-    colors: NDArray[np.uint8]
+    colors: Bytes
 
-    def transformed(self, scale: float, rotation: Array, translation: Array) -> Model:
+    def transformed(self, scale: float, rotation: Array, translation: Array) -> Self:
         """Return it after x -> scale rotation x + translation."""
         return replace(
             self,

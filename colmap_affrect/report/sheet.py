@@ -1,7 +1,5 @@
 """One picture of one level of a recipe: regions, space of tilts, depth, warps, features."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,11 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Bbox
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS, resized_from_original
 from colmap_affrect.data import GrayImage, LocalFeatures, RectificationPlan
 from colmap_affrect.geometry.affine import transform_frames
+from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.planes import normals_from_depth, shrink_depth
 from colmap_affrect.images.reading import shrink_to
 from colmap_affrect.rectifiers.base import CoverOptions
@@ -348,9 +346,7 @@ def _draw_map(axes: Axes, shown_px: Size, level: InspectedLevel, colors: Sequenc
 # --- Depth
 
 
-def _draw_depth_and_normals(
-    page: FigurePage, level: InspectedLevel, depth: NDArray[np.floating]
-) -> None:
+def _draw_depth_and_normals(page: FigurePage, level: InspectedLevel, depth: Floats) -> None:
     photograph = level.photograph
     size = fitted(photograph.size, DEPTH_BOX_PX)
     shrunk, shrunk_from_depth = shrink_depth(depth, MAX_DEPTH_SIZE_PX)
@@ -369,7 +365,7 @@ def _draw_depth_and_normals(
     page.top += HEAD_PX + size[1] + MARGIN_PX
 
 
-def normal_colors(normals: NDArray[np.floating]) -> NDArray[np.float64]:
+def normal_colors(normals: Floats) -> Array:
     """Return (h, w, 3) colours of unit normals that face the camera; white where unknown."""
     colors = (normals * [1.0, 1.0, -1.0] + 1.0) / 2.0
     return np.where(np.isnan(colors), 1.0, colors)

@@ -1,15 +1,13 @@
 """Which photographs match which: view graph and matrix of verified inliers, as parts of a page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import log, sqrt
 
 import networkx
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.report.pictures import base64_text
 
@@ -83,7 +81,7 @@ class Node:
 class Layout:
     """Where photographs are in all view graphs of a page, (N, 2) in ``GRAPH_SIZE``, and a side."""
 
-    centers: NDArray[np.float64]
+    centers: Array
     node_size: float
 
 
@@ -113,7 +111,7 @@ def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layou
     return Layout(_apart(centers, size), size)
 
 
-def _apart(centers: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+def _apart(centers: Array, size: float) -> Array:
     """Push squares of a side apart until edges show between them, or nearly."""
     low, high = size / 2 + EDGE, np.array(GRAPH_SIZE) - size / 2 - EDGE
     rows, columns = np.triu_indices(len(centers), 1)

@@ -1,7 +1,5 @@
 """Which pairs of a set may climb: those that would tie an image that mapping may well lose."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Collection, Mapping, Set
 from dataclasses import dataclass

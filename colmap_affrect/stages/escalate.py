@@ -17,8 +17,6 @@ lowest level that has something to do comes first, so that a killed run goes on 
   rest.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -32,12 +30,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.verification import (
-    PairVerifier,
-    connected_parts,
-    verified_pairs,
-    verify,
-)
+from colmap_affrect.colmap.verification import PairVerifier, connected_parts, verified_pairs, verify
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.consistency import num_consistent_matches

@@ -7,8 +7,6 @@ stays on record (``guided.h5``) for the last adjustment. The raw matches stay as
 COLMAP's own guided matching.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -218,7 +216,6 @@ class Guiding:
             self._keep(found)
 
     def _tasks(self, pairs: Sequence[Pair]) -> list[GuidedTask]:
-        """Return what can be guided."""
         tasks = []
         with colmap_database.open_database(self.path) as database:
             cameras = colmap_database.cameras_of_images(database)

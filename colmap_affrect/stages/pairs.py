@@ -1,7 +1,5 @@
 """Pairs: which photographs are matched, into ``pairs.txt``."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Collection, Sequence
@@ -139,7 +137,6 @@ def add_pairs(context: Context, pairs: Sequence[Pair]) -> None:
 
 
 def _pairs_there(context: Context) -> set[Pair]:
-    """Return the pairs that were chosen before."""
     path = context.workspace.pairs
     return set(listed_pairs(context)) if path.exists() and path.stat().st_size else set()
 
