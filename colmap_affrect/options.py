@@ -1,10 +1,8 @@
 """Options and exchangeable parts: what all of them have in common.
 
-Options are frozen pydantic models that live beside what they belong to. They refuse unknown names,
-values of another type and values out of range, in one line. A part (feature extractor, shape
-source, depth source, rectifier, matcher, mapper) is a class with its options class as attribute
-``Options``; a :class:`Registry` finds it by the name in its options, in this package or, by an
-entry point, in another one.
+Options are frozen pydantic models that refuse unknown names, values of another type and values out
+of range, in one line. A part is a class with its options class as attribute ``Options``; a
+:class:`Registry` finds it by the name in its options, here or, by an entry point, elsewhere.
 """
 
 import ast

@@ -1,12 +1,10 @@
 """Progress of long stages: a tqdm bar on a terminal, plain lines elsewhere, or silence."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
-from typing import TextIO
+from typing import Self, TextIO
 
 from tqdm import tqdm
 
@@ -15,9 +13,7 @@ from colmap_affrect.shown import shown
 
 logger = logging.getLogger(__name__)
 
-Advance = Callable[[int], None]
-"""Report that so many more units are done."""
-
+Advance = Callable[[int], None]  # report that so many more units are done
 NUM_PLAIN_LINES = 10
 
 
@@ -36,7 +32,7 @@ class Progress:
         self._stream, self._num_plain_lines = stream, num_plain_lines
         self._forecast: Forecast | None = None
 
-    def with_forecast(self, forecast: Forecast) -> Progress:
+    def with_forecast(self, forecast: Forecast) -> Self:
         """Return the same that also says how long all stages take, there and in the log."""
         new = copy(self)
         new._forecast = forecast
@@ -91,7 +87,7 @@ class _Told:
             self._forecast.end()
 
 
-def _update(bar: tqdm[None], count: int, told: _Told) -> None:
+def _update(bar: "tqdm[None]", count: int, told: _Told) -> None:
     bar.set_postfix_str(told.advance(count), refresh=False)
     bar.update(count)
 

@@ -2,8 +2,7 @@
 
 from collections.abc import Iterable
 
-MAX_NAMES = 3
-"""Examples in a line."""
+MAX_NAMES = 3  # examples in a line
 
 
 def shown(text: str) -> str:

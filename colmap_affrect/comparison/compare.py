@@ -41,8 +41,7 @@ from colmap_affrect.project.workspace import Workspace, first_difference
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 
 DEFAULT_SEEDS = (0, 1, 2)
-NUM_DIGITS = 16
-"""Of the digests of photographs on record: messages name them."""
+NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
 
 
 @dataclass(frozen=True, kw_only=True)

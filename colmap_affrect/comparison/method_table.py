@@ -23,8 +23,7 @@ MAIN_ROWS = {
 """Rows that decide; the others are folded away."""
 
 BYTES_PER_MB = 1_000_000
-NOTHING = "-"
-"""Where there is no number."""
+NOTHING = "-"  # where there is no number
 
 
 @dataclass(frozen=True)

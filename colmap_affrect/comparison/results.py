@@ -4,7 +4,6 @@ Everything derived (means, who registers what alone) is computed here from the r
 seeds, so that terminal, page, JSON and CSV cannot disagree.
 """
 
-import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field
@@ -12,10 +11,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Self
 
-from pydantic import BeforeValidator, Field, PlainSerializer, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, Field, PlainSerializer, TypeAdapter
 
 from colmap_affrect.colmap.poses import PoseScores
-from colmap_affrect.errors import StoreError
 from colmap_affrect.pairs.base import Pair
 
 PairCounts = Annotated[
@@ -308,17 +306,3 @@ class Comparison:
             "settings": dict(self.settings),
             "versions": dict(self.versions),
         }
-
-    @classmethod
-    def from_json(cls, text: str) -> Self:
-        """Read ``comparison.json``; StoreError when it is damaged or something else."""
-        try:
-            values = json.loads(text)
-            methods = tuple(MethodResult.from_mapping(*item) for item in values["methods"].items())
-            return TypeAdapter(cls).validate_python({**values, "methods": methods})
-        except ValidationError as error:
-            where, what = error.errors()[0]["loc"], error.errors()[0]["msg"]
-            place = ".".join(map(str, where))
-            raise StoreError(f"not the result of a comparison ({place}: {what})") from error
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise StoreError(f"not the result of a comparison ({error!r})") from error

@@ -18,9 +18,7 @@ MIN_MEAN_GAIN = 0.5
 """More photographs on average over the seeds than this is a gain, though no single photograph is
 registered in most seeds that was not before."""
 
-MIN_IMAGES = 3
-"""Fewer are a pair, not a reconstruction."""
-
+MIN_IMAGES = 3  # fewer are a pair, not a reconstruction
 MAX_NAMES = 6
 MIN_WHOLE_SECONDS = 10
 
@@ -109,7 +107,8 @@ def headline(comparison: Comparison) -> list[str]:
             f"Nothing was reconstructed: no method registers more than {most:g} of the {total} "
             "photographs."
         ]
-    reference, registers = reference_of(comparison), _registers(comparison)
+    registers = "correctly registers" if comparison.has_ground_truth else "registers"
+    reference = reference_of(comparison)
     best_of_total = f"{_number(_count(best))} of {total}"
     if reference is None:
         return [
@@ -268,10 +267,6 @@ def contradictions(comparison: Comparison) -> list[str]:
 def _count(method: MethodResult) -> Span:
     """Images that count: those registered correctly, without ground truth those registered."""
     return method.correct or method.registered
-
-
-def _registers(comparison: Comparison) -> str:
-    return "correctly registers" if comparison.has_ground_truth else "registers"
 
 
 def _number(span: Span) -> str:

@@ -5,8 +5,6 @@ run again, it goes on. It tells of its progress and of how it ended by lines of 
 everything else that is printed goes to stderr.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -23,7 +21,12 @@ from typing import Any, TextIO
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import read_camera_records
-from colmap_affrect.colmap.database import image_ids, open_database, unverified_pairs
+from colmap_affrect.colmap.database import (
+    image_ids,
+    keypoint_counts,
+    open_database,
+    unverified_pairs,
+)
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import (
     ExtractedPx,
@@ -60,8 +63,7 @@ from colmap_affrect.stages.verify import extracted_px, verify_matches
 
 logger = logging.getLogger("colmap_affrect")
 
-SAVE_EVERY_S = 1.0
-"""How often the costs so far are written down, in case the process is killed."""
+SAVE_EVERY_S = 1.0  # how often the costs so far are written down, in case the process is killed
 
 
 def main() -> None:
@@ -111,7 +113,7 @@ def compute(request: Request, progress: Progress) -> None:
     replace_text(request.result, json.dumps(content, indent=1, ensure_ascii=False))
 
 
-def _match_sift(request: Request, costs: _Costs, progress: Progress, *, affine: bool) -> None:
+def _match_sift(request: Request, costs: "_Costs", progress: Progress, *, affine: bool) -> None:
     path, base = request.folder / "database.db", request.layout.database
     if not path.exists():
         copy_database(base, path)
@@ -134,7 +136,7 @@ def _match_sift(request: Request, costs: _Costs, progress: Progress, *, affine: 
     costs.stage("match", match_all)
 
 
-def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Progress) -> None:
+def _match_recipe(request: Request, recipe: Recipe, costs: "_Costs", progress: Progress) -> None:
     context = Context(Workspace(request.folder), request.resources, progress=progress)
     inputs = Inputs.of(
         request.image_path,
@@ -158,17 +160,12 @@ def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Pro
 def _count_features(database_path: Path) -> tuple[dict[str, int], dict[Pair, int]]:
     with open_database(database_path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
-        keypoints = {
-            name: database.num_keypoints_for_image(image_id)
-            for image_id, name in names.items()
-            if database.exists_keypoints(image_id)
-        }
         pair_ids, counts = database.read_num_matches()
     matches = {
         _pair(names, pycolmap.pair_id_to_image_pair(pair_id)): int(count)
         for pair_id, count in zip(pair_ids, counts, strict=True)
     }
-    return dict(sorted(keypoints.items())), matches
+    return dict(sorted(keypoint_counts(database_path).items())), matches
 
 
 def _pair(names: Mapping[int, str], ids: tuple[int, int]) -> Pair:

@@ -17,8 +17,7 @@ from colmap_affrect.progress import SILENT, Progress
 
 __all__ = ["Diagnosis", "Finding", "diagnose"]
 
-USUAL_WEIGHTS = ("affnet", "orinet", "hardnet")
-"""What learned features need by default."""
+USUAL_WEIGHTS = ("affnet", "orinet", "hardnet")  # what learned features need by default
 
 
 def diagnose(

@@ -69,8 +69,7 @@ PROTOCOLS: Mapping[str, type[EvaluationProtocol]] = {
 }
 DEFAULT_RECIPES = ("unrectified-rootsift", "default")
 
-NOTHING: Array = np.zeros((0, 2))
-"""Matches of a pair that could not be matched."""
+NOTHING: Array = np.zeros((0, 2))  # matches of a pair that could not be matched
 
 
 def make_protocol(name: str, settings: Sequence[str] = ()) -> EvaluationProtocol:

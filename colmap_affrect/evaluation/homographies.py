@@ -30,12 +30,8 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import within
 
 Homography = Array
-Size = tuple[int, int]
-"""(width, height) in px."""
-
-CORRECT_PX = 3.0
-"""A match is correct if its transfer error in image 2 is smaller."""
-
+Size = tuple[int, int]  # (width, height) in px
+CORRECT_PX = 3.0  # a match is correct if its transfer error in image 2 is smaller
 THRESHOLDS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)
 """Pairs are counted whose homography error is smaller (the paper's table on EVD)."""
 

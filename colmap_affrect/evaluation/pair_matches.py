@@ -5,12 +5,10 @@ until COLMAP's geometric verification finds enough inliers, and the level with m
 Its cameras are taken for unknown.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -54,7 +52,7 @@ class MatchedPair:
     verified_inliers: int
     seconds: float
 
-    def better(self, new: MatchedPair) -> MatchedPair:
+    def better(self, new: Self) -> Self:
         """Choose the one with more verified inliers, the new one if none has any; add times."""
         takes_new = new.verified_inliers > self.verified_inliers or not self.verified_inliers
         seconds = self.seconds + new.seconds

@@ -22,11 +22,8 @@ GRID = "#DDDDDD"
 BARS = "#DDE3EA"
 PAPER_STYLE: dict[str, Any] = dict(marker=".", linestyle=":", linewidth=1.2, alpha=0.8)
 MIN_SECONDS = 0.01
-ROOM_FOR_NUMBERS = 1.12
-"""Of an axis, in lengths of the longest bar."""
-ROW_IN = 0.42
-"""Height of a row of bars."""
-
+ROOM_FOR_NUMBERS = 1.12  # of an axis, in lengths of the longest bar
+ROW_IN = 0.42  # height of a row of bars
 PAPER_THRESHOLD = "< "
 
 

@@ -47,14 +47,10 @@ from colmap_affrect.evaluation.truth_checks import image_sizes, pose_contradicti
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import IMAGE_SUFFIXES
 
-Names = tuple[str, str]
-"""Of the images of a pair, without suffix."""
-
+Names = tuple[str, str]  # of the images of a pair, without suffix
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
 CATEGORY_DEG = 10
-MAX_NOT_UNIT = 1e-3
-"""Largest deviation of the length of a quaternion from 1."""
-
+MAX_NOT_UNIT = 1e-3  # largest deviation of the length of a quaternion from 1
 SET_FOLDER = "set_100"
 LIST_FOLDER = "new-vis-pairs"
 CALIBRATION_PREFIX = "calibration_"
@@ -335,8 +331,7 @@ class Imc(PosedScenes):
         return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
 
 
-Calibration = tuple[Array, Pose]
-"""What a calibration file says: (3, 3) K and camera_from_world."""
+Calibration = tuple[Array, Pose]  # what a calibration file says: (3, 3) K and camera_from_world
 
 
 def disjoint_bins(lists: Mapping[int, list[str]]) -> dict[str, int]:

@@ -21,8 +21,7 @@ Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value 
 
 POSITIVE = within(1e-6, 1e9)
 
-GROUP = ": "
-"""Separates the name of a table from that of its column in the names of columns."""
+GROUP = ": "  # separates the name of a table from that of its column in the names of columns
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,7 @@ from colmap_affrect.evaluation.two_views import Points, Ransac, sampson_distance
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.options import within
 
-CORRECT_PX = 3.0
-"""A match agrees with a pose up to this Sampson distance."""
-
+CORRECT_PX = 3.0  # a match agrees with a pose up to this Sampson distance
 MAX_AUC_ERROR_DEG = 10.0
 
 ESTIMATORS = {"": "", "GC-RANSAC: ": "gc_"}

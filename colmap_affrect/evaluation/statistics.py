@@ -10,9 +10,7 @@ from colmap_affrect.geometry.arrays import Array, Indices
 NUM_RESAMPLES = 2000
 CONFIDENCE = 0.95
 
-MAX_ENUMERATED = 14
-"""Up to so many differences all signs are tried, above that random ones."""
-
+MAX_ENUMERATED = 14  # up to so many differences all signs are tried, above that random ones
 NUM_RANDOM_SIGNS = 9999
 
 

@@ -1,10 +1,8 @@
-"""Sanity checks of what a dataset gives as truth.
+"""Sanity checks of what a dataset gives as truth: converted wrongly it makes every method look bad.
 
-A dataset that was converted wrongly makes every method look bad. What can be seen from the numbers
-alone (rotations that are none, intrinsics of another image size) is looked for in every image; what
-only the images show (homographies inverted, coordinates exchanged, rotations transposed), in the
-matches of plain features: of every homography and of marked correspondences, and of a few easy
-pairs where the truth is of poses.
+What the numbers alone show is looked for in every image; what only the images show (homographies
+inverted, coordinates exchanged, rotations transposed), in the matches of plain features: of every
+homography and of marked correspondences, and of a few easy pairs where the truth is of poses.
 """
 
 import itertools
@@ -34,7 +32,7 @@ from colmap_affrect.evaluation.two_views import (
     symmetric_epipolar_distances,
 )
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.images.reading import read_gray
+from colmap_affrect.images.reading import read_gray, readable_size
 from colmap_affrect.images.warping import warp
 from colmap_affrect.matchers.nearest import (
     MatchableImage,
@@ -49,16 +47,12 @@ from colmap_affrect.stages.one_image import extract_image, prepare
 
 CHECK_RECIPE = "unrectified-rootsift"
 
-MAX_NOT_ORTHONORMAL = 1e-3
-"""Largest element of R Rᵀ - I of what passes for a rotation."""
-
+MAX_NOT_ORTHONORMAL = 1e-3  # largest element of R Rᵀ - I of what passes for a rotation
 MIN_SUPPORT = 8
 MIN_SUPPORT_FRAC = 0.25
 """Matches of the rectified pair that confirm a homography."""
 SUPPORT_PX = 5.0
-RESIZED = (0.5, 2.0)
-"""Sizes of an image that a truth might be of, in the place of its own."""
-
+RESIZED = (0.5, 2.0)  # sizes of an image that a truth might be of, in the place of its own
 EPIPOLAR_NOISE_PX = 1.0
 MIN_EPIPOLAR_CONSENSUS = 40
 MIN_EPIPOLAR_CONSENSUS_FRAC = 0.5
@@ -66,10 +60,8 @@ MIN_EPIPOLAR_CONSENSUS_FRAC = 0.5
 MAX_MEDIAN_PX = 10.0
 """Correspondences that disagree by more on average are doubted: they are a few px accurate."""
 
-MAX_CHECKED_PAIRS = 8
-"""Per scene."""
-CHECK_IMAGE_SIZE_PX = 800
-"""Longer side of the images in which poses are checked."""
+MAX_CHECKED_PAIRS = 8  # per scene
+CHECK_IMAGE_SIZE_PX = 800  # longer side of the images in which poses are checked
 MIN_POSE_CONSENSUS = 30
 MIN_POSE_CONSENSUS_FRAC = 0.3
 """Inliers of an essential matrix that prove that the matches of a pair are right."""
@@ -108,14 +100,7 @@ def rotation_fault(rotation: Array) -> str:
 
 def image_sizes(paths: Iterable[Path]) -> Iterator[Size | None]:
     """Yield (width, height) of images, None for those that cannot be read: they fail when used."""
-
-    def size(path: Path) -> Size | None:
-        try:
-            return size_of(read_gray(path))
-        except ImageError:
-            return None
-
-    return map_ordered(size, paths, available_cores())
+    return map_ordered(readable_size, paths, available_cores())
 
 
 def size_of(image: GrayImage) -> Size:

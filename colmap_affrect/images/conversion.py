@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.images.headers import pages
-from colmap_affrect.images.photographs import TIFF_SUFFIXES, photograph_files
+from colmap_affrect.images.photographs import TIFF_SUFFIXES, photograph_files, require_folder
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_bytes
@@ -48,10 +48,7 @@ def convert_images(
     What is there already is not made again. Raises ImageError when there are no photographs,
     OptionError when their folder is not there, or the new one is inside it.
     """
-    if image_path.is_file():
-        raise OptionError(f"{image_path}: is a file; give the folder that it is in")
-    if not image_path.is_dir():
-        raise OptionError(f"{image_path}: no such folder; give the folder of the photographs")
+    require_folder(image_path)
     if output_path.resolve() == image_path.resolve():
         raise OptionError(f"{output_path}: is the folder of the photographs; give another one")
     if output_path.resolve().is_relative_to(image_path.resolve()):

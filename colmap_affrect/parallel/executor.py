@@ -17,11 +17,8 @@ from typing import Protocol, TypeVar
 
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-BYTES_PER_RSS = 1 if sys.platform == "darwin" else 1024
-"""Unit of ``getrusage``."""
-
-ASSUMED_MEMORY_BYTES = 8 << 30
-"""Of systems that do not say what they have."""
+BYTES_PER_RSS = 1 if sys.platform == "darwin" else 1024  # unit of ``getrusage``
+ASSUMED_MEMORY_BYTES = 8 << 30  # of systems that do not say what they have
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -121,11 +118,6 @@ def one_openmp_thread() -> Iterator[None]:
     """
     with _loaded_libraries().limit(limits=1, user_api="openmp"):
         yield
-
-
-def use_one_blas_thread() -> None:
-    """Keep numpy's linear algebra to the calling thread from now on, in all of this process."""
-    threadpool_limits(1, user_api="blas")
 
 
 @cache

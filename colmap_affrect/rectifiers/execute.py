@@ -25,8 +25,7 @@ from colmap_affrect.images.warping import warp, warp_mask
 
 DUPLICATE_RADIUS_SIGMAS = 0.5
 MAX_DUPLICATE_RADIUS_PX = 4.0
-SAME_SCALE_RATIO = 2 ** (1 / 3)
-"""One layer of a scale space with three layers per octave."""
+SAME_SCALE_RATIO = 2 ** (1 / 3)  # one layer of a scale space with three layers per octave
 
 
 def extract_rectified(

@@ -16,8 +16,7 @@ from colmap_affrect.report.pictures import Picture
 
 MAX_NUM_LINES = 100
 
-PLOT_HEIGHT, GAP = 300.0, 8.0
-"""Of two photographs side by side, in units of the plot."""
+PLOT_HEIGHT, GAP = 300.0, 8.0  # of two photographs side by side, in units of the plot
 
 
 @dataclass(frozen=True)

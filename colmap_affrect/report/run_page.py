@@ -39,8 +39,7 @@ SOURCES = {
     "guess": "guess",
 }
 
-MAX_NUM_CAMERAS = 200
-"""In the table; report.json has all."""
+MAX_NUM_CAMERAS = 200  # in the table; report.json has all
 
 
 @dataclass(frozen=True)

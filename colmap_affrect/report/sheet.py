@@ -47,8 +47,7 @@ DPI = 100
 WIDTH_PX = 1800
 MARGIN_PX = 24
 INNER_PX = WIDTH_PX - 2 * MARGIN_PX
-HEAD_PX = 50
-"""Title and caption of a section."""
+HEAD_PX = 50  # title and caption of a section
 FONT_PT, TITLE_PT = 9.0, 12.0
 DARK = "#555555"
 
@@ -57,8 +56,7 @@ TILE_GAP_PX = 14
 MIN_TILE_WIDTH_PX = 190
 MAX_TILE_WIDTH_PX = (INNER_PX - TILE_GAP_PX) // 2
 MIN_TILE_HEIGHT_PX, MAX_TILE_HEIGHT_PX = 72, 440
-ALL_TILES_PX = INNER_PX * 550
-"""Area of all warps as they are shown, nearly."""
+ALL_TILES_PX = INNER_PX * 550  # area of all warps as they are shown, nearly
 
 STYLE: list[str | dict[str, Any]] = [
     "default",
@@ -161,8 +159,7 @@ def ranges(numbers: Sequence[int], max_num: int) -> str:
 
 
 NAME_PX, LINE_PX = 34, 20
-NAME_CHARS, LINE_CHARS = 110, 200
-"""What fits into a line of the header."""
+NAME_CHARS, LINE_CHARS = 110, 200  # what fits into a line of the header
 HEADER_PT, NAME_PT = 10.5, 16.0
 
 MAP_BOX_PX = (900, 720)
@@ -180,9 +177,7 @@ MAX_NUM_MARK_LABELS = 16
 MAX_NUM_FEATURES = 1500
 MAX_NUM_TILE_FEATURES = 120
 
-FEATURE_SIGMAS = 2.0
-"""Radius of the ellipses drawn for features, in sigma."""
-
+FEATURE_SIGMAS = 2.0  # radius of the ellipses drawn for features, in sigma
 WARNING = "#B03A00"
 
 OUTLINED = [withStroke(linewidth=2.5, foreground="white")]
@@ -231,8 +226,7 @@ def _draw_header(page: FigurePage, level: InspectedLevel, stored_size: Size) -> 
     page.top += MARGIN_PX
 
 
-MASKED = (0.0, 0.0, 0.0, 0.65)
-"""Colour and opacity over what a mask leaves out."""
+MASKED = (0.0, 0.0, 0.0, 0.65)  # colour and opacity over what a mask leaves out
 HOW_TO_READ = (
     "From above: where the photograph is looked at anew and how strongly it is tilted there, the"
     " warps made of these places, and the features of all of them; one colour is one warp."

@@ -27,9 +27,7 @@ from colmap_affrect.rectifiers.base import CoverOptions
 from colmap_affrect.report.levels import InspectedLevel
 from colmap_affrect.report.regions import Color
 
-TICKS = (2, 3, 4, 6, 8, 12, 20)
-"""Tilts written along the diameter."""
-
+TICKS = (2, 3, 4, 6, 8, 12, 20)  # tilts written along the diameter
 SIDE, BELOW, ABOVE = 1.10, 0.10, 1.12
 """Space to the sides, below and above in radii of the disc; labels stand in it."""
 

@@ -23,13 +23,11 @@ logger = logging.getLogger(__name__)
 
 MAX_MOTION_FRAC = 0.005
 """Of the longer side: what moves less has not moved; scans are not cut to the pixel."""
-NUM_CELLS = 48
-"""Cells along the longer side."""
+NUM_CELLS = 48  # cells along the longer side
 MIN_NUM_PAIRS = 3
 MIN_NUM_IMAGES = 3
 """Two views of a camera that did not turn have places that stay where they are; more have none."""
-MIN_SHARE = 0.5
-"""Of the pairs that have a match in a cell."""
+MIN_SHARE = 0.5  # of the pairs that have a match in a cell
 MAX_SHARE_OF_PHOTOGRAPH = 0.5
 """Where more of what is matched never moves it is the camera that stands still."""
 MAX_SHARE_BESIDE = 0.2
