@@ -137,20 +137,15 @@ def import_h5(
         ]
         num_verified = None
         if not skip_verification:
-            num_verified = _verify(new, len(files.pairs), random_seed, progress)
+            options = VerificationOptions(random_seed=random_seed)
+            with progress.stage("verify", len(files.pairs), "pairs") as advance:
+                verify(new, options, advance=advance)
+            num_verified = len(verified_pairs(new, options.min_num_inliers))
         new.replace(database_path)
     return InterchangeReport(
         "imported", files.layout, len(names) - len(rejected), sum(counts.values()),
         len(files.pairs), num_matches, num_verified, tuple(notes),
     )  # fmt: skip
-
-
-def _verify(path: Path, num_pairs: int, random_seed: int, progress: Progress) -> int:
-    """Verify all pairs; return how many have a two-view geometry then."""
-    options = VerificationOptions(random_seed=random_seed)
-    with progress.stage("verify", num_pairs, "pairs") as advance:
-        verify(path, options, advance=advance)
-    return len(verified_pairs(path, options.min_num_inliers))
 
 
 def _rounded(files: ForeignFiles) -> list[str]:

@@ -6,9 +6,8 @@ from math import sqrt
 import numpy as np
 
 from colmap_affrect.data import Mask, Rectification, in_mask
-from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.affine import fit_canvas, project, rectifying_affine, transform_frames
 from colmap_affrect.geometry.arrays import Array, Floats
-from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
 from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 
 MARGIN_PX = 16.0  # surroundings of a region that its descriptors may see, in warp px

@@ -3,8 +3,8 @@
 from typing import Literal
 
 from colmap_affrect.data import Photograph, Rectification, RectificationPlan
+from colmap_affrect.geometry.affine import fit_canvas, image_corners, rectifying_affine
 from colmap_affrect.geometry.arrays import Floats
-from colmap_affrect.geometry.canvas import fit_canvas, image_corners, rectifying_affine
 from colmap_affrect.geometry.tilts import asift_covering, near_optimal_covering
 from colmap_affrect.rectifiers.base import (
     AffineWarpOptions,

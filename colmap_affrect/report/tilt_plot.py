@@ -14,9 +14,8 @@ from matplotlib.patches import Arc, Polygon, Wedge
 from matplotlib.patheffects import withStroke
 
 from colmap_affrect.data import ShapeSamples
-from colmap_affrect.geometry.affine import compose_affine
+from colmap_affrect.geometry.affine import compose_affine, rectifying_affine
 from colmap_affrect.geometry.arrays import Array, Floats
-from colmap_affrect.geometry.canvas import rectifying_affine
 from colmap_affrect.geometry.tilts import (
     IDENTITY_LABEL,
     nearest_centers,

@@ -19,12 +19,12 @@ from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.pairs.connectivity import weakly_connected_images
 from colmap_affrect.pairs.lists import ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import GuidedPair
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.climbing import weakly_connected_images
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import recorded_extraction
 from colmap_affrect.stages.match import PAIRS_PER_WRITE

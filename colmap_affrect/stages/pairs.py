@@ -12,8 +12,7 @@ from colmap_affrect.matchers.base import Matches
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair, PairList, PairOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs, pairs_by_place, read_pairs, write_pairs
-from colmap_affrect.pairs.low_resolution import NUM_STRONGEST, low_resolution_pairs
-from colmap_affrect.pairs.retrieval import retrieved_pairs
+from colmap_affrect.pairs.retrieval import NUM_STRONGEST, low_resolution_pairs, retrieved_pairs
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
