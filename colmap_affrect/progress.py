@@ -23,12 +23,7 @@ class Progress:
     def __init__(
         self, stream: TextIO | None = None, num_plain_lines: int = NUM_PLAIN_LINES
     ) -> None:
-        """Write to ``stream``; None means silence.
-
-        Args:
-            stream: where bars or lines go.
-            num_plain_lines: at most so many lines for a stage where there is no terminal.
-        """
+        """Write to a stream, at most so many lines a stage without a terminal; None is silence."""
         self._stream, self._num_plain_lines = stream, num_plain_lines
         self._forecast: Forecast | None = None
 

@@ -193,17 +193,12 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Mark(Node):
-    """What one method does with one photograph.
-
-    Attributes:
-        is_doubtful: registered in poses that contradict those of other seeds, or of most other
-            methods.
-        is_only: usually registered by no other method.
-    """
+    """What one method does with one photograph."""
 
     column: Column
+    # registered in poses that contradict those of other seeds, or of most other methods
     is_doubtful: bool
-    is_only: bool
+    is_only: bool  # usually registered by no other method
 
     @property
     def kind(self) -> str:

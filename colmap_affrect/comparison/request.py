@@ -57,26 +57,20 @@ def _plain(method: Method) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Request:
-    """What one process is to do.
-
-    Attributes:
-        mapping: checked.
-        focal_vote: whether verified pairs vote on cameras that nobody knows.
-        may_share: whether cameras of images of one size may then turn out to be the same.
-        seeds: of verification and mapping; recipes that climb do it with the first.
-    """
+    """What one process is to do."""
 
     method: Annotated[Method, BeforeValidator(_method), PlainSerializer(_plain)]
     output_path: Path
     image_path: Path
     masks: MaskOptions
     verification: VerificationOptions
+    # whose values are checked
     mapping: Annotated[
         MapperOptions, BeforeValidator(MAPPERS.options), PlainSerializer(MapperOptions.to_mapping)
     ]
-    focal_vote: bool
-    may_share: bool
-    seeds: tuple[int, ...]
+    focal_vote: bool  # whether verified pairs vote on cameras that nobody knows
+    may_share: bool  # whether cameras of images of one size may then turn out to be the same
+    seeds: tuple[int, ...]  # of verification and mapping; recipes that climb do it with the first
     resources: Resources
 
     @property

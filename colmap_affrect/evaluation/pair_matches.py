@@ -32,25 +32,18 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class MatchedPair:
-    """The matches of a pair.
-
-    Attributes:
-        points: (M, 2) pixel-centre px of the matches in each image.
-        level: rectifier of the level of escalation that counts, ``none`` when no level was
-            verified; empty without escalation.
-        num_levels: that were tried.
-        verified_inliers: of COLMAP's two-view geometry; 0 if a run would not take it, or without
-            escalation.
-        seconds: of matching and verification, at all levels that were tried.
-    """
+    """The matches of a pair."""
 
     pair: EvaluationPair
-    points: tuple[Array, Array]
+    points: tuple[Array, Array]  # (M, 2) pixel-centre px of the matches in each image
     num_keypoints: tuple[int, int]
+    # rectifier of the level of escalation that counts, ``none`` when no level was verified;
+    # empty without escalation
     level: str
-    num_levels: int
+    num_levels: int  # that were tried
+    # of COLMAP's two-view geometry; 0 if a run would not take it, or without escalation
     verified_inliers: int
-    seconds: float
+    seconds: float  # of matching and verification, at all levels that were tried
 
     def better(self, new: Self) -> Self:
         """Choose the one with more verified inliers, the new one if none has any; add times."""

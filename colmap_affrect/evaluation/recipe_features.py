@@ -73,17 +73,11 @@ Reading images is not counted."""
 
 @dataclass(frozen=True)
 class ImageCost:
-    """What the features of one image cost, or the mean of several.
+    """What the features of one image cost, or the mean of several."""
 
-    Attributes:
-        area_mpx: area of all warps in megapixels, the image itself not counted.
-        num_keypoints: features of the image and of its warps.
-        num_regions: different parts of the image that are warped.
-    """
-
-    area_mpx: float = 0.0
-    num_keypoints: float = 0.0
-    num_regions: float = 0.0
+    area_mpx: float = 0.0  # area of all warps in megapixels, the image itself not counted
+    num_keypoints: float = 0.0  # features of the image and of its warps
+    num_regions: float = 0.0  # different parts of the image that are warped
     num_warps: float = 0.0
     plan_s: float = 0.0
     warp_s: float = 0.0

@@ -21,20 +21,15 @@ MIN_HOMOGRAPHY_MATCHES, MIN_FUNDAMENTAL_MATCHES, MIN_POSE_MATCHES = 4, 8, 6
 
 @dataclass(frozen=True)
 class Ransac:
-    """How to look for a model of (M, 2) and (M, 2) matches.
+    """How to look for a model of (M, 2) and (M, 2) matches."""
 
-    Attributes:
-        method: ``cv2.RANSAC``, ``cv2.USAC_MAGSAC`` or another of OpenCV's.
-        threshold: of an inlier (MAGSAC: largest noise) in px; of relative poses in units of the
-            focal length.
-        confidence: at which to end before all iterations.
-        random_seed: decides the order of the matches: OpenCV draws the same samples every time.
-    """
-
-    method: int
+    method: int  # ``cv2.RANSAC``, ``cv2.USAC_MAGSAC`` or another of OpenCV's
+    # of an inlier (MAGSAC: largest noise) in px; of relative poses in units of the focal
+    # length
     threshold: float
-    confidence: float
+    confidence: float  # at which to end before all iterations
     max_num_iterations: int
+    # decides the order of the matches: OpenCV draws the same samples every time
     random_seed: int = 0
 
     def reseeded(self, count: int) -> list[Self]:

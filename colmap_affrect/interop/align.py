@@ -131,7 +131,7 @@ def _positions(
             f"3 are needed; known are those of {', '.join(sorted(true)[:3]) or 'none'}"
         )
     places = np.array([true[name] for name in names])
-    origin = Georeference.middle_of(places) if is_on_earth else None
+    origin = Georeference(*places.mean(axis=0).tolist()) if is_on_earth else None
     if origin:
         places = origin.in_metres(places)
     return names, np.array([old[name] for name in names]), places, origin

@@ -31,11 +31,6 @@ class Georeference:
     altitude: float
 
     @classmethod
-    def middle_of(cls, positions: ArrayLike) -> Self:
-        """Put the origin into the middle of some latitudes, longitudes and altitudes."""
-        return cls(*np.mean(np.asarray(positions, float), axis=0).tolist())
-
-    @classmethod
     def read(cls, model_path: Path) -> Self | None:
         """Return what is on record beside a model, None if there is nothing."""
         path = model_path / FILE_NAME

@@ -218,7 +218,6 @@ class Cluster:
     """An :class:`~colmap_affrect.parallel.executor.Executor` on the workers of a cluster."""
 
     def __init__(self, client: Client, address: str) -> None:
-        """Take a client that is connected to the scheduler of this address."""
         self._client, self._address = client, address
         self._num_threads, self._asked_at = 0, -POLL_S
 

@@ -44,7 +44,6 @@ class Threads:
     """Work in threads of this process."""
 
     def __init__(self, num_threads: int) -> None:
-        """Set the number of tasks at a time."""
         self._num_threads = num_threads
 
     def sees(self, paths: Sequence[Path]) -> bool:

@@ -18,15 +18,10 @@ As the authors chose it."""
 
 @dataclass(frozen=True)
 class Region:
-    """Part of an image.
+    """Part of an image."""
 
-    Attributes:
-        mask: (h, w) bool, cropped to the part.
-        origin: (x, y) image pixel of the mask's first pixel.
-    """
-
-    mask: Mask
-    origin: tuple[int, int]
+    mask: Mask  # (h, w) bool, cropped to the part
+    origin: tuple[int, int]  # (x, y) image pixel of the mask's first pixel
 
     @property
     def area_px(self) -> int:

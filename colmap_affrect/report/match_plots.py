@@ -45,19 +45,13 @@ class SideBySide:
 
 @dataclass(frozen=True)
 class MatchPlot:
-    """The inliers of a pair, to be drawn over its photographs.
-
-    Attributes:
-        num_from_warps: inliers with a feature from a warp.
-        plain, warped: SVG paths of the lines of the others and of these.
-        missing: why there are no lines; empty if there are, or nothing was verified.
-    """
+    """The inliers of a pair, to be drawn over its photographs."""
 
     num_inliers: int
-    num_from_warps: int = 0
-    plain: str = ""
-    warped: str = ""
-    missing: str = ""
+    num_from_warps: int = 0  # inliers with a feature from a warp
+    plain: str = ""  # SVG path of the lines of the others
+    warped: str = ""  # and of these
+    missing: str = ""  # why there are no lines; empty if there are, or nothing was verified
 
 
 def plot_inliers(

@@ -28,18 +28,14 @@ DARKEST, COLOR_RANGE = 60, 140
 
 @dataclass(frozen=True)
 class View3D:
-    """A model ready for the page; lengths in units of the view's radius.
-
-    Attributes:
-        points: (N, 3) uint16 positions from -1 to 1 and then (N, 3) uint8 colours, as base64.
-        cameras: name and (5, 3) centre and corners of the pyramid of each camera.
-        note: what is special about it; empty if nothing is.
-    """
+    """A model ready for the page; lengths in units of the view's radius."""
 
     num_points: int = 0
+    # (N, 3) uint16 positions from -1 to 1 and then (N, 3) uint8 colours, as base64
     points: str = ""
+    # name and (5, 3) centre and corners of the pyramid of each camera
     cameras: tuple[tuple[str, Array], ...] = ()
-    note: str = ""
+    note: str = ""  # what is special about it; empty if nothing is
 
     def script_data(self, index: Mapping[str, int], kinds: Mapping[str, str]) -> dict[str, Any]:
         """Return what the script of the page reads.
@@ -61,21 +57,14 @@ class View3D:
 
 @dataclass(frozen=True)
 class Model:
-    """A model as arrays.
-
-    Attributes:
-        centers: (M, 3) of the cameras.
-        axes: (M, 3, 3) rotations world_from_camera.
-        half_sizes: (M, 2) half width and height of the view at depth 1.
-        points, colors: (N, 3) and (N, 3) uint8.
-    """
+    """A model as arrays."""
 
     names: tuple[str, ...]
-    centers: Array
-    axes: Array
-    half_sizes: Array
-    points: Array
-    colors: Bytes
+    centers: Array  # (M, 3) of the cameras
+    axes: Array  # (M, 3, 3) rotations world_from_camera
+    half_sizes: Array  # (M, 2) half width and height of the view at depth 1
+    points: Array  # (N, 3)
+    colors: Bytes  # (N, 3)
 
     def transformed(self, scale: float, rotation: Array, translation: Array) -> Self:
         """Return it after x -> scale rotation x + translation."""

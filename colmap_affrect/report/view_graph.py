@@ -52,17 +52,12 @@ def class_labels() -> list[str]:
 
 @dataclass(frozen=True)
 class Node:
-    """A photograph in a view graph; it has the same number, from 1, everywhere on the page.
-
-    Attributes:
-        state: ``always``, ``sometimes`` or ``never`` registered, over the seeds.
-        is_wrong: registered, but at a wrong place with some seed.
-    """
+    """A photograph in a view graph; it has the same number, from 1, everywhere on the page."""
 
     number: int
     name: str
-    state: str
-    is_wrong: bool
+    state: str  # ``always``, ``sometimes`` or ``never`` registered, over the seeds
+    is_wrong: bool  # registered, but at a wrong place with some seed
     text: str
 
 
