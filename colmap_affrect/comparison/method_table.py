@@ -62,8 +62,7 @@ class Row:
         return self.key in MAIN_ROWS
 
 
-Better = Callable[[Iterable[float]], float] | None
-"""``max`` or ``min`` of the means is best; None where neither is."""
+Better = Callable[[Iterable[float]], float] | None  # which of the means is best, if any
 
 
 def summary_rows(columns: Sequence[Column], comparison: Comparison) -> list[Row]:

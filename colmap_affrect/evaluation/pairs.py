@@ -79,9 +79,7 @@ INTRINSICS = dict.fromkeys(("intrinsics1", "intrinsics2"), (3, 3))
 POSE_SHAPES = {"rotation": (3, 3), "translation": (3,), **INTRINSICS}
 ORIGINS = ("center", "corner")
 
-MAX_OFF_CENTRE = 0.25
-"""A principal point further from the middle, in image sizes, does not fit the image."""
-
+MAX_OFF_CENTRE = 0.25  # principal points further from the middle, in image sizes, do not fit
 WXBS_THRESHOLDS_PX = tuple(range(20))
 """The score of WxBS is the mean over these of the share of correspondences that agree."""
 

@@ -54,11 +54,8 @@ MAX_NOT_UNIT = 1e-3  # largest deviation of the length of a quaternion from 1
 SET_FOLDER = "set_100"
 LIST_FOLDER = "new-vis-pairs"
 CALIBRATION_PREFIX = "calibration_"
-BINS = tuple(range(10))
-"""Lower limits of the categories, in tenths; the list of the first may be missing."""
-
-MAX_OFF_CENTRE = 1.15
-"""Twice the principal point and the size of the image may differ by this factor."""
+BINS = tuple(range(10))  # lower limits of the categories, in tenths; the first may have no list
+MAX_OFF_CENTRE = 1.15  # factor by which twice the principal point and the size may differ
 
 
 class PosedScenes(RelativePoseProtocol):

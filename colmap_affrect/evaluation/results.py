@@ -23,9 +23,7 @@ COMPLEXITY = "complexity"
 
 Interval = tuple[Number, Number]
 
-PAIR_RESULT = TypeAdapter(PairResult)
-"""Reads and writes results of pairs as JSON; infinite errors are null."""
-
+PAIR_RESULT = TypeAdapter(PairResult)  # results of pairs from and to JSON; infinite errors are null
 SECONDS = "seconds"  # the column of all time that a recipe took
 WIDTH = 100
 MAX_NOTES = 12

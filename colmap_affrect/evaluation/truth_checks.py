@@ -57,18 +57,14 @@ EPIPOLAR_NOISE_PX = 1.0
 MIN_EPIPOLAR_CONSENSUS = 40
 MIN_EPIPOLAR_CONSENSUS_FRAC = 0.5
 """Inliers of a fundamental matrix that prove that the matches of a pair are right."""
-MAX_MEDIAN_PX = 10.0
-"""Correspondences that disagree by more on average are doubted: they are a few px accurate."""
-
+MAX_MEDIAN_PX = 10.0  # correspondences off by more are doubted: they are a few px accurate
 MAX_CHECKED_PAIRS = 8  # per scene
 CHECK_IMAGE_SIZE_PX = 800  # longer side of the images in which poses are checked
 MIN_POSE_CONSENSUS = 30
 MIN_POSE_CONSENSUS_FRAC = 0.3
 """Inliers of an essential matrix that prove that the matches of a pair are right."""
-MIN_AGREEING_FRAC = 0.5
-"""Share of such inliers that agree with the truth; where fewer do, the truth is wrong."""
-MIN_EXPLAINED_FRAC = 0.9
-"""Share that must agree with poses mistaken in a known way, for this to be named."""
+MIN_AGREEING_FRAC = 0.5  # of such inliers, with the truth; where fewer do, it is wrong
+MIN_EXPLAINED_FRAC = 0.9  # must agree with poses mistaken in a known way, for this to be named
 
 POSE_MISTAKES: dict[str, Callable[[Pose], Pose]] = {
     "": lambda pose: pose,

@@ -26,8 +26,7 @@ MIN_SIMILARITIES_PER_CORE = 6e8  # with fewer than this, loading torch takes lon
 
 ERROR_SIGMAS = 6.0
 MAX_CODE, ZERO_CODE = 127, 128
-CODE_STEP = 1.0 / 250
-"""Of similarities in 8 bits; negative ones are 0, errors may make some more than 1."""
+CODE_STEP = 1.0 / 250  # of 8-bit similarities; negative ones are 0, errors make some more than 1
 NUM_ROWS_8_BIT = 512  # rows of similarities computed at once, a multiple of ``SIZE_MULTIPLE``
 SIZE_MULTIPLE = 256
 """Both factors of a product are filled up to a multiple of it: oneDNN prepares and keeps a program

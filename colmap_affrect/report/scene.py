@@ -14,16 +14,12 @@ from colmap_affrect.geometry.arrays import Array, Bytes
 from colmap_affrect.report.pictures import base64_text
 
 MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE = 20_000, 40_000  # of a model, and of all that are on a page
-POINT_PERCENTILE = 90.0
-"""Share of the points, from the middle outwards, that the view is made to hold."""
+POINT_PERCENTILE = 90.0  # share of the points, from the middle outwards, that the view holds
 RADIUS_MARGIN = 1.15
-MIN_COMMON_DIRECTION = 0.3
-"""Length of the mean of horizontal viewing directions from which a model has a front."""
-
+MIN_COMMON_DIRECTION = 0.3  # length of the mean horizontal viewing direction that gives a front
 CAMERA_DEPTH = 0.07  # depth of the pyramids that stand for cameras, as a share of the view's radius
 MAX_HALF_WIDTH = 0.8  # of the base of a pyramid per depth, for cameras with a very wide view
-DARKEST, COLOR_RANGE = 60, 140
-"""Colours of points are squeezed so that they show on light and on dark ground."""
+DARKEST, COLOR_RANGE = 60, 140  # colours of points are squeezed to show on light and on dark ground
 
 
 @dataclass(frozen=True)

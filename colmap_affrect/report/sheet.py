@@ -118,8 +118,7 @@ def fitted(size: Size, box: Size) -> Size:
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
-Tile = tuple[int, int, Size]
-"""Left, top and size of a picture in px, from the upper left corner of all."""
+Tile = tuple[int, int, Size]  # left, top and size of a picture in px
 
 
 def tiles(sizes: Sequence[Size]) -> list[Tile]:

@@ -21,15 +21,13 @@ from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
 
-MAX_MOTION_FRAC = 0.005
-"""Of the longer side: what moves less has not moved; scans are not cut to the pixel."""
+MAX_MOTION_FRAC = 0.005  # of the longer side; less is no motion: scans are not cut to the pixel
 NUM_CELLS = 48  # cells along the longer side
 MIN_NUM_PAIRS = 3
 MIN_NUM_IMAGES = 3
 """Two views of a camera that did not turn have places that stay where they are; more have none."""
 MIN_SHARE = 0.5  # of the pairs that have a match in a cell
-MAX_SHARE_OF_PHOTOGRAPH = 0.5
-"""Where more of what is matched never moves it is the camera that stands still."""
+MAX_SHARE_OF_PHOTOGRAPH = 0.5  # where more of what is matched never moves, the camera stands still
 MAX_SHARE_BESIDE = 0.2
 """Of all cells. Matches from beside one place to beside another are left out only where these cells
 are so few: one in 25 of the scene's goes with them then, and of a watermark all over, all would."""
