@@ -11,6 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.options import reason
 from colmap_affrect.project.atomic_files import replace_text
 
 FILE_NAME = "georeference.json"
@@ -39,7 +40,7 @@ class Georeference:
         try:
             return TypeAdapter(cls).validate_json(path.read_bytes())
         except (OSError, ValidationError) as error:
-            raise StoreError(f"{path}: damaged ({error}); align the model again") from error
+            raise StoreError(f"{path}: damaged ({reason(error)}); align the model again") from error
 
     def write(self, model_path: Path) -> None:
         """Put it on record beside a model."""
