@@ -4,8 +4,6 @@ Photographs in, COLMAP model out: ``colmap_affrect.run(image_path, output_path)`
 public names are loaded when first used, so that importing the package stays light.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import logging
 import sys

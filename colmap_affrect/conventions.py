@@ -14,15 +14,12 @@
    and hloc). COLMAP's affine shape maps the unit circle to one sigma.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
 HALF_PIXEL = 0.5
 
-MEASUREMENT_SIGMAS = 6.0
-"""Radius of the measurement ellipse of a local affine frame in units of sigma."""
+MEASUREMENT_SIGMAS = 6.0  # radius of the measurement ellipse of a local affine frame, in sigmas
 
 
 def colmap_from_pixel(points: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -64,8 +61,7 @@ def resized_from_original(
     return matrix
 
 
-DEFAULT_FOCAL_RATIO = 1.2
-"""COLMAP's guess of a focal length where EXIF has none, in units of the longer side."""
+DEFAULT_FOCAL_RATIO = 1.2  # COLMAP's guess where EXIF has none, in units of the longer side
 
 
 def camera_matrix(

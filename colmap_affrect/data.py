@@ -1,9 +1,8 @@
 """Data that flows between the layers: frozen, checked, numpy only."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,21 +137,21 @@ class LocalFeatures:
         """(N,) geometric mean radius sqrt(det A) of the measurement ellipses in px."""
         return np.asarray(np.sqrt(determinants(self.lafs[:, :, :2])))
 
-    def select(self, index: NDArray[np.generic]) -> LocalFeatures:
+    def select(self, index: NDArray[np.generic]) -> Self:
         """Keep the features of an index or mask array, in its order."""
-        return LocalFeatures(*(getattr(self, item.name)[index] for item in fields(self)))
+        return type(self)(*(getattr(self, item.name)[index] for item in fields(self)))
 
     @classmethod
-    def empty(cls, descriptor_size: int = 0) -> LocalFeatures:
+    def empty(cls, descriptor_size: int = 0) -> Self:
         """Return the result for an image without features."""
         descriptors = np.zeros((0, descriptor_size), np.float32)
         return cls(np.zeros((0, 2, 3)), np.zeros(0, np.float32), descriptors)
 
-    def with_frames(self, lafs: Array) -> LocalFeatures:
+    def with_frames(self, lafs: Array) -> Self:
         """Replace the frames."""
         return replace(self, lafs=lafs)
 
-    def with_rectification_id(self, rectification_id: int) -> LocalFeatures:
+    def with_rectification_id(self, rectification_id: int) -> Self:
         """Say which rectification all features come from."""
         return replace(self, rectification_ids=np.full(len(self), rectification_id, np.int32))
 

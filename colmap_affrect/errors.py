@@ -1,7 +1,5 @@
 """Errors that a user can act on: one line that says what, where, and what to do."""
 
-from __future__ import annotations
-
 
 class AffrectError(Exception):
     """Base of all errors that the command line prints as one line (exit code 1)."""

@@ -1,7 +1,5 @@
 """How long a whole run takes, roughly: from what its first images and pairs have taken."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,9 +9,7 @@ COSTS = {"extract": 1.0, "match": 0.25, "match by network": 0.7, "verify": 0.15,
 has not begun. With them what is left after ``extract`` was forecast within a factor of 2 in ten
 runs on 8 to 16 photographs and in one on a thousand."""
 
-MAP_COST_PER_IMAGE = 0.015
-"""What each image adds to the cost of mapping one: bundle adjustments grow with the model."""
-
+MAP_COST_PER_IMAGE = 0.015  # that each image adds to the cost of mapping one: adjustments grow
 MIN_DONE, MIN_ELAPSED_S = 5, 3.0
 """Less of a stage says too little of the rest: the first unit waits for what has to be loaded."""
 

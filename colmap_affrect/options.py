@@ -1,13 +1,9 @@
 """Options and exchangeable parts: what all of them have in common.
 
-Options are frozen pydantic models that live beside what they belong to. They refuse unknown names,
-values of another type and values out of range, in one line. A part (feature extractor, shape
-source, depth source, rectifier, matcher, mapper) is a class with its options class as attribute
-``Options``; a :class:`Registry` finds it by the name in its options, in this package or, by an
-entry point, in another one.
+Options are frozen pydantic models that refuse unknown names, values of another type and values out
+of range, in one line. A part is a class with its options class as attribute ``Options``; a
+:class:`Registry` finds it by the name in its options, here or, by an entry point, elsewhere.
 """
-
-from __future__ import annotations
 
 import ast
 import difflib
@@ -216,6 +212,11 @@ def _descriptions(cls: type) -> dict[str, str]:
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
                 found[ast.unparse(field.target)] = " ".join(ast.literal_eval(text.value).split())
     return found
+
+
+def reason(error: Exception) -> str:
+    """Return why something cannot be read, in one line: pydantic takes several."""
+    return error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
 
 
 def digest_of(values: Any) -> str:

@@ -1,7 +1,5 @@
 """From a folder of photographs to a COLMAP model: the stages one after the other."""
 
-from __future__ import annotations
-
 import json
 import platform
 import shutil

@@ -1,12 +1,10 @@
 """Progress of long stages: a tqdm bar on a terminal, plain lines elsewhere, or silence."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
-from typing import TextIO
+from typing import Self, TextIO
 
 from tqdm import tqdm
 
@@ -15,9 +13,7 @@ from colmap_affrect.shown import shown
 
 logger = logging.getLogger(__name__)
 
-Advance = Callable[[int], None]
-"""Report that so many more units are done."""
-
+Advance = Callable[[int], None]  # report that so many more units are done
 NUM_PLAIN_LINES = 10
 
 
@@ -27,16 +23,11 @@ class Progress:
     def __init__(
         self, stream: TextIO | None = None, num_plain_lines: int = NUM_PLAIN_LINES
     ) -> None:
-        """Write to ``stream``; None means silence.
-
-        Args:
-            stream: where bars or lines go.
-            num_plain_lines: at most so many lines for a stage where there is no terminal.
-        """
+        """Write to a stream, at most so many lines a stage without a terminal; None is silence."""
         self._stream, self._num_plain_lines = stream, num_plain_lines
         self._forecast: Forecast | None = None
 
-    def with_forecast(self, forecast: Forecast) -> Progress:
+    def with_forecast(self, forecast: Forecast) -> Self:
         """Return the same that also says how long all stages take, there and in the log."""
         new = copy(self)
         new._forecast = forecast
@@ -87,12 +78,11 @@ class _Told:
         return text
 
     def end(self) -> None:
-        """The stage is over."""
         if self._forecast:
             self._forecast.end()
 
 
-def _update(bar: tqdm[None], count: int, told: _Told) -> None:
+def _update(bar: "tqdm[None]", count: int, told: _Told) -> None:
     bar.set_postfix_str(told.advance(count), refresh=False)
     bar.update(count)
 

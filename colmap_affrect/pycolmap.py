@@ -4,8 +4,6 @@ A script that imports this in the place of pycolmap runs on: functions of ours r
 the same name, and every other name is pycolmap's own.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from colmap_affrect.colmap import pycolmap

@@ -4,8 +4,6 @@ A section is the options of a part, which ``name`` chooses; what a recipe leaves
 default.
 """
 
-from __future__ import annotations
-
 import difflib
 import tomllib
 from collections.abc import Mapping, Sequence

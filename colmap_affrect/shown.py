@@ -1,11 +1,8 @@
 """One filter for everything that is shown: names come out of files, and may be made to mislead."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
-MAX_NAMES = 3
-"""Examples in a line."""
+MAX_NAMES = 3  # examples in a line
 
 
 def shown(text: str) -> str:

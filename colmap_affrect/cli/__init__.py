@@ -1,7 +1,5 @@
 """Command line: parse, call one library function, print its result."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os
@@ -68,7 +66,7 @@ def main_of_process() -> NoReturn:
     sys.exit(code)
 
 
-def _interrupt_again(passed_over: sys.UnraisableHookArgs) -> None:
+def _interrupt_again(passed_over: "sys.UnraisableHookArgs") -> None:
     """Repeat a Ctrl-C that came where Python cannot raise it, as while objects are deleted.
 
     Else its traceback would be printed, and the command would go on to its end.
@@ -143,7 +141,6 @@ class _OneLine(logging.Formatter):
     """Shows a message in one line, whatever names are in it; a traceback keeps its lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        """Return the line."""
         return one_line(super().formatMessage(record))
 
 

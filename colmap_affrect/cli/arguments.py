@@ -1,7 +1,5 @@
 """The options of all commands, with help texts; which command has which, see :mod:`.parser`."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

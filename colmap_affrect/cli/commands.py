@@ -115,20 +115,20 @@ def escalate(options: argparse.Namespace) -> None:
 
 
 def guide(options: argparse.Namespace) -> None:
-    from colmap_affrect.colmap.model_files import read_model
+    from colmap_affrect.colmap.model_files import read_given_model
     from colmap_affrect.matchers.guided import GuidedOptions
     from colmap_affrect.stages.guide import guide, guided_counts
     from colmap_affrect.stages.guide_by_model import guide_by_model
 
+    path = options.model_path
+    model = read_given_model(path, "--model-path ") if path else None
     with given.context(options) as context:
         values = given.changed(context, "guide", "guided", options.set)
         values |= {"enabled": options.guided} if options.guided else {}
         chosen = GuidedOptions.from_mapping(values, "guided")
-        report = guide(
-            context, chosen, () if options.model_path else None, overwrite=options.overwrite
-        )
-        if options.model_path:
-            report = guide_by_model(context, read_model(options.model_path))
+        report = guide(context, chosen, () if model else None, overwrite=options.overwrite)
+        if model:
+            report = guide_by_model(context, model)
         counts = guided_counts(context)
     show(report.summary())
     if counts:
@@ -341,7 +341,6 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
 
 
 def _next_steps(report: ReconstructionReport, out: Path) -> list[str]:
-    """Say where things are, and commands for what comes next."""
     copied, begun = (Workspace(out).planned(stage) or {} for stage in ("copy", "extract"))
     photos = copied.get("image_path") or begun.get("image_path")
     model, page = out / "sparse" / "0", out / "report.html"

@@ -90,7 +90,6 @@ AnyOptions = TypeVar("AnyOptions", bound=Options)
 
 
 def _or_recorded(given: AnyOptions, recorded: Mapping[str, Any] | None) -> AnyOptions:
-    """Return what is given, or what is on record where nothing is."""
     if not recorded or given != type(given)():
         return given
     return type(given).from_mapping(recorded, "--config")

@@ -3,8 +3,6 @@
 COLMAP's database has one flag for a focal length, that somebody knows it. Here is who.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +12,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from colmap_affrect.errors import WorkspaceError
+from colmap_affrect.options import reason
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.shown import such_as
@@ -95,8 +94,7 @@ def read_camera_records(path: Path) -> dict[int, CameraRecord]:
     except FileNotFoundError:
         return {}
     except (OSError, ValidationError) as error:
-        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
-        raise WorkspaceError(f"{path}: damaged ({reason}); remove it") from error
+        raise WorkspaceError(f"{path}: damaged ({reason(error)}); remove it") from error
 
 
 def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:

@@ -1,7 +1,5 @@
 """The vote of verified pairs over cameras that nobody knows, and what it changes in a database."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
@@ -332,7 +330,6 @@ def _move(
     frame: pycolmap.Frame,
     rigs: Mapping[pycolmap.sensor_t, int],
 ) -> None:
-    """Give an image another camera, and its frame the rig of this camera."""
     sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
     moved = pycolmap.Frame(frame_id=frame.frame_id, rig_id=rigs[sensor])
     moved.add_data_id(pycolmap.data_t(sensor, image.image_id))
@@ -342,7 +339,6 @@ def _move(
 
 
 def _delete_geometries(database: pycolmap.Database, cameras: Collection[int]) -> None:
-    """Delete the two-view geometries of all pairs with an image of some cameras."""
     images = {image.image_id: image.camera_id for image in database.read_all_images()}
     for pair_id in database.read_two_view_geometry_num_inliers()[0]:
         pair = pycolmap.pair_id_to_image_pair(pair_id)

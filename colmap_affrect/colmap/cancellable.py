@@ -1,7 +1,5 @@
 """Run pycolmap's long calls so that Ctrl-C stops them cleanly and freed memory is theirs."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future

@@ -4,8 +4,6 @@ Rows that COLMAP does not expect end the process inside COLMAP, so the tables ar
 itself, of databases of all versions of COLMAP.
 """
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 from collections import defaultdict

@@ -4,8 +4,6 @@ Everything is checked before it is written: pycolmap stores wrong dtypes silentl
 index out of range would later end the Python process.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os
@@ -219,8 +217,7 @@ def write_keypoints(
 
 DESCRIPTOR_SIZE = 128
 DESCRIPTOR_NORM = 512
-SIGNED_SHIFT = 0.30
-"""Added to descriptors with negative elements: COLMAP's brute-force matcher needs cosines >= 0."""
+SIGNED_SHIFT = 0.30  # added to signed descriptors: COLMAP's brute-force matcher needs cosines >= 0
 
 
 def colmap_descriptors(descriptors: Floats) -> Bytes:

@@ -4,8 +4,6 @@ COLMAP migrates a database in place as soon as it opens it, even for reading. So
 is read and copied by SQLite itself, and COLMAP opens only the copy.
 """
 
-from __future__ import annotations
-
 import sqlite3
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping

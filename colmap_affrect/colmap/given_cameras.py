@@ -1,7 +1,5 @@
 """Cameras that the user gives: by options, in a COLMAP model, or in a table by image name."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -84,7 +82,6 @@ def _require_model(name: str, where: str) -> None:
 
 
 def _require_params(given: GivenCamera, where: str) -> None:
-    """Refuse parameters that do not fit the model."""
     if not given.params:
         return
     expected = pycolmap.Camera.create_from_model_name(1, given.model, 1.0, 1, 1)
@@ -98,7 +95,6 @@ def _require_params(given: GivenCamera, where: str) -> None:
 
 
 def _read_model(path: Path) -> dict[str, GivenCamera]:
-    """Read the cameras of a COLMAP model: its folder, or its file of cameras."""
     folder = path if path.is_dir() else path.parent
     if (folder / "cameras.txt").is_file() and path.name != "cameras.bin":
         return _read_text_model(folder)

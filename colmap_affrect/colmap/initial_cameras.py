@@ -3,8 +3,6 @@
 pycolmap reads the images, and their positions by GPS. Which cameras they have is decided here.
 """
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from collections import defaultdict
@@ -125,7 +123,6 @@ class InitialCameras:
                     )
 
     def _given_of(self, names: Sequence[str]) -> GivenCamera:
-        """Return what the user says of the one camera of some images."""
         named = [self._given[name] for name in names if name in self._given]
         first = named[0] if named else self._given[""]
         for other in named:

@@ -4,8 +4,6 @@ pycolmap's reader never ends, or takes all memory, on some damaged files. Here e
 followed to the end of its file, which damage seldom leaves in its place.
 """
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 from collections.abc import Callable
@@ -24,8 +22,6 @@ POSE_BYTES = 7 * 8  # quaternion and translation
 
 
 class _Reader:
-    """Steps through little-endian data."""
-
     def __init__(self, data: bytes) -> None:
         self.data = data
         self.position = 0

@@ -5,8 +5,6 @@ users pass options on to COLMAP, a report says where a run differs from COLMAP's
 another process gets its options. Lists, sets and arrays cannot be given so and are left out.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Mapping

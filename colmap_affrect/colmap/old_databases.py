@@ -3,8 +3,6 @@
 Their tables hold no rigs, frames or types of descriptors, and positions are columns of the images.
 """
 
-from __future__ import annotations
-
 import sqlite3
 import tempfile
 from collections.abc import Sequence

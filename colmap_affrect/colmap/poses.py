@@ -1,7 +1,5 @@
 """Camera poses of a model against ground truth, or against another model."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import Counter

@@ -1,7 +1,5 @@
 """What a COLMAP database of any version holds, read by SQLite: COLMAP migrates what it opens."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager

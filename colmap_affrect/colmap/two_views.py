@@ -3,8 +3,6 @@
 All points here are in COLMAP's pixels, the corner of the image being (0, 0).
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,11 +1,8 @@
 """Geometric verification of raw matches by pycolmap, and how significant what it finds is.
 
-Significance is of inliers, and of what their local affine frames say. A match of two frames is a
-local map from image 1 to image 2. It must carry the epipolar direction of image 1 to that of image
-2. The epipolar geometry of a plane is arbitrary; there the map must turn as the homography does.
+Significance is of inliers, and of what their local affine frames say
+(:mod:`colmap_affrect.geometry.pair_models`).
 """
-
-from __future__ import annotations
 
 import logging
 import math
@@ -320,7 +317,6 @@ def _write(
     done: list[tuple[tuple[int, int], pycolmap.TwoViewGeometry]],
     advance: Callable[[int], None] | None,
 ) -> None:
-    """Write geometries and forget them."""
     with pycolmap.DatabaseTransaction(database):
         for ids, geometry in done:
             database.write_two_view_geometry(*ids, geometry)

@@ -5,5 +5,4 @@ DEFAULT_METHODS = (
 )  # fmt: skip
 """What is compared where nothing else is asked for."""
 
-LEARNED_METHODS = ("aliked-lightglue", "on-demand-learned")
-"""What is compared then too, where the weights are."""
+LEARNED_METHODS = ("aliked-lightglue", "on-demand-learned")  # compared too where their weights are

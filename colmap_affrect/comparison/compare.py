@@ -4,8 +4,6 @@ What differs between methods are features and raw matches, and nothing else: cam
 masks, pairs, verification, mapping and seeds are the same for all.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil
@@ -15,7 +13,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.database_copy import copy_without_features
@@ -23,12 +21,7 @@ from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images,
 from colmap_affrect.colmap.poses import Poses, disagreeing_images, pose_scores, read_poses
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
-from colmap_affrect.comparison.methods import (
-    SIFT_COLMAP,
-    Method,
-    parse_methods,
-    without_weights,
-)
+from colmap_affrect.comparison.methods import SIFT_COLMAP, Method, parse_methods, without_weights
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.request import Layout, Request
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
@@ -48,8 +41,7 @@ from colmap_affrect.project.workspace import Workspace, first_difference
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 
 DEFAULT_SEEDS = (0, 1, 2)
-NUM_DIGITS = 16
-"""Of the digests of photographs on record: messages name them."""
+NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +122,7 @@ class _Plan:
     not_compared: str = ""
 
     @classmethod
-    def checked(cls, image_path: Path, layout: Layout, options: CompareOptions) -> _Plan:
+    def checked(cls, image_path: Path, layout: Layout, options: CompareOptions) -> Self:
         """Refuse what cannot work before anything is written."""
         lacking = without_weights(options.resources.weights_path) if not options.methods else {}
         learned = [name for name in LEARNED_METHODS if name not in lacking]
@@ -163,7 +155,6 @@ class _Plan:
         return cls(image_path, layout, options, methods, names, pairs, truth, absent)
 
     def inputs(self) -> dict[str, Any]:
-        """Return what the results of every method depend on."""
         options = self.options
         return {
             "photographs": self._contents(),
@@ -184,11 +175,9 @@ class _Plan:
 
     @cached_property
     def contents(self) -> Contents:
-        """The record of what files hold."""
         return Contents(Workspace(self.layout.path).contents)
 
     def settings(self) -> dict[str, Any]:
-        """Return what all methods had, for the report."""
         inputs = self.inputs()
         keys = ("image_list_path", "from_database", "ground_truth_path")
         paths: dict[str, Path | None] = {key: getattr(self.options, key) for key in keys}
@@ -204,7 +193,6 @@ class _Plan:
         }
 
     def requests(self) -> list[Request]:
-        """Return what the process of each method is to do."""
         options = self.options
         ours = options.verification, options.mapping, options.holds_vote
         mapper = MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset("colmap")
@@ -312,7 +300,6 @@ def _make_shared(plan: _Plan, inputs: Mapping[str, Any]) -> None:
 
 
 def _record(request: Request, *, overwrite: bool) -> None:
-    """Put a request on record; StaleStoreError when there are results of other options."""
     folder, path, name = request.folder, request.path, request.method.label
     if path.exists() and overwrite:
         shutil.rmtree(folder)

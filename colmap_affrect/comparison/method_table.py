@@ -1,7 +1,5 @@
 """The table of methods on the page: the methods that finished, and figures of each."""
 
-from __future__ import annotations
-
 import itertools
 import string
 from collections.abc import Callable, Iterable, Sequence
@@ -25,8 +23,7 @@ MAIN_ROWS = {
 """Rows that decide; the others are folded away."""
 
 BYTES_PER_MB = 1_000_000
-NOTHING = "-"
-"""Where there is no number."""
+NOTHING = "-"  # where there is no number
 
 
 @dataclass(frozen=True)
@@ -65,8 +62,7 @@ class Row:
         return self.key in MAIN_ROWS
 
 
-Better = Callable[[Iterable[float]], float] | None
-"""``max`` or ``min`` of the means is best; None where neither is."""
+Better = Callable[[Iterable[float]], float] | None  # which of the means is best, if any
 
 
 def summary_rows(columns: Sequence[Column], comparison: Comparison) -> list[Row]:
@@ -120,8 +116,6 @@ def _model_rows(methods: Sequence[MethodResult], comparison: Comparison) -> list
 
 
 def _score_rows(methods: Sequence[MethodResult]) -> list[Row]:
-    """Return the rows that only ground truth fills."""
-
     def scored(
         key: str, title: str, digits: int, better: Better, value: Callable[[PoseScores], Any]
     ) -> Row:

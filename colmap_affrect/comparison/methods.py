@@ -1,7 +1,5 @@
 """Methods by name: COLMAP's SIFT, and recipes with or without changed options."""
 
-from __future__ import annotations
-
 import difflib
 import re
 import zlib

@@ -1,7 +1,5 @@
 """A comparison of methods as one page, ``report.html``."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -95,7 +93,6 @@ def write_page(
 
 
 def _bars(columns: Sequence[Column], comparison: Comparison) -> list[dict[str, Any]]:
-    """Return a bar for each method: photographs registered and, in front, those correctly."""
     total = max(1, len(comparison.image_names))
     bars = []
     for column in columns:
@@ -110,7 +107,6 @@ def _bars(columns: Sequence[Column], comparison: Comparison) -> list[dict[str, A
 def _graphs_and_models(
     columns: Sequence[Column], comparison: Comparison, output_path: Path
 ) -> dict[str, Any]:
-    """Return the content of the sections that the script of the page works on."""
     names = comparison.image_names
     graphs = [column.method.pair_inliers for column in columns]
     layout = view_graph.lay_out(names, graphs)
@@ -197,17 +193,12 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Mark(Node):
-    """What one method does with one photograph.
-
-    Attributes:
-        is_doubtful: registered in poses that contradict those of other seeds, or of most other
-            methods.
-        is_only: usually registered by no other method.
-    """
+    """What one method does with one photograph."""
 
     column: Column
+    # registered in poses that contradict those of other seeds, or of most other methods
     is_doubtful: bool
-    is_only: bool
+    is_only: bool  # usually registered by no other method
 
     @property
     def kind(self) -> str:

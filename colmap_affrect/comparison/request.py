@@ -5,8 +5,6 @@ images and pairs. ``methods/NAME/`` is a workspace with the features and raw mat
 and ``methods/NAME/seed-K/`` has the two-view geometries and models of one seed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -59,26 +57,20 @@ def _plain(method: Method) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Request:
-    """What one process is to do.
-
-    Attributes:
-        mapping: checked.
-        focal_vote: whether verified pairs vote on cameras that nobody knows.
-        may_share: whether cameras of images of one size may then turn out to be the same.
-        seeds: of verification and mapping; recipes that climb do it with the first.
-    """
+    """What one process is to do."""
 
     method: Annotated[Method, BeforeValidator(_method), PlainSerializer(_plain)]
     output_path: Path
     image_path: Path
     masks: MaskOptions
     verification: VerificationOptions
+    # whose values are checked
     mapping: Annotated[
         MapperOptions, BeforeValidator(MAPPERS.options), PlainSerializer(MapperOptions.to_mapping)
     ]
-    focal_vote: bool
-    may_share: bool
-    seeds: tuple[int, ...]
+    focal_vote: bool  # whether verified pairs vote on cameras that nobody knows
+    may_share: bool  # whether cameras of images of one size may then turn out to be the same
+    seeds: tuple[int, ...]  # of verification and mapping; recipes that climb do it with the first
     resources: Resources
 
     @property

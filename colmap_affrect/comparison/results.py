@@ -4,9 +4,6 @@ Everything derived (means, who registers what alone) is computed here from the r
 seeds, so that terminal, page, JSON and CSV cannot disagree.
 """
 
-from __future__ import annotations
-
-import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field
@@ -14,10 +11,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Self
 
-from pydantic import BeforeValidator, Field, PlainSerializer, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, Field, PlainSerializer, TypeAdapter
 
 from colmap_affrect.colmap.poses import PoseScores
-from colmap_affrect.errors import StoreError
 from colmap_affrect.pairs.base import Pair
 
 PairCounts = Annotated[
@@ -239,7 +235,6 @@ KEPT_OF_FAILED = ("summary", "failures", "options", "folder")
 
 
 def _plain(result: SeedResult | MethodResult) -> dict[str, Any]:
-    """Return the fields of a result as plain values for JSON."""
     values: dict[str, Any] = TypeAdapter(type(result)).dump_python(result, by_alias=True)
     return values
 
@@ -311,17 +306,3 @@ class Comparison:
             "settings": dict(self.settings),
             "versions": dict(self.versions),
         }
-
-    @classmethod
-    def from_json(cls, text: str) -> Self:
-        """Read ``comparison.json``; StoreError when it is damaged or something else."""
-        try:
-            values = json.loads(text)
-            methods = tuple(MethodResult.from_mapping(*item) for item in values["methods"].items())
-            return TypeAdapter(cls).validate_python({**values, "methods": methods})
-        except ValidationError as error:
-            where, what = error.errors()[0]["loc"], error.errors()[0]["msg"]
-            place = ".".join(map(str, where))
-            raise StoreError(f"not the result of a comparison ({place}: {what})") from error
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise StoreError(f"not the result of a comparison ({error!r})") from error

@@ -1,7 +1,5 @@
 """COLMAP's SIFT through pycolmap, on the images and pairs of a database that has no features."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,11 +12,9 @@ from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
 
-ROWS_PER_IMAGE = 400
-"""Room for the features of an image: 8192 of 128 bytes and their positions, in rows of 4 KiB."""
+ROWS_PER_IMAGE = 400  # of 4 KiB, for 8192 features of 128 bytes and their positions
 ROWS_PER_PAIR = 8
-TEMPORARY_NAME = "id:{}"
-"""Name of an image by its id while COLMAP matches."""
+TEMPORARY_NAME = "id:{}"  # name of an image by its id while COLMAP matches
 
 
 def extraction_options(*, affine: bool) -> pycolmap.FeatureExtractionOptions:

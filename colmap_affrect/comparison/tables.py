@@ -1,7 +1,5 @@
 """A comparison as a table for the terminal, as CSV and as JSON."""
 
-from __future__ import annotations
-
 import json
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -89,7 +87,6 @@ def to_csv(comparison: Comparison) -> str:
 
 
 def _cells(method: MethodResult, seed: SeedResult, images: int) -> dict[str, Any]:
-    """Return what is known of a method, and all single numbers of a seed."""
     cells = {
         "method": method.name,
         "images": images,

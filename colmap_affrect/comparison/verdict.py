@@ -3,12 +3,11 @@
 Gains are counted in photographs registered, or registered correctly where there is ground truth.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 from colmap_affrect.comparison.results import Comparison, MethodResult, Span, in_most
 
@@ -19,9 +18,7 @@ MIN_MEAN_GAIN = 0.5
 """More photographs on average over the seeds than this is a gain, though no single photograph is
 registered in most seeds that was not before."""
 
-MIN_IMAGES = 3
-"""Fewer are a pair, not a reconstruction."""
-
+MIN_IMAGES = 3  # fewer are a pair, not a reconstruction
 MAX_NAMES = 6
 MIN_WHOLE_SECONDS = 10
 
@@ -67,7 +64,7 @@ class Change:
     time_ratio: float
 
     @classmethod
-    def between(cls, method: MethodResult, reference: MethodResult) -> Change:
+    def between(cls, method: MethodResult, reference: MethodResult) -> Self:
         """Compare a method with a reference; both have finished."""
         ours, others = method.usually_correct, reference.usually_correct
         ratio = method.total_s / reference.total_s if reference.total_s else 0.0
@@ -110,7 +107,8 @@ def headline(comparison: Comparison) -> list[str]:
             f"Nothing was reconstructed: no method registers more than {most:g} of the {total} "
             "photographs."
         ]
-    reference, registers = reference_of(comparison), _registers(comparison)
+    registers = "correctly registers" if comparison.has_ground_truth else "registers"
+    reference = reference_of(comparison)
     best_of_total = f"{_number(_count(best))} of {total}"
     if reference is None:
         return [
@@ -130,7 +128,6 @@ def headline(comparison: Comparison) -> list[str]:
 
 
 def _without_rectification(comparison: Comparison, best: MethodResult) -> str:
-    """Say when the best method owes nothing to its warps."""
     if not is_rectified(best):
         return " Rectification is not needed for that."
     as_good = [
@@ -270,10 +267,6 @@ def contradictions(comparison: Comparison) -> list[str]:
 def _count(method: MethodResult) -> Span:
     """Images that count: those registered correctly, without ground truth those registered."""
     return method.correct or method.registered
-
-
-def _registers(comparison: Comparison) -> str:
-    return "correctly registers" if comparison.has_ground_truth else "registers"
 
 
 def _number(span: Span) -> str:

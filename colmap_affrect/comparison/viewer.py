@@ -1,7 +1,5 @@
 """The models of a comparison as a recording for the viewer of rerun (the only user of rerun)."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path

@@ -5,8 +5,6 @@ run again, it goes on. It tells of its progress and of how it ended by lines of 
 everything else that is printed goes to stderr.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -23,7 +21,12 @@ from typing import Any, TextIO
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import read_camera_records
-from colmap_affrect.colmap.database import image_ids, open_database, unverified_pairs
+from colmap_affrect.colmap.database import (
+    image_ids,
+    keypoint_counts,
+    open_database,
+    unverified_pairs,
+)
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import (
     ExtractedPx,
@@ -34,12 +37,7 @@ from colmap_affrect.colmap.verification import (
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP
 from colmap_affrect.comparison.request import Request
 from colmap_affrect.comparison.results import MethodResult, SeedResult
-from colmap_affrect.comparison.sift import (
-    describe_options,
-    extract_sift,
-    match_sift,
-    rename_images,
-)
+from colmap_affrect.comparison.sift import describe_options, extract_sift, match_sift, rename_images
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
@@ -65,8 +63,7 @@ from colmap_affrect.stages.verify import extracted_px, verify_matches
 
 logger = logging.getLogger("colmap_affrect")
 
-SAVE_EVERY_S = 1.0
-"""How often the costs so far are written down, in case the process is killed."""
+SAVE_EVERY_S = 1.0  # how often the costs so far are written down, in case the process is killed
 
 
 def main() -> None:
@@ -116,8 +113,7 @@ def compute(request: Request, progress: Progress) -> None:
     replace_text(request.result, json.dumps(content, indent=1, ensure_ascii=False))
 
 
-def _match_sift(request: Request, costs: _Costs, progress: Progress, *, affine: bool) -> None:
-    """Put SIFT features and their matches into the database of the method."""
+def _match_sift(request: Request, costs: "_Costs", progress: Progress, *, affine: bool) -> None:
     path, base = request.folder / "database.db", request.layout.database
     if not path.exists():
         copy_database(base, path)
@@ -140,8 +136,7 @@ def _match_sift(request: Request, costs: _Costs, progress: Progress, *, affine: 
     costs.stage("match", match_all)
 
 
-def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Progress) -> None:
-    """Put our features and their matches into the workspace of the method."""
+def _match_recipe(request: Request, recipe: Recipe, costs: "_Costs", progress: Progress) -> None:
     context = Context(Workspace(request.folder), request.resources, progress=progress)
     inputs = Inputs.of(
         request.image_path,
@@ -163,20 +158,14 @@ def _match_recipe(request: Request, recipe: Recipe, costs: _Costs, progress: Pro
 
 
 def _count_features(database_path: Path) -> tuple[dict[str, int], dict[Pair, int]]:
-    """Return the keypoints of the images that have some, and the raw matches of the pairs."""
     with open_database(database_path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
-        keypoints = {
-            name: database.num_keypoints_for_image(image_id)
-            for image_id, name in names.items()
-            if database.exists_keypoints(image_id)
-        }
         pair_ids, counts = database.read_num_matches()
     matches = {
         _pair(names, pycolmap.pair_id_to_image_pair(pair_id)): int(count)
         for pair_id, count in zip(pair_ids, counts, strict=True)
     }
-    return dict(sorted(keypoints.items())), matches
+    return dict(sorted(keypoint_counts(database_path).items())), matches
 
 
 def _pair(names: Mapping[int, str], ids: tuple[int, int]) -> Pair:
@@ -253,7 +242,6 @@ def _vote(
     size_px: ExtractedPx = None,
     silent: Collection[Pair] = (),
 ) -> None:
-    """Let the pairs vote on cameras if they are to do that."""
     if request.focal_vote:
         paths, may_share = (workspace.database, workspace.cameras), request.may_share
         hold_vote(*paths, verification, size_px, may_share=may_share, silent=silent)
@@ -266,7 +254,6 @@ class _Costs:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read what was written to a file, if it exists."""
         self._path = path
         known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         self.wall_s: dict[str, float] = known.get("wall_s", {})
@@ -275,7 +262,6 @@ class _Costs:
         self._earlier_peak = int(known.get("peak_memory_bytes", 0))
 
     def stage(self, name: str, work: Callable[[], object]) -> None:
-        """Do and measure some work, unless it is finished."""
         if name in self._finished:
             return
         ended, start, before = threading.Event(), time.perf_counter(), self.wall_s.get(name, 0.0)
@@ -304,7 +290,6 @@ class _Costs:
         return max(self._earlier_peak, peak_memory_bytes(), children)
 
     def save(self) -> None:
-        """Write everything to the file."""
         values = {
             "wall_s": self.wall_s,
             "failures": self.failures,
@@ -323,7 +308,6 @@ class _Reported(Progress):
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        """See :class:`Progress`."""
         _tell(self._parent, stage=name, total=total, unit=unit)
         yield lambda count: _tell(self._parent, advance=count)
         _tell(self._parent, end=name)
@@ -338,7 +322,6 @@ class _OfSeed(Progress):
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        """See :class:`Progress`."""
         with self._progress.stage(f"{name}, seed {self._seed}", total, unit) as advance:
             yield advance
 

@@ -3,8 +3,6 @@
 Nothing is changed: databases are examined in a copy. No run can begin in a folder meanwhile.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from itertools import groupby
@@ -19,8 +17,7 @@ from colmap_affrect.progress import SILENT, Progress
 
 __all__ = ["Diagnosis", "Finding", "diagnose"]
 
-USUAL_WEIGHTS = ("affnet", "orinet", "hardnet")
-"""What learned features need by default."""
+USUAL_WEIGHTS = ("affnet", "orinet", "hardnet")  # what learned features need by default
 
 
 def diagnose(
@@ -50,7 +47,6 @@ def diagnose(
 
 
 def _examine_installation(findings: Findings, weights_path: Path | None) -> None:
-    """Examine versions, import order, device, weights and the COLMAP program."""
     versions = ", ".join(f"{name} {number}" for name, number in installed_versions().items())
     findings.checked.append(f"installation: {versions}")
     loaded = list(sys.modules)

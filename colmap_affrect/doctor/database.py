@@ -1,7 +1,5 @@
 """Examines a COLMAP database, in a copy: its tables, and whether pairs agree with its cameras."""
 
-from __future__ import annotations
-
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,18 +26,16 @@ from colmap_affrect.colmap.database_copy import (
 )
 from colmap_affrect.colmap.tables import Tables
 from colmap_affrect.doctor.findings import Findings, without_path
-from colmap_affrect.errors import DatabaseError, ImageError
+from colmap_affrect.errors import DatabaseError
 from colmap_affrect.geometry.focal_evidence import log_evidence
 from colmap_affrect.geometry.focal_vote import FOCALS, MAX_VOTE, FocalEstimate, ballot, count
 from colmap_affrect.images.exif import PLAUSIBLE_FOCALS
-from colmap_affrect.images.reading import read_gray
+from colmap_affrect.images.reading import readable_size
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
 from colmap_affrect.shown import such_as
 
-MAX_NUM_PAIRS = 48
-"""The strongest pairs that are asked, some seconds' worth."""
-
+MAX_NUM_PAIRS = 48  # the strongest pairs that are asked, some seconds' worth
 MAX_SPREAD = 2.5
 """Ratio of the ends of an interval beyond which pairs say too little to contradict; without them
 it is the usual lenses, 7."""
@@ -95,7 +91,6 @@ class _Examination:
     pairs: Sequence[VotingPair]
 
     def add(self, kind: str, items: Sequence[str]) -> None:
-        """Add a finding if there are any cameras or images that it concerns."""
         if items:
             self.findings.add(kind, self.path, items)
 
@@ -211,18 +206,11 @@ def _file_sizes(
     image_path: Path, names: Iterable[str], progress: Progress
 ) -> dict[str, tuple[int, int] | None]:
     """Read photographs for their (width, height), None for those that cannot be read."""
-
-    def size_of(name: str) -> tuple[int, int] | None:
-        try:
-            height, width = read_gray(image_path / name).shape
-        except ImageError:
-            return None
-        return width, height
-
     present = [n for n in names if not is_unsafe(n) and (image_path / n).is_file()]
     sizes = {}
     with progress.stage("read", len(present), "images") as advance:
-        found = map_ordered(size_of, present, available_cores())
+        paths = (image_path / name for name in present)
+        found = map_ordered(readable_size, paths, available_cores())
         for name, size in zip(present, found, strict=True):
             sizes[name] = size
             advance(1)

@@ -1,7 +1,5 @@
 """What the doctor finds, what it says about it, and what it has examined."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shlex

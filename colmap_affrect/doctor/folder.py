@@ -1,7 +1,5 @@
 """Examines an output folder."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -62,7 +60,6 @@ class _FolderExamination:
         self.found, self.workspace = found, workspace
 
     def examine(self, image_path: Path | None) -> None:
-        """Add what is found in the folder."""
         for path in sorted(p for kind in LEFTOVERS for p in self.workspace.path.glob(kind)):
             self._add("leftover", path, path=path)
         done = self._stages()
@@ -95,7 +92,6 @@ class _FolderExamination:
         self._add(kind, where, error=without_path(where, error))
 
     def _add_items(self, kind: str, where: Path | str, items: Sequence[str]) -> None:
-        """Add a finding if there are any items that it concerns."""
         if items:
             self.found.add(kind, where, items, folder=self.workspace.path)
 
@@ -167,7 +163,6 @@ class _FolderExamination:
         ]
 
     def _compare_keypoints(self, features: Mapping[str, int], tables: Tables) -> None:
-        """Compare the feature file with the database."""
         counts, store = tables.num_keypoints(), Context(self.workspace).features
         missing, behind, differ = [], [], []
         for name, count in features.items():

@@ -5,8 +5,6 @@ pairs by recipe and settings), ``evaluation.json``, ``evaluation.csv`` and plots
 was stopped goes on; scores of other settings are kept beside, so that only what changed is redone.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging
@@ -21,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.comparison.methods import Method, parse_methods
 from colmap_affrect.errors import AffrectError, EvaluationError, OptionError
@@ -55,6 +52,7 @@ from colmap_affrect.evaluation.results import (
     published,
 )
 from colmap_affrect.evaluation.statistics import bootstrap_intervals, paired_test
+from colmap_affrect.geometry.arrays import Array, Indices
 from colmap_affrect.images.reading import require_png
 from colmap_affrect.options import digest_of
 from colmap_affrect.pipeline import installed_versions
@@ -71,8 +69,7 @@ PROTOCOLS: Mapping[str, type[EvaluationProtocol]] = {
 }
 DEFAULT_RECIPES = ("unrectified-rootsift", "default")
 
-NOTHING: NDArray[np.float64] = np.zeros((0, 2))
-"""Matches of a pair that could not be matched."""
+NOTHING: Array = np.zeros((0, 2))  # matches of a pair that could not be matched
 
 
 def make_protocol(name: str, settings: Sequence[str] = ()) -> EvaluationProtocol:
@@ -167,7 +164,6 @@ def evaluate(
 
 
 def _methods(options: EvaluateOptions) -> tuple[Method, ...]:
-    """Parse recipes and refuse what cannot work."""
     methods = parse_methods(options.recipes)
     labels = [method.label for method in methods]
     for method in methods:
@@ -184,7 +180,6 @@ def _methods(options: EvaluateOptions) -> tuple[Method, ...]:
 
 
 def _loaded(protocol: EvaluationProtocol, path: Path, progress: Progress) -> Dataset:
-    """Load a dataset and refuse one without a pair that can be evaluated."""
     with progress.stage("check dataset", 1, "datasets") as advance:
         dataset = protocol.load(path)
         advance(1)
@@ -295,7 +290,6 @@ class _Run:
     def summarized(
         self, results: Sequence[PairResult], baseline: Sequence[PairResult] | None
     ) -> RecipeResult:
-        """Sum up the results of the pairs, and test them against those of the baseline."""
         num_levels: dict[str, int] = {}
         for pair, result in zip(self.pairs, results, strict=True):
             for image in pair.images:
@@ -330,7 +324,7 @@ class _Run:
             pairs=tuple(results),
         )
 
-    def _successes(self, results: Sequence[PairResult]) -> NDArray[np.float64]:
+    def _successes(self, results: Sequence[PairResult]) -> Array:
         return np.array([self.protocol.success(result) for result in results])
 
 
@@ -341,9 +335,7 @@ def _intervals(
     by_category = _by_category(results)
     columns = list(protocol.summarize(results))
 
-    def of_resampled(
-        rows: Sequence[int], names: Sequence[str], picked: NDArray[np.int64]
-    ) -> list[float]:
+    def of_resampled(rows: Sequence[int], names: Sequence[str], picked: Indices) -> list[float]:
         summary = protocol.summarize([results[rows[place]] for place in picked])
         return [summary.get(name, 0.0) for name in names]
 

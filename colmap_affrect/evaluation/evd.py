@@ -5,8 +5,6 @@ Oxford's, ``NAME_1.png``, ``NAME_2.png``, ..., ``H_NAME_1_2.txt``, ... Homograph
 px of image 1 to those of image 2.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -76,7 +74,6 @@ def _extreme_views(folder: Path) -> list[tuple[EvaluationPair, Path]]:
 
 
 def _sequences(folder: Path) -> list[tuple[EvaluationPair, Path]]:
-    """List the pairs of sequences that have a homography, with it."""
     found = []
     for path in sorted(folder.glob("H_*.txt")):
         if parts := re.fullmatch(r"H_(.+)_([^_]+)_([^_]+)", path.stem):

@@ -4,8 +4,6 @@ All homographies are (3, 3), image2_from_image1, of pixel-centre px, with a posi
 coordinate in the part of image 1 that image 2 shows.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +13,6 @@ from typing import Annotated, Any, ClassVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import is_inside
 from colmap_affrect.errors import EvaluationError
@@ -29,15 +26,12 @@ from colmap_affrect.evaluation.protocol import (
 )
 from colmap_affrect.evaluation.two_views import Points
 from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import within
 
-Homography = NDArray[np.float64]
-Size = tuple[int, int]
-"""(width, height) in px."""
-
-CORRECT_PX = 3.0
-"""A match is correct if its transfer error in image 2 is smaller."""
-
+Homography = Array
+Size = tuple[int, int]  # (width, height) in px
+CORRECT_PX = 3.0  # a match is correct if its transfer error in image 2 is smaller
 THRESHOLDS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)
 """Pairs are counted whose homography error is smaller (the paper's table on EVD)."""
 
@@ -129,14 +123,14 @@ class HomographyProtocol(EvaluationProtocol):
         }
 
 
-def transfer_errors(matrix: Homography, points1: Points, points2: Points) -> NDArray[np.float64]:
+def transfer_errors(matrix: Homography, points1: Points, points2: Points) -> Array:
     """Return the (N,) distances in image 2, in px, of (N, 2) points 1 carried over to points 2."""
     with np.errstate(divide="ignore", invalid="ignore"):
         distances = np.linalg.norm(project(matrix, points1) - points2, axis=1)
     return np.where(third_coordinates(matrix, points1) > 0, distances, np.inf)
 
 
-def third_coordinates(homography: Homography, points: Points) -> NDArray[np.float64]:
+def third_coordinates(homography: Homography, points: Points) -> Array:
     """Return the (N,) third coordinates of (N, 2) points carried over, before the division."""
     return np.asarray(points @ homography[2, :2] + homography[2, 2])
 

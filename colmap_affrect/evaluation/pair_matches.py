@@ -5,26 +5,20 @@ until COLMAP's geometric verification finds enough inliers, and the level with m
 Its cameras are taken for unknown.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import colmap_keypoints
-from colmap_affrect.colmap.verification import (
-    Side,
-    VerificationOptions,
-    estimate_geometry,
-)
+from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
 from colmap_affrect.conventions import DEFAULT_FOCAL_RATIO
 from colmap_affrect.evaluation.protocol import EvaluationPair
 from colmap_affrect.evaluation.recipe_features import RecipeFeatures
+from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
 from colmap_affrect.recipes import Recipe
@@ -38,27 +32,20 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class MatchedPair:
-    """The matches of a pair.
-
-    Attributes:
-        points: (M, 2) pixel-centre px of the matches in each image.
-        level: rectifier of the level of escalation that counts, ``none`` when no level was
-            verified; empty without escalation.
-        num_levels: that were tried.
-        verified_inliers: of COLMAP's two-view geometry; 0 if a run would not take it, or without
-            escalation.
-        seconds: of matching and verification, at all levels that were tried.
-    """
+    """The matches of a pair."""
 
     pair: EvaluationPair
-    points: tuple[NDArray[np.float64], NDArray[np.float64]]
+    points: tuple[Array, Array]  # (M, 2) pixel-centre px of the matches in each image
     num_keypoints: tuple[int, int]
+    # rectifier of the level of escalation that counts, ``none`` when no level was verified;
+    # empty without escalation
     level: str
-    num_levels: int
+    num_levels: int  # that were tried
+    # of COLMAP's two-view geometry; 0 if a run would not take it, or without escalation
     verified_inliers: int
-    seconds: float
+    seconds: float  # of matching and verification, at all levels that were tried
 
-    def better(self, new: MatchedPair) -> MatchedPair:
+    def better(self, new: Self) -> Self:
         """Choose the one with more verified inliers, the new one if none has any; add times."""
         takes_new = new.verified_inliers > self.verified_inliers or not self.verified_inliers
         seconds = self.seconds + new.seconds
@@ -158,7 +145,7 @@ class PairMatcher:
 
 
 def verified_inliers(
-    frames: tuple[NDArray[np.floating], NDArray[np.floating]],
+    frames: tuple[Floats, Floats],
     sizes: tuple[tuple[int, int], tuple[int, int]],
     extracted_px: int | None = None,
 ) -> int:

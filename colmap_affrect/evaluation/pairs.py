@@ -25,8 +25,6 @@ Scores: of homographies as :mod:`evd <colmap_affrect.evaluation.evd>` has them; 
 :mod:`svp <colmap_affrect.evaluation.posed_scenes>`; of correspondences as WxBS.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,7 +34,6 @@ from typing import Annotated, Any, ClassVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import is_unsafe
@@ -70,6 +67,7 @@ from colmap_affrect.evaluation.truth_checks import (
     true_homography,
 )
 from colmap_affrect.evaluation.two_views import Points, symmetric_epipolar_distances
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.options import within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
@@ -81,9 +79,7 @@ INTRINSICS = dict.fromkeys(("intrinsics1", "intrinsics2"), (3, 3))
 POSE_SHAPES = {"rotation": (3, 3), "translation": (3,), **INTRINSICS}
 ORIGINS = ("center", "corner")
 
-MAX_OFF_CENTRE = 0.25
-"""A principal point further from the middle, in image sizes, does not fit the image."""
-
+MAX_OFF_CENTRE = 0.25  # principal points further from the middle, in image sizes, do not fit
 WXBS_THRESHOLDS_PX = tuple(range(20))
 """The score of WxBS is the mean over these of the share of correspondences that agree."""
 
@@ -129,7 +125,7 @@ class CorrespondenceProtocol(EvaluationProtocol):
         }
 
 
-def recalls(distances_px: NDArray[np.float64]) -> dict[str, float]:
+def recalls(distances_px: Array) -> dict[str, float]:
     """Return the score of WxBS, and shares of (N,) distances up to single thresholds."""
 
     def share(limit_px: float) -> float:
@@ -236,7 +232,6 @@ def _read_list(path: Path) -> tuple[list[dict[str, Any]], float]:
 
 
 def _named(entry: Any, path: Path, number: int) -> str:
-    """Return the name of an entry whose keys are right."""
     where = f"{path}: pairs[{number}]"
     if not isinstance(entry, dict):
         raise EvaluationError(f"{where}: is not an object")
@@ -322,8 +317,7 @@ class _Entry:
         return replace(pair, images=images, truth=(posed[0], posed[1])), doubts
 
 
-def _pose_values(given: Any, where: str) -> dict[str, NDArray[np.float64]]:
-    """Return the arrays of a relative pose, after all checks."""
+def _pose_values(given: Any, where: str) -> dict[str, Array]:
     if not isinstance(given, dict) or given.keys() != POSE_SHAPES.keys():
         raise EvaluationError(f"{where}: relative_pose needs {', '.join(POSE_SHAPES)}")
     arrays = {

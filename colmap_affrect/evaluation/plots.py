@@ -1,7 +1,5 @@
 """Plots of an evaluation, with the axes of the paper's figures."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Iterator
@@ -24,11 +22,8 @@ GRID = "#DDDDDD"
 BARS = "#DDE3EA"
 PAPER_STYLE: dict[str, Any] = dict(marker=".", linestyle=":", linewidth=1.2, alpha=0.8)
 MIN_SECONDS = 0.01
-ROOM_FOR_NUMBERS = 1.12
-"""Of an axis, in lengths of the longest bar."""
-ROW_IN = 0.42
-"""Height of a row of bars."""
-
+ROOM_FOR_NUMBERS = 1.12  # of an axis, in lengths of the longest bar
+ROW_IN = 0.42  # height of a row of bars
 PAPER_THRESHOLD = "< "
 
 
@@ -56,7 +51,6 @@ def _figure(height_in: float = SIZE_IN[1]) -> Figure:
 
 
 def _published(evaluation: Evaluation) -> Iterator[tuple[PublishedRow, dict[str, Any]]]:
-    """Yield the paper's rows with their style, in other colours than the recipes if there are."""
     for number, row in enumerate(evaluation.published, len(evaluation.recipes)):
         label = f"paper: {row.method} ({row.table})"
         yield row, dict(color=f"C{number}", label=label, **PAPER_STYLE)

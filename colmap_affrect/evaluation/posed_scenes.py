@@ -22,8 +22,6 @@ is plainly that of another size (its principal point, taken for the middle, is f
 of the image), it is scaled.
 """
 
-from __future__ import annotations
-
 import itertools
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -32,7 +30,6 @@ from typing import ClassVar, NamedTuple
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, relative_pose
@@ -46,29 +43,19 @@ from colmap_affrect.evaluation.relative_pose import (
     posed_pair,
     rotation_angle_deg,
 )
-from colmap_affrect.evaluation.truth_checks import (
-    image_sizes,
-    pose_contradictions,
-    rotation_fault,
-)
+from colmap_affrect.evaluation.truth_checks import image_sizes, pose_contradictions, rotation_fault
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import IMAGE_SUFFIXES
 
-Names = tuple[str, str]
-"""Of the images of a pair, without suffix."""
-
+Names = tuple[str, str]  # of the images of a pair, without suffix
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
 CATEGORY_DEG = 10
-MAX_NOT_UNIT = 1e-3
-"""Largest deviation of the length of a quaternion from 1."""
-
+MAX_NOT_UNIT = 1e-3  # largest deviation of the length of a quaternion from 1
 SET_FOLDER = "set_100"
 LIST_FOLDER = "new-vis-pairs"
 CALIBRATION_PREFIX = "calibration_"
-BINS = tuple(range(10))
-"""Lower limits of the categories, in tenths; the list of the first may be missing."""
-
-MAX_OFF_CENTRE = 1.15
-"""Twice the principal point and the size of the image may differ by this factor."""
+BINS = tuple(range(10))  # lower limits of the categories, in tenths; the first may have no list
+MAX_OFF_CENTRE = 1.15  # factor by which twice the principal point and the size may differ
 
 
 class PosedScenes(RelativePoseProtocol):
@@ -235,7 +222,6 @@ def read_camera_poses(
 
 
 def _camera(words: list[str] | None) -> pycolmap.Camera:
-    """Return the camera of a line without its id; say what is wrong with it."""
     if words is None:
         raise EvaluationError("has no camera")
     try:
@@ -256,7 +242,7 @@ def _camera(words: list[str] | None) -> pycolmap.Camera:
 def _pose(words: list[str]) -> Pose:
     """Return the pose QW QX QY QZ TX TY TZ; say what is wrong with it."""
     try:
-        values: NDArray[np.float64] = np.array([float(value) for value in words])
+        values: Array = np.array([float(value) for value in words])
     except ValueError as error:
         raise EvaluationError("its pose cannot be read") from error
     length = float(np.linalg.norm(values[:4]))
@@ -269,7 +255,6 @@ def _pose(words: list[str]) -> Pose:
 
 
 def _difficulty_notes(listed: Sequence[ListedPair], poses: Mapping[str, Pose]) -> list[str]:
-    """Say which listed categories contradict the poses, of all listed pairs with poses."""
     wrong = [
         f"{' '.join(pair.names)} (listed {pair.difficulty}, by its poses {found})"
         for pair in listed
@@ -282,7 +267,6 @@ def _difficulty_notes(listed: Sequence[ListedPair], poses: Mapping[str, Pose]) -
 
 
 def _size_notes(pairs: Sequence[EvaluationPair]) -> list[str]:
-    """Count images that have another size in px than their intrinsics are for."""
     images: dict[str, PosedImage] = {im.image.name: im for pair in pairs for im in pair.truth}
     paths = [posed.image.path for posed in images.values()]
     wrong = [
@@ -344,8 +328,7 @@ class Imc(PosedScenes):
         return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
 
 
-Calibration = tuple[NDArray[np.float64], Pose]
-"""What a calibration file says: (3, 3) K and camera_from_world."""
+Calibration = tuple[Array, Pose]  # what a calibration file says: (3, 3) K and camera_from_world
 
 
 def disjoint_bins(lists: Mapping[int, list[str]]) -> dict[str, int]:
@@ -402,7 +385,6 @@ def _read_lists(folder: Path) -> tuple[dict[int, list[str]], list[str]]:
 
 
 def _read_calibrations(folder: Path) -> tuple[dict[str, Calibration], dict[str, str]]:
-    """Read all calibrations by image name; those that cannot be used with the reason."""
     found: dict[str, Calibration] = {}
     faults: dict[str, str] = {}
     for path in sorted(folder.glob(f"{CALIBRATION_PREFIX}*.h5")):
@@ -449,7 +431,7 @@ def _posed(
     ]
 
 
-def _scale(matrix: NDArray[np.float64], width: int, height: int) -> float | None:
+def _scale(matrix: Array, width: int, height: int) -> float | None:
     """Return what K is to be multiplied by to fit an image; None if nothing makes it fit."""
     ratios = np.array([width, height]) / (2.0 * matrix[:2, 2])
     if np.all(np.maximum(ratios, 1 / ratios) < MAX_OFF_CENTRE):

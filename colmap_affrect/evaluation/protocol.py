@@ -1,7 +1,5 @@
 """What an evaluation protocol is: pairs of images with truth, and a score for their matches."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -10,11 +8,11 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
 from colmap_affrect.errors import AffrectError, EvaluationError
 from colmap_affrect.evaluation.two_views import Points, Ransac
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import Options, within
 from colmap_affrect.shown import such_as
 
@@ -23,8 +21,7 @@ Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value 
 
 POSITIVE = within(1e-6, 1e9)
 
-GROUP = ": "
-"""Separates the name of a table from that of its column in the names of columns."""
+GROUP = ": "  # separates the name of a table from that of its column in the names of columns
 
 
 @dataclass(frozen=True)
@@ -37,7 +34,7 @@ class EvaluationImage:
 
     name: str
     path: Path
-    intrinsics: NDArray[np.float64] | None = None
+    intrinsics: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -103,7 +100,7 @@ class Dataset:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def united(cls, parts: Iterable[Dataset]) -> Self:
+    def united(cls, parts: Iterable[Self]) -> Self:
         """Return the pairs and notes of all parts of a dataset."""
         parts = list(parts)
         return cls(
@@ -200,7 +197,7 @@ def stem(name: str) -> str:
     return PurePosixPath(name).with_suffix("").as_posix()
 
 
-def read_numbers(path: Path) -> NDArray[np.float64]:
+def read_numbers(path: Path) -> Array:
     """Read a table of numbers from text; EvaluationError when it is none."""
     try:
         return np.loadtxt(path, dtype=np.float64, ndmin=2)
@@ -208,7 +205,7 @@ def read_numbers(path: Path) -> NDArray[np.float64]:
         raise EvaluationError(f"{path}: cannot be read as numbers ({error})") from error
 
 
-def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float64]:
+def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> Array:
     """Return an array of some shape, -1 in it for any number of rows but none.
 
     EvaluationError says what is wrong with ``what``.

@@ -1,7 +1,5 @@
 """The features of one recipe on the images of a dataset: computed once, measured, and kept."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Mapping, Sequence
@@ -9,13 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 from colmap_affrect.data import LocalFeatures, Photograph, RectificationPlan
 from colmap_affrect.errors import AffrectError, StaleStoreError
 from colmap_affrect.evaluation.protocol import EvaluationImage
 from colmap_affrect.features.weights import digests_by_name
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import digest_of
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import cannot_write, replace_bytes
@@ -77,17 +73,11 @@ Reading images is not counted."""
 
 @dataclass(frozen=True)
 class ImageCost:
-    """What the features of one image cost, or the mean of several.
+    """What the features of one image cost, or the mean of several."""
 
-    Attributes:
-        area_mpx: area of all warps in megapixels, the image itself not counted.
-        num_keypoints: features of the image and of its warps.
-        num_regions: different parts of the image that are warped.
-    """
-
-    area_mpx: float = 0.0
-    num_keypoints: float = 0.0
-    num_regions: float = 0.0
+    area_mpx: float = 0.0  # area of all warps in megapixels, the image itself not counted
+    num_keypoints: float = 0.0  # features of the image and of its warps
+    num_regions: float = 0.0  # different parts of the image that are warped
     num_warps: float = 0.0
     plan_s: float = 0.0
     warp_s: float = 0.0
@@ -144,7 +134,7 @@ def extract_measured(
     extractor: ImageExtractor,
     path: Path,
     name: str = "",
-    intrinsics: NDArray[np.float64] | None = None,
+    intrinsics: Array | None = None,
     level: int = 0,
 ) -> tuple[ExtractedImage, ImageCost]:
     """Extract the features of an image, as :meth:`ImageExtractor.extract_file`, and their cost."""

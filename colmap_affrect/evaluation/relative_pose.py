@@ -4,8 +4,6 @@ Cameras are COLMAP's, of any of its models: their pixels have the origin in the 
 the datasets whose truth COLMAP made. Points of matches are pixel-centre, as everywhere else.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,7 +13,6 @@ from typing import Annotated, Any, ClassVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, area_under_curve, pose_errors, relative_pose
@@ -29,11 +26,10 @@ from colmap_affrect.evaluation.protocol import (
     PairScore,
 )
 from colmap_affrect.evaluation.two_views import Points, Ransac, sampson_distances
+from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.options import within
 
-CORRECT_PX = 3.0
-"""A match agrees with a pose up to this Sampson distance."""
-
+CORRECT_PX = 3.0  # a match agrees with a pose up to this Sampson distance
 MAX_AUC_ERROR_DEG = 10.0
 
 ESTIMATORS = {"": "", "GC-RANSAC: ": "gc_"}
@@ -68,7 +64,7 @@ def true_pose(pair: EvaluationPair) -> Pose:
     return relative_pose(first.pose, second.pose)
 
 
-def rotation_angle_deg(rotation: NDArray[np.float64]) -> float:
+def rotation_angle_deg(rotation: Array) -> float:
     """Return the angle of a (3, 3) rotation, from 0 to 180 degrees."""
     nothing = np.zeros(3)
     return pose_errors((rotation, nothing), (np.eye(3), nothing))[0]
@@ -115,7 +111,6 @@ class RelativePoseProtocol(EvaluationProtocol):
         focal_px = mean_focal_px(cameras)
 
         def estimate(ransac: Ransac) -> tuple[float, float, int]:
-            """Return the errors of rotation and direction, and the number of inliers."""
             pose, inliers = ransac.relative_pose(rays1, rays2)
             errors = (math.inf, math.inf) if pose is None else pose_errors(pose, truth)
             return *errors, int(inliers.sum())
@@ -178,9 +173,7 @@ def mean_focal_px(cameras: Sequence[pycolmap.Camera]) -> float:
     return float(np.mean([camera.mean_focal_length() for camera in cameras]))
 
 
-def rays(
-    camera: pycolmap.Camera, points: NDArray[np.floating], *, use_distortion: bool = True
-) -> Points:
+def rays(camera: pycolmap.Camera, points: Floats, *, use_distortion: bool = True) -> Points:
     """Turn (N, 2) pixel-centre points into (N, 2) x/z, y/z; NaN for what a lens cannot produce."""
     pixels = colmap_from_pixel(np.asarray(points, dtype=np.float64).reshape(-1, 2))
     if use_distortion:

@@ -1,7 +1,5 @@
 """What an evaluation found: as JSON and CSV for programs, as tables for people."""
 
-from __future__ import annotations
-
 import json
 import math
 import textwrap
@@ -10,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter
 
@@ -25,12 +23,8 @@ COMPLEXITY = "complexity"
 
 Interval = tuple[Number, Number]
 
-PAIR_RESULT = TypeAdapter(PairResult)
-"""Reads and writes results of pairs as JSON; infinite errors are null."""
-
-SECONDS = "seconds"
-"""The column of all time that a recipe took."""
-
+PAIR_RESULT = TypeAdapter(PairResult)  # results of pairs from and to JSON; infinite errors are null
+SECONDS = "seconds"  # the column of all time that a recipe took
 WIDTH = 100
 MAX_NOTES = 12
 
@@ -99,11 +93,6 @@ class RecipeResult:
     warnings: Mapping[str, str]
     pairs: tuple[PairResult, ...]
 
-    @property
-    def num_failed(self) -> int:
-        """Pairs that could not be matched or scored at all."""
-        return sum(bool(pair.failure) for pair in self.pairs)
-
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -143,13 +132,6 @@ class Evaluation:
             recipe["pairs"] = [{"name": pair["name"], **pair} for pair in recipe["pairs"]]
         values["recipes"] = {recipe.pop("name"): recipe for recipe in values["recipes"]}
         return json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False)
-
-    @classmethod
-    def from_json(cls, text: str) -> Self:
-        """Read :meth:`to_json`."""
-        values = json.loads(text)
-        recipes = [{"name": name, **recipe} for name, recipe in values["recipes"].items()]
-        return TypeAdapter(cls).validate_python({**values, "recipes": recipes})
 
     def to_csv(self) -> str:
         """Return a row for each recipe and pair."""
@@ -201,7 +183,6 @@ def _score_table(evaluation: Evaluation, title: str, columns: Sequence[str]) -> 
 
 
 def _published_rows(published: Iterable[PublishedRow], columns: Sequence[str]) -> list[list[str]]:
-    """Return the paper's rows that have some of the columns."""
     return [
         [f"paper: {row.method} ({row.table})", *_cells(row.values, columns)]
         for row in published
@@ -220,7 +201,8 @@ def _chance_table(evaluation: Evaluation) -> str:
         cells = [f"{recipe.solved.mean:.2f}", f"{low:.2f}-{high:.2f}", *p_value]
         counts = [(fmean(p.num_keypoints), p.num_matches, p.num_inliers) for p in recipe.pairs]
         used = [f"{fmean(column):.0f}" for column in zip(*counts, strict=True)]
-        rows.append([recipe.name, *cells, str(recipe.num_failed), *used])
+        num_failed = sum(bool(pair.failure) for pair in recipe.pairs)
+        rows.append([recipe.name, *cells, str(num_failed), *used])
     return aligned(rows)
 
 
@@ -235,7 +217,6 @@ def complexity_columns(recipe: RecipeResult) -> dict[str, float]:
 
 
 def _cost_table(evaluation: Evaluation) -> str:
-    """Return complexity per image, as the paper's table, and seconds by step."""
     columns = list(complexity_columns(evaluation.recipes[0]))
     head = ["per image (match, estimate: per pair)", *columns, *(f"{step} [s]" for step in STEPS)]
     rows = []

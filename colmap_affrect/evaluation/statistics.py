@@ -1,24 +1,21 @@
 """How far results could differ by chance: intervals and a paired test over pairs of images."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+
+from colmap_affrect.geometry.arrays import Array, Indices
 
 NUM_RESAMPLES = 2000
 CONFIDENCE = 0.95
 
-MAX_ENUMERATED = 14
-"""Up to so many differences all signs are tried, above that random ones."""
-
+MAX_ENUMERATED = 14  # up to so many differences all signs are tried, above that random ones
 NUM_RANDOM_SIGNS = 9999
 
 
 def bootstrap_intervals(
-    count: int, statistics: Callable[[NDArray[np.int64]], Sequence[float]], seed: int
+    count: int, statistics: Callable[[Indices], Sequence[float]], seed: int
 ) -> list[tuple[float, float]]:
     """Compute percentile bootstrap intervals of statistics of ``count`` items, at least one.
 
@@ -33,9 +30,7 @@ def bootstrap_intervals(
     return list(zip(found[tail].tolist(), found[-1 - tail].tolist(), strict=True))
 
 
-def paired_test(
-    a: Sequence[float] | NDArray[np.float64], b: Sequence[float] | NDArray[np.float64], seed: int
-) -> float:
+def paired_test(a: Sequence[float] | Array, b: Sequence[float] | Array, seed: int) -> float:
     """Return the two-sided p-value of a difference of two methods, by their values pair by pair.
 
     Sign-flip permutation test on signed ranks (Wilcoxon's statistic): if the methods did not

@@ -1,13 +1,9 @@
-"""Sanity checks of what a dataset gives as truth.
+"""Sanity checks of what a dataset gives as truth: converted wrongly it makes every method look bad.
 
-A dataset that was converted wrongly makes every method look bad. What can be seen from the numbers
-alone (rotations that are none, intrinsics of another image size) is looked for in every image; what
-only the images show (homographies inverted, coordinates exchanged, rotations transposed), in the
-matches of plain features: of every homography and of marked correspondences, and of a few easy
-pairs where the truth is of poses.
+What the numbers alone show is looked for in every image; what only the images show (homographies
+inverted, coordinates exchanged, rotations transposed), in the matches of plain features: of every
+homography and of marked correspondences, and of a few easy pairs where the truth is of poses.
 """
-
-from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,7 +11,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap.poses import Pose, relative_pose
 from colmap_affrect.conventions import is_inside
@@ -36,7 +31,8 @@ from colmap_affrect.evaluation.two_views import (
     sampson_distances,
     symmetric_epipolar_distances,
 )
-from colmap_affrect.images.reading import read_gray
+from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.images.reading import read_gray, readable_size
 from colmap_affrect.images.warping import warp
 from colmap_affrect.matchers.nearest import (
     MatchableImage,
@@ -51,34 +47,24 @@ from colmap_affrect.stages.one_image import extract_image, prepare
 
 CHECK_RECIPE = "unrectified-rootsift"
 
-MAX_NOT_ORTHONORMAL = 1e-3
-"""Largest element of R Rᵀ - I of what passes for a rotation."""
-
+MAX_NOT_ORTHONORMAL = 1e-3  # largest element of R Rᵀ - I of what passes for a rotation
 MIN_SUPPORT = 8
 MIN_SUPPORT_FRAC = 0.25
 """Matches of the rectified pair that confirm a homography."""
 SUPPORT_PX = 5.0
-RESIZED = (0.5, 2.0)
-"""Sizes of an image that a truth might be of, in the place of its own."""
-
+RESIZED = (0.5, 2.0)  # sizes of an image that a truth might be of, in the place of its own
 EPIPOLAR_NOISE_PX = 1.0
 MIN_EPIPOLAR_CONSENSUS = 40
 MIN_EPIPOLAR_CONSENSUS_FRAC = 0.5
 """Inliers of a fundamental matrix that prove that the matches of a pair are right."""
-MAX_MEDIAN_PX = 10.0
-"""Correspondences that disagree by more on average are doubted: they are a few px accurate."""
-
-MAX_CHECKED_PAIRS = 8
-"""Per scene."""
-CHECK_IMAGE_SIZE_PX = 800
-"""Longer side of the images in which poses are checked."""
+MAX_MEDIAN_PX = 10.0  # correspondences off by more are doubted: they are a few px accurate
+MAX_CHECKED_PAIRS = 8  # per scene
+CHECK_IMAGE_SIZE_PX = 800  # longer side of the images in which poses are checked
 MIN_POSE_CONSENSUS = 30
 MIN_POSE_CONSENSUS_FRAC = 0.3
 """Inliers of an essential matrix that prove that the matches of a pair are right."""
-MIN_AGREEING_FRAC = 0.5
-"""Share of such inliers that agree with the truth; where fewer do, the truth is wrong."""
-MIN_EXPLAINED_FRAC = 0.9
-"""Share that must agree with poses mistaken in a known way, for this to be named."""
+MIN_AGREEING_FRAC = 0.5  # of such inliers, with the truth; where fewer do, it is wrong
+MIN_EXPLAINED_FRAC = 0.9  # must agree with poses mistaken in a known way, for this to be named
 
 POSE_MISTAKES: dict[str, Callable[[Pose], Pose]] = {
     "": lambda pose: pose,
@@ -89,7 +75,7 @@ POSE_MISTAKES: dict[str, Callable[[Pose], Pose]] = {
 """What turns a pose that was stored in a wrong way into the right one."""
 
 
-def rotation_fault(rotation: NDArray[np.float64]) -> str:
+def rotation_fault(rotation: Array) -> str:
     """Tell why a (3, 3) matrix is not a rotation; empty if it is one.
 
     >>> rotation_fault(2.0 * np.eye(3))
@@ -110,14 +96,7 @@ def rotation_fault(rotation: NDArray[np.float64]) -> str:
 
 def image_sizes(paths: Iterable[Path]) -> Iterator[Size | None]:
     """Yield (width, height) of images, None for those that cannot be read: they fail when used."""
-
-    def size(path: Path) -> Size | None:
-        try:
-            return size_of(read_gray(path))
-        except ImageError:
-            return None
-
-    return map_ordered(size, paths, available_cores())
+    return map_ordered(readable_size, paths, available_cores())
 
 
 def size_of(image: GrayImage) -> Size:
@@ -256,7 +235,6 @@ def pose_contradictions(pairs: Sequence[EvaluationPair]) -> list[str]:
 
 
 def _small_features(paths: Iterable[Path]) -> Iterator[MatchableImage | None]:
-    """Yield the plain features of shrunk images; None of those that cannot be read."""
     recipe = load_recipe(CHECK_RECIPE, [f"max_image_size_px={CHECK_IMAGE_SIZE_PX}"])
     extractor = prepare(recipe.extraction)
 

@@ -1,21 +1,19 @@
 """Geometry of two views: models from matches by OpenCV's random sampling, and distances to them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap.poses import Pose
+from colmap_affrect.geometry.arrays import Array, Bools, Floats
 from colmap_affrect.geometry.epipolar import epipolar_lines, sampson_errors
 from colmap_affrect.geometry.two_views import essential_matrix, homogeneous
 
-Points = NDArray[np.floating]
-Matrix = NDArray[np.float64]
+Points = Floats
+Matrix = Array
 
 MIN_HOMOGRAPHY_MATCHES, MIN_FUNDAMENTAL_MATCHES, MIN_POSE_MATCHES = 4, 8, 6
 """Of poses six: five leave several essential matrices, none of which another match supports."""
@@ -23,20 +21,15 @@ MIN_HOMOGRAPHY_MATCHES, MIN_FUNDAMENTAL_MATCHES, MIN_POSE_MATCHES = 4, 8, 6
 
 @dataclass(frozen=True)
 class Ransac:
-    """How to look for a model of (M, 2) and (M, 2) matches.
+    """How to look for a model of (M, 2) and (M, 2) matches."""
 
-    Attributes:
-        method: ``cv2.RANSAC``, ``cv2.USAC_MAGSAC`` or another of OpenCV's.
-        threshold: of an inlier (MAGSAC: largest noise) in px; of relative poses in units of the
-            focal length.
-        confidence: at which to end before all iterations.
-        random_seed: decides the order of the matches: OpenCV draws the same samples every time.
-    """
-
-    method: int
+    method: int  # ``cv2.RANSAC``, ``cv2.USAC_MAGSAC`` or another of OpenCV's
+    # of an inlier (MAGSAC: largest noise) in px; of relative poses in units of the focal
+    # length
     threshold: float
-    confidence: float
+    confidence: float  # at which to end before all iterations
     max_num_iterations: int
+    # decides the order of the matches: OpenCV draws the same samples every time
     random_seed: int = 0
 
     def reseeded(self, count: int) -> list[Self]:
@@ -69,7 +62,7 @@ class Ransac:
             return None, 0
         return np.asarray(matrix, dtype=np.float64), int(np.count_nonzero(inliers))
 
-    def relative_pose(self, rays1: Points, rays2: Points) -> tuple[Pose | None, NDArray[np.bool_]]:
+    def relative_pose(self, rays1: Points, rays2: Points) -> tuple[Pose | None, Bools]:
         """Estimate camera2_from_camera1, |t| = 1 (None if there is none), and its (N,) inliers.
 
         From five-point samples of (N, 2) x/z, y/z in front of each camera; NaN are never inliers.
@@ -101,9 +94,7 @@ class Ransac:
         return pose, inliers
 
 
-def symmetric_epipolar_distances(
-    matrix: Matrix | None, points1: Points, points2: Points
-) -> NDArray[np.float64]:
+def symmetric_epipolar_distances(matrix: Matrix | None, points1: Points, points2: Points) -> Array:
     """Return (N,) sqrt(d1^2 + d2^2) of points from their epipolar lines, px, as WxBS has it.
 
     Infinite without a matrix, and where a line is not defined.
@@ -118,7 +109,7 @@ def symmetric_epipolar_distances(
     return np.asarray(np.nan_to_num(distances, nan=np.inf))
 
 
-def sampson_distances(pose: Pose, rays1: Points, rays2: Points) -> NDArray[np.float64]:
+def sampson_distances(pose: Pose, rays1: Points, rays2: Points) -> Array:
     """Return (N,) first-order distances of (N, 2) x/z, y/z from a camera2_from_camera1.
 
     In units of the focal length; infinite where they are not defined, as without a baseline.

@@ -169,7 +169,6 @@ class AffNetHardNet:
         return shapes, descriptors
 
     def _run(self, network: nn.Module, patches: Tensor) -> Singles:
-        """Run a network on (N, 1, 32, 32) patches, in batches."""
         import torch
         from torch.nn.functional import pad
 

@@ -4,8 +4,6 @@ Those of another package become known by an entry point of the group ``colmap_af
 ``colmap_affrect.shapes``. Several threads may call the same object at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -5,8 +5,6 @@ without checking them; here a network is built empty, and a file must have its p
 of them and no others, in their shapes.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext

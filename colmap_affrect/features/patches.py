@@ -5,8 +5,6 @@ of the time on a CPU: the pyramid is built once for all samplings of an image, p
 sampling coordinates in one product, and they are computed in pieces that stay in the cache.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from kornia.feature import extract_patches_from_pyramid

@@ -1,7 +1,5 @@
 """Features ``rootsift``: OpenCV's DoG and SIFT, described as RootSIFT; no weights."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal
 

@@ -1,16 +1,10 @@
 """Weights of networks: where they are, where they come from, and reading them safely.
 
-Files keep their upstream names. They are looked for, before any image is touched, in
-
-1. the folder that the user gives,
-2. the folder in the environment variable ``COLMAP_AFFRECT_WEIGHTS``,
-3. torch's cache, where kornia keeps them too,
-4. installed distributions that carry them, of which nothing is imported,
-
-and else downloaded into that cache. torch and kornia are loaded only when they are needed.
+Files keep their upstream names. They are looked for, before any image is touched, in the folder
+that the user gives, the one in the environment variable ``COLMAP_AFFRECT_WEIGHTS``, torch's cache,
+where kornia keeps them too, and installed distributions that carry them, of which nothing is
+imported; else they are downloaded into that cache.
 """
-
-from __future__ import annotations
 
 import os
 import pickle
@@ -331,7 +325,6 @@ def _checked_installed(key: str) -> Path | None:
 
 
 def _download(key: str, folder: Path, progress: Progress) -> Path:
-    """Download a file from the first of its addresses that has it."""
     published = WEIGHT_FILES[key]
     target = folder / published.file_name
     failures = []

@@ -6,8 +6,6 @@ anywhere. So a handful of right matches among hundreds of wrong ones can be coun
 far too few for an epipolar geometry.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from colmap_affrect.geometry.arrays import Array, Floats, Indices

@@ -1,14 +1,10 @@
 """Epipolar geometry of two views, and what local affine frames say about it.
 
-A match of two frames gives the local affine map from image 1 to image 2. It must carry the
-direction of the epipolar line in image 1 to the one in image 2 (Barath, Hajder, Matas: epipolar
-geometry from affine correspondences): one more check of a match, which the positions do not make.
-
-All points are (N, 2) px of any one convention, the one of the fundamental matrix F with
-``x2^T F x1 = 0``; shapes are the (N, 2, 2) linear parts of frames, in the same axes.
+A match of two frames must carry the direction of the epipolar line in image 1 to the one in image 2
+(Barath, Hajder, Matas: epipolar geometry from affine correspondences). All points are (N, 2) px of
+any one convention, the one of the fundamental matrix F with ``x2^T F x1 = 0``; shapes are the
+(N, 2, 2) linear parts of frames, in the same axes.
 """
-
-from __future__ import annotations
 
 import numpy as np
 

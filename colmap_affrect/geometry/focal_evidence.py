@@ -10,8 +10,6 @@ into the noise.
 Points are (N, 2), from the image centre in units of the longer side; so are focal lengths.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 
@@ -75,6 +73,28 @@ def log_evidence(
     if misfit > max_misfit or not np.isfinite(found).all():
         return np.zeros(len(focals1))
     return np.asarray(found - found.max())
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    """What derivatives are made of, at one point for each focals."""
+
+    costs: Array
+    errors: Array
+    lengths: Array
+    sides1: Array
+    sides2: Array
+    lines1: Array
+    lines2: Array
+    state: Array
+
+    def replaced(self, where: Bools, other: Self) -> Self:
+        """Return a copy with some focals as in another one."""
+        values = {
+            name: np.where(where.reshape(-1, *[1] * (old.ndim - 1)), vars(other)[name], old)
+            for name, old in vars(self).items()
+        }
+        return type(self)(**values)
 
 
 class _Fit:
@@ -169,28 +189,6 @@ class _Fit:
         hessians = weighted @ jacobians + np.diag(precision)
         gradients = (weighted @ at.errors[..., None])[..., 0] + precision * at.state[:, self._free]
         return hessians, gradients
-
-
-@dataclass(frozen=True)
-class _Residuals:
-    """What derivatives are made of, at one point for each focals."""
-
-    costs: Array
-    errors: Array
-    lengths: Array
-    sides1: Array
-    sides2: Array
-    lines1: Array
-    lines2: Array
-    state: Array
-
-    def replaced(self, where: Bools, other: _Residuals) -> _Residuals:
-        """Return a copy with some focals as in another one."""
-        values = {
-            name: np.where(where.reshape(-1, *[1] * (old.ndim - 1)), vars(other)[name], old)
-            for name, old in vars(self).items()
-        }
-        return _Residuals(**values)
 
 
 def _singular_values(state: Array) -> Array:

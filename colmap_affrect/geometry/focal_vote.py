@@ -7,8 +7,6 @@ tied by pairs inform each other: belief propagation on the graph of the cameras.
 Focal lengths are in units of the longer side.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Fixed-radius neighbours of 2-D points through a grid of cells."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

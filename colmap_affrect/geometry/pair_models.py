@@ -4,8 +4,6 @@ Epipolar lines hold points, and local affine frames must carry the epipolar dire
 that of image 2; a homography holds places, and frames must turn as it does.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -3,8 +3,6 @@
 All points are (N, 2) px with the corner of the image at (0, 0); sizes are (width, height) px.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from colmap_affrect.geometry.arrays import Array, Floats, Indices

@@ -5,8 +5,6 @@ length in camera coordinates (x right, y down, z forward) and face the camera: n
 ray r that sees the surface.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -219,7 +217,6 @@ def _cosines(directions: Floats, centers: Floats, antipodal: bool) -> Floats:
 
 
 def _votes(candidates: Array, normals: Floats, bin_cos: float, antipodal: bool) -> Indices:
-    """Count the normals near each candidate."""
     by_axis = np.asfortranarray(normals)  # several times faster than rows of three
     return np.array(
         [

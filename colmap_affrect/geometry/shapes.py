@@ -5,8 +5,6 @@ entries (l11, l12); its eigenvalues are +-log t. Means of shapes are means of lo
 (log-Euclidean mean; Arsigny, Fillard, Pennec, Ayache 2007).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from colmap_affrect.geometry.affine import determinants

@@ -8,8 +8,6 @@ photographs with all features in one corner or in rows, and frames that are all 
 chances that they have.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -10,8 +10,6 @@ the paper. The authors' program has t1 / t2 where 1 / (t1 t2) stands in the form
 it is the formula, checked against a singular value decomposition in the tests.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

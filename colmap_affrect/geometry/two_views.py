@@ -4,8 +4,6 @@ A pose is (R, t) with ``x2 = R x1 + t`` for points in the two camera frames; ray
 normalized image coordinates, the point at depth z being ``z (x, y, 1)``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

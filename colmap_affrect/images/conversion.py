@@ -1,7 +1,5 @@
 """Photographs in formats that COLMAP cannot read, as PNG: JPEG 2000, WebP, AVIF, HEIC, pages."""
 
-from __future__ import annotations
-
 import io
 import shutil
 from collections.abc import Iterator, Sequence
@@ -13,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.images.headers import pages
-from colmap_affrect.images.photographs import TIFF_SUFFIXES, photograph_files
+from colmap_affrect.images.photographs import TIFF_SUFFIXES, photograph_files, require_folder
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_bytes
@@ -50,10 +48,7 @@ def convert_images(
     What is there already is not made again. Raises ImageError when there are no photographs,
     OptionError when their folder is not there, or the new one is inside it.
     """
-    if image_path.is_file():
-        raise OptionError(f"{image_path}: is a file; give the folder that it is in")
-    if not image_path.is_dir():
-        raise OptionError(f"{image_path}: no such folder; give the folder of the photographs")
+    require_folder(image_path)
     if output_path.resolve() == image_path.resolve():
         raise OptionError(f"{output_path}: is the folder of the photographs; give another one")
     if output_path.resolve().is_relative_to(image_path.resolve()):
@@ -76,7 +71,6 @@ def convert_images(
 
 
 def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> None:
-    """Convert or copy one file."""
     suffix = PurePosixPath(name).suffix.lower()
     numbers = pages(path) if suffix in TIFF_SUFFIXES else [0]
     as_it_is = suffix in IMAGE_SUFFIXES and not foreign_format(path) and numbers == [0]

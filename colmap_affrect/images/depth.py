@@ -5,8 +5,6 @@ covers the whole image at any resolution, so that ``conventions.resized_from_ori
 its pixels to those of the photograph. The unit is free: normals do not depend on it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import threading

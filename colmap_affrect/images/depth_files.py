@@ -9,8 +9,6 @@ Files may come from anywhere: whatever is wrong with one ends in :class:`Unusabl
 is trusted with more memory than a depth map may need.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from math import prod
 from pathlib import Path

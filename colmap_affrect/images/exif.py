@@ -4,8 +4,6 @@ EXIF tells of the file that a camera wrote. What has been shrunk, cropped or edi
 keeps it as it was, so that every statement is held against the others and against the file.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

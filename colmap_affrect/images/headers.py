@@ -1,7 +1,5 @@
 """Headers of image files: what they are of, before memory is taken for pixels."""
 
-from __future__ import annotations
-
 import struct
 import warnings
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Masks: where features may be, and connected parts of an image."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """The photographs of a run: which there are, how they share cameras, and their masks."""
 
-from __future__ import annotations
-
 import os
 import posixpath
 import unicodedata
@@ -136,10 +134,7 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     :func:`left_out`). OptionError when there is no such folder or list, ImageError when it holds
     none, or a listed one is missing.
     """
-    if image_path.is_file():
-        raise OptionError(f"{image_path}: is a file; give the folder that it is in")
-    if not image_path.is_dir():
-        raise OptionError(f"{image_path}: no such folder; give the folder of the photographs")
+    require_folder(image_path)
     if image_list_path is not None:
         return _listed_images(image_path, image_list_path)
     files = _visible_files(image_path)
@@ -148,6 +143,14 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
         others = "".join(f"; {kind}: {what}" for kind, what in left_out(image_path).items())
         raise ImageError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}")
     return names
+
+
+def require_folder(image_path: Path) -> None:
+    """Refuse what is no folder of photographs; OptionError."""
+    if image_path.is_file():
+        raise OptionError(f"{image_path}: is a file; give the folder that it is in")
+    if not image_path.is_dir():
+        raise OptionError(f"{image_path}: no such folder; give the folder of the photographs")
 
 
 def left_out(image_path: Path) -> dict[str, str]:

@@ -1,7 +1,5 @@
 """Reading of image files and encoding of pictures, through OpenCV."""
 
-from __future__ import annotations
-
 import math
 import re
 import struct
@@ -56,19 +54,28 @@ EIGHTH_OF_COLOR = cv2.IMREAD_REDUCED_COLOR_8 | cv2.IMREAD_IGNORE_ORIENTATION
 """Several times faster, of JPEG files."""
 
 
-def read_gray(path: Path, *, stretch: bool = False) -> GrayImage:
+def read_gray(path: Path) -> GrayImage:
     """Read an image as gray, as stored: EXIF orientation is not applied, 16 bit becomes 8.
 
-    With ``stretch`` low contrast fills the range (:func:`tones`). ImageError if it is no image.
+    Raises ImageError if it is no image.
     """
-    image = decode(path)
-    return in_eight_bits(image, tones(image) if stretch else None)
+    return in_eight_bits(decode(path))
+
+
+def readable_size(path: Path) -> tuple[int, int] | None:
+    """Return the (width, height) of an image as stored, None if it cannot be read."""
+    try:
+        height, width = decode(path).shape
+    except ImageError:
+        return None
+    return width, height
 
 
 def read_color(path: Path, max_size_px: int, *, stretch: bool = True) -> ColorImage:
     """Read an image in colour, as stored, its longer side shrunk to at most ``max_size_px``.
 
-    EXIF orientation is not applied; for ``stretch`` and errors see :func:`read_gray`.
+    EXIF orientation is not applied. With ``stretch`` low contrast fills the range (:func:`tones`).
+    Raises ImageError if it is no image.
     """
     size = header_size(path) if path.suffix.lower() in (".jpg", ".jpeg") else None
     is_far_larger = size is not None and max(size) >= 8 * max_size_px

@@ -1,7 +1,5 @@
 """Exact warps of images and of their regions, free of aliasing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from math import ceil, sqrt
 

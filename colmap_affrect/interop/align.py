@@ -1,7 +1,5 @@
 """Give a COLMAP model its scale and place: by positions, control points, or known distances."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -133,7 +131,7 @@ def _positions(
             f"3 are needed; known are those of {', '.join(sorted(true)[:3]) or 'none'}"
         )
     places = np.array([true[name] for name in names])
-    origin = Georeference.middle_of(places) if is_on_earth else None
+    origin = Georeference(*places.mean(axis=0).tolist()) if is_on_earth else None
     if origin:
         places = origin.in_metres(places)
     return names, np.array([old[name] for name in names]), places, origin

@@ -1,7 +1,5 @@
 """A COLMAP model for other programs: points, text, NVM, Bundler, flat photographs, tables."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -97,7 +95,6 @@ def export(
 
 
 def _recorded_images(model_path: Path) -> Path | None:
-    """Return where the photographs of a run are, if the model is that of a run."""
     recorded = Workspace(model_path.resolve().parent.parent).planned("extract") or {}
     return Path(recorded["image_path"]) if "image_path" in recorded else None
 

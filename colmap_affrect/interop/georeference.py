@@ -1,7 +1,5 @@
 """Where on earth a model is: beside COLMAP's files, which have no place for that."""
 
-from __future__ import annotations
-
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Self
@@ -13,6 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.options import reason
 from colmap_affrect.project.atomic_files import replace_text
 
 FILE_NAME = "georeference.json"
@@ -33,11 +32,6 @@ class Georeference:
     altitude: float
 
     @classmethod
-    def middle_of(cls, positions: ArrayLike) -> Self:
-        """Put the origin into the middle of some latitudes, longitudes and altitudes."""
-        return cls(*np.mean(np.asarray(positions, float), axis=0).tolist())
-
-    @classmethod
     def read(cls, model_path: Path) -> Self | None:
         """Return what is on record beside a model, None if there is nothing."""
         path = model_path / FILE_NAME
@@ -46,7 +40,7 @@ class Georeference:
         try:
             return TypeAdapter(cls).validate_json(path.read_bytes())
         except (OSError, ValidationError) as error:
-            raise StoreError(f"{path}: damaged ({error}); align the model again") from error
+            raise StoreError(f"{path}: damaged ({reason(error)}); align the model again") from error
 
     def write(self, model_path: Path) -> None:
         """Put it on record beside a model."""

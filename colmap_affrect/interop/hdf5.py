@@ -4,8 +4,6 @@ The layouts that are read and written are in :mod:`.hdf5_layouts`. Names must be
 in the folder, and every value is checked before it reaches COLMAP.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -139,20 +137,15 @@ def import_h5(
         ]
         num_verified = None
         if not skip_verification:
-            num_verified = _verify(new, len(files.pairs), random_seed, progress)
+            options = VerificationOptions(random_seed=random_seed)
+            with progress.stage("verify", len(files.pairs), "pairs") as advance:
+                verify(new, options, advance=advance)
+            num_verified = len(verified_pairs(new, options.min_num_inliers))
         new.replace(database_path)
     return InterchangeReport(
         "imported", files.layout, len(names) - len(rejected), sum(counts.values()),
         len(files.pairs), num_matches, num_verified, tuple(notes),
     )  # fmt: skip
-
-
-def _verify(path: Path, num_pairs: int, random_seed: int, progress: Progress) -> int:
-    """Verify all pairs; return how many have a two-view geometry then."""
-    options = VerificationOptions(random_seed=random_seed)
-    with progress.stage("verify", num_pairs, "pairs") as advance:
-        verify(path, options, advance=advance)
-    return len(verified_pairs(path, options.min_num_inliers))
 
 
 def _rounded(files: ForeignFiles) -> list[str]:
@@ -310,7 +303,6 @@ class _WorkspaceContent:
         self.notes: list[str] = []
 
     def features(self, name: str) -> tuple[tuple[int, int], Datasets]:
-        """Return the (width, height) of an image and its datasets as in hloc's layout."""
         found = self._features.read(name)
         data: Datasets = {
             "keypoints": found.keypoints.astype(np.float32),
@@ -320,7 +312,6 @@ class _WorkspaceContent:
         return self._sizes[name], data | frame_datasets(found.lafs)
 
     def matches(self) -> Iterator[PairMatches]:
-        """Yield the raw matches of all pairs."""
         return self._matches.read(self._pairs) if self._pairs else iter(())
 
 

@@ -16,8 +16,6 @@ Three layouts are read, two are written; in all of them (0, 0) is the centre of 
 These files are not trusted: links and data in other files are refused, and arrays are checked.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,14 +1,10 @@
 """Functions with the names and signatures of pycolmap's, for scripts that call those.
 
-With ``from colmap_affrect import pycolmap`` for ``import pycolmap`` a script has these, and all
-else of pycolmap as it is. Arguments of pycolmap that say how photographs, cameras and pairs are
-read mean the same; options that describe SIFT keep their defaults or are refused
-(:mod:`.pycolmap_options`). What a database has no place for (descriptors, scores, the record of
-options) is kept in a folder beside it, ``x.affrect`` for ``x.db``: it makes the functions go on
-where an earlier call stopped.
+Arguments that say how photographs, cameras and pairs are read mean the same; options that describe
+SIFT keep their defaults or are refused (:mod:`.pycolmap_options`). What a database has no place for
+(descriptors, scores, the record of options) is kept in a folder beside it, ``x.affrect`` for
+``x.db``: it makes the functions go on where an earlier call stopped.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -361,7 +357,6 @@ class _Cancellable(Progress):
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        """See :meth:`Progress.stage`."""
         self._check(0)
         with self._shown.stage(name, total, unit) as advance:
 

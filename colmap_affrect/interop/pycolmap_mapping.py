@@ -1,7 +1,5 @@
 """``incremental_mapping`` with pycolmap's signature, by our mapper; on any verified database."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A field that keeps pycolmap's default asks for nothing: ours stays. One that dif
 where :data:`HONOURED` has it, and refused by its name elsewhere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

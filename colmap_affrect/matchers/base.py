@@ -4,8 +4,6 @@ A matcher of another package becomes known by an entry point of the group
 ``colmap_affrect.matchers``. Several threads may call the same object at once.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable

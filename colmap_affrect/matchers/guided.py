@@ -10,11 +10,9 @@ groups whose epipolar lines (or places) lie close together, and a group is compa
 features of image 2 that any of its members may match.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal, Protocol, Self
 
 import numpy as np
 
@@ -98,7 +96,7 @@ class Guide(Protocol):
     def allowed(self, rows: Indices, columns: Indices) -> Bools:
         """Tell which of (R,) and (C,) features may match, (R, C)."""
 
-    def beside(self) -> Sequence[Guide]:
+    def beside(self) -> "Sequence[Guide]":
         """Return the geometry with image 2 moved away, so that in one of them nothing is right."""
 
 
@@ -159,7 +157,7 @@ class EpipolarGuide:
         squares = self._squares2[rows, None] + self._squares1[columns]
         return np.asarray(residuals**2 <= self._band**2 * squares)
 
-    def beside(self) -> list[EpipolarGuide]:
+    def beside(self) -> "list[EpipolarGuide]":
         """See :class:`Guide`; image 2 moves across most epipolar lines."""
         points1, points2 = self.model.points
         normals = self._lines2[:, :2] / np.sqrt(np.maximum(self._squares2, TINY))[:, None]
@@ -200,7 +198,7 @@ class HomographyGuide:
         """See :class:`Guide`."""
         return _within(self._places[rows], self._points2[columns], self._radius)
 
-    def beside(self) -> list[HomographyGuide]:
+    def beside(self) -> "list[HomographyGuide]":
         """See :class:`Guide`; what lies before or behind the plane is along one direction only."""
         points1, points2 = self.model.points
         steps = BANDS_BESIDE * self._band_px * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
@@ -219,7 +217,7 @@ class _Pencil:
     reach: tuple[float, float]  # the largest of both reaches
 
     @classmethod
-    def of(cls, indices: Indices, guide: EpipolarGuide) -> _Pencil:
+    def of(cls, indices: Indices, guide: EpipolarGuide) -> Self:
         angles = guide._angles2[indices]
         turns = np.concatenate([angles - np.pi, angles, angles + np.pi])
         first, second = (float(part[indices].max()) for part in guide._reach2)

@@ -7,8 +7,6 @@ in chunks of bounded memory; long lists coarsely at first, and exactly where tha
 (:mod:`colmap_affrect.matchers.nearest_8bit`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Literal
@@ -52,6 +50,23 @@ class NearestOptions(MatcherOptions):
     """Of matches closer than this at both ends the best one stays."""
 
 
+@dataclass(frozen=True)
+class MatchableImage:
+    """What matching needs of one image, prepared once for all of its pairs."""
+
+    descriptors: Singles  # (N, D) float32 rows of unit length
+    keypoints: Floats  # (N, 2) pixel-centre px
+    rivals: NeighborLists  # for each feature those too close to serve as its second neighbour
+    # the descriptors in few bits; None where that does not pay
+    coarse: CoarseDescriptors | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all arrays, on whatever device."""
+        kept = (self.descriptors, self.keypoints, self.rivals.starts, self.rivals.indices)
+        return sum(array.nbytes for array in kept) + (self.coarse.nbytes if self.coarse else 0)
+
+
 class NearestNeighbors:
     """Compares all descriptors; where the memory of a GPU is full, a CPU does, just the same."""
 
@@ -76,23 +91,6 @@ class NearestNeighbors:
             partial(match_features, first, second, self.options),
             partial(match_features, exact[0], exact[1], self.options),
         )
-
-
-@dataclass(frozen=True)
-class MatchableImage:
-    """What matching needs of one image, prepared once for all of its pairs."""
-
-    descriptors: Singles  # (N, D) float32 rows of unit length
-    keypoints: Floats  # (N, 2) pixel-centre px
-    rivals: NeighborLists  # for each feature those too close to serve as its second neighbour
-    # the descriptors in few bits; None where that does not pay
-    coarse: CoarseDescriptors | None = None
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of all arrays, on whatever device."""
-        kept = (self.descriptors, self.keypoints, self.rivals.starts, self.rivals.indices)
-        return sum(array.nbytes for array in kept) + (self.coarse.nbytes if self.coarse else 0)
 
 
 def matchable(

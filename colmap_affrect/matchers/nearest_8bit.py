@@ -9,8 +9,6 @@ that the matches are those of exact similarities.
 torch is loaded here, when there is enough to match to pay for that.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -28,8 +26,7 @@ MIN_SIMILARITIES_PER_CORE = 6e8  # with fewer than this, loading torch takes lon
 
 ERROR_SIGMAS = 6.0
 MAX_CODE, ZERO_CODE = 127, 128
-CODE_STEP = 1.0 / 250
-"""Of similarities in 8 bits; negative ones are 0, errors may make some more than 1."""
+CODE_STEP = 1.0 / 250  # of 8-bit similarities; negative ones are 0, errors make some more than 1
 NUM_ROWS_8_BIT = 512  # rows of similarities computed at once, a multiple of ``SIZE_MULTIPLE``
 SIZE_MULTIPLE = 256
 """Both factors of a product are filled up to a multiple of it: oneDNN prepares and keeps a program
@@ -266,7 +263,6 @@ def _part(
 
 
 def _joined(parts: list[ShortList]) -> ShortList:
-    """Put the lists of consecutive rows together."""
     begins = np.cumsum([0, *(len(part.rows) for part in parts)])
     moved = (replace(p, entry_rows=p.entry_rows + b) for p, b in zip(parts, begins, strict=False))
     none = np.zeros(0, np.int64)

@@ -1,7 +1,5 @@
 """What a pair is, lists of millions of them, and the options of how pairs are chosen."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Literal, overload
 
@@ -31,7 +29,7 @@ class PairList(Sequence[Pair]):
         self.names, self.numbers = names, numbers.astype(np.int32, copy=False).reshape(-1, 2)
 
     @classmethod
-    def of(cls, pairs: Iterable[Pair]) -> PairList:
+    def of(cls, pairs: Iterable[Pair]) -> "PairList":
         """Make a list of any pairs, in their order."""
         if isinstance(pairs, PairList):
             return pairs
@@ -46,8 +44,8 @@ class PairList(Sequence[Pair]):
     @overload
     def __getitem__(self, index: int) -> Pair: ...
     @overload
-    def __getitem__(self, index: slice) -> PairList: ...
-    def __getitem__(self, index: int | slice) -> Pair | PairList:
+    def __getitem__(self, index: slice) -> "PairList": ...
+    def __getitem__(self, index: int | slice) -> "Pair | PairList":
         if isinstance(index, slice):
             return PairList(self.names, self.numbers[index])
         first, second = self.numbers[index].tolist()
@@ -58,7 +56,7 @@ class PairList(Sequence[Pair]):
             for first, second in self.numbers[start : start + AT_ONCE].tolist():
                 yield self.names[first], self.names[second]
 
-    def at(self, which: Bools | NDArray[np.integer] | slice) -> PairList:
+    def at(self, which: Bools | NDArray[np.integer] | slice) -> "PairList":
         """Return the pairs of a slice, of a mask (N,), or at indices in their order."""
         return PairList(self.names, self.numbers[which])
 

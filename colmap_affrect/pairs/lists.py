@@ -1,7 +1,5 @@
 """Lists of pairs: all, by sequence or place, the most similar; their order, and their files."""
 
-from __future__ import annotations
-
 import difflib
 import itertools
 import re

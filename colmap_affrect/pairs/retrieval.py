@@ -1,4 +1,4 @@
-"""Which images show the same, by one vector per image (VLAD).
+"""Which images show the same: by one vector per image (VLAD), or by their strongest features.
 
 The vocabulary is built from descriptors of the images themselves. An image is described by the sums
 of the differences between its descriptors and their nearest words (Jegou et al., Aggregating local
@@ -6,8 +6,6 @@ descriptors into a compact image representation, 2010), each sum of unit length 
 roots, so that neither repeated structures nor single words decide (Arandjelovic and Zisserman, All
 about VLAD, 2013). What all images have in common is subtracted.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -17,8 +15,10 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.arrays import Indices, Singles
+from colmap_affrect.matchers.base import Matches
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import most_similar_pairs
+from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
 
 NUM_WORDS = 256
@@ -115,3 +115,37 @@ def _original_descriptors(features: LocalFeatures) -> Singles:
     """Return the (N, D) descriptors of the image itself; with those of warps recall is lower."""
     descriptors = features.descriptors[features.rectification_ids == 0]
     return np.asarray(descriptors, dtype=np.float32)
+
+
+NUM_STRONGEST = 1000  # features of each image that low-resolution matching looks at
+IMAGES_AT_ONCE = 256  # pairs are matched in blocks of that many images with that many others
+
+
+def low_resolution_pairs(
+    names: Sequence[str], match: Callable[[Pair], Matches], num_neighbors: int, progress: Progress
+) -> list[Pair]:
+    """Return the pairs of images of which the strongest features have the most matches.
+
+    ``match`` should keep ``2 * IMAGES_AT_ONCE`` images; neighbours are counted on average.
+    """
+    counts = np.zeros((len(names), len(names)), np.uint16)
+
+    def count(pair: tuple[int, int]) -> tuple[int, int, int]:
+        return *pair, len(match((names[pair[0]], names[pair[1]])).indices)
+
+    num_pairs = len(names) * (len(names) - 1) // 2
+    with progress.stage("low resolution", num_pairs, "pairs") as advance:
+        for i, j, matches in map_ordered(count, in_blocks(len(names)), available_cores()):
+            counts[i, j] = counts[j, i] = matches
+            advance(1)
+    return most_similar_pairs(names, counts, num_neighbors)
+
+
+def in_blocks(count: int) -> Iterator[tuple[int, int]]:
+    """Yield all pairs of numbers below ``count``, those of the same numbers close together."""
+    begins = range(0, count, IMAGES_AT_ONCE)
+    for begin1 in begins:
+        for begin2 in begins[begin1 // IMAGES_AT_ONCE :]:
+            for i in range(begin1, min(begin1 + IMAGES_AT_ONCE, count)):
+                for j in range(max(i + 1, begin2), min(begin2 + IMAGES_AT_ONCE, count)):
+                    yield i, j

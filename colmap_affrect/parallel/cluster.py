@@ -26,9 +26,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+import cv2
+from threadpoolctl import threadpool_limits
+
 from colmap_affrect.errors import ClusterError
-from colmap_affrect.parallel.executor import Result, Task, use_one_blas_thread
-from colmap_affrect.parallel.opencv_threads import use_one_opencv_thread
+from colmap_affrect.parallel.executor import Result, Task
 
 if TYPE_CHECKING:
     from distributed import Client, Future, Security
@@ -36,12 +38,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT_S = 10.0
-POLL_S = 2.0
-"""How often the scheduler is asked for the number of workers."""
-
-TASKS_PER_THREAD = 2
-"""One that is being worked on and one that waits, so that no worker has to."""
-
+POLL_S = 2.0  # how often the scheduler is asked for the number of workers
+TASKS_PER_THREAD = 2  # one that is being worked on and one that waits, so that no worker has to
 FINGERPRINT_BYTES = 1 << 16
 
 PACKAGES = (
@@ -119,8 +117,8 @@ def _function(job: _Job) -> Callable[[Any], Any]:
     """Unpickle a function once per process; the next one replaces it and frees its memory."""
     paths = [path for path, _ in job.environment.files]
     job.environment.require_same(WorkerEnvironment.of(paths))
-    use_one_blas_thread()
-    use_one_opencv_thread()
+    threadpool_limits(1, user_api="blas")
+    cv2.setNumThreads(1)
     function: Callable[[Any], Any] = pickle.loads(job.function)  # noqa: S301 - from the driver
     return function
 
@@ -220,7 +218,6 @@ class Cluster:
     """An :class:`~colmap_affrect.parallel.executor.Executor` on the workers of a cluster."""
 
     def __init__(self, client: Client, address: str) -> None:
-        """Take a client that is connected to the scheduler of this address."""
         self._client, self._address = client, address
         self._num_threads, self._asked_at = 0, -POLL_S
 

@@ -4,8 +4,6 @@ An :class:`Executor` says where: in threads of this process (:class:`Threads`), 
 a cluster (:mod:`colmap_affrect.parallel.cluster`). Results do not depend on it.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys
@@ -19,11 +17,8 @@ from typing import Protocol, TypeVar
 
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-BYTES_PER_RSS = 1 if sys.platform == "darwin" else 1024
-"""Unit of ``getrusage``."""
-
-ASSUMED_MEMORY_BYTES = 8 << 30
-"""Of systems that do not say what they have."""
+BYTES_PER_RSS = 1 if sys.platform == "darwin" else 1024  # unit of ``getrusage``
+ASSUMED_MEMORY_BYTES = 8 << 30  # of systems that do not say what they have
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -49,7 +44,6 @@ class Threads:
     """Work in threads of this process."""
 
     def __init__(self, num_threads: int) -> None:
-        """Set the number of tasks at a time."""
         self._num_threads = num_threads
 
     def sees(self, paths: Sequence[Path]) -> bool:
@@ -123,11 +117,6 @@ def one_openmp_thread() -> Iterator[None]:
     """
     with _loaded_libraries().limit(limits=1, user_api="openmp"):
         yield
-
-
-def use_one_blas_thread() -> None:
-    """Keep numpy's linear algebra to the calling thread from now on, in all of this process."""
-    threadpool_limits(1, user_api="blas")
 
 
 @cache

@@ -1,15 +1,8 @@
 """OpenCV's own threads, shared among those of this process."""
 
-from __future__ import annotations
-
 from threading import Lock
 
 import cv2
-
-
-def use_one_opencv_thread() -> None:
-    """Keep OpenCV to the calling thread from now on, in all of this process."""
-    cv2.setNumThreads(1)
 
 
 class _SharedThreads:
@@ -37,5 +30,4 @@ class _SharedThreads:
         cv2.setNumThreads(max(1, self._num_threads // max(1, num_inside)))
 
 
-SHARED_OPENCV_THREADS = _SharedThreads()
-"""To be held while an image is worked on."""
+SHARED_OPENCV_THREADS = _SharedThreads()  # to be held while an image is worked on

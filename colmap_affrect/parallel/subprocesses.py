@@ -3,8 +3,6 @@
 Started by their module's name, not by ``multiprocessing``, which would run a user's script again.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

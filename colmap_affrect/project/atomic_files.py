@@ -1,7 +1,5 @@
 """Files that change as a whole or not at all, also when the program is killed or the disk full."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import io
@@ -161,7 +159,6 @@ class FileTransaction(io.RawIOBase):
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a file that exists."""
         super().__init__()
         apply_journal(path)
         self._path = path
@@ -221,11 +218,12 @@ class FileTransaction(io.RawIOBase):
         ):
             self._page(number)  # cut off and now 0
         pages = sorted(self._pages.items())
-        inside = [(number, page) for number, page in pages if self._is_stored(number)]
+        page_end = ceil(self._stored_size / PAGE_BYTES) * PAGE_BYTES  # of the last stored page
+        inside = [(number, page) for number, page in pages if number * PAGE_BYTES < page_end]
         try:
             with self._path.open("r+b") as file:
                 file.seek(self._stored_size)
-                file.write(bytes(max(0, min(self._size, self._page_end) - self._stored_size)))
+                file.write(bytes(max(0, min(self._size, page_end) - self._stored_size)))
                 following = -1
                 for number, page in pages[len(inside) :]:
                     if number != following:
@@ -240,14 +238,6 @@ class FileTransaction(io.RawIOBase):
             os.truncate(self._path, self._stored_size)
             raise
         apply_journal(self._path)
-
-    @property
-    def _page_end(self) -> int:
-        """End of the page that the end of the stored file is in."""
-        return ceil(self._stored_size / PAGE_BYTES) * PAGE_BYTES
-
-    def _is_stored(self, number: int) -> bool:
-        return number * PAGE_BYTES < self._stored_size
 
     def _page(self, number: int) -> bytearray:
         """Return a page that may be changed."""

@@ -4,8 +4,6 @@ The digest of what an image was extracted from is stored with its features; here
 reading files again, and the digests of what a database and a list of pairs were made from.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """What is asked of all images of a file of features, kept so that thousands need not be opened."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable

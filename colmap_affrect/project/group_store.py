@@ -1,7 +1,5 @@
 """A HDF5 file of groups that are complete or do not count, which changes as a whole."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -76,7 +74,6 @@ class GroupStore:
             ) from error
 
     def _create(self) -> None:
-        """Make the file without groups."""
         content = io.BytesIO()
         with h5py.File(content, "w") as file:
             file.attrs["format"] = f"colmap_affrect/{self.kind}"

@@ -1,7 +1,5 @@
 """What stages and runs report: frozen, printable, JSON out."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

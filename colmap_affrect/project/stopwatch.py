@@ -1,7 +1,5 @@
 """Seconds by step, wherever steps are timed."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

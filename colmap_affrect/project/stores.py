@@ -1,21 +1,12 @@
-"""Features and matches of a run in HDF5, in hloc's layout.
+"""Features and matches of a run in HDF5, in hloc's layout (docs/formats.md).
 
-``features.h5``: a group per image name with ``keypoints`` (N, 2) float32, ``descriptors``
-(D, N) float16, ``scores`` (N,), ``image_size`` (width, height) and, of our own, ``lafs``
-(N, 2, 3) float32 and, for hloc's matchers, their ``scales`` (sigmas in px) and ``oris`` (degrees
-from x towards y), ``rectification_ids`` (N,), and ``level_ends``: the features of level k of
-escalation follow those of level k - 1 and end at ``level_ends[k]``. Descriptors of several sizes
-are filled up with zeros, which change no distance. ``matches.h5``: a group
-per pair with ``matches0`` (N0,), -1 where unmatched, ``matching_scores0`` (N0,) and the
+The features of level k of escalation follow those of level k - 1 and end at ``level_ends[k]``;
+descriptors of several sizes are filled up with zeros, which change no distance. Matches have the
 attributes ``level``, whose features were matched together with those of level 0, and
-``tried_level``, the highest that was tried. ``guided.h5``: a group per pair that was matched again
-by its geometry. Coordinates have their origin at the centre of the
-first pixel. Files are opened for one image or one batch of pairs and closed again; what is
-written in between appears as a whole (:mod:`colmap_affrect.project.atomic_files`). A group without
-the attribute ``complete``, of another program, does not count.
+``tried_level``, the highest that was tried. ``guided.h5`` has a group per pair that was matched
+again by its geometry. Files are opened for one image or one batch of pairs and closed again; what
+is written in between appears as a whole (:mod:`colmap_affrect.project.atomic_files`).
 """
-
-from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -74,7 +65,6 @@ class FeatureStore(GroupStore):
     kind = "features"
 
     def _entries(self) -> Entries:
-        """Return the complete groups."""
         if not self.path.exists():
             return {}
         with self._open("r") as file:

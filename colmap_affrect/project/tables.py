@@ -1,7 +1,5 @@
 """Tables that the user gives: CSV files with a header."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The output folder: its files, its lock, and the record of the options that made them."""
 
-from __future__ import annotations
-
 import logging
 import os
 import shutil
@@ -79,7 +77,7 @@ class Workspace:
         """Return the workspace of a user's database: ``x.affrect`` beside ``x.db``."""
         return cls(database_path.with_suffix(".affrect"), database_path)
 
-    def branch(self, path: Path) -> Workspace:
+    def branch(self, path: Path) -> "Workspace":
         """Make another folder with the same features, pairs, raw matches and records of cameras.
 
         Files are shared where the file system can do that.
@@ -99,7 +97,7 @@ class Workspace:
         return made
 
     @contextmanager
-    def locked(self) -> Iterator[Workspace]:
+    def locked(self) -> Iterator[Self]:
         """Create the folder and keep other runs out; WorkspaceError when that cannot be done."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -120,7 +118,7 @@ class Workspace:
             lock.release()
 
     @contextmanager
-    def locked_or_read_only(self) -> Iterator[Workspace]:
+    def locked_or_read_only(self) -> Iterator[Self]:
         """Keep other runs out as :meth:`locked`; a folder that cannot be written needs no lock."""
         with ExitStack() as stack:
             try:

@@ -4,19 +4,17 @@ A rectifier of another package becomes known by an entry point of the group
 ``colmap_affrect.rectifiers``. Several threads may call the same object at once.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, SerializeAsAny
 
 from colmap_affrect.data import Photograph, RectificationPlan
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.base import SHAPES, ShapeOptions, ShapeSource
 from colmap_affrect.features.shapes.second_moment import SecondMomentOptions
+from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.tilts import Cover, cover_shapes
 from colmap_affrect.images.depth import DepthSource
 from colmap_affrect.options import PartOptions, Registry, within
@@ -73,9 +71,7 @@ class CoverOptions(AffineWarpOptions):
     max_num_rectifications: Annotated[int, within(0, 192)] = 8
     """Upper bound on the covering maps."""
 
-    def cover(
-        self, metrics: NDArray[np.floating], votes: NDArray[np.floating] | None = None
-    ) -> Cover:
+    def cover(self, metrics: Floats, votes: Floats | None = None) -> Cover:
         """Cover (N, 3) metrics, each with one vote unless (N,) votes are given."""
         return cover_shapes(
             metrics,

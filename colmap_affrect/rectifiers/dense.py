@@ -3,8 +3,6 @@
 The paper's DenseAffNet (Sec. 3) with an exchangeable shape source.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 import numpy as np
@@ -15,8 +13,7 @@ from colmap_affrect.options import within
 from colmap_affrect.rectifiers.base import CoverOptions, WithInputs
 from colmap_affrect.rectifiers.regions import Region, affine_rectification
 
-GAP_BLOCKS = 5
-"""Groups of blocks closer than this are warped together."""
+GAP_BLOCKS = 5  # groups of blocks closer than this are warped together
 
 
 class DenseShapesOptions(CoverOptions):

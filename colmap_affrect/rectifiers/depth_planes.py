@@ -5,8 +5,6 @@ normals from a depth map, their clusters on the sphere, connected segments of ea
 paper's DepthAffNet warps each as ``affnet-shapes`` does, by a cover of the shapes inside it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan
+from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.planes import (
     cluster_normals,
     fronto_parallel_homography,
@@ -37,7 +36,7 @@ class PlanarSegment:
     """Connected part of an image, and its (3,) unit normal in camera coordinates, facing us."""
 
     region: Region
-    normal: NDArray[np.float64]
+    normal: Array
 
 
 class PlaneOptions(Options):
@@ -95,7 +94,7 @@ class DepthPlanes(WithInputs):
 
 
 def planar_segments(
-    photograph: Photograph, depth: NDArray[np.floating], options: PlaneOptions
+    photograph: Photograph, depth: Floats, options: PlaneOptions
 ) -> list[PlanarSegment]:
     """Segment a photograph into connected parts of planes.
 
@@ -133,7 +132,7 @@ def planar_segments(
 
 
 def _resampled(
-    labels: NDArray[np.int32], labels_from_image: NDArray[np.float64], size: tuple[int, int]
+    labels: NDArray[np.int32], labels_from_image: Array, size: tuple[int, int]
 ) -> NDArray[np.int32]:
     """Give each pixel of an image of (width, height) its nearest label; the map only scales."""
     columns, rows = (
@@ -146,7 +145,6 @@ def _resampled(
 
 
 def _union(segments: list[PlanarSegment], size: tuple[int, int]) -> Mask:
-    """Return the (H, W) mask of all segments."""
     mask = np.zeros(size[::-1], dtype=bool)
     for segment in segments:
         left, top = segment.region.origin

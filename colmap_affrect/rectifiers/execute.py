@@ -1,11 +1,8 @@
 """Execute a rectification plan: warp, detect, carry back, choose, describe, unite."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.data import (
@@ -21,14 +18,14 @@ from colmap_affrect.data import (
 )
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.geometry.affine import ellipse_extents, transform_frames
+from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.geometry.neighbors import neighbors_within
 from colmap_affrect.images.masks import mask_values
 from colmap_affrect.images.warping import warp, warp_mask
 
 DUPLICATE_RADIUS_SIGMAS = 0.5
 MAX_DUPLICATE_RADIUS_PX = 4.0
-SAME_SCALE_RATIO = 2 ** (1 / 3)
-"""One layer of a scale space with three layers per octave."""
+SAME_SCALE_RATIO = 2 ** (1 / 3)  # one layer of a scale space with three layers per octave
 
 
 def extract_rectified(
@@ -69,7 +66,7 @@ def extract_rectified(
     return union([features.with_rectification_id(number) for number, features in numbered])
 
 
-def _warped(source: NDArray[np.float32], rectification: Rectification, mask: Mask | None) -> View:
+def _warped(source: Singles, rectification: Rectification, mask: Mask | None) -> View:
     size = (source.shape[1], source.shape[0])
     inside = warp_mask(rectification, size)
     if mask is not None:
@@ -79,7 +76,6 @@ def _warped(source: NDArray[np.float32], rectification: Rectification, mask: Mas
 
 
 def _carried(features: LocalFeatures, rectification: Rectification | None) -> LocalFeatures:
-    """Carry features of a view back into the image."""
     if rectification is None:
         return features
     return features.with_frames(transform_frames(rectification.image_from_rectified, features.lafs))

@@ -1,21 +1,16 @@
 """Regions of an image and the warps that show them, each on a canvas that just holds it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.data import Mask, Rectification, in_mask
-from colmap_affrect.geometry.affine import project, transform_frames
-from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
+from colmap_affrect.geometry.affine import fit_canvas, project, rectifying_affine, transform_frames
+from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 
-MARGIN_PX = 16.0
-"""Surroundings of a region that its descriptors may see, in warp px."""
-
+MARGIN_PX = 16.0  # surroundings of a region that its descriptors may see, in warp px
 CANVAS_RATIO = 2.0
 """Area of a homography's canvas, its margin left out, in units of the region's area in the image.
 As the authors chose it."""
@@ -23,22 +18,17 @@ As the authors chose it."""
 
 @dataclass(frozen=True)
 class Region:
-    """Part of an image.
+    """Part of an image."""
 
-    Attributes:
-        mask: (h, w) bool, cropped to the part.
-        origin: (x, y) image pixel of the mask's first pixel.
-    """
-
-    mask: Mask
-    origin: tuple[int, int]
+    mask: Mask  # (h, w) bool, cropped to the part
+    origin: tuple[int, int]  # (x, y) image pixel of the mask's first pixel
 
     @property
     def area_px(self) -> int:
         """Number of its pixels."""
         return int(np.count_nonzero(self.mask))
 
-    def outline(self) -> NDArray[np.float64]:
+    def outline(self) -> Array:
         """Return (N, 2) pixel centres in the image whose convex hull is that of the region."""
         rows = np.flatnonzero(self.mask.any(axis=1))
         first = self.mask[rows].argmax(axis=1)
@@ -46,12 +36,12 @@ class Region:
         points = np.stack([np.concatenate([first, last]), np.concatenate([rows, rows])], axis=1)
         return np.asarray(points + self.origin, dtype=np.float64)
 
-    def middle(self) -> NDArray[np.float64]:
+    def middle(self) -> Array:
         """Return the (2,) mean of its pixel centres in the image."""
         rows, columns = np.nonzero(self.mask)
         return np.array([columns.mean(), rows.mean()]) + self.origin
 
-    def contains(self, points: NDArray[np.floating]) -> Mask:
+    def contains(self, points: Floats) -> Mask:
         """Tell which (N, 2) points, rounded to pixels, belong to it."""
         return in_mask(self.mask, points, self.origin)
 
@@ -67,9 +57,7 @@ def affine_rectification(
     )
 
 
-def homography_rectification(
-    region: Region, homography: NDArray[np.float64], segment_id: int
-) -> Rectification:
+def homography_rectification(region: Region, homography: Array, segment_id: int) -> Rectification:
     """Show a region by a homography, scaled so that the canvas has twice the region's area.
 
     It has a positive determinant, and positive third coordinates all over the region.

@@ -1,14 +1,10 @@
 """Rectifiers whose warps show the whole photograph: none, a fixed cover, a cover of its shapes."""
 
-from __future__ import annotations
-
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from colmap_affrect.data import Photograph, Rectification, RectificationPlan
-from colmap_affrect.geometry.canvas import fit_canvas, image_corners, rectifying_affine
+from colmap_affrect.geometry.affine import fit_canvas, image_corners, rectifying_affine
+from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.tilts import asift_covering, near_optimal_covering
 from colmap_affrect.rectifiers.base import (
     AffineWarpOptions,
@@ -73,7 +69,7 @@ class AffNetShapes(WithInputs):
 
 
 def plan_whole_image(
-    image_size: tuple[int, int], centers: NDArray[np.floating], options: AffineWarpOptions
+    image_size: tuple[int, int], centers: Floats, options: AffineWarpOptions
 ) -> RectificationPlan:
     """Warp an image of (width, height) as a whole by (K, 2) classes (tilt, angle_rad)."""
     items = []

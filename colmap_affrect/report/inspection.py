@@ -1,7 +1,5 @@
 """Show what a recipe does to an image: sheets to look at, and the plan as data."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,13 +1,10 @@
 """One level of a recipe carried out on one photograph, with all that is decided on the way."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.data import (
     GrayImage,
@@ -19,6 +16,7 @@ from colmap_affrect.data import (
     View,
 )
 from colmap_affrect.features.base import FeatureExtractor, ShapeSource
+from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.images.depth import DepthSource
 from colmap_affrect.project.stopwatch import Stopwatch
 from colmap_affrect.rectifiers.base import RectifierOptions
@@ -31,30 +29,21 @@ PIXELS_PER_MEGAPIXEL = 1_000_000
 
 @dataclass(frozen=True)
 class InspectedLevel:
-    """One level of a recipe, carried out on one photograph.
+    """One level of a recipe, carried out on one photograph."""
 
-    Attributes:
-        number: 0 for the level that every image gets.
-        photograph: at the size of processing; coordinates are px of it where nothing else is said.
-        warning: why it was not rectified though it was to be; empty if all went well.
-        views: what features were looked for in, by rectification id; 0 is the photograph itself.
-        found: all features detected there, frames in px of the view.
-        features: those of all views that were kept.
-        shapes: what the rectifier read; None if it reads no shapes.
-        depth: (h, w) z-depth that it read; None if it reads no depth.
-    """
-
-    number: int
+    number: int  # 0 for the level that every image gets
     options: RectifierOptions
     extractor_name: str
+    # at the size of processing; coordinates are px of it where nothing else is said
     photograph: Photograph
     plan: RectificationPlan
-    warning: str
+    warning: str  # why it was not rectified though it was to be; empty if all went well
+    # what features were looked for in, by rectification id; 0 is the photograph itself
     views: Mapping[int, View]
-    found: Mapping[int, LocalFeatures]
-    features: LocalFeatures
-    shapes: ShapeSamples | None
-    depth: NDArray[np.floating] | None
+    found: Mapping[int, LocalFeatures]  # all features detected there, frames in px of the view
+    features: LocalFeatures  # those of all views that were kept
+    shapes: ShapeSamples | None  # what the rectifier read; None if it reads no shapes
+    depth: Floats | None  # (h, w) z-depth that it read; None if it reads no depth
     seconds: Mapping[str, float]
 
     def kept_of(self, rectification_id: int) -> LocalFeatures:
@@ -130,7 +119,7 @@ class _Recorder(TimedFeatures):
 
 def _read_again(
     extractor: ImageExtractor, photograph: Photograph, number: int, *, with_depth: bool
-) -> tuple[ShapeSamples | None, NDArray[np.floating] | None]:
+) -> tuple[ShapeSamples | None, Floats | None]:
     """Read the shapes and the depth map that the rectifier of a level has read; None for none."""
     is_asked = min(photograph.size) >= MIN_RECTIFIABLE_PX
     rectifier = extractor.rectifiers[number] if is_asked else None

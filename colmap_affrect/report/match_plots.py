@@ -1,24 +1,22 @@
 """Verified pairs drawn with their inliers, the two photographs side by side, as parts of a page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.errors import AffrectError
+from colmap_affrect.geometry.arrays import Array, Bools
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.report.pictures import Picture
 
 MAX_NUM_LINES = 100
 
-PLOT_HEIGHT, GAP = 300.0, 8.0
-"""Of two photographs side by side, in units of the plot."""
+PLOT_HEIGHT, GAP = 300.0, 8.0  # of two photographs side by side, in units of the plot
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,7 @@ class SideBySide:
     widths: tuple[float, float]
 
     @classmethod
-    def of(cls, names: Pair, pictures: Mapping[str, Picture]) -> SideBySide:
+    def of(cls, names: Pair, pictures: Mapping[str, Picture]) -> Self:
         """Put the pictures of a pair side by side."""
         first, second = (PLOT_HEIGHT * pictures[n].width / pictures[n].height for n in names)
         return cls(names, (first, second))
@@ -47,19 +45,13 @@ class SideBySide:
 
 @dataclass(frozen=True)
 class MatchPlot:
-    """The inliers of a pair, to be drawn over its photographs.
-
-    Attributes:
-        num_from_warps: inliers with a feature from a warp.
-        plain, warped: SVG paths of the lines of the others and of these.
-        missing: why there are no lines; empty if there are, or nothing was verified.
-    """
+    """The inliers of a pair, to be drawn over its photographs."""
 
     num_inliers: int
-    num_from_warps: int = 0
-    plain: str = ""
-    warped: str = ""
-    missing: str = ""
+    num_from_warps: int = 0  # inliers with a feature from a warp
+    plain: str = ""  # SVG path of the lines of the others
+    warped: str = ""  # and of these
+    missing: str = ""  # why there are no lines; empty if there are, or nothing was verified
 
 
 def plot_inliers(
@@ -86,7 +78,7 @@ def plot_inliers(
 
 def _read_inliers(
     pairs: Sequence[Pair], database_path: Path, features_path: Path
-) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
+) -> list[tuple[Array, Bools]]:
     """Read the inliers of pairs.
 
     For each pair: (M, 2, 2) ends of its inliers, (x, y) in both images as shares of their sides,
@@ -114,9 +106,7 @@ def _read_inliers(
     return found
 
 
-def _plot(
-    num_inliers: int, shown: SideBySide, ends: NDArray[np.float64], from_warps: NDArray[np.bool_]
-) -> MatchPlot:
+def _plot(num_inliers: int, shown: SideBySide, ends: Array, from_warps: Bools) -> MatchPlot:
     points = ends * [[shown.widths[0], PLOT_HEIGHT], [shown.widths[1], PLOT_HEIGHT]]
     points[:, 1, 0] += shown.second_left
     every = max(1, -(-len(points) // MAX_NUM_LINES))

@@ -1,7 +1,5 @@
 """Pages that need nothing beside them, made from the parts in ``templates`` (home of jinja2)."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """Photographs as small pictures that are part of a page."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,8 +13,7 @@ from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import SILENT, Progress
 
 JPEG_QUALITY = 70
-MAX_TOTAL_PX, MAX_SIDE_PX = 12_000_000, 640
-"""Of all thumbnails of a page, and of each."""
+MAX_TOTAL_PX, MAX_SIDE_PX = 12_000_000, 640  # of all thumbnails of a page, and of each
 MAX_NUM_THUMBNAILS = 1000
 
 

@@ -1,7 +1,5 @@
 """The regions of a plan: where they lie, how large they are, and their colours in pictures."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap, to_rgb
@@ -9,6 +7,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import Mask, Rectification, RectificationPlan
 from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.arrays import Array
 
 Color = tuple[float, float, float]
 Size = tuple[int, int]
@@ -63,7 +62,7 @@ def bounding_box(item: Rectification, image_size: Size) -> tuple[int, int, int, 
     return left + item.region_origin[0], top + item.region_origin[1], width, height
 
 
-def region_middle(region: Mask, origin: tuple[int, int]) -> NDArray[np.float64]:
+def region_middle(region: Mask, origin: tuple[int, int]) -> Array:
     """Return the (2,) pixel of an (h, w) region that is nearest to its centre of mass, image px."""
     rows, columns = np.nonzero(region)
     points = np.stack([columns, rows], axis=1).astype(np.float64)
@@ -71,9 +70,7 @@ def region_middle(region: Mask, origin: tuple[int, int]) -> NDArray[np.float64]:
     return np.asarray(points[nearest] + origin)
 
 
-def circle_origin(
-    item: Rectification, middle: NDArray[np.float64], radius_px: float
-) -> NDArray[np.float64]:
+def circle_origin(item: Rectification, middle: Array, radius_px: float) -> Array:
     """Return the (2, N) ellipse round a point, image px, that a warp turns into a circle.
 
     Its area is that of a circle of ``radius_px``.

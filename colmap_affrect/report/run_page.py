@@ -1,7 +1,5 @@
 """A run as one page, ``report.html`` beside ``report.json``."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -41,8 +39,7 @@ SOURCES = {
     "guess": "guess",
 }
 
-MAX_NUM_CAMERAS = 200
-"""In the table; report.json has all."""
+MAX_NUM_CAMERAS = 200  # in the table; report.json has all
 
 
 @dataclass(frozen=True)
@@ -182,7 +179,6 @@ def _guided(report: ReconstructionReport) -> str:
 
 
 def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str, Any]:
-    """Return the table of cameras, each with its place on the scale of all focal lengths."""
     shown = report.cameras[:MAX_NUM_CAMERAS]
     values = [value for camera in shown for value in _focals(camera)]
     low, high = (min(values), max(values)) if values else (0.0, 0.0)

@@ -1,53 +1,37 @@
 """Cameras and points of models, in one frame, to be drawn in a page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import registered_names
 from colmap_affrect.errors import AffrectError
+from colmap_affrect.geometry.arrays import Array, Bytes
 from colmap_affrect.report.pictures import base64_text
 
-Array = NDArray[np.float64]
-
-MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE = 20_000, 40_000
-"""Of a model, and of all that are on a page."""
-POINT_PERCENTILE = 90.0
-"""Share of the points, from the middle outwards, that the view is made to hold."""
+MAX_NUM_POINTS, MAX_NUM_POINTS_OF_PAGE = 20_000, 40_000  # of a model, and of all that are on a page
+POINT_PERCENTILE = 90.0  # share of the points, from the middle outwards, that the view holds
 RADIUS_MARGIN = 1.15
-MIN_COMMON_DIRECTION = 0.3
-"""Length of the mean of horizontal viewing directions from which a model has a front."""
-
-CAMERA_DEPTH = 0.07
-"""Depth of the pyramids that stand for cameras, as a share of the view's radius."""
-MAX_HALF_WIDTH = 0.8
-"""Of the base of a pyramid per depth, for cameras with a very wide view."""
-
-DARKEST, COLOR_RANGE = 60, 140
-"""Colours of points are squeezed so that they show on light and on dark ground."""
+MIN_COMMON_DIRECTION = 0.3  # length of the mean horizontal viewing direction that gives a front
+CAMERA_DEPTH = 0.07  # depth of the pyramids that stand for cameras, as a share of the view's radius
+MAX_HALF_WIDTH = 0.8  # of the base of a pyramid per depth, for cameras with a very wide view
+DARKEST, COLOR_RANGE = 60, 140  # colours of points are squeezed to show on light and on dark ground
 
 
 @dataclass(frozen=True)
 class View3D:
-    """A model ready for the page; lengths in units of the view's radius.
-
-    Attributes:
-        points: (N, 3) uint16 positions from -1 to 1 and then (N, 3) uint8 colours, as base64.
-        cameras: name and (5, 3) centre and corners of the pyramid of each camera.
-        note: what is special about it; empty if nothing is.
-    """
+    """A model ready for the page; lengths in units of the view's radius."""
 
     num_points: int = 0
+    # (N, 3) uint16 positions from -1 to 1 and then (N, 3) uint8 colours, as base64
     points: str = ""
+    # name and (5, 3) centre and corners of the pyramid of each camera
     cameras: tuple[tuple[str, Array], ...] = ()
-    note: str = ""
+    note: str = ""  # what is special about it; empty if nothing is
 
     def script_data(self, index: Mapping[str, int], kinds: Mapping[str, str]) -> dict[str, Any]:
         """Return what the script of the page reads.
@@ -69,23 +53,16 @@ class View3D:
 
 @dataclass(frozen=True)
 class Model:
-    """A model as arrays.
-
-    Attributes:
-        centers: (M, 3) of the cameras.
-        axes: (M, 3, 3) rotations world_from_camera.
-        half_sizes: (M, 2) half width and height of the view at depth 1.
-        points, colors: (N, 3) and (N, 3) uint8.
-    """
+    """A model as arrays."""
 
     names: tuple[str, ...]
-    centers: Array
-    axes: Array
-    half_sizes: Array
-    points: Array
-    colors: NDArray[np.uint8]
+    centers: Array  # (M, 3) of the cameras
+    axes: Array  # (M, 3, 3) rotations world_from_camera
+    half_sizes: Array  # (M, 2) half width and height of the view at depth 1
+    points: Array  # (N, 3)
+    colors: Bytes  # (N, 3)
 
-    def transformed(self, scale: float, rotation: Array, translation: Array) -> Model:
+    def transformed(self, scale: float, rotation: Array, translation: Array) -> Self:
         """Return it after x -> scale rotation x + translation."""
         return replace(
             self,

@@ -1,7 +1,5 @@
 """One picture of one level of a recipe: regions, space of tilts, depth, warps, features."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,11 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Bbox
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS, resized_from_original
 from colmap_affrect.data import GrayImage, LocalFeatures, RectificationPlan
 from colmap_affrect.geometry.affine import transform_frames
+from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.planes import normals_from_depth, shrink_depth
 from colmap_affrect.images.reading import shrink_to
 from colmap_affrect.rectifiers.base import CoverOptions
@@ -49,8 +47,7 @@ DPI = 100
 WIDTH_PX = 1800
 MARGIN_PX = 24
 INNER_PX = WIDTH_PX - 2 * MARGIN_PX
-HEAD_PX = 50
-"""Title and caption of a section."""
+HEAD_PX = 50  # title and caption of a section
 FONT_PT, TITLE_PT = 9.0, 12.0
 DARK = "#555555"
 
@@ -59,8 +56,7 @@ TILE_GAP_PX = 14
 MIN_TILE_WIDTH_PX = 190
 MAX_TILE_WIDTH_PX = (INNER_PX - TILE_GAP_PX) // 2
 MIN_TILE_HEIGHT_PX, MAX_TILE_HEIGHT_PX = 72, 440
-ALL_TILES_PX = INNER_PX * 550
-"""Area of all warps as they are shown, nearly."""
+ALL_TILES_PX = INNER_PX * 550  # area of all warps as they are shown, nearly
 
 STYLE: list[str | dict[str, Any]] = [
     "default",
@@ -122,8 +118,7 @@ def fitted(size: Size, box: Size) -> Size:
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
-Tile = tuple[int, int, Size]
-"""Left, top and size of a picture in px, from the upper left corner of all."""
+Tile = tuple[int, int, Size]  # left, top and size of a picture in px
 
 
 def tiles(sizes: Sequence[Size]) -> list[Tile]:
@@ -163,8 +158,7 @@ def ranges(numbers: Sequence[int], max_num: int) -> str:
 
 
 NAME_PX, LINE_PX = 34, 20
-NAME_CHARS, LINE_CHARS = 110, 200
-"""What fits into a line of the header."""
+NAME_CHARS, LINE_CHARS = 110, 200  # what fits into a line of the header
 HEADER_PT, NAME_PT = 10.5, 16.0
 
 MAP_BOX_PX = (900, 720)
@@ -182,9 +176,7 @@ MAX_NUM_MARK_LABELS = 16
 MAX_NUM_FEATURES = 1500
 MAX_NUM_TILE_FEATURES = 120
 
-FEATURE_SIGMAS = 2.0
-"""Radius of the ellipses drawn for features, in sigma."""
-
+FEATURE_SIGMAS = 2.0  # radius of the ellipses drawn for features, in sigma
 WARNING = "#B03A00"
 
 OUTLINED = [withStroke(linewidth=2.5, foreground="white")]
@@ -233,8 +225,7 @@ def _draw_header(page: FigurePage, level: InspectedLevel, stored_size: Size) -> 
     page.top += MARGIN_PX
 
 
-MASKED = (0.0, 0.0, 0.0, 0.65)
-"""Colour and opacity over what a mask leaves out."""
+MASKED = (0.0, 0.0, 0.0, 0.65)  # colour and opacity over what a mask leaves out
 HOW_TO_READ = (
     "From above: where the photograph is looked at anew and how strongly it is tilted there, the"
     " warps made of these places, and the features of all of them; one colour is one warp."
@@ -348,9 +339,7 @@ def _draw_map(axes: Axes, shown_px: Size, level: InspectedLevel, colors: Sequenc
 # --- Depth
 
 
-def _draw_depth_and_normals(
-    page: FigurePage, level: InspectedLevel, depth: NDArray[np.floating]
-) -> None:
+def _draw_depth_and_normals(page: FigurePage, level: InspectedLevel, depth: Floats) -> None:
     photograph = level.photograph
     size = fitted(photograph.size, DEPTH_BOX_PX)
     shrunk, shrunk_from_depth = shrink_depth(depth, MAX_DEPTH_SIZE_PX)
@@ -369,7 +358,7 @@ def _draw_depth_and_normals(
     page.top += HEAD_PX + size[1] + MARGIN_PX
 
 
-def normal_colors(normals: NDArray[np.floating]) -> NDArray[np.float64]:
+def normal_colors(normals: Floats) -> Array:
     """Return (h, w, 3) colours of unit normals that face the camera; white where unknown."""
     colors = (normals * [1.0, 1.0, -1.0] + 1.0) / 2.0
     return np.where(np.isnan(colors), 1.0, colors)

@@ -3,8 +3,6 @@
 phi is in [0, pi): what leaves the half disc at one end of its diameter comes back at the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,11 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Arc, Polygon, Wedge
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
 from colmap_affrect.data import ShapeSamples
-from colmap_affrect.geometry.affine import compose_affine
-from colmap_affrect.geometry.canvas import rectifying_affine
+from colmap_affrect.geometry.affine import compose_affine, rectifying_affine
+from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.tilts import (
     IDENTITY_LABEL,
     nearest_centers,
@@ -29,9 +26,7 @@ from colmap_affrect.rectifiers.base import CoverOptions
 from colmap_affrect.report.levels import InspectedLevel
 from colmap_affrect.report.regions import Color
 
-TICKS = (2, 3, 4, 6, 8, 12, 20)
-"""Tilts written along the diameter."""
-
+TICKS = (2, 3, 4, 6, 8, 12, 20)  # tilts written along the diameter
 SIDE, BELOW, ABOVE = 1.10, 0.10, 1.12
 """Space to the sides, below and above in radii of the disc; labels stand in it."""
 
@@ -51,7 +46,7 @@ class TiltClass:
     color: Color
 
 
-def ball_outline(tilt: float, angle_rad: float, radius: float) -> NDArray[np.float64]:
+def ball_outline(tilt: float, angle_rad: float, radius: float) -> Array:
     """Return (N, 2) rows (tilt, angle_rad) of classes whose transition tilt to one is ``radius``.
 
     They are the classes of diag(r, 1) R(a) M for all a, where M is a map of the class: the
@@ -64,7 +59,7 @@ def ball_outline(tilt: float, angle_rad: float, radius: float) -> NDArray[np.flo
     return np.stack([tilts, np.unwrap(angles, period=np.pi)], axis=1)
 
 
-def plane_points(classes: NDArray[np.floating]) -> NDArray[np.float64]:
+def plane_points(classes: Floats) -> Array:
     """Return (N, 2) points log t (cos phi, sin phi) of rows (tilt, angle_rad), y up."""
     tilts, angles = classes[:, 0], classes[:, 1]
     return np.stack([np.log(tilts) * np.cos(angles), np.log(tilts) * np.sin(angles)], axis=1)

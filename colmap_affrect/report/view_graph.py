@@ -1,42 +1,29 @@
 """Which photographs match which: view graph and matrix of verified inliers, as parts of a page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import log, sqrt
 
 import networkx
 import numpy as np
-from numpy.typing import NDArray
 
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.report.pictures import base64_text
 
-CLASS_STARTS = (1, 30, 60, 120, 240, 480)
-"""Smallest number of inliers of each class."""
-
+CLASS_STARTS = (1, 30, 60, 120, 240, 480)  # smallest number of inliers of each class
 CLASS_COLORS = ("#e3b341", "#f08c3c", "#e2604f", "#cf4080", "#a14bb5", "#6f60dd")
 """Of few to many inliers; all stand out from white and from nearly black."""
 
-CLASS_WIDTHS = (1.2, 2.0, 3.0, 4.2, 5.6, 7.2)
-"""Of the edges, in units of the graph."""
-
+CLASS_WIDTHS = (1.2, 2.0, 3.0, 4.2, 5.6, 7.2)  # of the edges, in units of the graph
 GRAPH_SIZE = (640.0, 620.0)
-MAX_NUM_THUMBNAILS = 60
-"""With more photographs the nodes are dots."""
+MAX_NUM_THUMBNAILS = 60  # with more photographs the nodes are dots
 MAX_NUM_LAID_OUT, MAX_NUM_IN_MATRIX = 300, 1000
 """With more photographs the nodes are on a circle; and there is no matrix."""
 
-MAX_NODE, MIN_NODE, DOT = 64.0, 22.0, 9.0
-"""Sides of nodes in units of the graph."""
-
-EDGE = 3.0
-"""Free edge of a graph, in which frames of nodes are."""
-
-SPACING = 1.6
-"""Of nodes that are thumbnails, in their sides: edges show between them."""
-
+MAX_NODE, MIN_NODE, DOT = 64.0, 22.0, 9.0  # sides of nodes in units of the graph
+EDGE = 3.0  # free edge of a graph, in which frames of nodes are
+SPACING = 1.6  # of nodes that are thumbnails, in their sides: edges show between them
 MIDDLE, GRAVITY = "", 0.1
 """A node and the weight of its edges to all others: they hold parts of the graph
 together that have no edge between them."""
@@ -65,17 +52,12 @@ def class_labels() -> list[str]:
 
 @dataclass(frozen=True)
 class Node:
-    """A photograph in a view graph; it has the same number, from 1, everywhere on the page.
-
-    Attributes:
-        state: ``always``, ``sometimes`` or ``never`` registered, over the seeds.
-        is_wrong: registered, but at a wrong place with some seed.
-    """
+    """A photograph in a view graph; it has the same number, from 1, everywhere on the page."""
 
     number: int
     name: str
-    state: str
-    is_wrong: bool
+    state: str  # ``always``, ``sometimes`` or ``never`` registered, over the seeds
+    is_wrong: bool  # registered, but at a wrong place with some seed
     text: str
 
 
@@ -83,7 +65,7 @@ class Node:
 class Layout:
     """Where photographs are in all view graphs of a page, (N, 2) in ``GRAPH_SIZE``, and a side."""
 
-    centers: NDArray[np.float64]
+    centers: Array
     node_size: float
 
 
@@ -113,7 +95,7 @@ def lay_out(names: Sequence[str], graphs: Sequence[Mapping[Pair, int]]) -> Layou
     return Layout(_apart(centers, size), size)
 
 
-def _apart(centers: NDArray[np.float64], size: float) -> NDArray[np.float64]:
+def _apart(centers: Array, size: float) -> Array:
     """Push squares of a side apart until edges show between them, or nearly."""
     low, high = size / 2 + EDGE, np.array(GRAPH_SIZE) - size / 2 - EDGE
     rows, columns = np.triu_indices(len(centers), 1)

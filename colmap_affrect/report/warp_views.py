@@ -1,7 +1,5 @@
 """What a recipe warps in a photograph: its regions in colour and the largest warps, small."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

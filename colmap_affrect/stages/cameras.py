@@ -1,7 +1,5 @@
 """Cameras: a vote of the verified pairs over those that nobody knows, into the database."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Collection

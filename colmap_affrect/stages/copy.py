@@ -1,7 +1,5 @@
 """Copy: another program's database into the output folder, verified where it is not yet."""
 
-from __future__ import annotations
-
 import logging
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Depth maps of the photographs of a workspace, as mapping asks them."""
 
-from __future__ import annotations
-
 import logging
 from functools import lru_cache
 from pathlib import Path

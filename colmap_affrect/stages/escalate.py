@@ -1,23 +1,19 @@
 """Escalation on demand: more warps for the pairs of images that need them, and only those.
 
 Level by level (the recipe's ``escalation``; Mishkin, Matas, Perdoch, MODS, 2015) images get the
-features that the level adds, and pairs are matched again, by these features and those of the
-images themselves. New matches take the place of the old ones only when their two-view geometry has
-more inliers, so that no pair loses; or, where neither is verified, when more of them confirm each
-other. Which pairs climb is decided anew after every step, by what the database holds then, and the
-lowest level that has something to do comes first, so that a killed run goes on in the same way:
+features that the level adds, and pairs are matched again. New matches take the place of the old
+ones only when their two-view geometry has more inliers, or, where neither is verified, when more of
+them confirm each other. Which pairs climb is decided anew after every step, by what the database
+holds then, and the lowest level that has something to do comes first, so that a killed run goes on
+in the same way:
 
 - First pairs between images that no verified pairs connect, then those of an image that is not
-  secure: without a strong pair, or with few features in tracks through three images. Images that
-  are tied well keep no pair climbing.
+  secure: without a strong pair, or with few features in tracks through three images.
 - Of pairs that are not verified only those whose matches hint at a common surface
   (:mod:`colmap_affrect.geometry.consistency`), and the best few of an image that is left outside.
-- Then the verified pairs of the images that gained, while one of the two is not secure. Their new
-  features would otherwise be seen in two images only, and the mapper could not tie them to the
-  rest.
+- Then the verified pairs of the images that gained, while one of the two is not secure: new
+  features that two images alone have cannot be tied to the rest.
 """
-
-from __future__ import annotations
 
 import math
 import time
@@ -32,23 +28,17 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.verification import (
-    PairVerifier,
-    connected_parts,
-    verified_pairs,
-    verify,
-)
+from colmap_affrect.colmap.verification import PairVerifier, connected_parts, verified_pairs, verify
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.consistency import num_consistent_matches
 from colmap_affrect.mappers.pair_graph import MIN_SHARE
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.pairs.connectivity import weakly_connected_images
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace, temporary_folder
 from colmap_affrect.recipes import EscalateOptions
-from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images
+from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images, weakly_connected_images
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import (
     Inputs,

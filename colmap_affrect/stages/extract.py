@@ -1,13 +1,12 @@
 """Extract: photographs into ``features.h5``, cameras, images and keypoints into the database."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Self
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.camera_records import read_camera_records
@@ -76,7 +75,7 @@ class Inputs(Options):
         from_database: Path | None = None,
         cameras: CameraOptions | None = None,
         masks: MaskOptions | None = None,
-    ) -> Inputs:
+    ) -> Self:
         """Build from paths, which are made absolute."""
         return cls(
             image_path=str(image_path.resolve()),
@@ -87,7 +86,7 @@ class Inputs(Options):
         )
 
     @classmethod
-    def recorded(cls, workspace: Workspace) -> Inputs:
+    def recorded(cls, workspace: Workspace) -> Self:
         """Return what the extract stage of a workspace was given."""
         record = workspace.require("extract")
         values = {key: value for key, value in record.items() if key in cls.model_fields}
@@ -243,7 +242,6 @@ def _record(
     *,
     overwrite: bool,
 ) -> None:
-    """Put the options of this stage and those known of later ones on record."""
     weights = digests_by_name(extractor.weights)
     planned: dict[str, Options] = {"match": recipe.matching, "guide": recipe.guided}
     if recipe.extraction.escalation:

@@ -7,8 +7,6 @@ stays on record (``guided.h5``) for the last adjustment. The raw matches stay as
 COLMAP's own guided matching.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -21,12 +19,12 @@ from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.pairs.connectivity import weakly_connected_images
 from colmap_affrect.pairs.lists import ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import GuidedPair
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.stages.climbing import weakly_connected_images
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import recorded_extraction
 from colmap_affrect.stages.match import PAIRS_PER_WRITE
@@ -218,7 +216,6 @@ class Guiding:
             self._keep(found)
 
     def _tasks(self, pairs: Sequence[Pair]) -> list[GuidedTask]:
-        """Return what can be guided."""
         tasks = []
         with colmap_database.open_database(self.path) as database:
             cameras = colmap_database.cameras_of_images(database)

@@ -6,11 +6,10 @@ obeys the model's geometry, right or wrong, so that verification alone proves no
 frames, which are not looked at before, must agree with it as well.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Self
 
 import numpy as np
 
@@ -36,7 +35,7 @@ class View:
     points: Array  # (N, 3) of the model that it sees
 
     @classmethod
-    def of(cls, image: pycolmap.Image, model: pycolmap.Reconstruction) -> View:
+    def of(cls, image: pycolmap.Image, model: pycolmap.Reconstruction) -> Self:
         """Return an image that has a pose."""
         points = [model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()]
         pose = np.asarray(image.cam_from_world().matrix(), np.float64)

@@ -1,7 +1,5 @@
 """Match: raw matches of the listed pairs, into ``matches.h5`` and the database."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Generator, Sequence

@@ -1,9 +1,7 @@
 """What guided matching does for one pair, in a thread of this process or on a worker."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -40,7 +38,7 @@ class GuidedTask:
     def __str__(self) -> str:
         return " and ".join(self.names)
 
-    def scaled(self, scales: tuple[float, float]) -> GuidedTask:
+    def scaled(self, scales: tuple[float, float]) -> Self:
         """Return the same in pixels of images that are smaller by these factors."""
         first, second = (np.diag([scale, scale, 1.0]) for scale in scales)
         other = np.linalg.inv(second) if self.is_homography else second

@@ -4,16 +4,14 @@ Workers read photographs from shared storage. Where they do not see them, or see
 their place, photographs and masks travel with the tasks.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -84,7 +82,7 @@ class ImageTask:
     def __str__(self) -> str:
         return self.name
 
-    def with_files(self) -> ImageTask:
+    def with_files(self) -> Self:
         """Return the task with its files; extraction will report those that cannot be read."""
         sent = {}
         for path in self.photographs.files(self.name):
@@ -128,7 +126,7 @@ class ImageExtractor:
     def __post_init__(self) -> None:
         self.network_lock = Lock() if self.options.uses_networks else nullcontext()
 
-    def __reduce__(self) -> tuple[Callable[..., ImageExtractor], tuple[Any, ...]]:
+    def __reduce__(self) -> tuple[Any, ...]:
         digests = {key: file_sha256(path) for key, path in self.weights.items()}
         return _prepared_elsewhere, (self.options, self.resources, digests)
 
@@ -197,7 +195,7 @@ class ImageExtractor:
         return replace(found, warning="; ".join(filter(None, (MEMORY_IS_FULL, found.warning))))
 
     @cached_property
-    def _on_cpu(self) -> ImageExtractor:
+    def _on_cpu(self) -> "ImageExtractor":
         return prepare(self.options, replace(self.resources, device="cpu"))
 
     def photograph(

@@ -4,8 +4,6 @@ Workers read features from shared storage. Where they do not see the file, those
 travel with each pair.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Generator, Mapping, Sequence

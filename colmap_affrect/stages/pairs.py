@@ -1,7 +1,5 @@
 """Pairs: which photographs are matched, into ``pairs.txt``."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Collection, Sequence
@@ -14,8 +12,7 @@ from colmap_affrect.matchers.base import Matches
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair, PairList, PairOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs, pairs_by_place, read_pairs, write_pairs
-from colmap_affrect.pairs.low_resolution import NUM_STRONGEST, low_resolution_pairs
-from colmap_affrect.pairs.retrieval import retrieved_pairs
+from colmap_affrect.pairs.retrieval import NUM_STRONGEST, low_resolution_pairs, retrieved_pairs
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
@@ -139,7 +136,6 @@ def add_pairs(context: Context, pairs: Sequence[Pair]) -> None:
 
 
 def _pairs_there(context: Context) -> set[Pair]:
-    """Return the pairs that were chosen before."""
     path = context.workspace.pairs
     return set(listed_pairs(context)) if path.exists() and path.stat().st_size else set()
 

@@ -4,36 +4,30 @@ Such a thing is at the same place of many photographs, whatever they show. Its m
 camera that does not move, and can outvote those of the scene.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.data import Mask
-from colmap_affrect.geometry.arrays import Indices
+from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.images.masks import grown
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.stores import FeatureStore, MatchStore, PairMatches
 
 logger = logging.getLogger(__name__)
 
-MAX_MOTION_FRAC = 0.005
-"""Of the longer side: what moves less has not moved; scans are not cut to the pixel."""
-NUM_CELLS = 48
-"""Cells along the longer side."""
+MAX_MOTION_FRAC = 0.005  # of the longer side; less is no motion: scans are not cut to the pixel
+NUM_CELLS = 48  # cells along the longer side
 MIN_NUM_PAIRS = 3
 MIN_NUM_IMAGES = 3
 """Two views of a camera that did not turn have places that stay where they are; more have none."""
-MIN_SHARE = 0.5
-"""Of the pairs that have a match in a cell."""
-MAX_SHARE_OF_PHOTOGRAPH = 0.5
-"""Where more of what is matched never moves it is the camera that stands still."""
+MIN_SHARE = 0.5  # of the pairs that have a match in a cell
+MAX_SHARE_OF_PHOTOGRAPH = 0.5  # where more of what is matched never moves, the camera stands still
 MAX_SHARE_BESIDE = 0.2
 """Of all cells. Matches from beside one place to beside another are left out only where these cells
 are so few: one in 25 of the scene's goes with them then, and of a watermark all over, all would."""
@@ -45,12 +39,12 @@ Size = tuple[int, int]
 class _Evidence:
     """What the pairs of photographs of one size say, by cell: numbers of pairs, and images."""
 
-    matched: NDArray[np.int64]
-    still: NDArray[np.int64]
+    matched: Indices
+    still: Indices
     images: defaultdict[tuple[int, int], set[str]] = field(default_factory=lambda: defaultdict(set))
 
     @classmethod
-    def empty(cls, size: Size) -> _Evidence:
+    def empty(cls, size: Size) -> Self:
         width, height = _cells(np.array([size], np.float64) - 1.0, size)[0] + 1
         return cls(np.zeros((height, width), np.int64), np.zeros((height, width), np.int64))
 
@@ -130,7 +124,7 @@ class StationaryFilter:
             "them)"
         )
 
-    def _find(self, pairs: Sequence[Pair]) -> dict[Size, NDArray[np.int64]]:
+    def _find(self, pairs: Sequence[Pair]) -> dict[Size, Indices]:
         """Return the (N, 2) cells, column and row, of each size of photographs."""
         evidence: dict[Size, _Evidence] = {}
         alike = [pair for pair in pairs if self._common_size(pair)]
@@ -144,9 +138,7 @@ class StationaryFilter:
                 of_size.images[column, row].update(found.names)
         return {size: np.argwhere(e.places())[:, ::-1] for size, e in evidence.items()}
 
-    def _still(
-        self, names: Pair, indices: Indices, size: Size
-    ) -> tuple[Mask, NDArray[np.int64], NDArray[np.int64]]:
+    def _still(self, names: Pair, indices: Indices, size: Size) -> tuple[Mask, Indices, Indices]:
         """Tell which matches do not move; also the (M, 2) cells, column and row, of both ends."""
         first, second = (self._points(name)[indices[:, side]] for side, name in enumerate(names))
         motion = np.linalg.norm(second - first, axis=1)
@@ -157,19 +149,19 @@ class StationaryFilter:
         return size if size == self._sizes[pair[1]] else None
 
 
-def _cells(points: NDArray[np.floating], size: Size) -> NDArray[np.int64]:
+def _cells(points: Floats, size: Size) -> Indices:
     """Return the (N, 2) cells, column and row, of (N, 2) points in pixel-centre px."""
     inside = np.clip(points, 0.0, np.array(size) - 1.0)
     return np.asarray(inside * (NUM_CELLS / max(size)), np.int64)
 
 
-def _mask(cells: NDArray[np.int64]) -> Mask:
+def _mask(cells: Indices) -> Mask:
     """Return a mask of (N, 2) cells, column and row."""
     mask = np.zeros((NUM_CELLS, NUM_CELLS), bool)
     mask[cells[:, 1], cells[:, 0]] = True
     return mask
 
 
-def _at(mask: Mask, cells: NDArray[np.int64]) -> Mask:
+def _at(mask: Mask, cells: Indices) -> Mask:
     """Look up (N, 2) cells, column and row."""
     return np.asarray(mask[cells[:, 1], cells[:, 0]])

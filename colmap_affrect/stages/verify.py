@@ -1,7 +1,5 @@
 """Verify: two-view geometries of the matched pairs, into the database."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

@@ -26,8 +26,7 @@ from colmap_affrect.matchers.base import MatcherContext, Matches
 from colmap_affrect.matchers.nearest import MatchableImage, NearestNeighbors, NearestOptions
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import sequence_pairs
-from colmap_affrect.pairs.low_resolution import NUM_STRONGEST, low_resolution_pairs
-from colmap_affrect.pairs.retrieval import retrieved_pairs
+from colmap_affrect.pairs.retrieval import NUM_STRONGEST, low_resolution_pairs, retrieved_pairs
 from colmap_affrect.progress import SILENT
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context

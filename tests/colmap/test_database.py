@@ -25,8 +25,13 @@ from colmap_affrect.colmap.initial_cameras import import_images
 from colmap_affrect.data import Rectification
 from colmap_affrect.errors import DatabaseError, WorkspaceError
 from colmap_affrect.features.sift import RootSift, SiftOptions
-from colmap_affrect.geometry.affine import lafs_from_keypoints, rotation, transform_frames
-from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
+from colmap_affrect.geometry.affine import (
+    fit_canvas,
+    lafs_from_keypoints,
+    rectifying_affine,
+    rotation,
+    transform_frames,
+)
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.warping import warp
 

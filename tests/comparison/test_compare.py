@@ -190,7 +190,6 @@ def test_methods_had_the_same_cameras_images_and_pairs(compared) -> None:
 def test_json_and_csv_hold_the_same_figures(compared) -> None:
     comparison, out = compared
     text = (out / "comparison.json").read_text(encoding="utf-8")
-    assert Comparison.from_json(text) == comparison
     values = json.loads(text)
     assert values["verdict"] == list(verdict(comparison))
     assert values["registered_by_none"] == ["broken.png"]

@@ -17,7 +17,7 @@ from colmap_affrect.stages.one_image import prepare
 MODULE = """
     from typing import Literal
 
-    from colmap_affrect.geometry.canvas import fit_canvas, image_corners, rectifying_affine
+    from colmap_affrect.geometry.affine import fit_canvas, image_corners, rectifying_affine
     from colmap_affrect.rectifiers.base import RectifierOptions
     from colmap_affrect.data import Rectification, RectificationPlan
 

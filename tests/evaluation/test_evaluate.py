@@ -116,7 +116,7 @@ def test_every_recipe_solves_easy_pairs(done: tuple[Path, Evaluation]) -> None:
         assert recipe.summary["< 1 px"] == 3
         assert recipe.intervals["< 1 px"] == (3, 3)
         assert recipe.solved == Solved(1.0, (1.0, 1.0))
-        assert recipe.num_failed == 0
+        assert not any(pair.failure for pair in recipe.pairs)
         for pair in recipe.pairs:
             assert 4 <= pair.num_inliers <= pair.num_matches <= min(pair.num_keypoints)
             assert pair.seconds == pytest.approx(sum(pair.seconds_by_step.values()))
@@ -137,7 +137,7 @@ def test_costs_are_those_of_the_warps(done: tuple[Path, Evaluation]) -> None:
 def test_files_say_the_same(done: tuple[Path, Evaluation]) -> None:
     out, evaluation = done
     text = (out / "evaluation.json").read_text(encoding="utf-8")
-    assert Evaluation.from_json(text).to_json() == text == evaluation.to_json()
+    assert text == evaluation.to_json()
     values = json.loads(text)
     assert values["protocol"] == "evd"
     assert values["settings"]["scores"]["threshold_px"] == 0.5
@@ -216,9 +216,8 @@ def test_damaged_image_fails_its_pair_and_the_others_go_on(
     assert recipe.summary["< 20 px"] == 3 - len(failed)
     assert ("2/dance.png" in recipe.failures) == (when == "later")
     assert "dance" in evaluation.summary()
-    text = evaluation.to_json()
-    assert json.loads(text)["recipes"][recipe.name]["pairs"][1]["error"] is None
-    assert Evaluation.from_json(text) == evaluation
+    values = json.loads(evaluation.to_json())
+    assert values["recipes"][recipe.name]["pairs"][1]["error"] is None
 
 
 def test_intervals_of_a_category_are_over_its_pairs() -> None:

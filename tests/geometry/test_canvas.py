@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from strategies import Array, classes
 
-from colmap_affrect.geometry.affine import project
-from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
+from colmap_affrect.geometry.affine import fit_canvas, project, rectifying_affine
 from colmap_affrect.geometry.tilts import metrics_from_tilts, unit_metrics
 
 ROUNDING = 1e-8

@@ -14,8 +14,7 @@ from strategies import IMAGE_SIZE, Array, homographies, tilt_angles
 from synthetic import texture
 
 from colmap_affrect.data import GrayImage, Mask, Rectification
-from colmap_affrect.geometry.affine import project
-from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
+from colmap_affrect.geometry.affine import fit_canvas, project, rectifying_affine
 from colmap_affrect.images.warping import halved, warp, warp_mask
 
 RAMP_ERROR_PX = 0.05

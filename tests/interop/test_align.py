@@ -10,7 +10,7 @@ from command import Call
 from exported_model import write_model
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import AffrectError, OptionError, StoreError
 from colmap_affrect.interop.align import Reference, align
 from colmap_affrect.interop.georeference import Georeference
 
@@ -157,3 +157,10 @@ def test_nothing_is_overwritten_and_no_model_is_said(tmp_path: Path) -> None:
     wrong = Reference(positions_path=tmp_path / "x", distances=reference.distances)
     with pytest.raises(OptionError, match="leave it out"):
         align(tmp_path / "model", tmp_path / "new", wrong)
+
+
+def test_damaged_georeference_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "georeference.json").write_text('{"latitude": "north"}')
+    with pytest.raises(StoreError, match=r"georeference.json: damaged \(.*align") as caught:
+        Georeference.read(tmp_path)
+    assert "\n" not in str(caught.value)

@@ -12,7 +12,7 @@ from strategies import Array, tilt_distance
 
 from colmap_affrect.data import RectificationPlan
 from colmap_affrect.errors import OptionError
-from colmap_affrect.geometry.canvas import rectifying_affine
+from colmap_affrect.geometry.affine import rectifying_affine
 from colmap_affrect.rectifiers.base import RectifierInputs
 from colmap_affrect.rectifiers.depth_planes import (
     DepthAffNet,

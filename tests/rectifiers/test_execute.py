@@ -23,10 +23,11 @@ from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMom
 from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import (
     ellipse_extents,
+    fit_canvas,
     lafs_from_keypoints,
     project,
+    rectifying_affine,
 )
-from colmap_affrect.geometry.canvas import fit_canvas, rectifying_affine
 from colmap_affrect.matchers.nearest import NearestOptions, match_features, matchable
 from colmap_affrect.rectifiers.dense import DenseShapesOptions, plan_dense_shapes
 from colmap_affrect.rectifiers.execute import extract_rectified, found_again

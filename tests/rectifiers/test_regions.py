@@ -10,8 +10,7 @@ from numpy.testing import assert_allclose
 from strategies import classes
 
 from colmap_affrect.data import Mask, Rectification
-from colmap_affrect.geometry.affine import project, transform_frames
-from colmap_affrect.geometry.canvas import rectifying_affine
+from colmap_affrect.geometry.affine import project, rectifying_affine, transform_frames
 from colmap_affrect.geometry.planes import fronto_parallel_homography
 from colmap_affrect.geometry.tilts import metrics_from_tilts, unit_metrics
 from colmap_affrect.rectifiers.regions import (

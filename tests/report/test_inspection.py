@@ -27,8 +27,13 @@ from colmap_affrect.data import (
 )
 from colmap_affrect.errors import DepthError, ImageError
 from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
-from colmap_affrect.geometry.affine import lafs_from_keypoints, project
-from colmap_affrect.geometry.canvas import fit_canvas, image_corners, rectifying_affine
+from colmap_affrect.geometry.affine import (
+    fit_canvas,
+    image_corners,
+    lafs_from_keypoints,
+    project,
+    rectifying_affine,
+)
 from colmap_affrect.geometry.tilts import asift_covering, metrics_from_tilts
 from colmap_affrect.recipes import ExtractionOptions, LevelOptions
 from colmap_affrect.rectifiers.base import (

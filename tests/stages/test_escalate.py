@@ -19,7 +19,6 @@ from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.incremental import IncrementalOptions
-from colmap_affrect.pairs.connectivity import weakly_connected_images
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import FileTransaction
 from colmap_affrect.project.report import ModelSummary, StageReport
@@ -28,6 +27,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import escalate as escalation
 from colmap_affrect.stages import map as map_stage
+from colmap_affrect.stages.climbing import weakly_connected_images
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, recorded_escalation
 from colmap_affrect.stages.extract import Inputs, extract, recorded_extraction

@@ -18,7 +18,7 @@ from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, nearest_positions, open_database
 from colmap_affrect.errors import DatabaseError, OptionError
-from colmap_affrect.pairs import low_resolution as pair_selection
+from colmap_affrect.pairs import retrieval as pair_selection
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.project.report import EXIT_INTERRUPTED
 from colmap_affrect.project.workspace import Workspace

@@ -4,8 +4,6 @@ With a shape L ~ mu^(-1/2) the rectifying map is L^-1 ~ mu^(1/2), so the unit me
 rectifying map is mu / sqrt(det mu) itself (Lindeberg & Garding 1997; Baumberg 2000).
 """
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar, Literal
 
 import cv2
