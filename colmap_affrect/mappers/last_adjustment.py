@@ -1,8 +1,7 @@
-"""The last adjustment of models that guided matches or bridges have brought together, or whose
-cameras nobody knows.
+"""The last adjustment of models that matches or cameras of little certainty hold.
 
 Guided matches are less exact than others. They register images and tie them together, but where
-exact matches suffice to hold images these alone say where they stand. Where nobody knows the cameras
+exact matches suffice to hold images these alone say where they stand. Where nobody knows cameras
 COLMAP stops on the way, and takes distortions for focal lengths.
 """
 
