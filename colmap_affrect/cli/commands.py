@@ -115,20 +115,20 @@ def escalate(options: argparse.Namespace) -> None:
 
 
 def guide(options: argparse.Namespace) -> None:
-    from colmap_affrect.colmap.model_files import read_model
+    from colmap_affrect.colmap.model_files import read_given_model
     from colmap_affrect.matchers.guided import GuidedOptions
     from colmap_affrect.stages.guide import guide, guided_counts
     from colmap_affrect.stages.guide_by_model import guide_by_model
 
+    path: Path | None = options.model_path
+    model = read_given_model(path, "--model-path ") if path else None
     with given.context(options) as context:
         values = given.changed(context, "guide", "guided", options.set)
         values |= {"enabled": options.guided} if options.guided else {}
         chosen = GuidedOptions.from_mapping(values, "guided")
-        report = guide(
-            context, chosen, () if options.model_path else None, overwrite=options.overwrite
-        )
-        if options.model_path:
-            report = guide_by_model(context, read_model(options.model_path))
+        report = guide(context, chosen, () if model else None, overwrite=options.overwrite)
+        if model:
+            report = guide_by_model(context, model)
         counts = guided_counts(context)
     show(report.summary())
     if counts:
@@ -184,7 +184,8 @@ def compare(options: argparse.Namespace) -> int:
 
     if options.viewer:
         require_viewer()
-    methods = options.methods and parse_methods(options.methods, given.depth_settings(options))
+    depth = given.depth_settings(options)
+    methods = options.methods and parse_methods(options.methods, depth)
     comparison = compare(
         options.image_path,
         options.output_path,
@@ -376,6 +377,8 @@ def inspect(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.one_image import prepare
 
     recipe = given.recipe(options)
+    if not options.image.is_file():
+        raise OptionError(f"{options.image}: no such file; give a photograph")
     if options.output_path.resolve() == options.image.parent.resolve():
         raise OptionError(
             f"--output-path {options.output_path}: give another folder than that of the "
@@ -422,7 +425,7 @@ def weights(options: argparse.Namespace) -> None:
             show(path)
         return
     checks = {None: "", True: ", verified", False: ", NOT the published file"}
-    for row in describe_weights(options.weights):
+    for row in describe_weights(given.weights_folder(options)):
         file = row.published
         where = f"{row.path}{checks[row.verified]}"
         if not row.path:
