@@ -13,8 +13,9 @@ from typing import Literal
 from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.colmap.database_copy import schema_version
+from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
-from colmap_affrect.errors import ImageError
+from colmap_affrect.errors import ImageError, MappingError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.forecast import Forecast
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
@@ -22,6 +23,7 @@ from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions, MappingT
 from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.base import PairOptions
+from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
@@ -185,6 +187,8 @@ def run(
             options.extend.refuse_discarding(output_path)
         require_extends(mapper.options)
         existing_names(options.extend.model_path, names)
+    if options.pairs.match_list_path:
+        read_pairs(Path(options.pairs.match_list_path), names)
     options.recipe.extraction.check_depth()
     resolve(options.recipe.weights, options.resources.weights_path, progress=progress)
     later = {"pairs": options.pairs, "verify": options.verification, "map": mapper.options}
@@ -240,8 +244,10 @@ def map_from_database(
     """
     mapper = MAPPERS.make(mapping or MAPPERS.options(MAPPERS.default))
     schema_version(database_path)  # refuses what is no database before anything is made
-    if extend and overwrite:
-        extend.refuse_discarding(output_path)
+    if extend:
+        if overwrite:
+            extend.refuse_discarding(output_path)
+        read_given_model(extend.model_path, "--extend ", MappingError)
     context = Context(Workspace(output_path), progress=progress)
     with context.workspace.locked():
         chosen = verification or VerificationOptions()

@@ -248,6 +248,8 @@ def _read(name: str) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
+        if name.endswith(".toml"):
+            raise OptionError(f"recipe {name}: no such file") from error
         close = difflib.get_close_matches(name, recipe_names(), n=1)
         hint = f"did you mean '{close[0]}'? " if close else ""
         known = ", ".join(recipe_names())

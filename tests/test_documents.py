@@ -16,6 +16,7 @@ import pytest
 
 import colmap_affrect
 from colmap_affrect.cli.parser import COMMANDS, build_parser
+from colmap_affrect.project.workspace import STAGES
 from colmap_affrect.recipes import load_recipe
 
 ROOT = Path(__file__).parents[1]
@@ -73,6 +74,15 @@ def test_commands_are_understood(name: str) -> None:
         recipe = getattr(options, "recipe", None) or "default"
         if not recipe.endswith(".toml") and "recipe" in options:
             load_recipe(recipe, options.set)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_stages_come_after_those_that_they_need(name: str) -> None:
+    for block in blocks(text_of(name), "sh"):
+        commands = re.findall(r"^colmap-affrect (\w+)", block, re.MULTILINE)
+        stages = [command for command in commands if command in STAGES]
+        if stages[:1] == ["extract"]:
+            assert stages == list(STAGES[1 : len(stages) + 1]), block
 
 
 @pytest.mark.parametrize("name", NAMES)

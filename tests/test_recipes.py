@@ -216,7 +216,7 @@ def test_recipe_file_is_read_and_what_it_leaves_out_is_default(tmp_path: Path) -
         (b"\xff\xfe", r"mine\.toml: cannot be read"),
         (b"[rectifier]\ntilt = 3\n", r"mine\.toml: rectifier: unknown option 'tilt'"),
         (b"[mapping]\nx = 3\n", r"unknown option 'x'"),
-        (None, "unknown recipe"),
+        (None, r"mine\.toml: no such file"),
     ],
 )
 def test_unusable_recipe_file_is_one_clear_line(

@@ -120,7 +120,7 @@ def guide(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.guide import guide, guided_counts
     from colmap_affrect.stages.guide_by_model import guide_by_model
 
-    path = options.model_path
+    path: Path | None = options.model_path
     model = read_given_model(path, "--model-path ") if path else None
     with given.context(options) as context:
         values = given.changed(context, "guide", "guided", options.set)
@@ -184,7 +184,8 @@ def compare(options: argparse.Namespace) -> int:
 
     if options.viewer:
         require_viewer()
-    methods = options.methods and parse_methods(options.methods, given.depth_settings(options))
+    depth = given.depth_settings(options)
+    methods = options.methods and parse_methods(options.methods, depth)
     comparison = compare(
         options.image_path,
         options.output_path,
@@ -375,6 +376,8 @@ def inspect(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.one_image import prepare
 
     recipe = given.recipe(options)
+    if not options.image.is_file():
+        raise OptionError(f"{options.image}: no such file; give a photograph")
     if options.output_path.resolve() == options.image.parent.resolve():
         raise OptionError(
             f"--output-path {options.output_path}: give another folder than that of the "
@@ -421,7 +424,7 @@ def weights(options: argparse.Namespace) -> None:
             show(path)
         return
     checks = {None: "", True: ", verified", False: ", NOT the published file"}
-    for row in describe_weights(options.weights):
+    for row in describe_weights(given.weights_folder(options)):
         file = row.published
         where = f"{row.path}{checks[row.verified]}"
         if not row.path:

@@ -123,6 +123,8 @@ def recipe(options: argparse.Namespace, record: Mapping[str, Any] | None = None)
 
 def depth_settings(options: argparse.Namespace) -> list[str]:
     path, model = options.depth_path, options.depth_model
+    if path and not path.is_dir():
+        raise OptionError(f"--depth-path {path}: no such folder; give the folder of the depth maps")
     given = {
         "name": "monocular" if model else "files" if path else None,
         "path": str(path.resolve()) if path else None,
@@ -135,7 +137,14 @@ def depth_settings(options: argparse.Namespace) -> list[str]:
 def resources(options: argparse.Namespace) -> Resources:
     from colmap_affrect.stages.context import Resources
 
-    return Resources(options.weights, options.device)
+    return Resources(weights_folder(options), options.device)
+
+
+def weights_folder(options: argparse.Namespace) -> Path | None:
+    path: Path | None = options.weights
+    if path and not path.is_dir():
+        raise OptionError(f"--weights {path}: no such folder; give the folder of the weights")
+    return path
 
 
 @contextmanager

@@ -58,8 +58,9 @@ EXAMPLES = (
 
 ENDING = """
 What computes goes on where it stopped when it is run again. Exit codes: 0 done, 1 failed (one
-line says why; also when images could not be read, see --max-failures), 2 wrong usage, 3 finished
-without a model that can be trusted, 130 interrupted.
+line says why; also when images could not be read, see --max-failures), 2 wrong usage, or an option
+names a file or folder that is not there, 3 finished without a model that can be trusted, 130
+interrupted.
 """
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from colmap_affrect.doctor.database import examine_database
 from colmap_affrect.doctor.findings import Diagnosis, Finding, Findings
 from colmap_affrect.doctor.folder import examine_folder
+from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import describe_weights
 from colmap_affrect.pipeline import installed_versions
 from colmap_affrect.progress import SILENT, Progress
@@ -30,16 +31,19 @@ def diagnose(
     """Examine the installation and, if a path is given, an output folder or a COLMAP database.
 
     ``path`` may be damaged. With the folder of the photographs their sizes are compared with the
-    cameras. Weights of networks are looked for in ``weights_path`` first.
+    cameras. Weights of networks are looked for in ``weights_path`` first. OptionError when
+    something that is given is not there.
     """
+    if path is not None and not path.exists():
+        raise OptionError(
+            f"{path}: no such file or folder; give a COLMAP database or output folder"
+        )
+    for folder, option in ((image_path, "--image-path"), (weights_path, "--weights")):
+        if folder is not None and not folder.is_dir():
+            raise OptionError(f"{option} {folder}: no such folder")
     findings = Findings(progress)
-    if image_path is not None and not image_path.is_dir():
-        findings.add("no-photographs", image_path)
-        image_path = None
     if path is not None and path.is_dir():
         examine_folder(findings, path, image_path)
-    elif path is not None and not path.exists():
-        findings.add("not-there", path)
     elif path is not None:
         examine_database(findings, path, image_path)
     _examine_installation(findings, weights_path)
@@ -52,8 +56,6 @@ def _examine_installation(findings: Findings, weights_path: Path | None) -> None
     loaded = list(sys.modules)
     if loaded.index("pycolmap") < loaded.index("colmap_affrect"):
         findings.add("import-order", "installation")
-    if weights_path is not None and not weights_path.is_dir():
-        findings.add("no-weights-folder", f"--weights {weights_path}")
     try:
         _examine_networks(findings, weights_path)
     except (ImportError, OSError) as error:

@@ -23,13 +23,11 @@ VERIFY_AGAIN = "run 'colmap-affrect verify --output-path {folder} --overwrite' a
 MAP = "run 'colmap-affrect map --output-path {folder}'"
 
 TEXTS: dict[str, Check] = CHECKS | {
-    "no-photographs": ("error", "no such folder", "give the folder of the photographs"),
     # the installation
     "import-order": ("warning",
         "pycolmap was imported before colmap_affrect; if nothing has used zlib before, "
         "Python's zlib (PNG files, compressed arrays) ends the process",
         "import colmap_affrect first"),
-    "no-weights-folder": ("error", "not a folder", "give the folder of weights"),
     "no-torch": ("error", "torch or kornia cannot be loaded ({error})",
         "install them again; recipes with RootSIFT work without"),
     "no-colmap": ("note", "the program colmap is not on PATH",
@@ -41,7 +39,6 @@ TEXTS: dict[str, Check] = CHECKS | {
     "no-weights": ("note", "not found: {missing}",
         "run 'colmap-affrect weights fetch' before using learned features without network"),
     # a database as a whole
-    "not-there": ("error", "no such file or folder", "give a COLMAP database or an output folder"),
     "no-database": ("error", "{error}",
         "give a COLMAP database or an output folder of colmap-affrect; of a damaged database, "
         f"{RECOVER}"),

@@ -17,7 +17,7 @@ from kornia.feature.mkd import Whitening
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from colmap_affrect.errors import DeviceError, WeightsError
+from colmap_affrect.errors import DeviceError, OptionError, WeightsError
 from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict
 from colmap_affrect.shown import such_as
@@ -30,12 +30,12 @@ DESCRIPTOR_SIZE = 128  # width of all descriptors
 def resolve_device(name: str) -> torch.device:
     """Turn ``auto`` (CUDA if there is any, else the CPU), ``cpu``, ``cuda:1``, ``mps`` to a device.
 
-    Raises DeviceError for another name, or when the device is not there.
+    Raises OptionError for another name, DeviceError when the device is not there.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if not re.fullmatch(r"cpu|cuda(:\d+)?|mps", name):
-        raise DeviceError(f"--device {name}: not one of auto, cpu, cuda, cuda:0, mps")
+        raise OptionError(f"--device {name}: not one of auto, cpu, cuda, cuda:0, mps")
     device = torch.device(name)
     count = 1
     if device.type == "cuda":

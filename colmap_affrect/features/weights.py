@@ -143,7 +143,7 @@ def resolve(
     published one; OptionError when there is no such folder.
     """
     if weights_path is not None and not weights_path.is_dir():
-        raise OptionError(f"--weights {weights_path}: not a folder")
+        raise OptionError(f"--weights {weights_path}: no such folder")
     found = {key: _find_in_folders(key, weights_path) or _checked_installed(key) for key in keys}
     try:
         return {k: path or _download(k, cache_folder(), progress) for k, path in found.items()}

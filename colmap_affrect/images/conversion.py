@@ -99,7 +99,8 @@ def _page_name(name: str, page: int, num_pages: int) -> str:
 def _as_png(path: Path, numbers: Sequence[int]) -> Iterator[bytes]:
     """Yield pages of a file as PNG; ImageError if it is damaged, or of no format that is known."""
     try:
-        with Image.open(path) as image:
+        # By its name Pillow maps a file into memory, and garbles gray pages that lie on their side.
+        with path.open("rb") as opened, Image.open(opened) as image:
             for number in numbers:
                 image.seek(number)
                 page = image if image.mode in AS_STORED else image.convert("RGB")

@@ -143,7 +143,7 @@ def decode(path: Path, flags: int = GRAY_AS_STORED) -> NDArray[Any]:
         raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
     if name := _foreign(data[:16].tobytes()):
         raise ImageError(
-            f"{path}: is a {name} file, a format that COLMAP cannot read; convert it to PNG or "
+            f"{path}: is of the format {name}, which COLMAP cannot read; convert it to PNG or "
             "JPEG (colmap-affrect convert)"
         )
     _forget_orientation_of_tiff(data)

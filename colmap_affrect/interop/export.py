@@ -78,6 +78,8 @@ def export(
     for name in formats:
         if name not in FORMATS:
             raise OptionError(f"--format {name}: unknown{suggestion(name, FORMATS)}")
+    if image_path is not None and not image_path.is_dir():
+        raise OptionError(f"--image-path {image_path}: no such folder")
     source = Source(
         model_path, read_given_model(model_path), image_path or _recorded_images(model_path)
     )

@@ -15,7 +15,7 @@ from typing import Any, Self
 import tomli_w
 from filelock import FileLock, Timeout
 
-from colmap_affrect.errors import StaleStoreError, WorkspaceError
+from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
 from colmap_affrect.options import digest_of, flat
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 
@@ -234,10 +234,10 @@ class Workspace:
         return digest_of(chosen)
 
     def require(self, stage: str) -> dict[str, Any]:
-        """Return the recorded options of an earlier stage; WorkspaceError when it was not run."""
+        """Return the recorded options of an earlier stage; OptionError when it was not run."""
         record = self.recorded()
         if stage not in record.get("begun", []):
-            raise WorkspaceError(
+            raise OptionError(
                 f"{self.path}: the {stage} stage has not been run there; run "
                 f"'colmap-affrect {stage}' with this --output-path first"
             )

@@ -73,7 +73,8 @@ def write_set(
     for image in registered:
         if image.camera.model.name not in CAMERA_MODELS:
             raise SystemExit(
-                f"{image.name}: a camera with distortion; undistort with colmap image_undistorter"
+                f"{image.name}: a camera with distortion; undistort with "
+                "colmap-affrect export --format undistorted"
             )
         suffix = PurePosixPath(image.name).suffix
         shutil.copyfile(image_path / image.name, images / f"{stems[image.name]}{suffix}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -229,6 +230,73 @@ def test_wrong_mapping_options_are_said_before_any_image_is_read(
     assert not (out / "config.toml").exists()
 
 
+SELECTED = "--image-list-path --mask-path --camera-mask-path --from-database --cameras-path"
+RUN = "--image-path PHOTOS --output-path NEW"
+H5 = "--features-path OUT/features.h5 --matches-path OUT/matches.h5 --database-path NEW"
+MODEL = "--model-path OUT/sparse/0 --output-path NEW"
+
+INPUTS = {
+    f"run {RUN}": f"--config {SELECTED} --recipe --weights --depth-path --match-list-path --extend",
+    f"extract {RUN}": f"{SELECTED} --recipe --weights --depth-path",
+    f"compare {RUN}": f"{SELECTED} --weights --depth-path --match-list-path --ground-truth-path",
+    "pairs --output-path OUT": "--match-list-path",
+    "match --output-path OUT": "--recipe",
+    "escalate --output-path OUT": "--weights",
+    "guide --output-path OUT": "--model-path",
+    "map --output-path NEW --from-database OUT/database.db": "--image-path --extend",
+    "map --output-path OUT": "--extend",
+    "evaluate pairs --dataset-path PHOTOS --output-path NEW": "--recipes --weights --depth-path",
+    "inspect PHOTOS/a.png --output-path NEW": "--mask-path --recipe --weights --depth-path",
+    f"import-h5 --image-path PHOTOS {H5}": "--cameras-path",
+    f"export {MODEL}": "--image-path",
+    f"align {MODEL}": "--gps --positions --points",
+    "doctor OUT": "--image-path --weights",
+    "weights list": "--weights",
+    # what a command cannot do without
+    "run --output-path NEW --image-path NONE": "",
+    "extract --output-path NEW --image-path NONE": "",
+    **{f"{stage} --output-path NONE": "" for stage in ("pairs", "match", "verify", "escalate")},
+    **{f"{stage} --output-path NONE": "" for stage in ("guide", "map")},
+    "map --output-path NEW --from-database NONE": "",
+    "compare --output-path NEW --image-path NONE": "",
+    "evaluate evd --output-path NEW --dataset-path NONE": "",
+    "convert --output-path NEW --image-path NONE": "",
+    "inspect NONE --output-path NEW": "",
+    f"import-h5 --image-path NONE {H5}": "",
+    f"import-h5 --image-path PHOTOS {H5} --features-path NONE": "",
+    f"import-h5 --image-path PHOTOS {H5} --matches-path NONE": "",
+    "export-h5 --output-path NONE --features-path NEW --matches-path NEW.h5": "",
+    "export-h5 --database-path NONE --features-path NEW --matches-path NEW.h5": "",
+    "export-database NONE NEW": "",
+    "export --output-path NEW --model-path NONE": "",
+    "align --output-path NEW --distance a.png,b.png,1 --model-path NONE": "",
+    "doctor NONE": "",
+    "recipes NONE": "",
+}
+"""Commands with options of inputs that they may be given."""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [f"{text} {flag} NONE" for text, flags in INPUTS.items() for flag in flags.split()]
+    + [text for text, flags in INPUTS.items() if not flags],
+)
+def test_file_or_folder_that_is_not_there_is_wrong_usage_before_anything_is_made(
+    verified: Path, photos: Path, tmp_path: Path, text: str, call: Call
+) -> None:
+    places = {"PHOTOS": photos, "OUT": verified, "NEW": tmp_path / "new"}
+    places["NONE"] = tmp_path / "none.toml"
+    for name, path in places.items():
+        text = re.sub(rf"\b{name}\b", str(path), text)
+    before = {path: path.stat().st_mtime_ns for path in verified.rglob("*.*")}
+    done = call(*text.split())
+    assert (done.code, done.stdout, len(done.stderr)) == (2, "", 1)
+    assert str(places["NONE"]) in done.stderr[0]
+    assert not list(tmp_path.iterdir())
+    after = {path: path.stat().st_mtime_ns for path in verified.rglob("*.*")}
+    assert after | {verified / "run.log": 0} == before | {verified / "run.log": 0}
+
+
 FACADE = Path(__file__).parents[2] / "sample_scenes" / "facade" / "images" / "view_5_tilt70.jpg"
 
 
@@ -246,11 +314,11 @@ def test_inspect_draws_a_sheet_and_writes_the_plan(tmp_path: Path, call: Call) -
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["--device", "gpu"], 1, "--device gpu: not one of auto, cpu, cuda"),
+        (["--device", "gpu"], 2, "--device gpu: not one of auto, cpu, cuda"),
         (["--recipe", "depth-planes-recommended"], 2, "give --depth-path FOLDER, or --depth-mod"),
         (["--recipe", "depth-planes"], 2, "give --depth-path FOLDER, or --depth-model"),
         (["--recipe", "depth-planes-recommended", "--depth-path", "nowhere"], 2, "nowhere"),
-        (["--recipe", "dense-affnet", "--weights", "nowhere"], 2, "nowhere: not a folder"),
+        (["--recipe", "dense-affnet", "--weights", "nowhere"], 2, "nowhere: no such folder"),
         (["--recipe", "defalt"], 2, "did you mean 'default'"),
         (["--pairs", "vocab"], 2, "pairs: methods='vocab' is not one of"),
         (["--image-list-path", "none.txt"], 2, "none.txt: cannot be read (No such file"),

@@ -14,7 +14,7 @@ from random_weights import randomized
 from torch import nn
 from torch.nn import functional
 
-from colmap_affrect.errors import DeviceError, WeightsError
+from colmap_affrect.errors import DeviceError, OptionError, WeightsError
 from colmap_affrect.features.affnet_hardnet import AffNetHardNetOptions
 from colmap_affrect.features.networks import (
     DESCRIPTOR_NETWORKS,
@@ -106,7 +106,7 @@ def test_resolve_device_counts_cuda_devices(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "CPU", "", "cpu:1", "cuda:-1"])
 def test_resolve_device_of_an_unknown_name_lists_the_known_ones(name: str) -> None:
-    with pytest.raises(DeviceError, match="not one of auto, cpu, cuda, cuda:0, mps"):
+    with pytest.raises(OptionError, match="not one of auto, cpu, cuda, cuda:0, mps"):
         resolve_device(name)
 
 

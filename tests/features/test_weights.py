@@ -106,7 +106,7 @@ def test_resolve_searches_every_place_for_each_file(folders: dict[str, Path]) ->
         "hardnet": folders["cache"] / NAME,
     }
     assert resolve([]) == {}
-    with pytest.raises(OptionError, match=r"--weights .*nowhere: not a folder"):
+    with pytest.raises(OptionError, match=r"--weights .*nowhere: no such folder"):
         resolve(["affnet"], folders["given"] / "nowhere")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from colmap_affrect.errors import OptionError
 from colmap_affrect.images.conversion import convert_images
 from colmap_affrect.images.reading import decode
 
-FOCAL_LENGTH, EQUIVALENT, EXIF_IFD = 0x920A, 0xA405, 0x8769
+FOCAL_LENGTH, EQUIVALENT, EXIF_IFD, ORIENTATION = 0x920A, 0xA405, 0x8769, 0x0112
 
 
 def picture(seed: int) -> Image.Image:
@@ -69,6 +70,21 @@ def test_every_photograph_arrives_as_colmap_reads_it(scans: Path, tmp_path: Path
     assert bitmap.exif_focal_length() == pytest.approx(80 / 43.27 * np.hypot(45, 30), rel=0.01)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_pages_that_lie_on_their_side_are_upright(tmp_path: Path, dtype: type) -> None:
+    upright = np.arange(1350, dtype=np.uint16).reshape(30, 45).astype(dtype)
+    (tmp_path / "scans").mkdir()
+    with TiffImagePlugin.AppendingTiffWriter(str(tmp_path / "scans" / "a.tif")) as file:
+        for orientation, page in ((6, np.rot90(upright)), (3, np.rot90(upright, 2))):
+            Image.fromarray(page).save(file, format="TIFF", tiffinfo={ORIENTATION: orientation})
+            file.newFrame()
+    convert_images(tmp_path / "scans", tmp_path / "photos")
+    for name in ("a.tif-page1.png", "a.tif-page2.png"):
+        made = Image.open(tmp_path / "photos" / name)
+        assert ORIENTATION not in made.getexif()
+        np.testing.assert_array_equal(made, upright)
+
+
 def test_what_is_there_is_not_made_again(scans: Path, tmp_path: Path) -> None:
     convert_images(scans, tmp_path / "photos")
     (tmp_path / "photos" / "d.tif-page2.png").unlink()
@@ -91,10 +107,10 @@ def test_whatever_pillow_raises_of_a_damaged_file_the_others_are_converted(
 ) -> None:
     intact = Image.open
 
-    def fail_of_one(path: Path) -> Image.Image:
-        if path.name == "b.webp":
+    def fail_of_one(file: BinaryIO) -> Image.Image:
+        if Path(file.name).name == "b.webp":
             raise RuntimeError("Failed to decode image")  # as of AVIF
-        return intact(path)
+        return intact(file)
 
     monkeypatch.setattr(Image, "open", fail_of_one)
     report = convert_images(scans, tmp_path / "photos")

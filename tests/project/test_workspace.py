@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from colmap_affrect.errors import StaleStoreError, WorkspaceError
+from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
 from colmap_affrect.project.workspace import COPY_STAGES, Workspace, temporary_folder
 from colmap_affrect.project.workspace import STAGES as ALL_STAGES
 
@@ -50,7 +50,7 @@ def test_record_options_puts_the_options_on_record(workspace: Workspace) -> None
     }
     assert workspace.recipe() == "default"
     assert workspace.planned("match") == {"max_ratio": 0.8}
-    with pytest.raises(WorkspaceError, match="the match stage has not been run"):
+    with pytest.raises(OptionError, match="the match stage has not been run"):
         workspace.require("match")
     assert workspace.require("extract")["camera"] == {"mode": "auto"}
     assert [path.name for path in workspace.path.iterdir()] == ["config.toml"]
@@ -161,7 +161,7 @@ def test_results_of_somebody_else_are_refused_and_left_as_they_are(
 
 
 def test_require_of_a_stage_not_run_says_what_to_run(workspace: Workspace) -> None:
-    with pytest.raises(WorkspaceError, match=r"run 'colmap-affrect match' .* first"):
+    with pytest.raises(OptionError, match=r"run 'colmap-affrect match' .* first"):
         workspace.require("match")
 
 
@@ -254,7 +254,7 @@ def test_branch_begins_after_the_raw_matches(finished: Workspace, tmp_path: Path
         **finished.recorded(), "begun": ["extract", "pairs", "match"],
     }  # fmt: skip
     assert branch.options_digest("extract", "match") == finished.options_digest("extract", "match")
-    with pytest.raises(WorkspaceError, match="the verify stage has not been run"):
+    with pytest.raises(OptionError, match="the verify stage has not been run"):
         branch.require("verify")
     branch.record_options("verify", {"by": "another seed"})
     assert finished.require("verify") == {"by": "verify"}

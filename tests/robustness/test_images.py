@@ -139,7 +139,7 @@ def test_formats_that_colmap_cannot_read_are_reported(mixed: Mixed) -> None:
 def test_format_is_told_by_content_and_not_by_suffix(mixed: Mixed, kind: str) -> None:
     assert FORMATS[kind] in FOREIGN_FORMATS
     why = mixed.ended.report["stages"][0]["failures"][f"{kind}.jpg"]
-    assert f"{kind}.jpg: is a {FORMATS[kind]} file, a format that COLMAP cannot read; conv" in why
+    assert f"{kind}.jpg: is of the format {FORMATS[kind]}, which COLMAP cannot read; conv" in why
     # So it is in truth, or the rule would keep good images out.
     assert pycolmap.Bitmap.read(mixed.photos / f"{kind}.jpg", as_rgb=False) is None
 

@@ -117,7 +117,7 @@ def same_state(first: Workspace, second: Workspace) -> None:
 
 def test_escalation_before_its_turn_leaves_nothing_on_record(tmp_path: Path, call: Call) -> None:
     ended = call("escalate", "--output-path", tmp_path)
-    assert ended.code == 1
+    assert ended.code == 2
     assert "the verify stage has not been run there" in ended.errors[0]
     assert not Workspace(tmp_path).config.exists()
 

@@ -416,7 +416,7 @@ def test_overwrite_redoes_a_stage_and_run_goes_on_from_it(
 @pytest.mark.parametrize("stage", ["pairs", "match", "verify", "map"])
 def test_stage_before_its_turn_says_what_to_run(tmp_path: Path, call: Call, stage: str) -> None:
     code, stdout, stderr = call(stage, "--output-path", tmp_path)
-    assert (code, stdout, len(stderr)) == (1, "", 1)
+    assert (code, stdout, len(stderr)) == (2, "", 1)
     assert "stage has not been run there; run 'colmap-affrect " in stderr[0]
 
 
