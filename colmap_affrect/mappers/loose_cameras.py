@@ -13,7 +13,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.base import MappingTask
-from colmap_affrect.mappers.last_adjustment import solve
+from colmap_affrect.mappers.last_adjustment import robust_options, solve
 
 FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
 
@@ -41,11 +41,14 @@ def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str
         return ()
     fixed = {key for key, record in task.cameras.items() if record.is_fixed} & set(model.cameras)
     sparse = _with_fewer_points(model)
-    most = MIN_GROWTH * solve(sparse, fixed)
+    options = robust_options()
+    is_straight = all(model.cameras[key].is_undistorted() for key in unknown)
+    options.refine_extra_params = not is_straight  # what no point tells stays as it is
+    most = MIN_GROWTH * solve(sparse, fixed, options)
     loose: set[int] = set()
     for keys in np.array_split(unknown, min(len(unknown), MAX_NUM_TRIALS)):
         held = fixed.union(keys.tolist())
-        if any(solve(_scaled(sparse, keys, factor), held) < most for factor in FACTORS):
+        if any(solve(_scaled(sparse, keys, factor), held, options) < most for factor in FACTORS):
             loose.update(keys.tolist())
     return tuple(sorted(image.name for image in images if image.camera_id in loose))
 
