@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import image_ids
+from colmap_affrect.colmap.database import all_cameras, image_ids
 from colmap_affrect.colmap.model_files import num_long_tracks, registered_names, write_model
 from colmap_affrect.colmap.verification import inlier_matches, num_tied
 from colmap_affrect.errors import StoreError
@@ -21,7 +22,7 @@ from colmap_affrect.mappers.doubts import (
     without_impossible,
 )
 from colmap_affrect.mappers.existing import require_extends
-from colmap_affrect.mappers.last_adjustment import MIN_NUM_TRACKS, adjust_last
+from colmap_affrect.mappers.last_adjustment import MIN_NUM_TRACKS, adjust_last, robust_options
 from colmap_affrect.mappers.loose_cameras import loose_images
 from colmap_affrect.mappers.pair_graph import MIN_NUM_MATCHES, graph_of
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
@@ -44,6 +45,9 @@ MAX_HOLDING_ATTEMPTS = 2
 
 LARGE_MODEL = 100
 """From this size on the first pair no longer matters, and another attempt takes long."""
+
+REFINING = "ba_refine_", "mapper.bundle_adjustment.refine_"
+"""What options of COLMAP's two mappers begin with that say what of cameras is refined."""
 
 
 def map_database(
@@ -198,9 +202,12 @@ def _is_well_tied(model: pycolmap.Reconstruction) -> bool:
     return all(counts[image_id] >= MIN_NUM_TRACKS for image_id in model.reg_image_ids())
 
 
-def _has_unknown_cameras(model: MappedModel, task: MappingTask) -> bool:
+def _needs_cameras(model: MappedModel, task: MappingTask) -> bool:
+    """Tell whether nobody knows cameras of a model, nor many images."""
     images = model.reconstruction.images.values()
     used = {image.camera_id for image in images if image.has_pose}
+    if model.reconstruction.num_reg_images() >= LARGE_MODEL:  # has points of many images
+        return False
     return any(task.cameras[key].source == "guess" for key in used & task.cameras.keys())
 
 
@@ -210,25 +217,43 @@ def _possible(models: list[MappedModel], task: MappingTask) -> list[MappedModel]
 
 
 def _adjust_weak(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -> bool:
-    """Adjust models that guided matches or bridges hold, or whose cameras nobody knows.
+    """Adjust models that guided matches or bridges hold, or small ones whose cameras nobody knows.
 
-    Others stay as COLMAP made them.
+    Others stay as COLMAP made them. What the user says is not to be refined stays as well.
 
     Returns:
         Whether there were any.
     """
     weak = [
-        model
-        for model in models
-        if task.guided or model.bridges or _has_unknown_cameras(model, task)
+        model for model in models if task.guided or model.bridges or _needs_cameras(model, task)
     ]
-    verified = inlier_matches(task.database_path, 1) if weak else {}
+    if not weak:
+        return False
+    verified = inlier_matches(task.database_path, 1)
+    begun = {camera.camera_id: camera for camera in all_cameras(task.database_path)}
     for model in weak:
         constant = task.constant_cameras(mapper.options) | runaways(model.reconstruction, task)
         if task.keeps_focal_lengths(mapper.options):
             constant = set(model.reconstruction.cameras)
-        adjust_last(model.reconstruction, verified, task.guided, constant_cameras=constant)
-    return bool(weak)
+        adjust_last(
+            model.reconstruction,
+            verified,
+            task.guided,
+            constant_cameras=constant,
+            starts=begun,
+            options=_refining(mapper.options.mapper_options),
+        )
+    return True
+
+
+def _refining(given: Mapping[str, Any]) -> pycolmap.BundleAdjustmentOptions:
+    """Return robust options that refine of cameras what options of a mapper say."""
+    options = robust_options()
+    for part in ("focal_length", "principal_point", "extra_params"):
+        for prefix in REFINING:
+            if prefix + part in given:
+                setattr(options, f"refine_{part}", given[prefix + part])
+    return options
 
 
 def _size(model: MappedModel) -> tuple[int, int]:

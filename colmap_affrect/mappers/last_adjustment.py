@@ -7,6 +7,7 @@ COLMAP stops on the way, and takes distortions for focal lengths.
 
 from __future__ import annotations
 
+import copy
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping
 from itertools import combinations
@@ -37,9 +38,12 @@ MAX_NUM_ITERATIONS = 300
 """Where nobody knows the cameras and few points are seen by three images, focal lengths move slowly
 and far: 100 end on the way."""
 
+MIN_CHANGE = 1e-8
+"""Of the error in one iteration; what changes less has ended. COLMAP's 0 makes all iterations."""
+
 MIN_GROWTH_WITHOUT_DISTORTION = 1.07
-"""Of the error of adjustment, with lenses that do not distort; less, and the points do not tell the
-distortion. It then takes up what belongs to focal lengths."""
+"""Of the error of adjustment, with lenses that distort as at the start; less, and the points do not
+tell the distortion. It then takes up what belongs to focal lengths."""
 
 MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
 """What fits, as for COLMAP's mappers."""
@@ -54,6 +58,8 @@ def adjust_last(
     guided: Matches,
     *,
     constant_cameras: Collection[int] = (),
+    starts: Mapping[int, pycolmap.Camera] | None = None,
+    options: pycolmap.BundleAdjustmentOptions | None = None,
 ) -> int:
     """Adjust a model that guided matches or bridges hold, and take out what no longer fits.
 
@@ -66,6 +72,9 @@ def adjust_last(
         verified: (M, 2) inliers of each pair of image ids, as they made the model.
         guided: those of them that only guided matching has found.
         constant_cameras: ids of cameras whose parameters stay as they are.
+        starts: cameras before they were refined, by id; they have their distortion again where the
+            points do not tell it.
+        options: changed in place; by default :func:`robust_options`.
 
     Returns:
         How many observations of guided matches were taken out first.
@@ -79,34 +88,42 @@ def adjust_last(
     for image_id, index in zip(dropped >> 32, dropped & 0xFFFFFFFF, strict=True):
         if model.images[image_id].points2D[index].has_point3D():
             model.delete_observation(image_id, index)
-    options = robust_options()
-    free = set(model.cameras) - set(constant_cameras)
-    if free and not _tells_distortion(model, constant_cameras):
-        _straighten(model, free)
+    options = options or robust_options()
+    found = {
+        key: start
+        for key, start in (starts or {}).items()
+        if key in model.cameras and key not in constant_cameras and len(start.extra_params_idxs())
+    }
+    asks = bool(found) and options.refine_extra_params
+    if asks and not _tells_distortion(model, constant_cameras, found, options):
+        _take_back_distortion(model, found)
         options.refine_extra_params = False
     adjust(model, options, constant_cameras)
     return len(dropped)
 
 
-def _tells_distortion(model: pycolmap.Reconstruction, constant_cameras: Collection[int]) -> bool:
+def _tells_distortion(
+    model: pycolmap.Reconstruction,
+    constant_cameras: Collection[int],
+    starts: Mapping[int, pycolmap.Camera],
+    options: pycolmap.BundleAdjustmentOptions,
+) -> bool:
     """Tell whether the points say how much the lenses distort that may be refined."""
-    distorted, straight = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
-    _straighten(straight, set(straight.cameras) - set(constant_cameras))
-    options = robust_options()
-    options.refine_extra_params = False
-    most = MIN_GROWTH_WITHOUT_DISTORTION * solve(distorted, constant_cameras)
-    return solve(straight, constant_cameras, options) > most
+    refined, start = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
+    _take_back_distortion(start, starts)
+    held = copy.deepcopy(options)
+    held.refine_extra_params = False
+    most = MIN_GROWTH_WITHOUT_DISTORTION * solve(refined, constant_cameras, options)
+    return solve(start, constant_cameras, held) > most
 
 
-def _straighten(model: pycolmap.Reconstruction, cameras: Collection[int]) -> None:
-    """Let some cameras not distort."""
-    for key in cameras:
-        camera = model.cameras[key]
-        new = pycolmap.Camera.create_from_model_id(
-            key, camera.model, camera.mean_focal_length(), camera.width, camera.height
-        )
-        for index in camera.extra_params_idxs():
-            camera.params[index] = new.params[index]
+def _take_back_distortion(
+    model: pycolmap.Reconstruction, starts: Mapping[int, pycolmap.Camera]
+) -> None:
+    """Let cameras distort as they did before they were refined."""
+    for key, start in starts.items():
+        for index in start.extra_params_idxs():
+            model.cameras[key].params[index] = start.params[index]
 
 
 def robust_options() -> pycolmap.BundleAdjustmentOptions:
@@ -116,6 +133,7 @@ def robust_options() -> pycolmap.BundleAdjustmentOptions:
     options.ceres.loss_function_scale = LOSS_SCALE_PX
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.max_num_iterations = MAX_NUM_ITERATIONS
+    options.ceres.solver_options.function_tolerance = MIN_CHANGE
     return options
 
 

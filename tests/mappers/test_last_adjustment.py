@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import copy
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import inlier_matches
+from colmap_affrect.mappers import attempts
+from colmap_affrect.mappers.attempts import map_database
+from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.mappers.last_adjustment import Matches, adjust_last, exactly_held
 
 LAST = 5
@@ -115,10 +121,74 @@ def test_lenses_do_not_distort_unless_points_tell_so(true: float, start: float) 
     model = pycolmap.synthesize_dataset(options)
     pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), model)
     for camera in model.cameras.values():
+        camera.params[3] = 0.0
+    begun = copy.deepcopy(dict(model.cameras))
+    for camera in model.cameras.values():
         camera.params[3] = start
-    adjust_last(model, {}, {})
+    adjust_last(model, {}, {}, starts=begun)
     ends = [camera.params[3] for camera in model.cameras.values()]
     assert ends == ([0.0] if true == 0.0 else pytest.approx([true], abs=0.05))
+
+
+class RefiningTooMuch:
+    """Has a true model, and gives its cameras another distortion than the database has."""
+
+    def __init__(self, model: pycolmap.Reconstruction, options: dict[str, bool]) -> None:
+        self.model = copy.deepcopy(model)
+        self.options = IncrementalOptions(mapper_options=options)
+
+    def map(self, *_: object) -> list[MappedModel]:
+        for camera in self.model.cameras.values():
+            camera.params[0] *= 1.01
+            camera.params[3] += 0.01
+        return [MappedModel(self.model)]
+
+
+def task_of(path: Path, model: pycolmap.Reconstruction) -> MappingTask:
+    """Of cameras that nobody knows, as another program's database has them."""
+    names = {image.camera_id: image.name for image in model.images.values()}
+    records = {key: CameraRecord((name,), "guess", 1280.0) for key, name in names.items()}
+    return MappingTask(path, None, cameras=records)
+
+
+@pytest.mark.parametrize(
+    ("options", "is_refined"),
+    [({}, (True, False)), ({"ba_refine_focal_length": False}, (False, False)),
+     ({"ba_refine_extra_params": False}, (True, True))],
+)  # fmt: skip
+def test_distortion_is_held_at_its_start_and_what_is_not_to_be_refined_stays(
+    tmp_path: Path, options: dict[str, bool], is_refined: tuple[bool, bool]
+) -> None:
+    synthetic = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=LAST)
+    synthetic.camera_params = [1280.0, 512.0, 384.0, 0.05]
+    pycolmap.set_random_seed(1)
+    with open_database(tmp_path / "database.db") as database:
+        true = pycolmap.synthesize_dataset(synthetic, database)
+        pycolmap.synthesize_noise(
+            pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), true, database
+        )
+    mapper, task = RefiningTooMuch(true, options), task_of(tmp_path / "database.db", true)
+    map_database(mapper, task, tmp_path / "sparse", lambda _: None)
+    (camera,) = pycolmap.Reconstruction(tmp_path / "sparse" / "0").cameras.values()
+    focal_moved = camera.params[0] != 1280.0 * 1.01
+    assert (focal_moved, camera.params[3] != 0.05) == is_refined
+    if is_refined[1]:
+        assert camera.params[3] == pytest.approx(0.06)
+
+
+def test_large_models_whose_cameras_nobody_knows_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(attempts, "LARGE_MODEL", LAST)
+    with open_database(tmp_path / "database.db") as database:
+        pycolmap.set_random_seed(1)
+        true = pycolmap.synthesize_dataset(
+            pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=LAST), database
+        )
+    mapper = RefiningTooMuch(true, {})
+    map_database(mapper, task_of(tmp_path / "database.db", true), tmp_path / "s", lambda _: None)
+    (camera,) = pycolmap.Reconstruction(tmp_path / "s" / "0").cameras.values()
+    assert camera.params[0] == 1280.0 * 1.01
 
 
 def track(point: int, *images: int) -> list[list[int]]:
