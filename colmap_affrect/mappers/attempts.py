@@ -33,6 +33,7 @@ from colmap_affrect.mappers.starts import (
     runaways,
     started,
     starts,
+    unknown_cameras,
 )
 from colmap_affrect.mappers.summaries import read_summary, write_summary
 from colmap_affrect.project.report import ModelSummary
@@ -204,11 +205,11 @@ def _is_well_tied(model: pycolmap.Reconstruction) -> bool:
 
 def _needs_cameras(model: MappedModel, task: MappingTask) -> bool:
     """Tell whether nobody knows cameras of a model, nor many images."""
-    images = model.reconstruction.images.values()
-    used = {image.camera_id for image in images if image.has_pose}
     if model.reconstruction.num_reg_images() >= LARGE_MODEL:  # has points of many images
         return False
-    return any(task.cameras[key].source == "guess" for key in used & task.cameras.keys())
+    images = model.reconstruction.images.values()
+    used = {image.camera_id for image in images if image.has_pose}
+    return not used.isdisjoint(unknown_cameras(task))
 
 
 def _possible(models: list[MappedModel], task: MappingTask) -> list[MappedModel]:
@@ -230,7 +231,8 @@ def _adjust_weak(mapper: Mapper, task: MappingTask, models: list[MappedModel]) -
     if not weak:
         return False
     verified = inlier_matches(task.database_path, 1)
-    begun = {camera.camera_id: camera for camera in all_cameras(task.database_path)}
+    unknown = unknown_cameras(task)
+    begun = {c.camera_id: c for c in all_cameras(task.database_path) if c.camera_id in unknown}
     for model in weak:
         constant = task.constant_cameras(mapper.options) | runaways(model.reconstruction, task)
         if task.keeps_focal_lengths(mapper.options):

@@ -54,11 +54,7 @@ def starts(task: MappingTask) -> list[Start]:
     allow, for all unknown cameras at once; and from a long lens, which mapping that starts from a
     short one hardly ever ends with.
     """
-    unknown = {
-        key: record
-        for key, record in task.cameras.items()
-        if record.source == "guess" and record.low_px is not None
-    }
+    unknown = unknown_cameras(task)
     found = [Start()]
     if unknown:
         found.append(Start(distortion_held=True))
@@ -75,6 +71,15 @@ def starts(task: MappingTask) -> list[Start]:
         if moved:
             found.append(Start(moved, distortion_held=True))
     return found
+
+
+def unknown_cameras(task: MappingTask) -> dict[int, CameraRecord]:
+    """Return the cameras that nobody knows, and of which pairs tell something."""
+    return {
+        key: record
+        for key, record in task.cameras.items()
+        if record.source == "guess" and record.low_px is not None
+    }
 
 
 def _shared(records: Mapping[int, CameraRecord]) -> dict[int, CameraRecord]:

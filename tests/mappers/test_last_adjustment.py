@@ -147,7 +147,9 @@ class RefiningTooMuch:
 def task_of(path: Path, model: pycolmap.Reconstruction) -> MappingTask:
     """Of cameras that nobody knows, as another program's database has them."""
     names = {image.camera_id: image.name for image in model.images.values()}
-    records = {key: CameraRecord((name,), "guess", 1280.0) for key, name in names.items()}
+    records = {
+        key: CameraRecord((name,), "guess", 1280.0, 600.0, 2400.0) for key, name in names.items()
+    }
     return MappingTask(path, None, cameras=records)
 
 
