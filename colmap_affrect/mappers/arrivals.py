@@ -1,7 +1,5 @@
 """How the images of a model came in."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 

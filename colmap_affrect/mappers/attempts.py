@@ -1,7 +1,5 @@
 """From a verified database to a folder of models, by any mapper."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace

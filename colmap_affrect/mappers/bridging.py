@@ -6,8 +6,6 @@ to those of the pair at neighbouring places is the scale (:mod:`colmap_affrect.g
 What a bridge would do is judged by all other verified pairs of the images that it brings in.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -3,8 +3,6 @@
 Doubts have two degrees: what is certainly wrong leaves the model, the rest is told.
 """
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@ It may be of another program, or of an earlier run with other ids: images are to
 and cameras, poses and points are moved into a reconstruction with the ids of the database.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Collection
 from dataclasses import dataclass

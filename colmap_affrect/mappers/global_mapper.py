@@ -3,8 +3,6 @@
 ``pycolmap.global_mapping`` takes no cancellation token: only the end of its process stops it.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable, Mapping

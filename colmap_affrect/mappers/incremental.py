@@ -1,7 +1,5 @@
 """COLMAP's incremental mapper."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ exact matches suffice to hold images these alone say where they stand. Where nob
 COLMAP stops on the way, and takes distortions for focal lengths.
 """
 
-from __future__ import annotations
-
 import copy
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping

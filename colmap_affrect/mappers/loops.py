@@ -5,8 +5,6 @@ allows two relative poses. Both show in the loops that they stand in: rotations 
 robustly over the whole graph follow the majority, weighted by inliers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache

@@ -5,8 +5,6 @@ images, a model bends to nearly any focal length. The adjustment still ends some
 errors and small variances, and poses are off by tens of degrees.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 import numpy as np

@@ -1,13 +1,11 @@
 """The verified pairs of a database, and how well poses agree with them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +66,7 @@ class VerifiedPair:
         """What the pair counts beside others."""
         return float(np.sqrt(len(self.matches)))
 
-    def some_matches(self) -> VerifiedPair:
+    def some_matches(self) -> Self:
         """Return the pair with ``MAX_MATCHES`` of its inliers at most, spread over all."""
         step = -(-len(self.matches) // MAX_MATCHES)
         return replace(self, matches=self.matches[::step])
@@ -115,7 +113,7 @@ class PairGraph:
         path: Path,
         min_num_matches: int = MIN_NUM_MATCHES,
         depth_at: DepthLookup | None = None,
-    ) -> PairGraph:
+    ) -> Self:
         """Read the pairs with at least as many inliers."""
         with open_database(path) as database:
             images = {image.image_id: image for image in database.read_all_images()}
@@ -146,7 +144,7 @@ class PairGraph:
             depth_at,
         )
 
-    def without(self, ids: Collection[tuple[int, int]]) -> PairGraph:
+    def without(self, ids: Collection[tuple[int, int]]) -> Self:
         """Leave out some pairs; the cache keeps them."""
         return replace(self, pairs=tuple(pair for pair in self.pairs if pair.ids not in ids))
 

@@ -1,7 +1,5 @@
 """Snapshots of a long mapping, from which it goes on after it has been killed."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The sparse mapper: COLMAP's incremental mapper, and bridges to what it leaves out."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Focal lengths that mapping starts from where nobody knows them, and cameras that ran away."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

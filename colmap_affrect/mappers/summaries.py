@@ -1,7 +1,5 @@
 """What is known of a finished model, kept beside it: COLMAP's files cannot hold it all."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path

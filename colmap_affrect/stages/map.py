@@ -1,7 +1,5 @@
 """Map: models of the verified pairs, into ``sparse/``."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import Counter, defaultdict
