@@ -59,19 +59,19 @@ def adjust_last(
     starts: Mapping[int, pycolmap.Camera] | None = None,
     options: pycolmap.BundleAdjustmentOptions | None = None,
 ) -> int:
-    """Adjust a model that guided matches or bridges hold, and take out what no longer fits.
+    """Adjust a model whose matches or cameras are uncertain, and take out what no longer fits.
 
     Observations that only guided matches tie to their tracks are taken out first where exact ones
     hold all images. Elsewhere they fix what exact ones leave open, the scale of one part against
     another for one; the loss is robust, so that the exact ones, which fit better, count more.
+    Lenses distort as at the start where the points do not tell another distortion.
 
     Args:
         model: changed in place.
         verified: (M, 2) inliers of each pair of image ids, as they made the model.
         guided: those of them that only guided matching has found.
         constant_cameras: ids of cameras whose parameters stay as they are.
-        starts: cameras before they were refined, by id; they have their distortion again where the
-            points do not tell it.
+        starts: cameras that nobody knows, by id, as they were before they were refined.
         options: changed in place; by default :func:`robust_options`.
 
     Returns:
