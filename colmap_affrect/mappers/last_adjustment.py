@@ -43,6 +43,9 @@ MIN_GROWTH_WITHOUT_DISTORTION = 1.07
 """Of the error of adjustment, with lenses that distort as at the start; less, and the points do not
 tell the distortion. It then takes up what belongs to focal lengths."""
 
+MAX_NUM_POINTS = 2_000
+"""Of a model, for what need not be exact."""
+
 MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
 """What fits, as for COLMAP's mappers."""
 
@@ -107,12 +110,24 @@ def _tells_distortion(
     options: pycolmap.BundleAdjustmentOptions,
 ) -> bool:
     """Tell whether the points say how much the lenses distort that may be refined."""
-    refined, start = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
+    refined = with_fewer_points(model)
+    start = pycolmap.Reconstruction(refined)
     _take_back_distortion(start, starts)
     held = copy.deepcopy(options)
     held.refine_extra_params = False
     most = MIN_GROWTH_WITHOUT_DISTORTION * solve(refined, constant_cameras, options)
     return solve(start, constant_cameras, held) > most
+
+
+def with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Return a copy with every n-th point, of ``MAX_NUM_POINTS`` at most."""
+    fewer = pycolmap.Reconstruction(model)
+    ids = sorted(fewer.point3D_ids())
+    kept = set(ids[:: max(1, -(-len(ids) // MAX_NUM_POINTS))])
+    for point_id in ids:
+        if point_id not in kept:
+            fewer.delete_point3D(point_id)
+    return fewer
 
 
 def _take_back_distortion(

@@ -11,7 +11,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.mappers.base import MappingTask
-from colmap_affrect.mappers.last_adjustment import robust_options, solve
+from colmap_affrect.mappers.last_adjustment import robust_options, solve, with_fewer_points
 
 FACTORS = 1.25, 0.8  # other focal lengths that are tried: poses are off by 5 degrees and more then
 
@@ -20,7 +20,7 @@ MIN_GROWTH = 1.07
 0.4 to 3 times, for long lenses around a small object by a tenth, where anything fits by 0.05."""
 
 MAX_NUM_TRIALS = 12  # more cameras than that are tried several at once
-MAX_NUM_POINTS, MAX_NUM_IMAGES = 2_000, 100  # looked at; larger models have points of many images
+MAX_NUM_IMAGES = 100  # looked at; larger models have points of many images
 
 
 def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str, ...]:
@@ -38,7 +38,7 @@ def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str
     if not unknown or len(images) > MAX_NUM_IMAGES or model.num_points3D() == 0:
         return ()
     fixed = {key for key, record in task.cameras.items() if record.is_fixed} & set(model.cameras)
-    sparse = _with_fewer_points(model)
+    sparse = with_fewer_points(model)
     options = robust_options()
     is_straight = all(model.cameras[key].is_undistorted() for key in unknown)
     options.refine_extra_params = not is_straight  # what no point tells stays as it is
@@ -49,17 +49,6 @@ def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str
         if any(solve(_scaled(sparse, keys, factor), held, options) < most for factor in FACTORS):
             loose.update(keys.tolist())
     return tuple(sorted(image.name for image in images if image.camera_id in loose))
-
-
-def _with_fewer_points(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """Return a copy with every n-th point."""
-    copy = pycolmap.Reconstruction(model)
-    ids = sorted(copy.point3D_ids())
-    kept = set(ids[:: -(-len(ids) // MAX_NUM_POINTS)])
-    for point_id in ids:
-        if point_id not in kept:
-            copy.delete_point3D(point_id)
-    return copy
 
 
 def _scaled(

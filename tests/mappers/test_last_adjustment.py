@@ -130,6 +130,14 @@ def test_lenses_do_not_distort_unless_points_tell_so(true: float, start: float) 
     assert ends == ([0.0] if true == 0.0 else pytest.approx([true], abs=0.05))
 
 
+def test_a_model_without_points_is_left_as_it_is(model: pycolmap.Reconstruction) -> None:
+    begun = copy.deepcopy(dict(model.cameras))
+    for point_id in list(model.point3D_ids()):
+        model.delete_point3D(point_id)
+    assert adjust_last(model, {}, {}, starts=begun) == 0
+    assert model.num_reg_images() == LAST
+
+
 class RefiningTooMuch:
     """Has a true model, and gives its cameras another distortion than the database has."""
 
