@@ -75,7 +75,10 @@ def _averaged(
     """Return a rotation for each image, one connected part of the graph after the other."""
     rotations: dict[int, NDArray[np.float64]] = {}
     left = dict(poses)
-    options = pycolmap.RotationEstimatorOptions(random_seed=max(random_seed, 0))
+    options = pycolmap.RotationEstimatorOptions(
+        random_seed=max(random_seed, 0),
+        reweighting=pycolmap.RotationAveragingReweighting.INLIER_MATCH_COUNT,
+    )
     while left:
         model, edges = pycolmap.Reconstruction(), pycolmap.PoseGraph()
         model.load(cache)

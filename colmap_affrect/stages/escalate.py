@@ -200,6 +200,7 @@ class Escalation:
         self.features, self.matches = context.features, context.matches
         self.path = context.workspace.database
         self.levels = range(1, len(self.extraction.levels))
+        self._is_measured = [level.features.has_shapes for level in self.extraction.levels]
         self._consistent: dict[Pair, tuple[bytes, int]] = {}
 
     @cached_property
@@ -272,10 +273,13 @@ class Escalation:
         graph, levels = self.graph(), self.matches.levels(self.pairs)
         tried = self.matches.tried_levels(self.pairs)
         joining, hanging = graph.joining(self.options), graph.hanging(self.options)
+        strong = self.options.strong_num_inliers
         for level in self.levels:
             unwritten = {pair for pair in self._unwritten if tried[pair] == level}
             for pairs in (joining, hanging, graph.links(levels, level)):
                 todo = [pair for pair in pairs if tried[pair] < level]
+                if not self._is_measured[level] and self._is_measured[0]:
+                    todo = [pair for pair in todo if graph.num_inliers.get(pair, 0) < strong]
                 if todo or unwritten.intersection(pairs):
                     return level, todo
         return None
@@ -336,7 +340,7 @@ class Escalation:
 
     def measured(self, pair: Pair, indices: NDArray[np.integer]) -> Bools:
         """Return which of the (M, 2) matches of a pair are of frames that were measured singly."""
-        kinds = np.array([level.features.has_shapes for level in self.extraction.levels])
+        kinds = np.array(self._is_measured)
         sides = []
         for side, name in enumerate(pair):
             ends = self.features.level_ends(name)
@@ -404,7 +408,7 @@ class Escalation:
 
     def _inliers_of_other_kind(self, pairs: Sequence[Pair], level: int) -> dict[Pair, Indices]:
         """Return the (M, 2) inliers, of frames measured or not, that a level does not look for."""
-        is_measured, todo = self.extraction.levels[level].features.has_shapes, set(pairs)
+        is_measured, todo = self._is_measured[level], set(pairs)
         found = {}
         for (one, two), inliers in verified_inliers(self.context).items():
             pair, indices = (
