@@ -2,11 +2,10 @@
 
 Repeated structure gives wrong pairs that no test of two views finds, and a plane seen twice
 allows two relative poses. Both show in the loops that they stand in: rotations that are averaged
-robustly over the whole graph follow the majority, weighted by inliers.
+robustly over the whole graph follow the majority.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 
 import networkx as nx
@@ -26,22 +25,12 @@ MAX_ROUNDS = 3
 """How often rotations are averaged again after other poses of pairs have been chosen."""
 
 
-@dataclass(frozen=True)
-class Loops:
-    """What loops say about the pairs of a graph.
-
-    Attributes:
-        poses: relative poses of each pair, the one that fits the loops best first.
-        contradicting: pairs none of whose poses fits, though their images are tied without them.
-    """
-
-    poses: Mapping[Ids, tuple[RelativePose, ...]]
-    contradicting: frozenset[Ids]
-
-
 @lru_cache(maxsize=1)
-def check_loops(graph: PairGraph, random_seed: int) -> Loops:
-    """Average the rotations of all pairs of a graph and compare each pair with the result."""
+def contradicting_pairs(graph: PairGraph, random_seed: int) -> frozenset[Ids]:
+    """Return the pairs that contradict others, and without which their images are still tied.
+
+    The rotations of all pairs are averaged; none of the relative poses of such a pair fits them.
+    """
     poses = {
         pair.ids: graph.relative_poses(pair, graph.cameras, random_seed) for pair in graph.pairs
     }
@@ -60,10 +49,7 @@ def check_loops(graph: PairGraph, random_seed: int) -> Loops:
         if not changed:
             break
     wrong = [ids for ids in errors if errors[ids] > MAX_ERROR_DEG]
-    return Loops(
-        {ids: tuple(found) for ids, found in poses.items()},
-        frozenset(_dispensable(sorted(wrong, key=lambda ids: -errors[ids]), weights)),
-    )
+    return frozenset(_dispensable(sorted(wrong, key=lambda ids: -errors[ids]), weights))
 
 
 def _averaged(
@@ -75,10 +61,7 @@ def _averaged(
     """Return a rotation for each image, one connected part of the graph after the other."""
     rotations: dict[int, NDArray[np.float64]] = {}
     left = dict(poses)
-    options = pycolmap.RotationEstimatorOptions(
-        random_seed=max(random_seed, 0),
-        reweighting=pycolmap.RotationAveragingReweighting.INLIER_MATCH_COUNT,
-    )
+    options = pycolmap.RotationEstimatorOptions(random_seed=max(random_seed, 0))
     while left:
         model, edges = pycolmap.Reconstruction(), pycolmap.PoseGraph()
         model.load(cache)
@@ -106,13 +89,26 @@ def _error_deg(
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def _dispensable(wrong: Iterable[Ids], pairs: Iterable[Ids]) -> list[Ids]:
-    """Return the wrong pairs without which their images are still tied to each other."""
-    graph, dropped = nx.Graph(list(pairs)), []
+def _dispensable(wrong: Iterable[Ids], weights: Mapping[Ids, int]) -> list[Ids]:
+    """Return the wrong pairs without which their images are still tied to each other.
+
+    Where these hang on single pairs else, the loop says no more than that one of them is wrong: the
+    weakest goes.
+    """
+    graph, dropped = nx.Graph(list(weights)), []
     for ids in wrong:
+        if not graph.has_edge(*ids):
+            continue
         graph.remove_edge(*ids)
-        if nx.has_path(graph, *ids):
-            dropped.append(ids)
-        else:
+        if not nx.has_path(graph, *ids):
             graph.add_edge(*ids)
+            continue
+        single = set(map(frozenset, nx.bridges(graph)))
+        path = nx.utils.pairwise(nx.shortest_path(graph, *ids))
+        hanging = [(min(edge), max(edge)) for edge in path if frozenset(edge) in single]
+        weakest = min([ids, *hanging], key=weights.__getitem__)
+        if weakest != ids:
+            graph.add_edge(*ids)
+            graph.remove_edge(*weakest)
+        dropped.append(weakest)
     return dropped

@@ -13,7 +13,7 @@ from colmap_affrect.colmap.database_copy import copy_without_pairs
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 from colmap_affrect.mappers.bridging import Bridges, Hypothesis, Part
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
-from colmap_affrect.mappers.loops import check_loops
+from colmap_affrect.mappers.loops import contradicting_pairs
 from colmap_affrect.mappers.pair_graph import PairGraph, graph_of
 
 MAX_TRIALS = 5
@@ -44,7 +44,7 @@ class SparseMapper(IncrementalMapper):
         graph = graph_of(task, native.min_num_matches)
         if models and graph.is_explained_by(models[0]):
             return [MappedModel(model) for model in models]
-        contradicting = check_loops(graph, random_seed).contradicting
+        contradicting = contradicting_pairs(graph, random_seed)
         trusted = graph.without(contradicting)
         if models and trusted.is_explained_by(models[0]):
             return [MappedModel(model) for model in models]
