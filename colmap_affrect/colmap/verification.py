@@ -396,3 +396,27 @@ def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], In
         for pair_id, geometry in zip(pair_ids, geometries, strict=True)
         if len(geometry.inlier_matches) >= min_num_inliers
     }
+
+
+def num_in_tracks(matches: Mapping[tuple[T, T], Indices]) -> dict[T, int]:
+    """Return how many features of each image are in tracks through three images or more.
+
+    ``matches`` has (M, 2) features of the first and the second image of each pair.
+    """
+    images = sorted({image for pair in matches for image in pair})
+    number = {image: index for index, image in enumerate(images)}
+    ends: list[Indices] = [
+        (number[pair[side]] << 32) + indices[:, side]
+        for side in (0, 1)
+        for pair, indices in matches.items()
+    ]
+    features, index, num_matches = np.unique(
+        np.concatenate([np.zeros(0, np.int64), *ends]), return_inverse=True, return_counts=True
+    )
+    first, second = index.reshape(2, -1)
+    is_shared = num_matches > 1
+    in_track = is_shared.copy()
+    in_track[first[is_shared[second]]] = True
+    in_track[second[is_shared[first]]] = True
+    counts = np.bincount(features[in_track] >> 32, minlength=len(images)).tolist()
+    return dict(zip(images, counts, strict=True))

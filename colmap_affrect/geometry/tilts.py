@@ -130,17 +130,16 @@ def cover_shapes(
     max_tilt: float,
     covered_frac: float,
     max_num_centers: int,
-    candidates: Floats | None = None,
 ) -> Cover:
     """Choose centres greedily until their r-balls hold enough shapes, then partition.
 
     Shapes, (N, 3) metrics of rectifying maps with (N,) votes >= 0, count as covered from the start
     in the r-ball of the identity, r > 1 being a tilt ratio; those of a tilt above ``max_tilt``
     neither vote nor count. Every shape then goes to the nearest of the centres and the identity if
-    it lies in that r-ball (Sec. 2.4 of the paper). Candidates are (C, 2) rows (tilt, angle_rad),
-    the paper's 192 by default; ``covered_frac`` of the votes are to be covered.
+    it lies in that r-ball (Sec. 2.4 of the paper). Candidates are those of :func:`covering_grid`;
+    ``covered_frac`` of the votes are to be covered.
     """
-    candidates = covering_grid() if candidates is None else candidates
+    candidates = covering_grid()
     threshold = ball_threshold(radius)
     identity_cosh = metrics[:, :2].sum(axis=1) / 2.0
     votes = np.where(identity_cosh <= ball_threshold(max_tilt), weights, 0.0)

@@ -107,8 +107,6 @@ def scale_by_planes(
     whose ratio is the scale. But a place counts only with ``NUM_ON_PLANE`` known ones within the
     radius, which may be several times as large. None where no place counts.
     """
-    if not len(known[0]) or not len(places[0]):
-        return None
     rows, columns, _ = _nearest_known(known[0], places[0], radius_px, NUM_ON_PLANE)
     full = np.flatnonzero(np.bincount(rows, minlength=len(places[0])) == NUM_ON_PLANE)
     columns = columns[np.isin(rows, full)].reshape(-1, NUM_ON_PLANE)

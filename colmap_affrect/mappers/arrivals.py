@@ -1,13 +1,11 @@
 """How the images of a model came in."""
 
-from collections import Counter, defaultdict
 from collections.abc import Mapping
-
-import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import num_long_tracks, seen_points
-from colmap_affrect.colmap.verification import inlier_matches
+from colmap_affrect.colmap.verification import inlier_matches, num_in_tracks
+from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 from colmap_affrect.project.report import Arrival
 
@@ -49,23 +47,12 @@ def bridges_of(known: Mapping[str, Arrival]) -> tuple[Bridge, ...]:
 def _tied_by_guided_matches(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:
     """Return the images that too few three-view tracks would tie without guided matches."""
     points = {i: seen_points(model.images[i]) for i in model.reg_image_ids()}
-    links: defaultdict[tuple[int, int], list[tuple[int, int]]] = defaultdict(list)
+    exact = {}
     for ids, matches in inlier_matches(task.database_path, 1).items():
-        if not points.keys() >= set(ids):
-            continue
-        both = [points[i][matches[:, side]] for side, i in enumerate(ids)]
-        known = (both[0] == both[1]) & (both[0] >= 0)
-        guided = set(map(tuple, np.asarray(task.guided.get(ids, ())).tolist()))
-        for first, second in matches[known].tolist():
-            if (first, second) not in guided:
-                links[ids[0], first].append((ids[1], second))
-                links[ids[1], second].append((ids[0], first))
-    seen = num_long_tracks(model)
-    tied = Counter(
-        feature[0]
-        for feature, others in links.items()
-        if len(others) > 1 or len(links[others[0]]) > 1
-    )
-    return {
-        image_id for image_id in points if tied[image_id] < MIN_THREE_VIEW_POINTS <= seen[image_id]
-    }
+        if points.keys() >= set(ids):
+            first, second = (points[i][matches[:, side]] for side, i in enumerate(ids))
+            seen_by_both = matches[(first == second) & (first >= 0)]
+            guided = task.guided.get(ids, seen_by_both[:0])
+            exact[ids] = seen_by_both[~rows_in(seen_by_both, guided)]
+    seen, tied = num_long_tracks(model), num_in_tracks(exact)
+    return {i for i in points if tied.get(i, 0) < MIN_THREE_VIEW_POINTS <= seen[i]}

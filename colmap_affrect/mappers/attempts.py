@@ -141,7 +141,8 @@ class _Attempts:
     """
 
     def __init__(self, mapper: Mapper, task: MappingTask, num_images: int) -> None:
-        self._mapper, self._task, self._num_images = mapper, task, num_images
+        self._mapper, self._num_images = mapper, num_images
+        self._given = self._task = task
         is_large = num_images >= LARGE_MODEL
         self._starts = [Start()] if task.extend or is_large else starts(task)
         num = 1 if task.extend else mapper.options.max_num_attempts
@@ -168,7 +169,7 @@ class _Attempts:
         """Keep how well the largest model of an attempt agrees with the pairs, and its focals."""
         if found and len(self._starts) > 1:
             model = found[0].reconstruction
-            self._focals.append((graph_of(self._task).score_of(model), focals_px(model)))
+            self._focals.append((graph_of(self._given).score_of(model), focals_px(model)))
 
     def with_rivals(self, best: list[MappedModel]) -> list[MappedModel]:
         """Return models whose largest one knows the focal lengths of those as good as it."""
@@ -184,6 +185,7 @@ class _Attempts:
         start = self._starts[self._done % len(self._starts)]
         self._done += 1
         task = started(self._task, start, database_path)
+        self._task = replace(self._task, snapshot_path=None)  # those are of the first attempt
         found = self._mapper.map(task, output_path, seed, show)
         self._ran = runaways(max(found, key=_size).reconstruction, self._task) if found else set()
         return found
@@ -303,11 +305,9 @@ def summarize(mapped: MappedModel, task: MappingTask, *, is_largest: bool) -> Mo
     """Count what a model holds, and judge it."""
     model = mapped.reconstruction
     loose = loose_images(model, task) if is_largest and not task.extend else ()
-    doubts = find_doubts(mapped, task, loose)
+    doubts, focals = find_doubts(mapped, task, loose), focals_px(model)
     return ModelSummary(
-        registered_names=tuple(
-            sorted(model.images[image_id].name for image_id in model.reg_image_ids())
-        ),
+        registered_names=tuple(sorted(focals)),
         num_points3D=model.num_points3D(),
         mean_track_length=float(model.compute_mean_track_length()),
         mean_reprojection_error_px=float(model.compute_mean_reprojection_error()),
@@ -315,7 +315,7 @@ def summarize(mapped: MappedModel, task: MappingTask, *, is_largest: bool) -> Mo
         doubts=doubts.model,
         arrivals=arrivals(mapped, task),
         taken_out=dict(mapped.taken_out),
-        focals_px=focals_px(model),
+        focals_px=focals,
         rival_focals_px=dict(mapped.rival_focals_px),
         loose=tuple(name for name, why in doubts.images.items() if why == FOCAL_DOUBT),
     )

@@ -127,9 +127,9 @@ class Bridges:
         found = [*self._to_images(part)]
         for index, other in enumerate(others):
             found += self._to_model(part, other, index)
-        return sorted(found, key=lambda hypothesis: -hypothesis.rank)
+        return sorted(filter(None, found), key=lambda hypothesis: -hypothesis.rank)
 
-    def _to_images(self, part: Part) -> Iterator[Hypothesis]:
+    def _to_images(self, part: Part) -> Iterator[Hypothesis | None]:
         for pair in self.graph.pairs:
             inside = [image_id in part.poses for image_id in pair.ids]
             if sum(inside) != 1:
@@ -144,20 +144,16 @@ class Bridges:
                 pose = relative.pose if side == 0 else inverse(relative.pose)
                 rotation, translation = part.poses[near]
                 moved = pose[0] @ rotation, pose[0] @ translation + scale.scale * pose[1]
-                hypothesis = self._judged(
-                    part, (near, far), {far: moved}, {far: cameras[far]}, scale
-                )
-                if hypothesis is not None:
-                    yield hypothesis
+                yield self._judged(part, (near, far), {far: moved}, {far: cameras[far]}, scale)
 
-    def _to_model(self, part: Part, other: Part, index: int) -> Iterator[Hypothesis]:
+    def _to_model(self, part: Part, other: Part, index: int) -> Iterator[Hypothesis | None]:
         """Yield bridges to a model: by a common image, and by pairs between both."""
         for common in part.poses.keys() & other.poses.keys():
             places = other.known_depths(common)
             radius = RADIUS_FRAC * _longer_side(part.cameras[common])
             estimate = _trusted(scale_between(part.known_depths(common), places, radius))
             if estimate is not None:
-                yield from self._moved(part, other, index, (common, common), estimate, IDENTITY)
+                yield self._moved(part, other, index, (common, common), estimate, IDENTITY)
         for pair in self.graph.pairs:
             for side in (0, 1):
                 near, far = pair.ids[side], pair.ids[1 - side]
@@ -176,7 +172,7 @@ class Bridges:
                     pose = relative.pose if side == 0 else inverse(relative.pose)
                     scaled = pose[0], pose[1] * scales[0].scale
                     both = _quotient(scales[0], scales[1])
-                    yield from self._moved(part, other, index, (near, far), both, scaled)
+                    yield self._moved(part, other, index, (near, far), both, scaled)
 
     def _moved(
         self,
@@ -186,7 +182,7 @@ class Bridges:
         ids: tuple[int, int],
         scale: ScaleEstimate,
         relative: Pose,
-    ) -> Iterator[Hypothesis]:
+    ) -> Hypothesis | None:
         """Move a model so that ``relative`` leads from a near image to one of its images.
 
         ``scale`` is the length of the part's unit in those of the other: lengths of the other
@@ -205,11 +201,9 @@ class Bridges:
                 moved = scale.scale * own_translation + own_rotation @ shift
                 poses[image_id] = own_rotation @ turn, moved
         if not poses:
-            return
-        cameras = {i: part.cameras.get(i, self._camera(part, i, other.cameras[i])) for i in poses}
-        hypothesis = self._judged(part, ids, poses, cameras, scale, index)
-        if hypothesis is not None:
-            yield hypothesis
+            return None
+        cameras = {i: self._camera(part, i, other.cameras[i]) for i in poses}
+        return self._judged(part, ids, poses, cameras, scale, index)
 
     def _scale(
         self, part: Part, image_id: int, side: int, relative: RelativePose

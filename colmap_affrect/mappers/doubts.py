@@ -7,7 +7,6 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +78,7 @@ FOCAL_DOUBT = "any focal length fits, and the place of the camera depends on tha
 MIRRORED_COPY = "mirrored copy of"
 
 MAX_PAIRS_FOR_PARALLAX, MAX_POINTS_FOR_ANGLES = 100, 2000
-"""Pairs and points looked at; more change no share."""
+"""Pairs looked at, and points (of fewer than twice as many all); more change no share."""
 
 MAX_PAIRS_FOR_COPIES = 1000  # looked at, all of 45 photographs; of more some copies are missed
 
@@ -128,20 +127,15 @@ def without_impossible(model: MappedModel, task: MappingTask) -> MappedModel | N
         if not doubts.impossible:
             break
         name = doubts.impossible[0]
-        taken[name] = doubts.images[name]
-        reconstruction.deregister_frame(reconstruction.find_image_with_name(name).frame_id)
+        frame_id = reconstruction.find_image_with_name(name).frame_id
+        for image in reconstruction.images.values():  # of a rig, all that were taken at once
+            if image.frame_id == frame_id and image.has_pose:
+                why = f"taken with {name}: {doubts.images[name]}"
+                taken[image.name] = doubts.images.get(image.name, why)
+        reconstruction.deregister_frame(frame_id)
     if reconstruction.num_reg_images() < 2:
         return None
     return replace(model, taken_out={**model.taken_out, **taken})
-
-
-def _camera(image: pycolmap.Image) -> pycolmap.Camera:
-    """Return the camera, which registered images always have."""
-    return cast("pycolmap.Camera", image.camera)
-
-
-def _side(camera: pycolmap.Camera) -> int:
-    return max(camera.width, camera.height)
 
 
 def _image_doubts(
@@ -169,7 +163,7 @@ def _image_doubts(
         agreeing, total = totals[image_id].tolist()
         agreement = agreeing / total if total else 1.0
         found = [
-            *([] if image.camera_id in given else _camera_doubts(_camera(image))),
+            *([] if image.camera_id in given else _camera_doubts(cameras[image_id])),
             *_support_doubts(image.num_points3D, agreement),
             *_angle_doubts(reconstruction, image, [nearest for nearest, _ in angles[image_id]]),
             *_place_doubts(near[image_id], len(registered) - 1),
@@ -187,7 +181,7 @@ def _image_doubts(
 
 def _camera_doubts(camera: pycolmap.Camera) -> Iterator[tuple[str, bool]]:
     """Doubt cameras that no lens has; each reason comes with whether it is certain."""
-    focal = camera.mean_focal_length() / _side(camera)
+    focal = camera.mean_focal_length() / max(camera.width, camera.height)
     if not FOCAL_LENGTHS[0] <= focal <= FOCAL_LENGTHS[1]:
         low, high = IMPOSSIBLE_FOCAL_LENGTHS
         view_deg = 2.0 * np.rad2deg(np.arctan(0.5 / focal))
@@ -346,14 +340,12 @@ def _images_nearby(model: pycolmap.Reconstruction) -> dict[int, list[str]]:
     """Return, of each image, the others whose centres its points hardly tell from its own."""
     ids = sorted(model.reg_image_ids())
     centers = np.array([model.images[i].projection_center() for i in ids])
-    distances = np.linalg.norm(centers[:, None] - centers, axis=2)
-    depths = np.array([_median_distance(model, model.images[i]) for i in ids])
-    is_near = distances < np.tan(np.deg2rad(MIN_BASELINE_DEG)) * depths[:, None]
-    np.fill_diagonal(is_near, False)
-    return {
-        image_id: [model.images[ids[k]].name for k in np.flatnonzero(near)]
-        for image_id, near in zip(ids, is_near, strict=True)
-    }
+    found = {}
+    for i, center in zip(ids, centers, strict=True):
+        least = np.tan(np.deg2rad(MIN_BASELINE_DEG)) * _median_distance(model, model.images[i])
+        near = np.flatnonzero(np.linalg.norm(centers - center, axis=1) < least)
+        found[i] = [model.images[ids[k]].name for k in near if ids[k] != i]
+    return found
 
 
 def _median_distance(model: pycolmap.Reconstruction, image: pycolmap.Image) -> float:

@@ -83,10 +83,10 @@ class GlobalMapper:
         """Give the cameras that are to stay their parameters back, and adjust all else."""
         constant = task.constant_cameras(self.options) & set(model.cameras)
         given = {c.camera_id: c.params.tolist() for c in all_cameras(task.database_path)}
-        before = {key: model.cameras[key].params.tolist() for key in constant}
-        for key in constant:
+        moved = {key for key in constant if model.cameras[key].params.tolist() != given[key]}
+        for key in moved:
             model.cameras[key].params = given[key]
-        if any(before[key] != given[key] for key in constant):
+        if moved:
             adjust(model, options, constant)
 
     def native(self, task: MappingTask, random_seed: int) -> pycolmap.GlobalPipelineOptions:

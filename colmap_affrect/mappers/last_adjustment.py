@@ -6,7 +6,7 @@ COLMAP stops on the way, and takes distortions for focal lengths.
 """
 
 import copy
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Collection, Mapping
 from itertools import combinations
 from typing import cast
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import seen_points
+from colmap_affrect.geometry.arrays import rows_in
 
 Matches = Mapping[tuple[int, int], NDArray[np.int64]]
 Observations = NDArray[np.int64]
@@ -82,7 +83,7 @@ def adjust_last(
     """
     points = {i: seen_points(model.images[i]) for i in model.reg_image_ids()}
     all_ties, guided_ties = _ties(points, verified), _ties(points, guided)
-    ties = all_ties[~np.isin(_keys(all_ties), _keys(guided_ties))]
+    ties = all_ties[~rows_in(all_ties, guided_ties)]
     dropped = np.setdiff1d(all_ties, ties)
     if len(exactly_held(ties)) < len(points):
         dropped = dropped[:0]
@@ -150,11 +151,6 @@ def robust_options() -> pycolmap.BundleAdjustmentOptions:
     return options
 
 
-def _keys(ties: Observations) -> NDArray[np.complex128]:
-    """Return one number for each (E, 2) tie."""
-    return ties[:, 0] + 1j * ties[:, 1]
-
-
 def _ties(points: Mapping[int, NDArray[np.int64]], matches: Matches) -> Observations:
     """Return the (E, 2) observations of matches that see the same point."""
     found = [np.zeros((0, 2), np.int64)]
@@ -175,13 +171,12 @@ def exactly_held(ties: Observations) -> set[int]:
     tracks = nx.Graph()
     tracks.add_edges_from(ties.tolist())
     num_tracks: Counter[int] = Counter()
-    shared: dict[tuple[int, int], int] = defaultdict(int)
+    shared: Counter[tuple[int, int]] = Counter()
     for track in nx.connected_components(tracks):
         images = sorted({observation >> 32 for observation in track})
         if len(images) > 2:
             num_tracks.update(images)
-            for pair in combinations(images, 2):
-                shared[pair] += 1
+            shared.update(combinations(images, 2))
     parts = nx.Graph()
     parts.add_nodes_from(image for image, count in num_tracks.items() if count >= MIN_NUM_TRACKS)
     parts.add_edges_from(
@@ -207,14 +202,14 @@ def adjust(
 def solve(
     model: pycolmap.Reconstruction,
     constant_cameras: Collection[int],
-    options: pycolmap.BundleAdjustmentOptions | None = None,
+    options: pycolmap.BundleAdjustmentOptions,
 ) -> float:
     """Adjust all images of a model, of which some cameras stay.
 
     Args:
         model: changed in place.
         constant_cameras: ids of cameras whose parameters stay as they are.
-        options: by default :func:`robust_options`.
+        options: of the adjustment.
 
     Returns:
         The error in the unit of the loss, infinite if the adjustment fails.
@@ -225,6 +220,6 @@ def solve(
     for camera_id in constant_cameras:
         config.set_constant_cam_intrinsics(int(camera_id))
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = pycolmap.create_default_bundle_adjuster(options or robust_options(), config, model)
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
     summary = cast("pycolmap.CeresBundleAdjustmentSummary", adjuster.solve())
     return summary.ceres_summary.final_cost if summary.is_solution_usable() else np.inf

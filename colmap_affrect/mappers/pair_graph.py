@@ -168,12 +168,13 @@ class PairGraph:
         some = pair.some_matches()
         return float(_agrees(pose, (camera1, camera2), self.points(some))[0].mean())
 
-    def score(self, poses: PoseById, cameras: CameraById) -> float:
-        """Return how well poses agree with all pairs whose images have one.
+    def score_of(self, model: pycolmap.Reconstruction) -> float:
+        """Return how well a model agrees with all pairs whose images it has registered.
 
         Each pair counts by the root of its inliers; one whose inliers mostly disagree counts
         against the poses. Images without a pose are not counted, so more right images are better.
         """
+        poses, cameras = poses_of(model), cameras_of(model)
         return sum(
             pair.weight * (2.0 * self.agreement(pair, poses, cameras) - 1.0)
             for pair in self.pairs_inside(poses)
@@ -188,10 +189,6 @@ class PairGraph:
             if agreeing < MIN_SHARE * sum(pair.weight for pair in pairs):
                 return False
         return True
-
-    def score_of(self, model: pycolmap.Reconstruction) -> float:
-        """Return the :meth:`score` of the images that a model has registered."""
-        return self.score(poses_of(model), cameras_of(model))
 
     def best_score(self, models: Iterable[pycolmap.Reconstruction]) -> float:
         """Return the best :meth:`score_of` any of some models, 0 without any."""
@@ -230,8 +227,6 @@ class PairGraph:
             candidates += decomposed_homography(pair.homography, (camera1, camera2))
         allowed = []
         for pose in candidates:
-            if np.linalg.norm(pose[1]) < 1e-9:
-                continue
             agrees, depths = _agrees(pose, (camera1, camera2), points)
             known = agrees & (depths.angles_deg > MIN_ANGLE_DEG)
             if agrees.mean() >= MIN_SHARE and known.any():
@@ -240,9 +235,9 @@ class PairGraph:
         return allowed
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)  # the task of all attempts, and that of one
 def graph_of(task: MappingTask, min_num_matches: int = MIN_NUM_MATCHES) -> PairGraph:
-    """Return the graph of what is to be mapped, read once for all attempts."""
+    """Return the graph of what is to be mapped; of one task it is read once."""
     return PairGraph.read(task.database_path, min_num_matches, task.depth_at)
 
 

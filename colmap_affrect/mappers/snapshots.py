@@ -60,10 +60,10 @@ def with_snapshots(
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def largest_snapshot(folder: Path | None) -> Path | None:
+def largest_snapshot(folder: Path) -> Path | None:
     """Return the complete snapshot with most images, of several the newest."""
     found: list[tuple[int, str, Path]] = []
-    for path in folder.iterdir() if folder else ():
+    for path in folder.iterdir():
         try:
             found.append((len(registered_names(path)), path.name, path))
         except StoreError:
@@ -80,12 +80,11 @@ def drop_old_snapshots(folder: Path) -> None:
     folders = [path for path in folder.iterdir() if path.is_dir()]
     if len(folders) <= NUM_KEPT:
         return
-    sizes = {
-        path: (path / "frames.bin").stat().st_size
-        for path in folders
-        if (path / "frames.bin").exists()
-    }
     newest = max(folders, key=lambda path: path.name)  # may still be written
-    complete = sorted((size, path.name, path) for path, size in sizes.items() if path != newest)
+    complete = sorted(
+        ((path / "frames.bin").stat().st_size, path.name, path)
+        for path in folders
+        if path != newest and (path / "frames.bin").exists()
+    )
     for _, _, path in complete[: -(NUM_KEPT - 1)]:
         shutil.rmtree(path, ignore_errors=True)

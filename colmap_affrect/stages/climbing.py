@@ -1,13 +1,12 @@
 """Which pairs of a set may climb: those that would tie an image that mapping may well lose."""
 
 import heapq
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
-from colmap_affrect.colmap.verification import connected_parts
+from colmap_affrect.colmap.verification import connected_parts, num_in_tracks
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.recipes import EscalateOptions
@@ -55,13 +54,16 @@ class ClimbingGraph:
         parts = self.components
         between = [pair for pair in self.num_inliers if parts[pair[0]] != parts[pair[1]]]
         best: set[Pair] = set()
+        of_end: defaultdict[str | int, list[Pair]] = defaultdict(list)  # of an image, or a part
+        for pair in between:
+            for end in (*pair, parts[pair[0]], parts[pair[1]]):
+                of_end[end].append(pair)
         for name in (name for name, part in parts.items() if part):
-            own = (pair for pair in between if name in pair)
+            own = of_end[name]
             ranked = heapq.nlargest(options.num_best_pairs, own, self.num_consistent.__getitem__)
             best |= set(ranked) - self.stalled
         for part in set(parts.values()) - {0} if options.num_best_pairs else ():
-            own = (pair for pair in between if part in (parts[pair[0]], parts[pair[1]]))
-            best.update(heapq.nlargest(1, own, self.num_consistent.__getitem__))
+            best.update(heapq.nlargest(1, of_end[part], self.num_consistent.__getitem__))
         return [pair for pair in between if pair in best or self._is_promising(pair, options)]
 
     def hanging(self, options: EscalateOptions) -> list[Pair]:
@@ -93,23 +95,6 @@ def weakly_connected_images(matches: Mapping[Pair, Indices], min_num_features: i
     """Return the images with fewer features than that in tracks through three images or more.
 
     A mapper registers an image by features whose matches it has triangulated already. That takes
-    two other images, so a strong pair alone ties an image to nothing. ``matches`` has (M, 2)
-    features of the first and the second image of each verified pair.
+    two other images, so a strong pair alone ties an image to nothing.
     """
-    names = sorted({name for pair in matches for name in pair})
-    number = {name: index for index, name in enumerate(names)}
-    ends = [
-        (number[pair[side]] << 32) + indices[:, side]
-        for side in (0, 1)
-        for pair, indices in matches.items()
-    ]
-    features, index, num_matches = np.unique(
-        np.concatenate([np.zeros(0, np.int64), *ends]), return_inverse=True, return_counts=True
-    )
-    first, second = index.reshape(2, -1)
-    is_shared = num_matches > 1
-    in_track = is_shared.copy()
-    in_track[first[is_shared[second]]] = True
-    in_track[second[is_shared[first]]] = True
-    counts = np.bincount(features[in_track] >> 32, minlength=len(names))
-    return {name for name, count in zip(names, counts, strict=True) if count < min_num_features}
+    return {name for name, count in num_in_tracks(matches).items() if count < min_num_features}

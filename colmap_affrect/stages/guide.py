@@ -16,7 +16,7 @@ import numpy as np
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
-from colmap_affrect.geometry.arrays import Indices
+from colmap_affrect.geometry.arrays import Indices, rows_in
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import ordered_for_reuse
@@ -112,10 +112,9 @@ def guided_matches(context: Context) -> dict[tuple[int, int], Matches]:
     ids = colmap_database.image_ids(context.workspace.database)
     found = {}
     for pair in guided:
-        exact = set(map(tuple, pair.exact.tolist()))
-        new = [row for row in verified[pair.names].tolist() if tuple(row) not in exact]
         first, second = pair.names
-        found[ids[first], ids[second]] = np.array(new, np.int64).reshape(-1, 2)
+        inliers = verified[pair.names]
+        found[ids[first], ids[second]] = inliers[~rows_in(inliers, pair.exact)]
     return found
 
 
@@ -278,6 +277,5 @@ def _is_better(geometry: pycolmap.TwoViewGeometry, pair: GuidedPair, before: int
     configs = pycolmap.TwoViewGeometryConfiguration
     if before == configs.CALIBRATED and geometry.config == configs.UNCALIBRATED:
         return False
-    found = set(map(tuple, geometry.inlier_matches.tolist()))
-    num_kept = sum(tuple(row) in found for row in pair.exact.tolist())
-    return num_kept >= MIN_SHARE_KEPT * len(pair.exact)
+    kept = rows_in(pair.exact, np.asarray(geometry.inlier_matches, np.int64))
+    return bool(kept.sum() >= MIN_SHARE_KEPT * len(pair.exact))

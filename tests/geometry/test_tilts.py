@@ -232,18 +232,3 @@ def test_cover_shapes_needs_no_center(
     tilts: list[float], angles: list[float], weights: list[float]
 ) -> None:
     assert len(cover_with_defaults(tilts, angles, weights)) == 0
-
-
-def test_cover_shapes_chooses_among_the_candidates_given() -> None:
-    candidates = np.array([[2.0, 0.0], [3.2, 0.52]])
-    cover = cover_shapes(
-        metrics_from_tilts([3.0], [0.5]),
-        np.ones(1),
-        radius=RADIUS,
-        max_tilt=MAX_TILT,
-        covered_frac=1.0,
-        max_num_centers=8,
-        candidates=candidates,
-    )
-    assert_allclose(cover.centers, candidates[1:])
-    assert cover.labels.tolist() == [0]
