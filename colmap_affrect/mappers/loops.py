@@ -49,7 +49,7 @@ def contradicting_pairs(graph: PairGraph, random_seed: int) -> frozenset[Ids]:
         if not changed:
             break
     wrong = [ids for ids in errors if errors[ids] > MAX_ERROR_DEG]
-    return frozenset(_dispensable(sorted(wrong, key=lambda ids: -errors[ids]), weights))
+    return frozenset(dispensable(sorted(wrong, key=lambda ids: -errors[ids]), weights))
 
 
 def _averaged(
@@ -89,7 +89,7 @@ def _error_deg(
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def _dispensable(wrong: Iterable[Ids], weights: Mapping[Ids, int]) -> list[Ids]:
+def dispensable(wrong: Iterable[Ids], weights: Mapping[Ids, int]) -> list[Ids]:
     """Return the wrong pairs without which their images are still tied to each other.
 
     Where these hang on single pairs else, the loop says no more than that one of them is wrong: the

@@ -13,6 +13,8 @@ in the same way:
   (:mod:`colmap_affrect.geometry.consistency`), and the best few of an image that is left outside.
 - Then the verified pairs of the images that gained, while one of the two is not secure: new
   features that two images alone have cannot be tied to the rest.
+- To frames that are not measured, those of learned features, no strong pair climbs from measured
+  ones: their places are less exact, and unknown focal lengths follow them.
 """
 
 import math

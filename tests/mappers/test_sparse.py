@@ -15,7 +15,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Poses, model_poses, pose_errors, relative_pose
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.mappers.base import DepthLookup, MappedModel
-from colmap_affrect.mappers.loops import contradicting_pairs
+from colmap_affrect.mappers.loops import contradicting_pairs, dispensable
 from colmap_affrect.mappers.pair_graph import PairGraph
 from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
 
@@ -228,6 +228,22 @@ def test_wrong_pair_in_a_loop_of_four_contradicts_it(tmp_path: Path) -> None:
             relative_pose(truth[first], truth[second_name]),
         )
         assert max(errors) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("others", "dropped"),
+    [
+        ({}, []),  # nothing else ties its images
+        ({(1, 3): 573, (2, 3): 44}, [(2, 3)]),  # one loop, which does not tell the wrong pair
+        ({(1, 3): 573, (2, 3): 500}, [(1, 2)]),
+        ({(1, 3): 573, (2, 3): 44, (1, 4): 60, (2, 4): 50}, [(1, 2)]),  # two loops, which do
+        ({(1, 3): 44, (1, 4): 60, (3, 5): 50, (4, 5): 70, (2, 5): 9}, [(2, 5)]),
+    ],
+)
+def test_of_a_single_loop_the_weakest_pair_goes(
+    others: dict[tuple[int, int], int], dropped: list[tuple[int, int]]
+) -> None:
+    assert dispensable([(1, 2)], {(1, 2): 308, **others}) == dropped
 
 
 @pytest.mark.parametrize("count", [2, 3])
