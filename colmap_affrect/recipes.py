@@ -125,8 +125,7 @@ class EscalateOptions(Options):
 
     strong_num_inliers: Annotated[int, within(0, 1_000_000)] = 100
     """The pairs of an image climb while none of them has as many: an image that hangs on weak
-    pairs alone is verified but rarely registered. A pair with as many inliers does not climb from
-    measured frames to others, which are less exact."""
+    pairs alone is verified but rarely registered."""
     min_num_tracks: Annotated[int, within(0, 1_000_000)] = 30
     """The pairs of an image climb when fewer of its features are in tracks through three images or
     more: mapping registers images by such features, and COLMAP wants 30 of them."""

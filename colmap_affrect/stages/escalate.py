@@ -13,8 +13,6 @@ in the same way:
   (:mod:`colmap_affrect.geometry.consistency`), and the best few of an image that is left outside.
 - Then the verified pairs of the images that gained, while one of the two is not secure: new
   features that two images alone have cannot be tied to the rest.
-- To frames that are not measured, those of learned features, no strong pair climbs from measured
-  ones: their places are less exact, and unknown focal lengths follow them.
 """
 
 import math
@@ -275,13 +273,10 @@ class Escalation:
         graph, levels = self.graph(), self.matches.levels(self.pairs)
         tried = self.matches.tried_levels(self.pairs)
         joining, hanging = graph.joining(self.options), graph.hanging(self.options)
-        strong = self.options.strong_num_inliers
         for level in self.levels:
             unwritten = {pair for pair in self._unwritten if tried[pair] == level}
             for pairs in (joining, hanging, graph.links(levels, level)):
                 todo = [pair for pair in pairs if tried[pair] < level]
-                if not self._is_measured[level] and self._is_measured[0]:
-                    todo = [pair for pair in todo if graph.num_inliers.get(pair, 0) < strong]
                 if todo or unwritten.intersection(pairs):
                     return level, todo
         return None

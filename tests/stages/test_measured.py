@@ -21,7 +21,7 @@ from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import EscalateOptions, load_recipe
+from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import map as stage
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, escalate, measured_database, reject
@@ -98,18 +98,6 @@ def test_matches_of_both_kinds_of_frames_are_united(
         num_measured = np.count_nonzero(escalation.measured(pair, inliers))
         assert 0.5 * len(inliers) < 2 * num_measured < 1.5 * len(inliers)
     assert all(after[ids] > 1.5 * before[ids] for ids in before)
-
-
-@pytest.mark.parametrize(("strong", "num_pairs"), [(1, 0), (1_000_000, 6)])
-def test_strong_pairs_of_measured_frames_climb_to_no_others(
-    context: Context, strong: int, num_pairs: int
-) -> None:
-    options = EscalateOptions(strong_num_inliers=strong, min_num_tracks=1_000_000)
-    escalation = Escalation(context, options)
-    escalation.undo()
-    assert all(escalation.num_inliers().values())
-    work = escalation.next_work()
-    assert (len(work[1]) if work else 0) == num_pairs
 
 
 class OneKind:
