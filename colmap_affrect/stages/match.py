@@ -32,8 +32,7 @@ WEIGHTS = "weights"  # of the record, beside the options: file name to sha256
 
 def recorded_matching(workspace: Workspace) -> MatcherOptions:
     """Return the options on record of matching, done or still to be done."""
-    record = {k: value for k, value in (workspace.planned("match") or {}).items() if k != WEIGHTS}
-    options: MatcherOptions = MATCHERS.options(record)
+    options: MatcherOptions = MATCHERS.options(workspace.planned("match") or {})
     return options
 
 
