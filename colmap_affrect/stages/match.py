@@ -48,6 +48,7 @@ def match(
     context.resources.require_device()
     pairs = listed_pairs(context)
     options = options or recorded_matching(context.workspace)
+    recorded_extraction(context.workspace).require_matching(options)
     digests = digests_by_name(resolve(options.weights, context.resources.weights_path))
     record = options.to_mapping() | ({WEIGHTS: digests} if digests else {})
     context.workspace.record_options("match", record, overwrite=overwrite)
@@ -99,7 +100,7 @@ def matched_at_level(
     ``options`` count where the level has none of its own.
     """
     features, chosen = context.features, recorded_extraction(context.workspace).levels[level]
-    options, extractor = chosen.matching or options, chosen.features.name
+    options, extractor = chosen.matching or options, chosen.features.kind
     matching = Matching(features, options, level, chosen.base, extractor, context.resources)
     stationary = StationaryFilter(features, context.matches)
     with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:
