@@ -103,6 +103,11 @@ class ExtractionOptions(Options):
                 "--depth-model NAME for a monocular depth network"
             )
 
+    def require_matching(self, matching: MatcherOptions) -> None:
+        """Refuse a matcher, of all levels without one of their own, for features of others."""
+        for level in self.levels:
+            (level.matching or matching).require_extractor(level.features.kind)
+
     @property
     def _network_parts(self) -> tuple[NetworkOptions, ...]:
         covers = (level.rectifier for level in self.levels)
@@ -178,8 +183,7 @@ class Recipe:
         extraction = {key: options.pop(key) for key in ExtractionOptions.model_fields}
         recipe = cls(name, extraction=ExtractionOptions(**extraction), **options)
         try:
-            for level in recipe.extraction.levels:
-                (level.matching or recipe.matching).require_extractor(level.features.name)
+            recipe.extraction.require_matching(recipe.matching)
         except OptionError as error:
             raise OptionError(f"{where}: {error}") from error
         if recipe.mapping:

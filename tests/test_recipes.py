@@ -11,6 +11,7 @@ import tomli_w
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.shapes.second_moment import SecondMomentOptions
 from colmap_affrect.features.sift import SiftOptions
+from colmap_affrect.matchers.lightglue import TRAININGS, Training
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.recipes import (
     ExtractionOptions,
@@ -123,6 +124,44 @@ def test_levels_build_on_the_lowest_one_with_their_features() -> None:
     assert len({level.name for level in levels}) == len(levels)
     assert set(recipe.weights) == {"aliked-n16", "lightglue-aliked"}
     assert load_recipe("on-demand").extraction.levels[3].base == 0
+
+
+TRAINED_FOR = "dog-affnet-hardnet-lightglue"
+
+
+@pytest.mark.parametrize(
+    ("recipe", "setting", "advice"),
+    [
+        ("default", "matching.name=lightglue",
+         "'aliked' takes features of aliked, not of rootsift; use --recipe aliked-lightglue, or "
+         "--set matching.trained_for=sift"),
+        (TRAINED_FOR, "features.descriptor=hardtfeat",
+         "takes features of dog-affnet-hardnet, not of dog-affnet-hardtfeat; use --recipe "
+         "dog-affnet-hardnet-lightglue"),
+        (TRAINED_FOR, "features.detector=hessian",
+         "takes features of dog-affnet-hardnet, not of hessian-affnet-hardnet; use --recipe "
+         "dog-affnet-hardnet-lightglue"),
+        (TRAINED_FOR, "matching.trained_for=keynet-affnet-hardnet",
+         "takes features of keynet-affnet-hardnet, not of dog-affnet-hardnet; use --recipe "
+         "dog-affnet-hardnet-lightglue --set features.detector=keynet --set "
+         "matching.trained_for=keynet-affnet-hardnet, or --set "
+         "matching.trained_for=dog-affnet-hardnet"),
+    ],
+)  # fmt: skip
+def test_matcher_must_be_trained_for_detector_and_descriptor(
+    recipe: str, setting: str, advice: str
+) -> None:
+    with pytest.raises(OptionError) as error:
+        load_recipe(recipe, [setting])
+    assert str(error.value).endswith(advice)
+
+
+@pytest.mark.parametrize("training", TRAININGS.values(), ids=list(TRAININGS))
+def test_recipe_that_is_advised_has_the_features_of_a_training(training: Training) -> None:
+    name, *settings = training.recipe.split(" --set ")
+    recipe = load_recipe(name, settings)
+    assert recipe.extraction.features.kind == training.kind
+    assert recipe.matching.weights == (training.weights,)
 
 
 def test_matching_of_a_level_must_take_its_features() -> None:

@@ -134,7 +134,7 @@ def setting(example: str) -> Option:
 
 
 MATCHER = _value("--matcher", "NAME",
-    "nearest, or one of another package (default: that of the recipe)")  # fmt: skip
+    "nearest, lightglue, or one of another package (default: that of the recipe)")  # fmt: skip
 GUIDED = _choice("--guided", ["auto", "always", "never"],
     "match verified pairs again, guided by their geometry: those of images that are missing or "
     "hang on few tracks, all, or none (default: auto)")  # fmt: skip
@@ -146,7 +146,8 @@ DEVICE = _value("--device", "DEVICE",
     default="auto")  # fmt: skip
 RESOURCES = (
     _path("--weights", "FOLDER",
-        "weights of networks (default: $COLMAP_AFFRECT_WEIGHTS, torch's cache, download)"),
+        "weights of networks (default: $COLMAP_AFFRECT_WEIGHTS, torch's cache, packages that are "
+        "installed, download)"),
     DEVICE,
 )  # fmt: skip
 SCHEDULER = _value("--scheduler", "ADDRESS",

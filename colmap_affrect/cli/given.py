@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from colmap_affrect.errors import OptionError, WorkspaceError
 from colmap_affrect.options import Options, suggestion
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.workspace import Workspace, placeless
+from colmap_affrect.project.workspace import WEIGHTS, Workspace, placeless, without_digests
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap.verification import VerificationOptions
@@ -57,7 +57,7 @@ def _refuse_unknown(record: Mapping[str, Any], where: str) -> None:
     from colmap_affrect.stages.extract import Inputs
 
     sections = {"format_version", "recipe", "begun", *STAGES}
-    of_extract = {*Inputs.model_fields, *ExtractionOptions.model_fields, "weights"}
+    of_extract = {*Inputs.model_fields, *ExtractionOptions.model_fields, WEIGHTS}
     for names, known in ((record, sections), (record["extract"], of_extract)):
         for name in names:
             if name not in known:
@@ -115,7 +115,9 @@ def recipe(options: argparse.Namespace, record: Mapping[str, Any] | None = None)
     if options.recipe or not record:
         return load_recipe(options.recipe or "default", settings)
     sections = {"match": "matching", "escalate": "escalate", "guide": "guided"}
-    values = {sections[stage]: record[stage] for stage in sections if stage in record}
+    values = {
+        sections[stage]: without_digests(record[stage]) for stage in sections if stage in record
+    }
     known = ExtractionOptions.model_fields
     values |= {key: value for key, value in record["extract"].items() if key in known}
     return Recipe.from_mapping(record["recipe"], with_settings(values, settings), "--config")

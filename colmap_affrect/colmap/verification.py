@@ -287,11 +287,7 @@ def verify(
         if options.min_significance and any(
             telling_shapes(side(image_id).keypoints) is None for image_id in todo[0]
         ):
-            logger.warning(
-                "%s: keypoints have no shapes; pairs need more inliers to count as verified, and "
-                "sides that look alike are not told apart",
-                path,
-            )
+            _say_that_shapes_are_missing(path)
 
         def estimate(task: _Task) -> tuple[tuple[int, int], pycolmap.TwoViewGeometry]:
             ids, sides, matches = task
@@ -310,6 +306,16 @@ def verify(
                     _write(database, done, advance)
         finally:
             _write(database, done, advance)
+
+
+@lru_cache(maxsize=64)  # a run verifies some of its pairs again, with better cameras
+def _say_that_shapes_are_missing(path: Path) -> None:
+    """Say it once of each database."""
+    logger.warning(
+        "%s: keypoints have no shapes; pairs need more inliers to count as verified, and sides "
+        "that look alike are not told apart",
+        path,
+    )
 
 
 def _write(

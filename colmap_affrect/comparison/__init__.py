@@ -5,4 +5,7 @@ DEFAULT_METHODS = (
 )  # fmt: skip
 """What is compared where nothing else is asked for."""
 
-LEARNED_METHODS = ("aliked-lightglue", "on-demand-learned")  # compared too where their weights are
+LEARNED_METHODS = (
+    "aliked-lightglue", "disk-lightglue", "xfeat-lighterglue", "on-demand-learned",
+)  # fmt: skip
+"""Compared too where their weights are."""

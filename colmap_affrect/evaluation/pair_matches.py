@@ -107,7 +107,7 @@ class PairMatcher:
             chosen.matching or self.recipe.matching,
             level,
             chosen.base,
-            chosen.features.name,
+            chosen.features.kind,
             self.features.resources,
             self.max_num_keypoints,
         )

@@ -62,6 +62,11 @@ class AffNetHardNetOptions(DogOptions):
     is faster with them."""
 
     @property
+    def kind(self) -> str:
+        """Detector and descriptor; where shapes are circles descriptors are of the same kind."""
+        return f"{self.detector}-affnet-{self.descriptor}"
+
+    @property
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights that the networks read."""
         shape = ("affnet",) if self.affine_shape else ()

@@ -136,8 +136,8 @@ def match_exhaustive(
 
     Args:
         database_path: the same as there.
-        matching_options: ours, by default those of the recipe; of pycolmap's, what to verify and
-            where the work is done.
+        matching_options: ours, by default those of the recipe, of which a dictionary without
+            ``name`` changes some; of pycolmap's, what to verify and where the work is done.
         pairing_options: as in pycolmap; the size of blocks does not change results.
         verification_options: ours, or those of pycolmap, what differs from its defaults.
         device: where matching runs, and networks of recipes that escalate; overrules ``use_gpu``,
@@ -302,7 +302,8 @@ def _match(
     if unknown := ours.keys() - Ours.__annotations__.keys():
         raise TypeError(f"unexpected keyword argument {min(unknown)!r}")
     verification = translate.verification_options(verification_options, ours.get("random_seed"))
-    matching, asked = translate.matching_options(matching_options)
+    recorded = Workspace.beside(Path(database_path)).planned("match")
+    matching, asked = translate.matching_options(matching_options, recorded)
     shown = _Cancellable(ours.get("progress", SILENT), token)
     with _context(database_path, device, asked, ours.get("weights_path"), shown) as context:
         context.workspace.require("extract")

@@ -120,14 +120,20 @@ def extraction_recipe(given: object) -> tuple[Recipe, dict[str, Any]]:
     raise _not_ours(given, "extraction_options", "colmap_affrect.ExtractionOptions")
 
 
-def matching_options(given: object) -> tuple[MatcherOptions | None, dict[str, Any]]:
-    """Return our options, None for those of the recipe, and what pycolmap's options ask for."""
+def matching_options(
+    given: object, recorded: Mapping[str, Any] | None = None
+) -> tuple[MatcherOptions | None, dict[str, Any]]:
+    """Return our options, None for those of the recipe, and what pycolmap's options ask for.
+
+    A dictionary without ``name`` changes those on record.
+    """
     if given is None or isinstance(given, MatcherOptions):
         return given, {}
     if is_native(given, pycolmap.FeatureMatchingOptions, MATCHERS.part(MATCHERS.default).Options):
         return None, changes(given, pycolmap.FeatureMatchingOptions, "matching_options")
     if isinstance(given, Mapping):
-        return MATCHERS.options(given, where="matching_options"), {}
+        values = given if "name" in given else {**(recorded or {}), **given}
+        return MATCHERS.options(values, where="matching_options"), {}
     raise _not_ours(given, "matching_options", "colmap_affrect.NearestOptions")
 
 

@@ -122,8 +122,9 @@ def without_impossible(model: MappedModel, task: MappingTask) -> MappedModel | N
     reconstruction = model.reconstruction
     graph = graph_of(task)
     taken: dict[str, str] = {}
+    agreements: dict[Ids, float] = {}  # of pairs; what stays keeps its pose
     while reconstruction.num_reg_images():
-        doubts = _image_doubts(model, graph, task)
+        doubts = _image_doubts(model, graph, task, agreements=agreements)
         if not doubts.impossible:
             break
         name = doubts.impossible[0]
@@ -139,19 +140,26 @@ def without_impossible(model: MappedModel, task: MappingTask) -> MappedModel | N
 
 
 def _image_doubts(
-    model: MappedModel, graph: PairGraph, task: MappingTask, loose: Collection[str] = ()
+    model: MappedModel,
+    graph: PairGraph,
+    task: MappingTask,
+    loose: Collection[str] = (),
+    agreements: dict[Ids, float] | None = None,
 ) -> Doubts:
-    """Judge the images one by one."""
+    """Judge the images one by one; ``agreements`` of pairs are taken if known, and added to."""
     reconstruction = model.reconstruction
     registered = set(reconstruction.reg_image_ids())
     bridges = {name: bridge for bridge in model.bridges for name in bridge.names}
     poses, cameras = poses_of(reconstruction), cameras_of(reconstruction)
     given = {key for key, record in task.cameras.items() if record.is_fixed}
     totals = {image_id: np.zeros(2) for image_id in registered}
+    known = {} if agreements is None else agreements
     agreeing_of: dict[Ids, float] = {}
     for pair in graph.pairs_inside(registered):
+        if pair.ids not in known:
+            known[pair.ids] = graph.agreement(pair, poses, cameras)
         count = len(pair.matches)
-        agreeing_of[pair.ids] = count * graph.agreement(pair, poses, cameras)
+        agreeing_of[pair.ids] = count * known[pair.ids]
         for image_id in pair.ids:
             totals[image_id] += agreeing_of[pair.ids], count
     originals = _originals(graph, agreeing_of)

@@ -33,9 +33,10 @@ class MatcherOptions(NetworkOptions):
     one such place to another: captions, frames of scans, watermarks."""
 
     def require_extractor(self, extractor: str) -> None:
-        """Raise OptionError for a feature extractor whose features cannot be matched.
+        """Raise OptionError for a kind of features that cannot be matched.
 
-        An empty name is that of another program, and passes.
+        It is :attr:`~colmap_affrect.features.base.FeatureOptions.kind`; an empty one is that of
+        another program, and passes.
         """
 
 
@@ -60,7 +61,7 @@ class ImageFeatures:
     Attributes:
         features: frames, scores (``responses``), descriptors and the warps they come from.
         image_size: (width, height) of the stored image in px.
-        extractor: name of the feature extractor.
+        extractor: kind of the features, mostly the name of their extractor.
     """
 
     features: LocalFeatures

@@ -58,18 +58,25 @@ class Training:
     """What weights were trained for."""
 
     weights: str  # key of the file
-    extractor: str  # whose features they take
+    kind: str  # of the features that they take
+    recipe: str  # with such features, and what is to be changed in it
     has_circles: bool = True  # whether frames are circles of one radius in the view, upright
 
 
 TRAININGS: dict[str, Training] = {
-    "aliked": Training("lightglue-aliked", "aliked"),
-    "disk": Training("lightglue-disk", "disk"),
-    "xfeat": Training("lighterglue-xfeat", "xfeat"),
-    "sift": Training("lightglue-sift", "rootsift", False),
-    "dog-affnet-hardnet": Training("lightglue-dog-affnet-hardnet", "affnet-hardnet", False),
-    "keynet-affnet-hardnet": Training("lightglue-keynet-affnet-hardnet", "affnet-hardnet", False),
-}
+    "aliked": Training("lightglue-aliked", "aliked", "aliked-lightglue"),
+    "disk": Training("lightglue-disk", "disk", "disk-lightglue"),
+    "xfeat": Training("lighterglue-xfeat", "xfeat", "xfeat-lighterglue"),
+    "sift": Training("lightglue-sift", "rootsift", "sift-lightglue", False),
+    "dog-affnet-hardnet": Training(
+        "lightglue-dog-affnet-hardnet", "dog-affnet-hardnet", "dog-affnet-hardnet-lightglue", False
+    ),
+    "keynet-affnet-hardnet": Training(
+        "lightglue-keynet-affnet-hardnet", "keynet-affnet-hardnet",
+        "dog-affnet-hardnet-lightglue --set features.detector=keynet "
+        "--set matching.trained_for=keynet-affnet-hardnet", False,
+    ),
+}  # fmt: skip
 
 
 class LightGlueOptions(MatcherOptions):
@@ -104,11 +111,14 @@ class LightGlueOptions(MatcherOptions):
 
     def require_extractor(self, extractor: str) -> None:
         """Refuse features that the weights were not trained for."""
-        wanted = TRAININGS[self.trained_for].extractor
-        if extractor not in ("", wanted):
+        training = TRAININGS[self.trained_for]
+        if extractor not in ("", training.kind):
+            advice = [f"--recipe {training.recipe}"]
+            advice += [f"--set matching.trained_for={name}" for name, other in TRAININGS.items()
+                       if other.kind == extractor]  # fmt: skip
             raise OptionError(
-                f"matching: trained_for={self.trained_for!r} takes features of {wanted}, not of "
-                f"{extractor}"
+                f"matching: trained_for={self.trained_for!r} takes features of {training.kind}, "
+                f"not of {extractor}; use {', or '.join(advice)}"
             )
 
 

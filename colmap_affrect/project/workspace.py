@@ -34,6 +34,7 @@ STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "m
 COPY_STAGES = ("copy", "verify", "map")  # of a folder in which another program's database is mapped
 BYTES_OF_MARK = 200  # at the beginning of our files, in which they tell what they are
 TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
+WEIGHTS = "weights"  # of a record: the digests of files, beside the options of a stage
 FORMAT_VERSION = 6  # of ``config.toml``: counts up when a stage records other options than before
 
 
@@ -153,7 +154,8 @@ class Workspace:
 
     def planned(self, stage: str) -> dict[str, Any] | None:
         """Return the options on record for a stage, begun or not; None if there are none."""
-        return self.recorded().get(stage)
+        options = self.recorded().get(stage)
+        return None if options is None else without_digests(options)
 
     def record_options(
         self,
@@ -329,6 +331,11 @@ def placeless(options: Mapping[str, Any], there: str = "", prefix: str = "") -> 
         elif value and prefix + key in PLACES:
             found[key] = there
     return found
+
+
+def without_digests(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is on record for a stage without the digests of weights, which nobody gives."""
+    return {key: value for key, value in options.items() if key != WEIGHTS}
 
 
 def first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:

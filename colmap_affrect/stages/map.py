@@ -14,6 +14,7 @@ from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import num_tied, verified_pairs
 from colmap_affrect.errors import StaleStoreError
+from colmap_affrect.features.weights import install_hint
 from colmap_affrect.features.weights import missing as missing_weights
 from colmap_affrect.mappers.attempts import LARGE_MODEL, map_database, read_models
 from colmap_affrect.mappers.base import Mapper, MappingTask
@@ -80,9 +81,11 @@ def map_images(
     warnings = {}
     if num_rejected:
         inputs = _inputs(workspace, extend)
+        is_one = num_rejected == 1
         warnings[workspace.database.name] = (
-            f"{num_rejected} pairs that only learned matching verified contradict the others and "
-            "were rejected"
+            f"{num_rejected} {'pair' if is_one else 'pairs'} that only learned matching verified "
+            f"{'contradicts the others and was' if is_one else 'contradict the others and were'} "
+            "rejected"
         )
     replace_text(path, inputs)
     if extend and existing and existing.num_other_keypoints:
@@ -90,6 +93,8 @@ def map_images(
             f"keypoints of {existing.num_other_keypoints} of its {len(existing.names)} images are "
             "not those of the database: poses and cameras kept, points triangulated anew"
         )
+    for where, what in warnings.items():
+        logger.warning("%s: %s", where, what)
     wall_s = time.perf_counter() - start
     return StageReport("map", wall_s, len(models), warnings=warnings), models
 
@@ -319,8 +324,9 @@ def _other_recipes(context: Context) -> list[str]:
     if recipe != LEARNED_RECIPE:
         weights = load_recipe(LEARNED_RECIPE).weights
         gone = missing_weights(weights, context.resources.weights_path)
-        fetch = f" (first: colmap-affrect weights fetch {' '.join(weights)})" if gone else ""
-        texts.append(f"run again with --recipe {LEARNED_RECIPE}, if light or age differ{fetch}")
+        get = f"{install_hint(gone)}colmap-affrect weights fetch {' '.join(weights)}"
+        first = f" (first: {get})" if gone else ""
+        texts.append(f"run again with --recipe {LEARNED_RECIPE}, if light or age differ{first}")
     return texts
 
 

@@ -32,8 +32,7 @@ WEIGHTS = "weights"  # of the record, beside the options: file name to sha256
 
 def recorded_matching(workspace: Workspace) -> MatcherOptions:
     """Return the options on record of matching, done or still to be done."""
-    record = {k: value for k, value in (workspace.planned("match") or {}).items() if k != WEIGHTS}
-    options: MatcherOptions = MATCHERS.options(record)
+    options: MatcherOptions = MATCHERS.options(workspace.planned("match") or {})
     return options
 
 
@@ -49,6 +48,7 @@ def match(
     context.resources.require_device()
     pairs = listed_pairs(context)
     options = options or recorded_matching(context.workspace)
+    recorded_extraction(context.workspace).require_matching(options)
     digests = digests_by_name(resolve(options.weights, context.resources.weights_path))
     record = options.to_mapping() | ({WEIGHTS: digests} if digests else {})
     context.workspace.record_options("match", record, overwrite=overwrite)
@@ -100,7 +100,7 @@ def matched_at_level(
     ``options`` count where the level has none of its own.
     """
     features, chosen = context.features, recorded_extraction(context.workspace).levels[level]
-    options, extractor = chosen.matching or options, chosen.features.name
+    options, extractor = chosen.matching or options, chosen.features.kind
     matching = Matching(features, options, level, chosen.base, extractor, context.resources)
     stationary = StationaryFilter(features, context.matches)
     with closing(iterate_matches(pairs, matching, context.executor)) as found_pairs:

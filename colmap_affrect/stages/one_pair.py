@@ -39,7 +39,7 @@ class Matching:
     options: MatcherOptions  # of the matcher
     level: int = 0  # of escalation: its features, together with those of its base
     base: int = 0  # level that has the features of the images themselves
-    extractor: str = ""  # name of the feature extractor; empty for another program's
+    extractor: str = ""  # kind of the features; empty for another program's
     resources: Resources = field(default_factory=Resources)  # weights and device
     max_num_features: int | None = None  # of each image, by response; None for all
     num_similarities: float = 0  # about how many pairs of features there will be to compare

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from command import Call, on_photographs
+from random_weights import write_comparing_lightglue
 from small_scene import write_photographs
 
 from colmap_affrect import __version__, pipeline
@@ -388,6 +389,37 @@ def test_what_is_printed_may_end_early() -> None:
     command = f"{sys.executable} -m colmap_affrect recipes on-demand | head -n 1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
     assert (len(done.stdout.splitlines()), done.stderr) == (1, "")
+
+
+def test_matcher_with_weights_goes_on_and_is_taken_from_the_record(
+    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[pipeline.RunOptions] = []
+
+    def keep(_: Path, __: Path, options: pipeline.RunOptions, **___: object) -> None:
+        taken.append(options)
+        raise OptionError("enough")
+
+    write_photographs(tmp_path / "photos", 2)
+    write_comparing_lightglue(tmp_path / "sift_lightglue.pth")
+    monkeypatch.setenv(weights.ENVIRONMENT_VARIABLE, str(tmp_path))
+    out = ["--output-path", tmp_path / "out"]
+    assert call("extract", "--image-path", tmp_path / "photos", *out,
+                "--recipe", "sift-lightglue").code == 0  # fmt: skip
+    assert call("pairs", *out).code == 0
+    refused = call("match", *out, "--set", "matching.trained_for=disk")
+    assert "not of rootsift; use --recipe disk-lightglue, or --set" in refused.errors[0]
+    change = ["--set", "matching.min_score=0.2", "--overwrite"]
+    for more in ([], [], ["--overwrite"], change, []):
+        assert call("match", *out, "-q", *more).stderr == []
+    record = Workspace(tmp_path / "out").recorded()["match"]
+    assert record["weights"]
+    assert record["min_score"] == 0.2
+    monkeypatch.setattr(pipeline, "run", keep)
+    done = call("run", "--config", tmp_path / "out" / "config.toml", "--output-path", tmp_path)
+    assert done.stderr == ["error: enough"]
+    changed = load_recipe("sift-lightglue", ["matching.min_score=0.2"]).matching
+    assert [options.recipe.matching for options in taken] == [changed]
 
 
 def test_run_repeats_what_is_on_record_and_options_win(

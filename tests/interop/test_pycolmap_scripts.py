@@ -29,10 +29,12 @@ from colmap_affrect.interop.pycolmap_options import (
     matching_options,
     verification_options,
 )
+from colmap_affrect.matchers.lightglue import LightGlueOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
+from colmap_affrect.stages.match import recorded_matching
 
 COARSE = {"rectifier": "identity", "max_image_size_px": 320}
 
@@ -151,6 +153,10 @@ def test_options_are_translated() -> None:
         None, {"num_threads": 3},
     )  # fmt: skip
     assert matching_options({"max_ratio": 0.7}) == (NearestOptions(max_ratio=0.7), {})
+    learned = {"name": "lightglue", "trained_for": "disk"}
+    changed = LightGlueOptions(trained_for="disk", min_score=0.3)
+    assert matching_options({"min_score": 0.3}, learned) == (changed, {})
+    assert matching_options({"name": "nearest"}, learned) == (NearestOptions(), {})
     with pytest.raises(OptionError, match=r"sift\.max_ratio=0\.7 cannot be carried over"):
         matching_options({"sift": {"max_ratio": 0.7}})
     usual = colmap_affrect.VerificationOptions()
@@ -162,6 +168,15 @@ def test_options_are_translated() -> None:
 
 
 @pytest.mark.long
+def test_dictionary_without_a_matcher_changes_that_on_record(extracted: Path) -> None:
+    config = Workspace.beside(extracted).config
+    text = config.read_text(encoding="utf-8")
+    config.write_text(text.replace("ratio_both_ways = true", "ratio_both_ways = false"))
+    colmap_affrect.match_exhaustive(extracted, {"max_ratio": 0.7})
+    options = recorded_matching(Workspace.beside(extracted))
+    assert options == NearestOptions(max_ratio=0.7, ratio_both_ways=False)
+
+
 def test_what_matching_options_ask_for_is_done(extracted: Path) -> None:
     asked = pycolmap.FeatureMatchingOptions(skip_geometric_verification=True, num_threads=1)
     (match,) = replaced.match_exhaustive(extracted, asked)

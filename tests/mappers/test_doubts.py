@@ -17,6 +17,7 @@ from colmap_affrect.geometry.parallax import mirrored_share
 from colmap_affrect.mappers.arrivals import arrivals
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
 from colmap_affrect.mappers.doubts import find_doubts, without_impossible
+from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair
 from colmap_affrect.project.report import Arrival
 
 
@@ -103,6 +104,29 @@ def test_image_that_contradicts_its_pairs_leaves_and_the_others_stay(tmp_path: P
     assert "of the matches of verified pairs agree with the pose" in kept.taken_out[image.name]
     assert kept.reconstruction.num_reg_images() == 3
     assert find_doubts(kept, task).images == {}
+
+
+def test_agreement_of_a_pair_is_measured_once_however_many_images_leave(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, task = scene(tmp_path, 6)
+    images = [model.reconstruction.images[i] for i in sorted(model.reconstruction.reg_image_ids())]
+    for number, image in enumerate(images[4:], 1):
+        turn = pycolmap.Rotation3d(0.1 * number * np.array([1.0, 2.0, 0.5]))
+        wrong = pycolmap.Rigid3d(turn, np.array([1.0, 2.0, 3.0])) * image.cam_from_world()
+        image.frame.set_cam_from_world(image.camera_id, wrong)
+    measured = []
+
+    def agreement(graph: PairGraph, pair: VerifiedPair, *given: object) -> float:
+        measured.append(pair.ids)
+        return agreement_of(graph, pair, *given)
+
+    agreement_of = PairGraph.agreement
+    monkeypatch.setattr(PairGraph, "agreement", agreement)
+    kept = without_impossible(model, task)
+    assert kept is not None
+    assert sorted(kept.taken_out) == [image.name for image in images[4:]]
+    assert len(measured) == len(set(measured)) > 10
 
 
 def test_nothing_is_left_of_a_pair_that_loses_an_image(tmp_path: Path) -> None:

@@ -240,7 +240,7 @@ def test_every_kind_of_features_is_matched_and_in_warps(trained_for: str, tmp_pa
     dimension = 64 if trained_for == "xfeat" else 128
     parts = [features(20, seed, dimension=dimension) for seed in (1, 2)]
     parts[1] = parts[1].with_rectification_id(1)
-    views = matcher.prepare(image(union(parts), training.extractor))
+    views = matcher.prepare(image(union(parts), training.kind))
     indices = matcher.match(views, views).indices
     assert_array_equal(indices[:, 0], indices[:, 1])
     assert set(indices[:, 0] // 20) == {0, 1}

@@ -166,7 +166,9 @@ def poses(workspace: Workspace, names: list[str]) -> list[NDArray[Any]]:
 
 
 @pytest.mark.parametrize("is_wrong", [False, True])
-def test_other_pairs_are_rejected_where_they_contradict(context: Context, is_wrong: bool) -> None:
+def test_other_pairs_are_rejected_where_they_contradict(
+    context: Context, is_wrong: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     workspace, escalation = context.workspace, escalation_of(context)
     shapeless_only(escalation, PAIR)
     if is_wrong:
@@ -186,6 +188,10 @@ def test_other_pairs_are_rejected_where_they_contradict(context: Context, is_wro
     before = poses(workspace, NAMES)
     assert stage.map_images(context, mapper)[0].num_done == 0
     assert np.array_equal(before, poses(workspace, NAMES))
+    assert [line for line in caplog.messages if "was rejected" in line] == is_wrong * [
+        "database.db: 1 pair that only learned matching verified contradicts the others and was "
+        "rejected"
+    ]
 
 
 @pytest.mark.long

