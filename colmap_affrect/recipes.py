@@ -105,8 +105,12 @@ class ExtractionOptions(Options):
 
     def require_matching(self, matching: MatcherOptions) -> None:
         """Refuse a matcher, of all levels without one of their own, for features of others."""
-        for level in self.levels:
-            (level.matching or matching).require_extractor(level.features.kind)
+        for level, matcher in zip(self.levels, self.matchers(matching), strict=True):
+            matcher.require_extractor(level.features.kind)
+
+    def matchers(self, matching: MatcherOptions) -> tuple[MatcherOptions, ...]:
+        """Return the matcher of each level, ``matching`` where it has none of its own."""
+        return tuple(level.matching or matching for level in self.levels)
 
     @property
     def _network_parts(self) -> tuple[NetworkOptions, ...]:
@@ -196,8 +200,8 @@ class Recipe:
     @property
     def weights(self) -> tuple[str, ...]:
         """Keys of the files of weights of all parts, sorted."""
-        matching = (level.matching or self.matching for level in self.extraction.levels)
-        return tuple(sorted({*self.extraction.weights}.union(*(item.weights for item in matching))))
+        matchers = self.extraction.matchers(self.matching)
+        return tuple(sorted({*self.extraction.weights}.union(*(item.weights for item in matchers))))
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all sections with all options, as :meth:`from_mapping` takes them."""

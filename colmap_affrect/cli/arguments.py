@@ -335,9 +335,10 @@ DOCTOR = (
 SHOWN_RECIPE = Option("name", nargs="?", help="print this recipe with all of its options")
 WEIGHTS = (
     _choice("action", ["list", "fetch"],
-        "fetch downloads what is missing, for a machine without network (default: list)",
+        "fetch downloads what is missing or damaged, for a machine without network (default: list)",
         nargs="?", default="list"),
-    _value("keys", "KEY", "which files to fetch (default: affnet, orinet, hardnet)", nargs="*"),
+    _value("keys", "KEY", "which files (default: list all, fetch affnet, orinet and hardnet)",
+        nargs="*"),
     _path("--weights", "FOLDER",
         "look there first, and fetch into it (default: torch's cache)"),
 )  # fmt: skip

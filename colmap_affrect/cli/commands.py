@@ -416,18 +416,19 @@ def recipes(options: argparse.Namespace) -> None:
 
 
 def weights(options: argparse.Namespace) -> None:
-    from colmap_affrect.features.weights import describe_weights, fetch, install_hint
+    from colmap_affrect.features.weights import describe_weights, fetch, install_hint, remedy
 
     if options.action == "fetch":
         keys = options.keys or ["affnet", "orinet", "hardnet"]
         for path in fetch(keys, options.weights, progress=Progress(sys.stderr)).values():
             show(path)
         return
-    checks = {None: "", True: ", verified", False: ", NOT the published file"}
-    for row in describe_weights(given.weights_folder(options)):
+    for row in describe_weights(given.weights_folder(options), options.keys):
         file = row.published
-        where = f"{row.path}{checks[row.verified]}"
-        if not row.path:
+        where = f"{row.path}{', verified' if row.verified else ''}"
+        if row.path and row.verified is False:
+            where += f", NOT the published file: {remedy(row.path)}, unless it is your own"
+        elif not row.path:
             where = f"not found: {install_hint([file])}colmap-affrect weights fetch {row.key}"
         show(f"{row.key:32s} {file.used_for}, {file.file_name}")
         show(f"{'':4s}{where}")

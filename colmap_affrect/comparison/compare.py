@@ -27,7 +27,7 @@ from colmap_affrect.comparison.request import Layout, Request
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.tables import to_csv, to_json
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
-from colmap_affrect.features.weights import install_hint
+from colmap_affrect.features.weights import install_hint, resolve
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import Options
 from colmap_affrect.pairs.base import Pair, PairOptions
@@ -80,9 +80,12 @@ def compare(
     """
     options = options or CompareOptions()
     plan = _Plan.checked(image_path, Layout(output_path), options)
+    requests = plan.requests()
+    todo = [item.method.recipe for item in requests if overwrite or not _finished(item)]
+    keys = {key for recipe in todo if recipe for key in recipe.weights}
+    resolve(sorted(keys), options.resources.weights_path, progress=progress)
     with Workspace(output_path).locked():
         unreadable = _share(plan, overwrite=overwrite)
-        requests = plan.requests()
         for request in requests:
             _record(request, overwrite=overwrite)
         results = []

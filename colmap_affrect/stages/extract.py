@@ -15,7 +15,6 @@ from colmap_affrect.colmap.database_copy import copy_without_features, read_name
 from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
 from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
-from colmap_affrect.features.weights import digests_by_name
 from colmap_affrect.images.photographs import (
     CameraOptions,
     MaskOptions,
@@ -30,7 +29,7 @@ from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.project.workspace import WEIGHTS, Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe
 from colmap_affrect.shown import one_line
 from colmap_affrect.stages.changes import (
@@ -39,7 +38,7 @@ from colmap_affrect.stages.changes import (
     refuse_other_photographs,
     source_files,
 )
-from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.context import Context, digests_to_record
 from colmap_affrect.stages.one_image import (
     ExtractedImage,
     ImageExtractor,
@@ -242,7 +241,7 @@ def _record(
     *,
     overwrite: bool,
 ) -> None:
-    weights = digests_by_name(extractor.weights)
+    weights = digests_to_record(workspace, "extract", extractor.weights, overwrite=overwrite)
     planned: dict[str, Options] = {"match": recipe.matching, "guide": recipe.guided}
     if recipe.extraction.escalation:
         planned["escalate"] = recipe.escalate
@@ -251,7 +250,7 @@ def _record(
     planned |= later
     workspace.record_options(
         "extract",
-        {**inputs.to_mapping(), **recipe.extraction.to_mapping(), "weights": weights},
+        {**inputs.to_mapping(), **recipe.extraction.to_mapping(), WEIGHTS: weights},
         plan={stage: chosen.to_mapping() for stage, chosen in planned.items()},
         recipe=recipe.name,
         overwrite=overwrite,

@@ -8,14 +8,14 @@ from contextlib import closing
 import numpy as np
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.features.weights import digests_by_name, resolve
+from colmap_affrect.features.weights import resolve
 from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.project.contents import sha256_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
-from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context
+from colmap_affrect.project.workspace import WEIGHTS, Workspace
+from colmap_affrect.stages.context import Context, digests_to_record
 from colmap_affrect.stages.extract import recorded_extraction, write_images_and_keypoints
 from colmap_affrect.stages.one_pair import Matching, iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
@@ -25,9 +25,6 @@ logger = logging.getLogger(__name__)
 
 PAIRS_PER_WRITE = 64
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
-
-
-WEIGHTS = "weights"  # of the record, beside the options: file name to sha256
 
 
 def recorded_matching(workspace: Workspace) -> MatcherOptions:
@@ -48,10 +45,13 @@ def match(
     context.resources.require_device()
     pairs = listed_pairs(context)
     options = options or recorded_matching(context.workspace)
-    recorded_extraction(context.workspace).require_matching(options)
-    digests = digests_by_name(resolve(options.weights, context.resources.weights_path))
+    workspace, extraction = context.workspace, recorded_extraction(context.workspace)
+    extraction.require_matching(options)
+    keys = {key for matcher in extraction.matchers(options) for key in matcher.weights}
+    weights = resolve(sorted(keys), context.resources.weights_path)
+    digests = digests_to_record(workspace, "match", weights, overwrite=overwrite)
     record = options.to_mapping() | ({WEIGHTS: digests} if digests else {})
-    context.workspace.record_options("match", record, overwrite=overwrite)
+    workspace.record_options("match", record, overwrite=overwrite)
     matches, digest = context.matches, sha256_of(context.workspace.pairs)
     finished = matches.finished_list()
     is_finished = finished == digest and matches.num_pairs() == len(pairs)

