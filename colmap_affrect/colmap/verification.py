@@ -28,7 +28,7 @@ from colmap_affrect.colmap.database import (
 from colmap_affrect.colmap.native_options import Plain, differences
 from colmap_affrect.colmap.two_views import PLANAR, epipolar_pair, keypoint_shapes
 from colmap_affrect.geometry.affine import homography_errors
-from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
+from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
 from colmap_affrect.geometry.epipolar import common_sign
 from colmap_affrect.geometry.pair_models import HomographyModel, PairModel, Points, Rows
 from colmap_affrect.geometry.shapes import of_unit_area, vary_singly
@@ -358,15 +358,45 @@ class PairVerifier:
         self, names: tuple[str, str], frames: tuple[Floats, Floats], indices: NDArray[np.integer]
     ) -> pycolmap.TwoViewGeometry:
         """Return the geometry of the same from the image with the lower id; empty if rejected."""
+        ids, sides, indices = self._ordered(names, frames, indices)
+        size_px = of_pair(self._extracted_px, ids)
+        return estimate_geometry(sides, indices, self._options, size_px)
+
+    def are_explained(
+        self,
+        names: tuple[str, str],
+        frames: tuple[Floats, Floats],
+        indices: NDArray[np.integer],
+        by: NDArray[np.integer],
+    ) -> Bools:
+        """Tell which of (M, 2) matches the geometry of other ones, ``by``, explains, as inliers.
+
+        All where that geometry is rejected, or one that nothing can contradict.
+        """
+        geometry = self.geometry(names, frames, by)
+        ids, (first, second), indices = self._ordered(names, frames, indices)
+        cameras = (first.camera, second.camera)
+        matched = (first.keypoints[indices[:, 0]], second.keypoints[indices[:, 1]])
+        with np.errstate(all="ignore"):  # points that a camera cannot undistort are not explained
+            model = _model(geometry, cameras, matched)
+            if model is None:
+                return np.ones(len(indices), np.bool_)
+            rows = np.arange(len(indices))
+            limit_px = max_error_px(cameras, self._options, of_pair(self._extracted_px, ids))
+            return np.asarray(model.errors(rows, rows) <= limit_px)
+
+    def _ordered(
+        self, names: tuple[str, str], frames: tuple[Floats, Floats], indices: NDArray[np.integer]
+    ) -> tuple[tuple[int, int], tuple[Side, Side], NDArray[np.integer]]:
+        """Return ids, sides and (M, 2) matches of a pair from the image with the lower id."""
         ids = self._ids[names[0]], self._ids[names[1]]
         first, second = (
             Side(self._cameras[image_id], colmap_keypoints(lafs))
             for image_id, lafs in zip(ids, frames, strict=True)
         )
         if ids[0] > ids[1]:
-            ids, first, second, indices = ids[::-1], second, first, indices[:, ::-1]
-        size_px = of_pair(self._extracted_px, ids)
-        return estimate_geometry((first, second), indices, self._options, size_px)
+            return ids[::-1], (second, first), indices[:, ::-1]
+        return ids, (first, second), indices
 
 
 def verified_pairs(path: Path, min_num_inliers: int) -> dict[tuple[int, int], int]:

@@ -160,11 +160,12 @@ def _or_first_level(
 def _map(
     context: Context, mapper: Mapper, task: MappingTask, advance: Callable[[int], None]
 ) -> tuple[list[ModelSummary], int]:
-    """Map, first the pairs that measured frames support where there are others, too.
+    """Map, first by the matches of measured frames where there are others, too.
 
-    Learned matching verifies sides of a building that look the same as one. Its pairs have no say
-    where the others register as many images without them; those that contradict are rejected.
-    Returns the models, and how many pairs were rejected.
+    Learned matching verifies sides of a building that look the same as one, and is off by more than
+    a pixel, which bends models of unknown cameras. It has no say where the others register as many
+    images without it; its pairs that contradict are rejected. Returns the models, and how many
+    pairs were rejected.
     """
     sparse = context.workspace.sparse
     if task.extend or is_copy(context.workspace):

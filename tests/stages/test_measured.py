@@ -16,15 +16,22 @@ from small_scene import INTRINSICS, NAMES
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.verification import PairVerifier, verified_pairs
+from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions, verified_pairs
 from colmap_affrect.features.base import EXTRACTORS
+from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import map as stage
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation, escalate, measured_database, reject
+from colmap_affrect.stages.escalate import (
+    MIN_NUM_TELLING,
+    Escalation,
+    escalate,
+    measured_database,
+    reject,
+)
 from colmap_affrect.stages.extract import Inputs, extract
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
@@ -110,6 +117,9 @@ class OneKind:
         rows = self._escalation.measured(names, indices) == self._measured
         return indices[rows] if rows.any() else indices
 
+    def are_explained(self, _: object, __: object, indices: NDArray[Any], *___: object) -> Any:
+        return np.ones(len(indices), np.bool_)
+
 
 @pytest.mark.parametrize(
     ("is_measured", "worth"), [(False, 0), (True, math.inf)], ids=["they stay", "they win"]
@@ -133,21 +143,51 @@ def test_measured_frames_decide_where_both_kinds_differ(
     assert count == np.count_nonzero(measured)
 
 
-def test_measured_database_lacks_the_pairs_that_no_measured_frames_support(
-    context: Context,
+@pytest.mark.parametrize("step", [1, -1], ids=["from the first", "from the second"])
+@pytest.mark.parametrize("num_measured", [MIN_NUM_TELLING, MIN_NUM_TELLING - 1])
+def test_enough_measured_matches_decide_which_others_are_right(
+    context: Context, step: int, num_measured: int
 ) -> None:
     escalation = escalation_of(context)
-    with measured_database(context) as found:
-        assert found is None
-    shapeless_only(escalation, PAIR, (NAMES[1], NAMES[3]))
-    everything = verified_pairs(context.workspace.database, 1)
+    (found,) = escalation.matches.read([PAIR])
+    found = replace(found, names=PAIR[::step], indices=found.indices[:, ::step])
+    measured = escalation.measured(found.names, found.indices)
+    right, level = found.indices[measured][:num_measured], found.indices[~measured]
+    wrong = np.stack([level[:, 0], np.roll(level[:, 1], len(level) // 2)], axis=1)
+    indices = np.concatenate([level, wrong])
+    both = replace(found, indices=indices, scores=np.ones(len(indices), np.float32))
+    verifier = PairVerifier(context.workspace.database, VerificationOptions())
+    united, _ = escalation._judged(both, right, verifier)
+    is_wrong = rows_in(united.indices, wrong) & ~rows_in(united.indices, level)
+    assert rows_in(right, united.indices).all()
+    assert rows_in(level, united.indices).mean() > 0.9
+    assert len(united.scores) == len(united.indices)
+    if num_measured == MIN_NUM_TELLING:
+        assert is_wrong.sum() < 0.1 * len(wrong)
+    else:
+        assert is_wrong.sum() == len(wrong)
+
+
+def test_measured_database_has_the_inliers_of_measured_frames_alone(context: Context) -> None:
+    escalation = escalation_of(context)
+    without = PAIR, (NAMES[1], NAMES[3])
+    shapeless_only(escalation, *without)
+    path = context.workspace.database
+    everything = verified_inliers(context)
     with measured_database(context) as found:
         assert found
-        path, doubted = found
-        assert set(doubted) == {PAIR, (NAMES[1], NAMES[3])}
-        measured = verified_pairs(path, 1)
-    assert len(measured) == len(everything) - 2
-    assert measured.items() <= everything.items()
+        copy, doubted = found
+        assert set(doubted) == set(without)
+        assert verified_pairs(copy, 1).keys() < verified_pairs(path, 1).keys()
+        copy.replace(path)
+    kept = verified_inliers(context)
+    assert kept.keys() == everything.keys() - set(without)
+    for pair, indices in kept.items():
+        measured = escalation.measured(pair, everything[pair])
+        assert not measured.all()
+        assert np.array_equal(indices, everything[pair][measured])
+    with measured_database(context) as found:
+        assert found is None
 
 
 def test_rejected_pairs_stay_so(context: Context) -> None:
