@@ -420,7 +420,7 @@ def weights(options: argparse.Namespace) -> None:
 
     if options.action == "fetch":
         keys = options.keys or ["affnet", "orinet", "hardnet"]
-        for path in fetch(keys, options.weights, progress=Progress(sys.stderr)).values():
+        for path in fetch(keys, options.weights, progress=given.progress(options)).values():
             show(path)
         return
     for row in describe_weights(given.weights_folder(options), options.keys):

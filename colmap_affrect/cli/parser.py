@@ -207,5 +207,5 @@ COMMANDS: dict[str, Command] = {
         (*args.DOCTOR, args.json("print JSON"), args.VOLUME)),
     "recipes": (commands.recipes, "list the recipes and what they need", (args.SHOWN_RECIPE,)),
     "weights": (commands.weights, "list the files of weights, or fetch them beforehand",
-        args.WEIGHTS),
+        (*args.WEIGHTS, args.VOLUME)),
 }  # fmt: skip

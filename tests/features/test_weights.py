@@ -263,15 +263,16 @@ def test_fetch_fills_a_folder_and_leaves_what_can_be_read(
 
 
 def test_fetch_replaces_a_damaged_file_and_keeps_it_beside(
-    installed: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    installed: Path, monkeypatch: pytest.MonkeyPatch, call: Call
 ) -> None:
     server = FakeServer(monkeypatch, hardnet={"https://a/x": OSError("down")})
     cache_folder().mkdir(parents=True)
     for name in ("xfeat.pt", NAME):
         (cache_folder() / name).write_bytes(b"half")
-    assert fetch(["xfeat"]) == {"xfeat": cache_folder() / "xfeat.pt"}
+    ended = call("weights", "fetch", "xfeat")
+    assert ended.stdout == f"{cache_folder() / 'xfeat.pt'}\n"
+    assert "xfeat.pt: was not the published file, and is xfeat.pt.old now" in ended.stderr[0]
     assert (cache_folder() / "xfeat.pt").read_bytes() == installed.read_bytes()
-    assert "xfeat.pt: was not the published file, and is xfeat.pt.old now" in caplog.text
     with pytest.raises(WeightsError, match="down"):
         fetch(["hardnet"])
     assert (cache_folder() / NAME).read_bytes() == b"half"  # until there is a better one
