@@ -60,7 +60,7 @@ def test_matches_of_other_weights_are_not_mixed(
 ) -> None:
     matched(tmp_path / "out", extracted, weights, Threads(1))
     workspace = Workspace(tmp_path / "out")
-    assert list(workspace.recorded()["match"]["weights"]) == ["sift_lightglue.pth"]
+    assert list(workspace.recorded()["match"]["weights"]) == ["lightglue-sift"]
     assert recorded_matching(workspace) == RECIPE.matching
     write_comparing_lightglue(tmp_path / "sift_lightglue.pth", sharpness=30.0)
     with pytest.raises(StaleStoreError, match="match stage was run there with weights"):
