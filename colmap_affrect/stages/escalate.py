@@ -71,6 +71,10 @@ MIN_NUM_TELLING = 30
 """So many inliers of measured frames decide alone which other matches are right. Wrong ones of a
 similar side may keep nine tenths of 76, and turn their geometry from 2.5 to 30 degrees off."""
 
+OUTNUMBERED = 4
+"""So many inliers of other frames to one of measured frames decide, where they agree with half of
+these: of what changes, such as a sitter, few gradients match, and their geometry is off."""
+
 
 def recorded_escalation(workspace: Workspace) -> EscalateOptions:
     """Return the options on record of escalation, done or still to be done."""
@@ -179,7 +183,10 @@ def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | No
 
 
 def _measured_inliers(context: Context) -> dict[Pair, Indices]:
-    """Return the (M, 2) inliers of measured frames of the verified pairs that have others, too."""
+    """Return the (M, 2) inliers of measured frames of the verified pairs that have others, too.
+
+    Not of pairs in which those are outnumbered by others that agree with them.
+    """
     if all(level.features.has_shapes for level in recorded_extraction(context.workspace).levels):
         return {}
     escalation, inliers = Escalation(context, EscalateOptions()), verified_inliers(context)
@@ -192,7 +199,12 @@ def _measured_inliers(context: Context) -> dict[Pair, Indices]:
     )
     if num_tied_by_measured < MIN_SHARE * num_tied:
         return {}
-    return {pair: rows for pair, rows in measured.items() if len(rows) < len(inliers[pair])}
+    return {
+        pair: rows
+        for pair, rows in measured.items()
+        if (num_others := len(inliers[pair]) - len(rows))
+        and (not len(rows) or num_others < OUTNUMBERED * len(rows))
+    }
 
 
 def reject(context: Context, pairs: Sequence[Pair]) -> None:
@@ -395,7 +407,8 @@ class Escalation:
         That is its inliers, or without any how many matches confirm each other. Inliers that the
         pair has of the other kind of frames are added where both agree, but for those that many
         measured ones contradict; else those decide that were measured one by one: they tell right
-        matches from wrong, while of others there may be more where two sides look the same.
+        matches from wrong, while of others there may be more where two sides look the same. Only
+        where these are many times more, and agree with half of the measured ones, they decide.
         """
         inliers = self._inliers(found, verifier)
         if not len(inliers):
@@ -408,13 +421,16 @@ class Escalation:
         united = replace(found, indices=indices[order], scores=scores[order])
         explained = self._inliers(united, verifier)
         is_measured = bool(self.measured(found.names, inliers).all())
-        measured = inliers if is_measured else others
-        if self.measured(found.names, explained).sum() >= MIN_SHARE_KEPT * len(measured):
-            if len(measured) >= MIN_NUM_TELLING:
-                united = self._agreeing(united, measured, verifier)
-                explained = self._inliers(united, verifier)
-            return united, (len(explained), 0)
-        return found, (math.inf if is_measured else 0, 0)
+        measured, unmeasured = (inliers, others) if is_measured else (others, inliers)
+        num_kept = self.measured(found.names, explained).sum()
+        do_agree = num_kept >= MIN_SHARE_KEPT * len(measured)
+        is_outnumbered = len(unmeasured) >= OUTNUMBERED * len(measured)
+        if not do_agree and not (is_outnumbered and num_kept >= MIN_SHARE * len(measured)):
+            return found, (math.inf if is_measured else 0, 0)
+        if do_agree and len(measured) >= MIN_NUM_TELLING:
+            united = self._agreeing(united, measured, verifier)
+            explained = self._inliers(united, verifier)
+        return united, (len(explained), 0)
 
     def _agreeing(
         self, united: PairMatches, measured: Indices, verifier: PairVerifier

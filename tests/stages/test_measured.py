@@ -27,6 +27,7 @@ from colmap_affrect.stages import map as stage
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import (
     MIN_NUM_TELLING,
+    OUTNUMBERED,
     Escalation,
     escalate,
     measured_database,
@@ -143,6 +144,37 @@ def test_measured_frames_decide_where_both_kinds_differ(
     assert count == np.count_nonzero(measured)
 
 
+class Outnumbering:
+    """Says that a geometry explains all matches of other frames, and the first measured ones."""
+
+    def __init__(self, escalation: Escalation, num_measured: int) -> None:
+        self._escalation, self._num_measured = escalation, num_measured
+
+    def inliers(self, names: tuple[str, str], _: object, indices: NDArray[Any]) -> NDArray[Any]:
+        measured = self._escalation.measured(names, indices)
+        return np.concatenate([indices[~measured], indices[measured][: self._num_measured]])
+
+
+@pytest.mark.parametrize("num_fewer", [0, 1], ids=["many times more", "fewer"])
+@pytest.mark.parametrize("num_kept", [5, 4], ids=["half agree", "most do not"])
+def test_many_others_decide_where_half_of_the_measured_agree(
+    context: Context, num_fewer: int, num_kept: int
+) -> None:
+    escalation = escalation_of(context)
+    (found,) = escalation.matches.read([PAIR])
+    measured = escalation.measured(PAIR, found.indices)
+    level = np.flatnonzero(~measured)[: OUTNUMBERED * 10 - num_fewer]
+    level_matches = replace(found, indices=found.indices[level], scores=found.scores[level])
+    verifier = cast("PairVerifier", Outnumbering(escalation, num_kept))
+    judged, worth = escalation._judged(level_matches, found.indices[measured][:10], verifier)
+    if num_fewer or num_kept < 5:
+        assert judged is level_matches
+        assert worth == (0, 0)
+    else:
+        assert len(judged.indices) == len(level) + 10
+        assert worth == (len(level) + num_kept, 0)
+
+
 @pytest.mark.parametrize("step", [1, -1], ids=["from the first", "from the second"])
 @pytest.mark.parametrize("num_measured", [MIN_NUM_TELLING, MIN_NUM_TELLING - 1])
 def test_enough_measured_matches_decide_which_others_are_right(
@@ -188,6 +220,23 @@ def test_measured_database_has_the_inliers_of_measured_frames_alone(context: Con
         assert np.array_equal(indices, everything[pair][measured])
     with measured_database(context) as found:
         assert found is None
+
+
+def test_measured_database_keeps_others_that_outnumber_measured_frames(context: Context) -> None:
+    path, pairs = context.workspace.database, list(verified_inliers(context))
+    escalation, kept = escalation_of(context), {}
+    for pair, indices in verified_inliers(context).items():
+        measured = escalation.measured(pair, indices)
+        count = np.count_nonzero(~measured) // OUTNUMBERED + (pair != pairs[0])
+        kept[pair] = np.concatenate([indices[~measured], indices[measured][:count]])
+    colmap_database.keep_inliers(path, kept, 1)
+    with measured_database(context) as found:
+        assert found
+        assert found[1] == []
+        found[0].replace(path)
+    for pair, indices in verified_inliers(context).items():
+        assert len(indices) < len(kept[pair]) or pair == pairs[0]
+        assert np.array_equal(indices, kept[pair][: len(indices)]) == (pair == pairs[0])
 
 
 def test_rejected_pairs_stay_so(context: Context) -> None:
