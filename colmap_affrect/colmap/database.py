@@ -262,21 +262,19 @@ def replace_matches(
 
 def reject_pairs(path: Path, pairs: Iterable[tuple[str, str]]) -> None:
     """Let pairs of image names count as verified in vain; their matches stay."""
-    keep_inliers(path, dict.fromkeys(pairs, np.zeros((0, 2), np.int64)), 1)
+    keep_inliers(path, dict.fromkeys(pairs, np.zeros((0, 2), np.int64)))
 
 
-def keep_inliers(
-    path: Path, inliers: Mapping[tuple[str, str], Indices], min_num_inliers: int
-) -> None:
+def keep_inliers(path: Path, inliers: Mapping[tuple[str, str], Indices]) -> None:
     """Let verified pairs of image names have (M, 2) of their inliers.
 
-    Those that keep fewer than ``min_num_inliers`` count as verified in vain.
+    Those that keep none count as verified in vain.
     """
     ids = image_ids(path)
     with open_database(path) as database, pycolmap.DatabaseTransaction(database):
         for (first, second), indices in inliers.items():
             pair, geometry = (ids[first], ids[second]), pycolmap.TwoViewGeometry()
-            if len(indices) >= min_num_inliers:
+            if len(indices):
                 geometry = database.read_two_view_geometry(*pair)
                 geometry.inlier_matches = indices.astype(np.uint32)
             database.delete_two_view_geometry(*pair)

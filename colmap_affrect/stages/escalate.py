@@ -159,7 +159,7 @@ def first_level_database(context: Context) -> Iterator[Path | None]:
 
 
 def unmeasured_pairs(context: Context) -> list[Pair]:
-    """Return the verified pairs that no match of measured frames supports.
+    """Return the verified pairs that matches of measured frames alone do not verify.
 
     None where the others tie fewer than half of the images that all of them tie.
     """
@@ -168,43 +168,41 @@ def unmeasured_pairs(context: Context) -> list[Pair]:
 
 @contextmanager
 def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | None]:
-    """Give a copy of the database whose inliers are of measured frames, and the pairs without any.
+    """Give a copy of the database as measured frames have it, and the pairs that it lacks.
 
-    None where all are measured, or where measured ones tie fewer than half of the images.
+    Pairs have the inliers of measured frames there, with those of others only where these are
+    many times more. None where that changes nothing, or ties fewer than half of the images.
     """
     found = _measured_inliers(context)
     if not found:
         yield None
         return
-    least = recorded_verification(context.workspace).min_num_inliers
     with _copied_database(context) as path:
-        colmap_database.keep_inliers(path, found, least)
+        colmap_database.keep_inliers(path, found)
         yield path, [pair for pair, indices in found.items() if not len(indices)]
 
 
 def _measured_inliers(context: Context) -> dict[Pair, Indices]:
-    """Return the (M, 2) inliers of measured frames of the verified pairs that have others, too.
+    """Return the (M, 2) inliers that verified pairs have as measured frames have it, if others.
 
-    Not of pairs in which those are outnumbered by others that agree with them.
+    M is 0 where measured ones are too few for a verified pair.
     """
     if all(level.features.has_shapes for level in recorded_extraction(context.workspace).levels):
         return {}
     escalation, inliers = Escalation(context, EscalateOptions()), verified_inliers(context)
-    measured = {
-        pair: indices[escalation.measured(pair, indices)] for pair, indices in inliers.items()
-    }
-    num_tied, num_tied_by_measured = (
-        max(map(len, connected_parts(pairs)), default=0)
-        for pairs in (inliers, [pair for pair, indices in measured.items() if len(indices)])
+    found = {}
+    for pair, indices in inliers.items():
+        measured = indices[escalation.measured(pair, indices)]
+        num_others = len(indices) - len(measured)
+        if len(measured) < escalation.verification.min_num_inliers:
+            found[pair] = measured[:0]
+        elif 0 < num_others < OUTNUMBERED * len(measured):
+            found[pair] = measured
+    kept = [pair for pair in inliers if pair not in found or len(found[pair])]
+    num_tied, num_kept = (
+        max(map(len, connected_parts(pairs)), default=0) for pairs in (inliers, kept)
     )
-    if num_tied_by_measured < MIN_SHARE * num_tied:
-        return {}
-    return {
-        pair: rows
-        for pair, rows in measured.items()
-        if (num_others := len(inliers[pair]) - len(rows))
-        and (not len(rows) or num_others < OUTNUMBERED * len(rows))
-    }
+    return found if num_kept >= MIN_SHARE * num_tied else {}
 
 
 def reject(context: Context, pairs: Sequence[Pair]) -> None:
@@ -430,6 +428,8 @@ class Escalation:
         if do_agree and len(measured) >= MIN_NUM_TELLING:
             united = self._agreeing(united, measured, verifier)
             explained = self._inliers(united, verifier)
+            if is_measured:  # others that it contradicts may have been more
+                return united, (math.inf, 0)
         return united, (len(explained), 0)
 
     def _agreeing(

@@ -163,9 +163,9 @@ def _map(
     """Map, first by the matches of measured frames where there are others, too.
 
     Learned matching verifies sides of a building that look the same as one, and is off by more than
-    a pixel, which bends models of unknown cameras. It has no say where the others register as many
-    images without it; its pairs that contradict are rejected. Returns the models, and how many
-    pairs were rejected.
+    a pixel, which bends models of unknown cameras. But for pairs in which its matches are many
+    times more it has no say where the others register as many images without it; its pairs that
+    contradict are rejected. Returns the models, and how many pairs were rejected.
     """
     sparse = context.workspace.sparse
     if task.extend or is_copy(context.workspace):
@@ -175,22 +175,22 @@ def _map(
             return map_database(mapper, task, sparse, advance), 0
         path, doubted = found
         num_images = num_tied(context.workspace.database, _min_num_inliers(context.workspace))
-        first = path.with_name("sparse")
-        models = map_database(mapper, replace(task, database_path=path), first, advance)
+        models = map_database(mapper, replace(task, database_path=path), sparse, advance)
         num = _num_registered(models)
         if num < MIN_SHARE * num_images or not models[0].is_consistent:
             return map_database(mapper, task, sparse, _ignore), 0
         if num < num_images:
-            others = map_database(mapper, task, sparse, _ignore)
+            every = path.with_name("sparse")
+            others = map_database(mapper, task, every, _ignore)
             if _rank(others) > _rank(models):
+                rmtree(sparse)
+                every.rename(sparse)
                 return others, 0
         graph = PairGraph.read(context.workspace.database)
-        contradicting = _contradicting(graph, pycolmap.Reconstruction(first / "0"))
+        contradicting = _contradicting(graph, pycolmap.Reconstruction(sparse / "0"))
         rejected = [pair for pair in doubted if frozenset(pair) in contradicting]
         if rejected:
             reject(context, rejected)
-        rmtree(sparse, ignore_errors=True)
-        first.rename(sparse)
     return models, len(rejected)
 
 

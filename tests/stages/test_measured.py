@@ -141,7 +141,7 @@ def test_measured_frames_decide_where_both_kinds_differ(
     agreeing = cast("PairVerifier", OneKind(escalation, measured=True))
     united, (count, _) = escalation._judged(level, others, agreeing)
     assert np.array_equal(united.indices, found.indices)
-    assert count == np.count_nonzero(measured)
+    assert count == (math.inf if is_measured else np.count_nonzero(measured))
 
 
 class Outnumbering:
@@ -229,7 +229,7 @@ def test_measured_database_keeps_others_that_outnumber_measured_frames(context: 
         measured = escalation.measured(pair, indices)
         count = np.count_nonzero(~measured) // OUTNUMBERED + (pair != pairs[0])
         kept[pair] = np.concatenate([indices[~measured], indices[measured][:count]])
-    colmap_database.keep_inliers(path, kept, 1)
+    colmap_database.keep_inliers(path, kept)
     with measured_database(context) as found:
         assert found
         assert found[1] == []
@@ -237,6 +237,24 @@ def test_measured_database_keeps_others_that_outnumber_measured_frames(context: 
     for pair, indices in verified_inliers(context).items():
         assert len(indices) < len(kept[pair]) or pair == pairs[0]
         assert np.array_equal(indices, kept[pair][: len(indices)]) == (pair == pairs[0])
+
+
+def test_few_measured_matches_verify_no_pair(context: Context) -> None:
+    escalation, kept = escalation_of(context), {}
+    for pair, indices in verified_inliers(context).items():
+        measured = escalation.measured(pair, indices)
+        kept[pair] = np.concatenate([indices[measured][:14], indices[~measured][:30]])
+    colmap_database.keep_inliers(context.workspace.database, kept)
+    with measured_database(context) as found:
+        assert found is None  # nothing would be left
+
+
+def test_measured_matches_are_mapped_alone(context: Context) -> None:
+    stage.map_images(context, MAPPERS.make(MAPPERS.options("sparse")))
+    for image in pycolmap.Reconstruction(context.workspace.sparse / "0").images.values():
+        rows = np.array([row for row, p in enumerate(image.points2D) if p.has_point3D()])
+        assert len(rows)
+        assert (rows < context.features.level_ends(image.name)[0]).all()
 
 
 def test_rejected_pairs_stay_so(context: Context) -> None:
