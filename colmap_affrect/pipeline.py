@@ -55,7 +55,7 @@ from colmap_affrect.stages.map import (
     num_verified_inliers,
     unregistered,
 )
-from colmap_affrect.stages.match import match
+from colmap_affrect.stages.match import load_matchers, match
 from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed_pairs
 from colmap_affrect.stages.verify import recorded_verification, verify_matches
 
@@ -191,6 +191,7 @@ def run(
         read_pairs(Path(options.pairs.match_list_path), names)
     options.recipe.extraction.check_depth()
     resolve(options.recipe.weights, options.resources.weights_path, progress=progress)
+    load_matchers(context, options.recipe.extraction.matchers(options.recipe.matching))
     later = {"pairs": options.pairs, "verify": options.verification, "map": mapper.options}
     with context.workspace.locked():
         reports = [

@@ -63,6 +63,9 @@ def main_of_process() -> NoReturn:
         sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if code == EXIT_INTERRUPTED:  # threads may be in the middle of something long
+        sys.stderr.flush()
+        os._exit(EXIT_INTERRUPTED)
     sys.exit(code)
 
 

@@ -427,7 +427,9 @@ def weights(options: argparse.Namespace) -> None:
         file = row.published
         where = f"{row.path}{', verified' if row.verified else ''}"
         if row.path and row.verified is False:
-            where += f", NOT the published file: {remedy(row.path)}, unless it is your own"
+            where += f", NOT the published file: unless it is your own, {remedy(row.path)}"
+        elif row.path and row.verified is None:
+            where += ", not checked: the sha256 of the published file is not known"
         elif not row.path:
             where = f"not found: {install_hint([file])}colmap-affrect weights fetch {row.key}"
         show(f"{row.key:32s} {file.used_for}, {file.file_name}")

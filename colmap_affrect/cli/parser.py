@@ -40,7 +40,9 @@ EXAMPLES = (
     "inspect photos/a.jpg --output-path out",
     "recipes",
     "recipes on-demand",
-    "weights fetch",
+    "weights",
+    "weights list aliked-n16 lightglue-aliked",
+    "weights fetch affnet orinet hardnet --weights folder",
     "doctor out",
     "doctor database.db --image-path photos",
     "import-h5 --image-path photos --features-path features.h5 \\\n"

@@ -311,7 +311,7 @@ def verify(
 @lru_cache(maxsize=64)  # a run verifies some of its pairs again, with better cameras
 def _say_that_shapes_are_missing(path: Path) -> None:
     """Say it once of each database."""
-    logger.warning(
+    logger.info(
         "%s: keypoints have no shapes; pairs need more inliers to count as verified, and sides "
         "that look alike are not told apart",
         path,

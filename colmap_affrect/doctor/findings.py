@@ -35,9 +35,10 @@ TEXTS: dict[str, Check] = CHECKS | {
     "no-gpu": ("note", "torch sees no GPU that it can use",
         "nothing to do for RootSIFT; learned features and depth networks take longer"),
     "other-weights": ("warning", "not the published file of {key}",
-        "{remedy}, unless it is your own"),
+        "unless it is your own, {remedy}"),
     "no-weights": ("note", "not found: {missing}",
-        "run 'colmap-affrect weights fetch {keys}' before using learned features without network"),
+        "before using recipes with AffNet and HardNet without network, run: "
+        "colmap-affrect weights fetch {keys}"),
     # a database as a whole
     "no-database": ("error", "{error}",
         "give a COLMAP database or an output folder of colmap-affrect; of a damaged database, "

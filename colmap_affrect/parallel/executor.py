@@ -131,17 +131,21 @@ def map_ordered(
 
     Meanwhile numpy's linear algebra keeps to the calling thread: thread pools of its own in
     every task would only wait for each other. An exception of the function is raised at the place
-    of its task. Work that has not begun is dropped when the iteration ends early.
+    of its task. Work that has not begun is dropped when the iteration ends early; KeyboardInterrupt
+    does not wait for what has begun either, which may take long.
     """
     pending: deque[Future[Result]] = deque()
-    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(num_threads) as pool:
-        try:
+    pool, is_waited_for = ThreadPoolExecutor(num_threads), True
+    try:
+        with threadpool_limits(1, user_api="blas"):
             for task in tasks:
                 pending.append(pool.submit(function, task))
                 if len(pending) >= 2 * num_threads:
                     yield pending.popleft().result()
             while pending:
                 yield pending.popleft().result()
-        finally:
-            for future in pending:
-                future.cancel()
+    except KeyboardInterrupt:
+        is_waited_for = False
+        raise
+    finally:
+        pool.shutdown(wait=is_waited_for, cancel_futures=True)

@@ -2,14 +2,16 @@
 
 import logging
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 
 from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import resolve
-from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
+from colmap_affrect.matchers.base import MATCHERS, MatcherContext, MatcherOptions
 from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.project.contents import sha256_of
 from colmap_affrect.project.report import StageReport
@@ -46,9 +48,12 @@ def match(
     pairs = listed_pairs(context)
     options = options or recorded_matching(context.workspace)
     workspace, extraction = context.workspace, recorded_extraction(context.workspace)
-    extraction.require_matching(options)
-    keys = {key for matcher in extraction.matchers(options) for key in matcher.weights}
-    weights = resolve(sorted(keys), context.resources.weights_path)
+    try:
+        extraction.require_matching(options)
+    except OptionError as error:
+        other = "other features than those here take 'run' with another --output-path"
+        raise OptionError(f"{error}; {other}") from error
+    weights = load_matchers(context, extraction.matchers(options))
     digests = digests_to_record(workspace, "match", weights, overwrite=overwrite)
     record = options.to_mapping() | ({WEIGHTS: digests} if digests else {})
     workspace.record_options("match", record, overwrite=overwrite)
@@ -71,6 +76,20 @@ def match(
     write_matches(context, pairs)
     wall_s = time.perf_counter() - start
     return StageReport("match", wall_s, len(missing), len(pairs) - len(missing), warnings=warnings)
+
+
+def load_matchers(context: Context, matchers: Iterable[MatcherOptions]) -> dict[str, Path]:
+    """Return the files of weights that matchers read, by key.
+
+    Their networks are built once before matching begins: WeightsError for what cannot be used.
+    """
+    resources, learned = context.resources, {m for m in matchers if m.weights}
+    keys = sorted({key for options in learned for key in options.weights})
+    weights = resolve(keys, resources.weights_path)
+    if "match" not in context.workspace.recorded().get("begun", []):
+        for options in learned:
+            MATCHERS.make(options, MatcherContext(weights, "cpu"))
+    return weights
 
 
 def match_pairs(

@@ -409,6 +409,7 @@ def test_matcher_with_weights_goes_on_and_is_taken_from_the_record(
     assert call("pairs", *out).code == 0
     refused = call("match", *out, "--set", "matching.trained_for=disk")
     assert "not of rootsift; use --recipe disk-lightglue, or --set" in refused.errors[0]
+    assert refused.errors[0].endswith("take 'run' with another --output-path")
     change = ["--set", "matching.min_score=0.2", "--overwrite"]
     for more in ([], [], ["--overwrite"], change, []):
         assert call("match", *out, "-q", *more).stderr == []

