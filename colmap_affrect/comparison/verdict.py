@@ -112,8 +112,8 @@ def headline(comparison: Comparison) -> list[str]:
     best_of_total = f"{_number(_count(best))} of {total}"
     if reference is None:
         return [
-            f"{best.name} {registers} most photographs, {best_of_total}. COLMAP's SIFT was not "
-            "run, so nothing can be said about a gain."
+            f"{best.name} {registers} {best_of_total} photographs, no method more. COLMAP's SIFT "
+            "was not run, so nothing can be said about a gain."
         ]
     if len(finished) == 1:
         return [f"{best.name} {registers} {best_of_total} photographs; no other method finished."]

@@ -79,8 +79,8 @@ PLAIN = method("plain", "abcd", options=IDENTITY, seconds=7.0)
         ),
         (
             [PLAIN],
-            "plain registers most photographs, 4 of 6. COLMAP's SIFT was not run, so nothing can "
-            "be said about a gain.",
+            "plain registers 4 of 6 photographs, no method more. COLMAP's SIFT was not run, so "
+            "nothing can be said about a gain.",
         ),
         (
             [method("sift", ""), default("ab", "", "ab")],
