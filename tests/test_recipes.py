@@ -113,7 +113,7 @@ def test_escalation_climbs_from_no_warps_to_all_tilts() -> None:
 def test_levels_build_on_the_lowest_one_with_their_features() -> None:
     recipe = load_recipe("on-demand-learned")
     levels = recipe.extraction.levels
-    assert [level.base for level in levels] == [0, 0, 2, 0, 2]
+    assert [level.base for level in levels] == [0, 0, 2, 3, 2]
     assert [level.max_image_size_px for level in levels] == [2400, 2400, 1024, 2400, 1024]
     assert [level.matching and level.matching.name for level in levels] == [
         *(None, None, "lightglue"),
