@@ -22,6 +22,8 @@ from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions, MappingTask
 from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
 from colmap_affrect.mappers.sparse import SparseOptions
+from colmap_affrect.mappers.starts import MIN_SHARE_OF_RIVAL
+from colmap_affrect.mappers.summaries import read_summary
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import Executor
@@ -365,7 +367,7 @@ def map_guided(
     if new:
         again, models = map_images(context, mapper)
         reports += [guided, again]
-        if agreement(context, sparse) > agreement(context, aside):
+        if _are_better(context, models, aside):
             shutil.rmtree(aside)
             return reports, models
         restore_exact(context, new)
@@ -374,6 +376,18 @@ def map_guided(
     (sparse / GUIDED_BEFORE).unlink()
     report, models = map_images(context, mapper)  # which reads them
     return reports or [report], models
+
+
+def _are_better(context: Context, models: Sequence[ModelSummary], aside: Path) -> bool:
+    """Tell whether models with guided matches are better than those before, ``aside``.
+
+    They agree better with the pairs or, where only their points tell the focal lengths, nearly as
+    well.
+    """
+    old = read_summary(aside / "0")
+    tell_more = old and old.loose and models and not models[0].loose
+    least = (MIN_SHARE_OF_RIVAL if tell_more else 1.0) * agreement(context, aside)
+    return agreement(context, context.workspace.sparse) > least
 
 
 def installed_versions() -> dict[str, str]:

@@ -303,8 +303,6 @@ def apply_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
     """
     camera_of = {name: key for key, record in records.items() for name in record.names}
     with open_database(path) as database, pycolmap.DatabaseTransaction(database):
-        rigs = {rig.ref_sensor_id: rig.rig_id for rig in database.read_all_rigs()}
-        frames = {frame.frame_id: frame for frame in database.read_all_frames()}
         new_priors = set()
         for camera in database.read_all_cameras():
             record = records.get(camera.camera_id)
@@ -315,12 +313,34 @@ def apply_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
                     camera.has_prior_focal_length = True
                     new_priors.add(camera.camera_id)
                 database.update_camera(camera)
-        for image in database.read_all_images():
-            key = camera_of.get(image.name, image.camera_id)
-            if key != image.camera_id:
-                _move(database, image, key, frames[image.frame_id], rigs)
+        _move_images(database, camera_of)
         _delete_geometries(database, new_priors)
     _delete_unused_cameras(path)
+
+
+def apply_cameras(path: Path, model: pycolmap.Reconstruction) -> set[int]:
+    """Give the registered images of a model, in a database, the cameras that they have in it.
+
+    Returns the ids of these cameras.
+    """
+    images = [model.images[image_id] for image_id in model.reg_image_ids()]
+    keys = {image.camera_id for image in images}
+    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
+        for key in keys:
+            database.update_camera(model.cameras[key])
+        _move_images(database, {image.name: image.camera_id for image in images})
+    _delete_unused_cameras(path)
+    return keys
+
+
+def _move_images(database: pycolmap.Database, camera_of: Mapping[str, int]) -> None:
+    """Give images, by name, another camera that is there."""
+    rigs = {rig.ref_sensor_id: rig.rig_id for rig in database.read_all_rigs()}
+    frames = {frame.frame_id: frame for frame in database.read_all_frames()}
+    for image in database.read_all_images():
+        key = camera_of.get(image.name, image.camera_id)
+        if key != image.camera_id:
+            _move(database, image, key, frames[image.frame_id], rigs)
 
 
 def _move(

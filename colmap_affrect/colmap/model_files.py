@@ -6,7 +6,7 @@ followed to the end of its file, which damage seldom leaves in its place.
 
 import struct
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
-from colmap_affrect.geometry.arrays import Indices
+from colmap_affrect.geometry.arrays import Bools, Indices
 from colmap_affrect.project.atomic_files import cannot_write
 
 SENSOR_BYTES = 8  # type and id of a sensor
@@ -159,14 +159,29 @@ RECORDS: dict[str, Callable[[_Reader], str | None]] = {
 """The files of a model, and what steps over one record of each."""
 
 
-def num_long_tracks(model: pycolmap.Reconstruction) -> Counter[int]:
-    """Return how many points that three images or more see each image sees, by its id."""
+def num_long_tracks(
+    model: pycolmap.Reconstruction, counted: Mapping[int, Bools] | None = None
+) -> Counter[int]:
+    """Return how many points that three images or more see each image sees, by its id.
+
+    Args:
+        model: any.
+        counted: which keypoints count, (N,) by image id; by default all.
+    """
     return Counter(
         image_id
         for point in model.points3D.values()
-        if len(images := {element.image_id for element in point.track.elements}) > 2
+        if len(images := _seen_by(point, counted)) > 2
         for image_id in images
     )
+
+
+def _seen_by(point: pycolmap.Point3D, counted: Mapping[int, Bools] | None) -> set[int]:
+    return {
+        element.image_id
+        for element in point.track.elements
+        if counted is None or counted[element.image_id][element.point2D_idx]
+    }
 
 
 def seen_points(image: pycolmap.Image) -> Indices:

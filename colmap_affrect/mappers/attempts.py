@@ -173,9 +173,11 @@ class _Attempts:
 
     def with_rivals(self, best: list[MappedModel]) -> list[MappedModel]:
         """Return models whose largest one knows the focal lengths of those as good as it."""
-        if not self._focals:
-            return best
-        return [replace(best[0], rival_focals_px=rival_focals_px(self._focals)), *best[1:]]
+        told_by = self._given.told_by
+        rivals = dict(told_by.rival_focals_px) if told_by else {}
+        if self._focals:
+            rivals |= rival_focals_px(self._focals)
+        return [replace(best[0], rival_focals_px=rivals), *best[1:]] if best else best
 
     def next(
         self, database_path: Path, output_path: Path, show: Callable[[int], None]
@@ -304,7 +306,9 @@ def _judged_anew(folder: Path, task: MappingTask) -> ModelSummary:
 def summarize(mapped: MappedModel, task: MappingTask, *, is_largest: bool) -> ModelSummary:
     """Count what a model holds, and judge it."""
     model = mapped.reconstruction
-    loose = loose_images(model, task) if is_largest and not task.extend else ()
+    loose = set(loose_images(model, task) if is_largest and not task.extend else ())
+    if task.told_by:
+        loose |= {name for name, why in task.told_by.doubtful.items() if FOCAL_DOUBT in why}
     doubts, focals = find_doubts(mapped, task, loose), focals_px(model)
     return ModelSummary(
         registered_names=tuple(sorted(focals)),

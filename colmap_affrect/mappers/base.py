@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from colmap_affrect.colmap import pycolmap
     from colmap_affrect.colmap.camera_records import CameraRecord
     from colmap_affrect.mappers.existing import ExistingModel
+    from colmap_affrect.project.report import ModelSummary
 
 
 class MapperOptions(PartOptions, PresetOptions):
@@ -62,6 +63,7 @@ class MappingTask:
         guided: (M, 2) features of pairs of image ids that only guided matching has matched.
         cameras: what is known of the cameras, by id.
         held: ids of cameras whose parameters stay as they are in the database.
+        told_by: the model that held cameras are from, which says whether its points told them.
         distortion_held: only focal lengths are refined.
         depth_at: depth maps of the images, where there are any.
     """
@@ -74,6 +76,7 @@ class MappingTask:
     guided: Mapping[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
     held: frozenset[int] = frozenset()
+    told_by: ModelSummary | None = None
     distortion_held: bool = False
     depth_at: DepthLookup | None = None
 

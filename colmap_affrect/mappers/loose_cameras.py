@@ -26,13 +26,14 @@ MAX_NUM_IMAGES = 100  # looked at; larger models have points of many images
 def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str, ...]:
     """Return the images whose focal length neither anybody nor the points know, sorted.
 
+    Cameras that are held are left out: other points have told them.
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
     focal length of each camera that nobody knows, while all else may move.
     """
     images = [model.images[image_id] for image_id in model.reg_image_ids()]
     unknown = sorted(
         key
-        for key in {image.camera_id for image in images} & task.cameras.keys()
+        for key in {image.camera_id for image in images} & task.cameras.keys() - task.held
         if task.cameras[key].source in ("guess", "pairs")
     )
     if not unknown or len(images) > MAX_NUM_IMAGES or model.num_points3D() == 0:

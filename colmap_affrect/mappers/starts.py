@@ -9,10 +9,11 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
-from colmap_affrect.colmap.camera_vote import apply_records
+from colmap_affrect.colmap.camera_vote import apply_cameras, apply_records
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.mappers.base import MappingTask
+from colmap_affrect.project.report import ModelSummary
 
 MIN_STEP = 1.15
 """Starts that are nearer to one another end in the same model."""
@@ -50,13 +51,14 @@ def starts(task: MappingTask) -> list[Start]:
     That is: with one camera for images of one size that may share one, first of all since it is
     the simplest; without distortion; from focal lengths halfway to both ends of what the pairs
     allow, for all unknown cameras at once; and from a long lens, which mapping that starts from a
-    short one hardly ever ends with.
+    short one hardly ever ends with. Cameras that are held stay as they are.
     """
-    unknown = unknown_cameras(task)
+    free = {key: record for key, record in task.cameras.items() if key not in task.held}
+    unknown = unknown_cameras(replace(task, cameras=free))
     found = [Start()]
     if unknown:
         found.append(Start(distortion_held=True))
-    shared = _shared(task.cameras)
+    shared = _shared(free)
     if shared:
         found.insert(0, Start(records=shared, distortion_held=True))
     ends = [_halfway(unknown, side) for side in ("low_px", "high_px")]
@@ -130,6 +132,22 @@ def started(task: MappingTask, start: Start, path: Path) -> MappingTask:
                 camera.params[index] = focals[camera.camera_id]
             database.update_camera(camera)
     return replace(task, database_path=path, snapshot_path=None)
+
+
+def holding(
+    task: MappingTask, model: pycolmap.Reconstruction, summary: ModelSummary, path: Path
+) -> MappingTask:
+    """Return a task whose images have the cameras of a model that has registered them.
+
+    Args:
+        task: as it is.
+        model: of the same images; its cameras are held.
+        summary: of the model.
+        path: where the database of the new task goes.
+    """
+    copy_database(task.database_path, path)
+    held = task.held | apply_cameras(path, model)
+    return replace(task, database_path=path, snapshot_path=None, held=held, told_by=summary)
 
 
 def runaways(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import PairVerifier, connected_parts, verified_pairs, verify
 from colmap_affrect.errors import ImageError
@@ -182,15 +183,26 @@ def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | No
         yield path, [pair for pair, indices in found.items() if not len(indices)]
 
 
+def measured_keypoints(context: Context, model: pycolmap.Reconstruction) -> dict[int, Bools] | None:
+    """Return which keypoints, (N,) by image id, are of measured frames; None without others."""
+    escalation = Escalation(context, EscalateOptions())
+    if not escalation.has_both_kinds:
+        return None
+    return {
+        image_id: escalation.are_measured(image.name, np.arange(image.num_points2D()))
+        for image_id, image in model.images.items()
+    }
+
+
 def _measured_inliers(context: Context) -> dict[Pair, Indices]:
     """Return the (M, 2) inliers that verified pairs have as measured frames have it, if others.
 
     M is 0 where measured ones are too few for a verified pair.
     """
-    if all(level.features.has_shapes for level in recorded_extraction(context.workspace).levels):
+    escalation = Escalation(context, EscalateOptions())
+    if not escalation.has_both_kinds:
         return {}
-    escalation, inliers = Escalation(context, EscalateOptions()), verified_inliers(context)
-    found = {}
+    found, inliers = {}, verified_inliers(context)
     for pair, indices in inliers.items():
         measured = indices[escalation.measured(pair, indices)]
         num_others = len(indices) - len(measured)
@@ -226,6 +238,11 @@ class Escalation:
         self.levels = range(1, len(self.extraction.levels))
         self._is_measured = [level.features.has_shapes for level in self.extraction.levels]
         self._consistent: dict[Pair, tuple[bytes, int]] = {}
+
+    @property
+    def has_both_kinds(self) -> bool:
+        """Whether frames of some levels are measured and those of others are not."""
+        return len(set(self._is_measured)) > 1
 
     @cached_property
     def _unwritten(self) -> set[Pair]:
@@ -361,12 +378,16 @@ class Escalation:
 
     def measured(self, pair: Pair, indices: NDArray[np.integer]) -> Bools:
         """Return which of the (M, 2) matches of a pair are of frames that were measured singly."""
-        kinds = np.array(self._is_measured)
-        sides = []
-        for side, name in enumerate(pair):
-            ends = self.features.level_ends(name)
-            sides.append(kinds[np.searchsorted(ends, indices[:, side], side="right")])
-        return np.asarray(sides[0] & sides[1])
+        first, second = (
+            self.are_measured(name, indices[:, side]) for side, name in enumerate(pair)
+        )
+        return np.asarray(first & second)
+
+    def are_measured(self, name: str, rows: NDArray[np.integer]) -> Bools:
+        """Return which keypoints of an image, (N,) rows, are of frames that were measured."""
+        ends = self.features.level_ends(name)
+        levels = np.searchsorted(ends, rows, side="right")
+        return np.asarray(np.array(self._is_measured)[levels])
 
     def _match_again(
         self, pairs: Sequence[Pair], level: int, advance: Callable[[int], None]

@@ -20,6 +20,7 @@ from colmap_affrect.mappers.attempts import LARGE_MODEL, map_database, read_mode
 from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
+from colmap_affrect.mappers.starts import holding
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
@@ -28,7 +29,12 @@ from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import is_copy
 from colmap_affrect.stages.depth_lookup import depth_lookup
-from colmap_affrect.stages.escalate import first_level_database, measured_database, reject
+from colmap_affrect.stages.escalate import (
+    first_level_database,
+    measured_database,
+    measured_keypoints,
+    reject,
+)
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
 from colmap_affrect.stages.guide import guided_matches
 from colmap_affrect.stages.pairs import listed_pairs
@@ -162,35 +168,35 @@ def _map(
 ) -> tuple[list[ModelSummary], int]:
     """Map, first by the matches of measured frames where there are others, too.
 
-    Learned matching verifies sides of a building that look the same as one, and is off by more than
-    a pixel, which bends models of unknown cameras. But for pairs in which its matches are many
-    times more it has no say where the others register as many images without it; its pairs that
-    contradict are rejected. Returns the models, and how many pairs were rejected.
+    Learned matching is off by more than a pixel, which bends models whose cameras nobody knows, and
+    verifies sides of a building that look the same as one. So measured ones tell the cameras, and
+    which pairs are wrong: these are rejected; then all matches tie the images, among them those
+    that the measured ones alone tie by hardly any point. Returns the models, and how many pairs
+    were rejected.
     """
-    sparse = context.workspace.sparse
-    if task.extend or is_copy(context.workspace):
+    workspace, sparse = context.workspace, context.workspace.sparse
+    if task.extend or is_copy(workspace):
         return map_database(mapper, task, sparse, advance), 0
     with measured_database(context) as found:
         if not found:
             return map_database(mapper, task, sparse, advance), 0
         path, doubted = found
-        num_images = num_tied(context.workspace.database, _min_num_inliers(context.workspace))
+        num_images = num_tied(workspace.database, _min_num_inliers(workspace))
         models = map_database(mapper, replace(task, database_path=path), sparse, advance)
-        num = _num_registered(models)
-        if num < MIN_SHARE * num_images or not models[0].is_consistent:
+        if _num_registered(models) < MIN_SHARE * num_images or not models[0].is_consistent:
             return map_database(mapper, task, sparse, _ignore), 0
-        if num < num_images:
-            every = path.with_name("sparse")
-            others = map_database(mapper, task, every, _ignore)
-            if _rank(others) > _rank(models):
-                rmtree(sparse)
-                every.rename(sparse)
-                return others, 0
-        graph = PairGraph.read(context.workspace.database)
-        contradicting = _contradicting(graph, pycolmap.Reconstruction(sparse / "0"))
+        model = pycolmap.Reconstruction(sparse / "0")
+        contradicting = _contradicting(PairGraph.read(workspace.database), model)
         rejected = [pair for pair in doubted if frozenset(pair) in contradicting]
         if rejected:
             reject(context, rejected)
+        every = path.with_name("sparse")
+        held = holding(task, model, models[0], path.with_name("held.db"))
+        others = map_database(mapper, held, every, _ignore)
+        if _rank(others) >= _rank(models):
+            rmtree(sparse)
+            every.rename(sparse)
+            return others, len(rejected)
     return models, len(rejected)
 
 
@@ -365,13 +371,14 @@ def contradicting_pairs(context: Context) -> dict[str, int]:
 def images_in_need(context: Context, sparse_path: Path, min_num_tracks: int) -> set[str]:
     """Return the images that are not in the largest model, or there see few of its points.
 
-    Few are less than ``min_num_tracks`` that three images or more see.
+    Few are less than ``min_num_tracks`` that three images or more see. Where there are others only
+    measured frames count, since these tell the cameras.
     """
     names = set(colmap_database.image_ids(context.workspace.database))
     path = sparse_path / "0"
     if not path.exists() or len(names) < 3:
         return names if len(names) > 2 else set()
     model = pycolmap.Reconstruction(path)
-    by_id = num_long_tracks(model)
+    by_id = num_long_tracks(model, measured_keypoints(context, model))
     counts = {image.name: by_id[image_id] for image_id, image in model.images.items()}
     return {name for name in names if counts.get(name, 0) < min_num_tracks}

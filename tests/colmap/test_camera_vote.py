@@ -22,6 +22,7 @@ from colmap_affrect.colmap.camera_records import (
 from colmap_affrect.colmap.camera_vote import (
     MAX_SPREAD,
     CameraVote,
+    apply_cameras,
     apply_records,
     forget_votes,
     needs_vote,
@@ -196,6 +197,39 @@ def test_colmap_maps_what_the_vote_made(voted: Path, tmp_path: Path) -> None:
     assert (len(model.reconstruction.cameras), len(model.reconstruction.rigs)) == (2, 2)
     for camera in model.reconstruction.cameras.values():
         assert camera.mean_focal_length() == pytest.approx(1000 * FOCAL, rel=0.03)
+
+
+def test_images_of_a_model_bring_their_cameras_into_a_database(
+    scans: Path, voted: Path, tmp_path: Path
+) -> None:
+    with open_database(voted) as database:
+        shared = {image.name: image.camera_id for image in database.read_all_images()}
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    assert len(set(shared.values())) == 2
+    model = pycolmap.Reconstruction()
+    for key, camera in cameras.items():
+        camera.params = [1000.0 + key, 500.0, 375.0, 0.01 * key]
+        model.add_camera_with_trivial_rig(camera)
+    with open_database(scans) as database:
+        images = {image.name: image.image_id for image in database.read_all_images()}
+    first, second, last = sorted(images)
+    for name in (first, last):
+        image = pycolmap.Image(name, camera_id=shared[name], image_id=images[name])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    path = copied(scans, tmp_path)
+    used = {shared[name] for name in (first, last)}
+    assert apply_cameras(path, model) == used
+    with open_database(path) as database:
+        found = {image.name: image.camera_id for image in database.read_all_images()}
+        left = {camera.camera_id: camera.params.tolist() for camera in database.read_all_cameras()}
+        rigs = {frame.rig_id for frame in database.read_all_frames()}
+    assert {name: found[name] for name in (first, last)} == {
+        name: shared[name] for name in (first, last)
+    }
+    assert set(left) == set(found.values())
+    assert all(left[key] == [1000.0 + key, 500.0, 375.0, 0.01 * key] for key in used)
+    assert len(rigs) == len(left)
+    assert second in found
 
 
 def test_a_vote_that_was_held_is_not_held_again(voted: Path, tmp_path: Path) -> None:

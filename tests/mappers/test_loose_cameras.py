@@ -66,3 +66,4 @@ def test_what_is_known_need_not_be_told_by_points() -> None:
     assert loose_images(model, task_of(replace(UNKNOWN, source="exif"))) == ()
     assert loose_images(model, replace(task_of(), cameras={})) == ()
     assert loose_images(pycolmap.Reconstruction(), task_of()) == ()
+    assert loose_images(model, replace(task_of(), held=frozenset({1}))) == ()

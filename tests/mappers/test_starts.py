@@ -16,10 +16,12 @@ from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers import starts as module
 from colmap_affrect.mappers.attempts import MAX_HOLDING_ATTEMPTS, map_database, read_models
 from colmap_affrect.mappers.base import MAPPERS, Bridge, MappedModel, MapperOptions, MappingTask
+from colmap_affrect.mappers.doubts import FOCAL_DOUBT
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.mappers.starts import (
     MAX_EXCESS,
     Start,
+    holding,
     is_within,
     rival_focals_px,
     runaways,
@@ -27,6 +29,7 @@ from colmap_affrect.mappers.starts import (
     starts,
 )
 from colmap_affrect.mappers.summaries import read_summary
+from colmap_affrect.project.report import ModelSummary
 
 TRUE_FOCAL, NUM_IMAGES = 1280.0, 4
 VAGUE = CameraRecord(("a",), "guess", 1000.0, 500.0, 2000.0, size=(1024, 768))
@@ -192,6 +195,31 @@ def test_focal_lengths_that_pairs_cannot_tell_apart_are_kept_beside_the_model(
     read = read_summary(tmp_path / "sparse" / "0")
     assert read
     assert read.rival_focals_px == {name: (1150.0, 1360.0)}
+
+
+def test_cameras_of_another_model_are_held_and_what_it_says_of_them_holds(
+    scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(attempts, "MIN_NUM_TRACKS", 1_000)
+    (model,) = (found.reconstruction for found in without(scene, 1, c1=1100.0, c2=1200.0))
+    inside = {model.images[image_id].camera_id for image_id in model.reg_image_ids()}
+    names = {image.camera_id: image.name for image in scene[1].images.values()}
+    told_by = ModelSummary(
+        tuple(sorted(names[key] for key in inside)), 1, 2.0, 0.5,
+        doubtful={names[1]: f"held by only 9 points; {FOCAL_DOUBT}"},
+        rival_focals_px={names[2]: (1000.0, 1300.0)},
+    )  # fmt: skip
+    task = MappingTask(scene[0], None, snapshot_path=tmp_path, cameras=records(scene, VAGUE))
+    held = holding(task, model, told_by, tmp_path / "held.db")
+    assert (held.held, held.snapshot_path) == (inside, None)
+    (outside,) = names.keys() - inside
+    assert all(set(start.focals_px) <= {outside} for start in starts(held))
+    mapper = Recorder(lambda _: without(scene, 0))
+    (summary,) = map_database(mapper, held, tmp_path / "sparse", lambda _: None)  # type: ignore[arg-type]
+    assert {(focals[0], focals[1]) for focals in mapper.focals} == {(1100.0, 1200.0)}
+    assert FOCAL_DOUBT in summary.doubtful[names[1]]
+    assert not any(FOCAL_DOUBT in summary.doubtful.get(names[key], "") for key in inside - {1})
+    assert summary.rival_focals_px[names[2]] == (1000.0, 1300.0)
 
 
 def test_a_camera_that_ran_away_is_held(

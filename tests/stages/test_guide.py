@@ -22,6 +22,7 @@ from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.mappers.last_adjustment import adjust_last
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.pipeline import map_guided
+from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import guide as stage
@@ -289,6 +290,30 @@ def test_model_of_guided_pairs_stays_where_it_agrees_better(
     assert again.num_done == 0  # sparse/ belongs to the database
     assert [m.num_points3D for m in kept] == [m.num_points3D for m in models]
     assert not list(context.workspace.path.glob("sparse.*"))
+
+
+@pytest.mark.parametrize(
+    ("loose_before", "loose", "agreed", "is_better"),
+    [
+        (False, False, 0.99, False),
+        (False, False, 1.01, True),
+        (True, False, 0.98, True),  # only guided matches tell the focal lengths
+        (True, False, 0.96, False),
+        (True, True, 0.99, False),
+    ],
+)
+def test_models_that_tell_focal_lengths_may_agree_a_little_less(
+    monkeypatch: pytest.MonkeyPatch, loose_before: bool, loose: bool, agreed: float, is_better: bool
+) -> None:
+    def summary(is_loose: bool) -> ModelSummary:
+        return ModelSummary(("a.jpg",), 1, 2.0, 0.5, loose=("a.jpg",) if is_loose else ())
+
+    context, aside = Context(Workspace(Path("out"))), Path("out/aside")
+    monkeypatch.setattr(pipeline, "read_summary", lambda _: summary(loose_before))
+    monkeypatch.setattr(
+        pipeline, "agreement", lambda _, path: agreed if path == context.workspace.sparse else 1.0
+    )
+    assert pipeline._are_better(context, [summary(loose)], aside) == is_better
 
 
 @pytest.mark.long

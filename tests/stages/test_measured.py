@@ -20,7 +20,9 @@ from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.mappers.attempts import map_database
+from colmap_affrect.mappers.base import MAPPERS, Mapper, MappingTask
+from colmap_affrect.progress import Advance
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import map as stage
@@ -249,12 +251,30 @@ def test_few_measured_matches_verify_no_pair(context: Context) -> None:
         assert found is None  # nothing would be left
 
 
-def test_measured_matches_are_mapped_alone(context: Context) -> None:
-    stage.map_images(context, MAPPERS.make(MAPPERS.options("sparse")))
-    for image in pycolmap.Reconstruction(context.workspace.sparse / "0").images.values():
+def test_measured_matches_tell_the_cameras_and_all_tie_the_images(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[set[int], list[float]]] = []
+
+    def spied(mapper: Mapper, task: MappingTask, path: Path, show: Advance) -> Any:
+        models = map_database(mapper, task, path, show)
+        (camera,) = pycolmap.Reconstruction(path / "0").cameras.values()
+        told.append((set(task.held), camera.params.tolist()))
+        return models
+
+    monkeypatch.setattr(stage, "map_database", spied)
+    stage.map_images(context, MAPPERS.make(MAPPERS.options({"keep_given_intrinsics": False})))
+    (free, measured), (held, params) = told
+    assert (free, held) == (set(), {1})
+    assert measured == params != [float(value) for value in INTRINSICS.split(",")]
+    model = pycolmap.Reconstruction(context.workspace.sparse / "0")
+    assert model.cameras[1].params.tolist() == measured
+    for image in model.images.values():
         rows = np.array([row for row, p in enumerate(image.points2D) if p.has_point3D()])
-        assert len(rows)
-        assert (rows < context.features.level_ends(image.name)[0]).all()
+        is_measured = rows < context.features.level_ends(image.name)[0]
+        assert is_measured.any()
+        assert not is_measured.all()
+    assert stage.images_in_need(context, context.workspace.sparse, 1) == set()
 
 
 def test_rejected_pairs_stay_so(context: Context) -> None:
@@ -313,6 +333,7 @@ def test_images_that_other_pairs_alone_tie_come_in(context: Context) -> None:
     assert image
     assert image.num_points3D > 50
     assert not models[0].doubtful
+    assert stage.images_in_need(context, workspace.sparse, 1) == {last}  # of measured matches
 
 
 def test_report_counts_pairs_that_the_model_contradicts(context: Context) -> None:
