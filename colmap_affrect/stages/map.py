@@ -21,6 +21,7 @@ from colmap_affrect.mappers.base import Mapper, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
 from colmap_affrect.mappers.starts import holding
+from colmap_affrect.mappers.summaries import read_summary
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
@@ -371,14 +372,16 @@ def contradicting_pairs(context: Context) -> dict[str, int]:
 def images_in_need(context: Context, sparse_path: Path, min_num_tracks: int) -> set[str]:
     """Return the images that are not in the largest model, or there see few of its points.
 
-    Few are less than ``min_num_tracks`` that three images or more see. Where there are others only
-    measured frames count, since these tell the cameras.
+    Few are less than ``min_num_tracks`` that three images or more see. Where points do not tell the
+    focal lengths only those of measured frames count, for they tell the cameras.
     """
     names = set(colmap_database.image_ids(context.workspace.database))
     path = sparse_path / "0"
     if not path.exists() or len(names) < 3:
         return names if len(names) > 2 else set()
     model = pycolmap.Reconstruction(path)
-    by_id = num_long_tracks(model, measured_keypoints(context, model))
+    summary = read_summary(path)
+    counted = measured_keypoints(context, model) if summary and summary.loose else None
+    by_id = num_long_tracks(model, counted)
     counts = {image.name: by_id[image_id] for image_id, image in model.images.items()}
     return {name for name in names if counts.get(name, 0) < min_num_tracks}

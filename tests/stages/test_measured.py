@@ -322,7 +322,9 @@ def test_other_pairs_are_rejected_where_they_contradict(
 
 
 @pytest.mark.long
-def test_images_that_other_pairs_alone_tie_come_in(context: Context) -> None:
+def test_images_that_other_pairs_alone_tie_come_in(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
     workspace, escalation, last = context.workspace, escalation_of(context), NAMES[3]
     shapeless_only(escalation, *(pair for pair in escalation.pairs if last in pair))
     mapper = MAPPERS.make(MAPPERS.options("sparse"))
@@ -333,6 +335,9 @@ def test_images_that_other_pairs_alone_tie_come_in(context: Context) -> None:
     assert image
     assert image.num_points3D > 50
     assert not models[0].doubtful
+    assert stage.images_in_need(context, workspace.sparse, 1) == set()
+    loose = replace(models[0], loose=(last,))
+    monkeypatch.setattr(stage, "read_summary", lambda _: loose)
     assert stage.images_in_need(context, workspace.sparse, 1) == {last}  # of measured matches
 
 
