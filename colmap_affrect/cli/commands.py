@@ -10,7 +10,7 @@ import argparse
 import json
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -418,12 +418,16 @@ def recipes(options: argparse.Namespace) -> None:
 def weights(options: argparse.Namespace) -> None:
     from colmap_affrect.features.weights import describe_weights, fetch, install_hint, remedy
 
+    keys = _weight_keys(options.keys)
+    if options.keys and not keys:
+        show(f"{', '.join(options.keys)}: no weights are needed")
+        return
     if options.action == "fetch":
-        keys = options.keys or ["affnet", "orinet", "hardnet"]
+        keys = keys or ["affnet", "orinet", "hardnet"]
         for path in fetch(keys, options.weights, progress=given.progress(options)).values():
             show(path)
         return
-    for row in describe_weights(given.weights_folder(options), options.keys):
+    for row in describe_weights(given.weights_folder(options), keys):
         file = row.published
         where = f"{row.path}{', verified' if row.verified else ''}"
         if row.path and row.verified is False:
@@ -436,3 +440,12 @@ def weights(options: argparse.Namespace) -> None:
         show(f"{'':4s}{where}")
         sha256, licence = file.sha256 or "not known", file.licence or "not stated"
         show(f"{'':4s}sha256 {sha256}; licence {licence}")
+
+
+def _weight_keys(names: Sequence[str]) -> list[str]:
+    """Return keys of weights once each, with those of recipes in the place of their names."""
+    from colmap_affrect.recipes import load_recipe, recipe_names
+
+    recipes = recipe_names()
+    keys = (load_recipe(name).weights if name in recipes else (name,) for name in names)
+    return list(dict.fromkeys(key for some in keys for key in some))

@@ -41,7 +41,7 @@ EXAMPLES = (
     "recipes",
     "recipes on-demand",
     "weights",
-    "weights list aliked-n16 lightglue-aliked",
+    "weights list on-demand-learned",
     "weights fetch affnet orinet hardnet --weights folder",
     "doctor out",
     "doctor database.db --image-path photos",

@@ -374,6 +374,14 @@ def test_unknown_weights_are_wrong_usage(call: Call) -> None:
     assert done.stderr == ["error: unknown weights 'afnet' (did you mean 'affnet'?)"]
 
 
+def test_weights_of_recipes_are_listed_by_their_names(call: Call) -> None:
+    listed = call("weights", "list", "aliked-lightglue", "aliked-n16").stdout
+    keys = [line.split()[0] for line in listed.splitlines() if not line.startswith(" ")]
+    assert keys == ["aliked-n16", "lightglue-aliked"]
+    done = call("weights", "fetch", "default")
+    assert (done.code, done.stdout) == (0, "default: no weights are needed\n")
+
+
 def test_damaged_photograph_is_no_reason_to_compare_methods(
     photos: Path, tmp_path: Path, call: Call
 ) -> None:
