@@ -20,6 +20,7 @@ from colmap_affrect.features.weights import resolve
 from colmap_affrect.forecast import Forecast
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions, MappingTask
+from colmap_affrect.mappers.doubts import loose_names
 from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.mappers.starts import MIN_SHARE_OF_RIVAL
@@ -382,10 +383,11 @@ def _are_better(context: Context, models: Sequence[ModelSummary], aside: Path) -
     """Tell whether models with guided matches are better than those before, ``aside``.
 
     They agree better with the pairs or, where only their points tell the focal lengths, nearly as
-    well.
+    well with as many images.
     """
-    old = read_summary(aside / "0")
-    tell_more = old and old.loose and models and not models[0].loose
+    old, tell_more = read_summary(aside / "0"), False
+    if old and models and len(models[0].registered_names) >= len(old.registered_names):
+        tell_more = bool(loose_names(old)) and not loose_names(models[0])
     least = (MIN_SHARE_OF_RIVAL if tell_more else 1.0) * agreement(context, aside)
     return agreement(context, context.workspace.sparse) > least
 

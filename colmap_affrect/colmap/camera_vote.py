@@ -367,9 +367,16 @@ def _delete_geometries(database: pycolmap.Database, cameras: Collection[int]) ->
 
 
 def _delete_unused_cameras(path: Path) -> None:
-    """Delete cameras and rigs without images, which pycolmap cannot; models would have them all."""
+    """Delete cameras and rigs without images, which pycolmap cannot; models would have them all.
+
+    A rig with images keeps the cameras that have none.
+    """
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("DELETE FROM rigs WHERE rig_id NOT IN (SELECT rig_id FROM frames)")
+        connection.execute("DELETE FROM rig_sensors WHERE rig_id NOT IN (SELECT rig_id FROM rigs)")
         connection.execute(
-            "DELETE FROM cameras WHERE camera_id NOT IN (SELECT camera_id FROM images)"
+            "DELETE FROM cameras WHERE camera_id NOT IN (SELECT camera_id FROM images UNION "
+            "SELECT ref_sensor_id FROM rigs WHERE ref_sensor_type = :camera UNION "
+            "SELECT sensor_id FROM rig_sensors WHERE sensor_type = :camera)",
+            {"camera": int(pycolmap.SensorType.CAMERA)},
         )

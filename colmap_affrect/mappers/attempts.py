@@ -1,7 +1,7 @@
 """From a verified database to a folder of models, by any mapper."""
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from colmap_affrect.mappers.doubts import (
     FOCAL_DOUBT,
     MIRRORED_COPY,
     find_doubts,
+    loose_names,
     without_impossible,
 )
 from colmap_affrect.mappers.existing import require_extends
@@ -174,10 +175,14 @@ class _Attempts:
     def with_rivals(self, best: list[MappedModel]) -> list[MappedModel]:
         """Return models whose largest one knows the focal lengths of those as good as it."""
         told_by = self._given.told_by
+        if not best or not (self._focals or told_by):
+            return best
         rivals = dict(told_by.rival_focals_px) if told_by else {}
         if self._focals:
             rivals |= rival_focals_px(self._focals)
-        return [replace(best[0], rival_focals_px=rivals), *best[1:]] if best else best
+        names = focals_px(best[0].reconstruction).keys()
+        inside = {name: ends for name, ends in rivals.items() if name in names}
+        return [replace(best[0], rival_focals_px=inside), *best[1:]]
 
     def next(
         self, database_path: Path, output_path: Path, show: Callable[[int], None]
@@ -303,12 +308,19 @@ def _judged_anew(folder: Path, task: MappingTask) -> ModelSummary:
     return summary
 
 
+def _sharing_cameras(model: pycolmap.Reconstruction, names: Collection[str]) -> set[str]:
+    """Return the names of the registered images that have the cameras of some of them."""
+    images = [model.images[image_id] for image_id in model.reg_image_ids()]
+    keys = {image.camera_id for image in images if image.name in names}
+    return {image.name for image in images if image.camera_id in keys}
+
+
 def summarize(mapped: MappedModel, task: MappingTask, *, is_largest: bool) -> ModelSummary:
     """Count what a model holds, and judge it."""
     model = mapped.reconstruction
-    loose = set(loose_images(model, task) if is_largest and not task.extend else ())
+    loose = set(loose_images(model, task)) if is_largest and not task.extend else set()
     if task.told_by:
-        loose |= {name for name, why in task.told_by.doubtful.items() if FOCAL_DOUBT in why}
+        loose |= _sharing_cameras(model, loose_names(task.told_by))
     doubts, focals = find_doubts(mapped, task, loose), focals_px(model)
     return ModelSummary(
         registered_names=tuple(sorted(focals)),

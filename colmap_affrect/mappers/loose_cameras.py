@@ -26,9 +26,9 @@ MAX_NUM_IMAGES = 100  # looked at; larger models have points of many images
 def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str, ...]:
     """Return the images whose focal length neither anybody nor the points know, sorted.
 
-    Cameras that are held are left out: other points have told them.
     A copy with some of the points is adjusted, once as it is, and with a longer and with a shorter
-    focal length of each camera that nobody knows, while all else may move.
+    focal length of each camera that nobody knows, while all else may move. Cameras that are held
+    stay as they are, and are left out: other points have told them.
     """
     images = [model.images[image_id] for image_id in model.reg_image_ids()]
     unknown = sorted(
@@ -38,7 +38,8 @@ def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str
     )
     if not unknown or len(images) > MAX_NUM_IMAGES or model.num_points3D() == 0:
         return ()
-    fixed = {key for key, record in task.cameras.items() if record.is_fixed} & set(model.cameras)
+    given = {key for key, record in task.cameras.items() if record.is_fixed}
+    fixed = (given | task.held) & set(model.cameras)
     sparse = with_fewer_points(model)
     options = robust_options()
     is_straight = all(model.cameras[key].is_undistorted() for key in unknown)

@@ -10,7 +10,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.camera_vote import apply_cameras, apply_records
-from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database import all_cameras, open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.project.report import ModelSummary
@@ -139,15 +139,25 @@ def holding(
 ) -> MappingTask:
     """Return a task whose images have the cameras of a model that has registered them.
 
+    These are held; what is known of cameras that have no images any more is left out.
+
     Args:
         task: as it is.
-        model: of the same images; its cameras are held.
+        model: of the same images.
         summary: of the model.
         path: where the database of the new task goes.
     """
     copy_database(task.database_path, path)
     held = task.held | apply_cameras(path, model)
-    return replace(task, database_path=path, snapshot_path=None, held=held, told_by=summary)
+    left = {camera.camera_id for camera in all_cameras(path)}
+    return replace(
+        task,
+        database_path=path,
+        snapshot_path=None,
+        cameras={key: record for key, record in task.cameras.items() if key in left},
+        held=held,
+        told_by=summary,
+    )
 
 
 def runaways(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:

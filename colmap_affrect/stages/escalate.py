@@ -162,7 +162,7 @@ def first_level_database(context: Context) -> Iterator[Path | None]:
 def unmeasured_pairs(context: Context) -> list[Pair]:
     """Return the verified pairs that matches of measured frames alone do not verify.
 
-    None where the others tie fewer than half of the images that all of them tie.
+    There are none where the others tie fewer than half of the images that all of them tie.
     """
     return [pair for pair, indices in _measured_inliers(context).items() if not len(indices)]
 
@@ -184,7 +184,7 @@ def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | No
 
 
 def measured_keypoints(context: Context, model: pycolmap.Reconstruction) -> dict[int, Bools] | None:
-    """Return which keypoints, (N,) by image id, are of measured frames; None without others."""
+    """Return which keypoints, (N,) by image id, are of measured frames; None if all or none."""
     escalation = Escalation(context, EscalateOptions())
     if not escalation.has_both_kinds:
         return None

@@ -18,6 +18,7 @@ from colmap_affrect.features.weights import install_hint
 from colmap_affrect.features.weights import missing as missing_weights
 from colmap_affrect.mappers.attempts import LARGE_MODEL, map_database, read_models
 from colmap_affrect.mappers.base import Mapper, MappingTask
+from colmap_affrect.mappers.doubts import loose_names
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
 from colmap_affrect.mappers.starts import holding
@@ -188,7 +189,12 @@ def _map(
             return map_database(mapper, task, sparse, _ignore), 0
         model = pycolmap.Reconstruction(sparse / "0")
         contradicting = _contradicting(PairGraph.read(workspace.database), model)
-        rejected = [pair for pair in doubted if frozenset(pair) in contradicting]
+        unsure = models[0].doubtful.keys() - set(
+            models[0].loose
+        )  # these may stand wrong themselves
+        rejected = [
+            pair for pair in doubted if frozenset(pair) in contradicting and not unsure & set(pair)
+        ]
         if rejected:
             reject(context, rejected)
         every = path.with_name("sparse")
@@ -381,7 +387,8 @@ def images_in_need(context: Context, sparse_path: Path, min_num_tracks: int) -> 
         return names if len(names) > 2 else set()
     model = pycolmap.Reconstruction(path)
     summary = read_summary(path)
-    counted = measured_keypoints(context, model) if summary and summary.loose else None
+    is_loose = summary and loose_names(summary)
+    counted = measured_keypoints(context, model) if is_loose else None
     by_id = num_long_tracks(model, counted)
     counts = {image.name: by_id[image_id] for image_id, image in model.images.items()}
     return {name for name in names if counts.get(name, 0) < min_num_tracks}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -212,6 +214,10 @@ def test_images_of_a_model_bring_their_cameras_into_a_database(
         model.add_camera_with_trivial_rig(camera)
     with open_database(scans) as database:
         images = {image.name: image.image_id for image in database.read_all_images()}
+        own = {image.name: image.camera_id for image in database.read_all_images()}
+        before = {
+            camera.camera_id: camera.params.tolist() for camera in database.read_all_cameras()
+        }
     first, second, last = sorted(images)
     for name in (first, last):
         image = pycolmap.Image(name, camera_id=shared[name], image_id=images[name])
@@ -229,7 +235,32 @@ def test_images_of_a_model_bring_their_cameras_into_a_database(
     assert set(left) == set(found.values())
     assert all(left[key] == [1000.0 + key, 500.0, 375.0, 0.01 * key] for key in used)
     assert len(rigs) == len(left)
-    assert second in found
+    assert found[second] == own[second]
+    assert found[second] not in used
+    assert left[found[second]] == before[found[second]]
+
+
+def test_a_camera_of_a_rig_stays_without_images(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=50
+    )
+    with open_database(path) as database:
+        model = pycolmap.synthesize_dataset(options, database)
+        (rig,) = database.read_all_rigs()
+        (other,) = {camera.camera_id for camera in database.read_all_cameras()} - {
+            rig.ref_sensor_id.id
+        }
+        for image in database.read_all_images():
+            if image.camera_id == other:
+                with closing(sqlite3.connect(path)) as connection, connection:
+                    connection.execute("DELETE FROM images WHERE image_id=?", (image.image_id,))
+    for image_id in model.reg_image_ids():
+        if model.images[image_id].camera_id == other:
+            model.deregister_frame(model.images[image_id].frame_id)
+    apply_cameras(path, model)
+    with open_database(path) as database:
+        assert other in {camera.camera_id for camera in database.read_all_cameras()}
 
 
 def test_a_vote_that_was_held_is_not_held_again(voted: Path, tmp_path: Path) -> None:

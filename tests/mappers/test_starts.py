@@ -222,6 +222,29 @@ def test_cameras_of_another_model_are_held_and_what_it_says_of_them_holds(
     assert summary.rival_focals_px[names[2]] == (1000.0, 1300.0)
 
 
+def test_what_is_known_of_cameras_without_images_is_not_held_nor_shared(
+    scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
+) -> None:
+    vague = replace(VAGUE, may_be_shared=True)
+    task = MappingTask(scene[0], None, cameras=records(scene, vague))
+    shared, *_ = starts(task)
+    found = started(task, shared, tmp_path / "started.db")
+    with open_database(found.database_path) as database:
+        (camera,) = database.read_all_cameras()
+        names = [image.name for image in database.read_all_images()]
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    for number, name in enumerate(sorted(names)[:-1], 1):
+        image = pycolmap.Image(name, camera_id=camera.camera_id, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    held = holding(task, model, ModelSummary((), 1, 2.0, 0.5), tmp_path / "held.db")
+    assert held.held == {camera.camera_id}
+    assert len(held.cameras) == 2
+    for number, start in enumerate(starts(held)):
+        assert not start.records
+        started(held, start, tmp_path / f"{number}.db")
+
+
 def test_a_camera_that_ran_away_is_held(
     scene: tuple[Path, pycolmap.Reconstruction], tmp_path: Path
 ) -> None:

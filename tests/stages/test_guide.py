@@ -18,6 +18,7 @@ from colmap_affrect.colmap.database import geometry_digest, image_ids, open_data
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.mappers.doubts import FOCAL_DOUBT
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.mappers.last_adjustment import adjust_last
 from colmap_affrect.matchers.guided import GuidedOptions
@@ -300,13 +301,20 @@ def test_model_of_guided_pairs_stays_where_it_agrees_better(
         (True, False, 0.98, True),  # only guided matches tell the focal lengths
         (True, False, 0.96, False),
         (True, True, 0.99, False),
+        (True, None, 0.98, False),  # there are fewer images
     ],
 )
 def test_models_that_tell_focal_lengths_may_agree_a_little_less(
-    monkeypatch: pytest.MonkeyPatch, loose_before: bool, loose: bool, agreed: float, is_better: bool
+    monkeypatch: pytest.MonkeyPatch,
+    loose_before: bool,
+    loose: bool | None,
+    agreed: float,
+    is_better: bool,
 ) -> None:
-    def summary(is_loose: bool) -> ModelSummary:
-        return ModelSummary(("a.jpg",), 1, 2.0, 0.5, loose=("a.jpg",) if is_loose else ())
+    def summary(is_loose: bool | None) -> ModelSummary:
+        names = () if is_loose is None else ("a.jpg",)
+        doubtful = {"a.jpg": f"held by only 9 points; {FOCAL_DOUBT}"} if is_loose else {}
+        return ModelSummary(names, 1, 2.0, 0.5, doubtful=doubtful)
 
     context, aside = Context(Workspace(Path("out"))), Path("out/aside")
     monkeypatch.setattr(pipeline, "read_summary", lambda _: summary(loose_before))

@@ -22,6 +22,7 @@ from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MappingTask
+from colmap_affrect.mappers.doubts import FOCAL_DOUBT
 from colmap_affrect.progress import Advance
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
@@ -336,7 +337,7 @@ def test_images_that_other_pairs_alone_tie_come_in(
     assert image.num_points3D > 50
     assert not models[0].doubtful
     assert stage.images_in_need(context, workspace.sparse, 1) == set()
-    loose = replace(models[0], loose=(last,))
+    loose = replace(models[0], doubtful={last: FOCAL_DOUBT})
     monkeypatch.setattr(stage, "read_summary", lambda _: loose)
     assert stage.images_in_need(context, workspace.sparse, 1) == {last}  # of measured matches
 
