@@ -293,6 +293,32 @@ def poses(workspace: Workspace, names: list[str]) -> list[NDArray[Any]]:
     return [image.cam_from_world().matrix() for image in images if image]
 
 
+def swap_inliers(workspace: Workspace) -> None:
+    """Make a pair contradict all poses."""
+    ids = colmap_database.image_ids(workspace.database)
+    with colmap_database.open_database(workspace.database) as database:
+        geometry = database.read_two_view_geometry(*(ids[name] for name in PAIR))
+        inliers = np.asarray(geometry.inlier_matches)
+        geometry.inlier_matches = np.stack([inliers[:, 0], inliers[::-1, 1]], axis=1)
+        database.delete_two_view_geometry(*(ids[name] for name in PAIR))
+        database.write_two_view_geometry(*(ids[name] for name in PAIR), geometry)
+
+
+def test_pairs_of_doubtful_images_are_not_rejected(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def doubted(mapper: Mapper, task: MappingTask, path: Path, show: Advance) -> Any:
+        largest, *others = map_database(mapper, task, path, show)
+        return [replace(largest, doubtful={PAIR[0]: "held by only 9 points"}), *others]
+
+    monkeypatch.setattr(stage, "map_database", doubted)
+    shapeless_only(escalation_of(context), PAIR)
+    swap_inliers(context.workspace)
+    report, _ = stage.map_images(context, MAPPERS.make(MAPPERS.options("sparse")))
+    assert not report.warnings
+    assert escalation_of(context).num_inliers()[PAIR]
+
+
 @pytest.mark.parametrize("is_wrong", [False, True])
 def test_other_pairs_are_rejected_where_they_contradict(
     context: Context, is_wrong: bool, caplog: pytest.LogCaptureFixture
@@ -300,13 +326,7 @@ def test_other_pairs_are_rejected_where_they_contradict(
     workspace, escalation = context.workspace, escalation_of(context)
     shapeless_only(escalation, PAIR)
     if is_wrong:
-        ids = colmap_database.image_ids(workspace.database)
-        with colmap_database.open_database(workspace.database) as database:
-            geometry = database.read_two_view_geometry(*(ids[name] for name in PAIR))
-            inliers = np.asarray(geometry.inlier_matches)
-            geometry.inlier_matches = np.stack([inliers[:, 0], inliers[::-1, 1]], axis=1)
-            database.delete_two_view_geometry(*(ids[name] for name in PAIR))
-            database.write_two_view_geometry(*(ids[name] for name in PAIR), geometry)
+        swap_inliers(workspace)
     mapper = MAPPERS.make(MAPPERS.options("sparse"))
     report, models = stage.map_images(context, mapper)
     assert models[0].registered_names == tuple(sorted(NAMES))
