@@ -189,9 +189,8 @@ def _map(
             return map_database(mapper, task, sparse, _ignore), 0
         model = pycolmap.Reconstruction(sparse / "0")
         contradicting = _contradicting(PairGraph.read(workspace.database), model)
-        unsure = models[0].doubtful.keys() - set(
-            models[0].loose
-        )  # these may stand wrong themselves
+        # Images that something speaks against may stand wrong themselves.
+        unsure = models[0].doubtful.keys() - set(models[0].loose)
         rejected = [
             pair for pair in doubted if frozenset(pair) in contradicting and not unsure & set(pair)
         ]

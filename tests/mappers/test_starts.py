@@ -136,9 +136,13 @@ def mapped(
     mapper: object,
     cameras: dict[int, CameraRecord],
 ) -> None:
-    task = MappingTask(scene[0], None, cameras=cameras)
-    map_database(mapper, task, tmp_path / "sparse", lambda _: None)  # type: ignore[arg-type]
+    map_task(mapper, MappingTask(scene[0], None, cameras=cameras), tmp_path)
+
+
+def map_task(mapper: object, task: MappingTask, tmp_path: Path) -> list[ModelSummary]:
+    summaries = map_database(mapper, task, tmp_path / "sparse", lambda _: None)  # type: ignore[arg-type]
     assert not (tmp_path / "sparse.partial").exists()
+    return summaries
 
 
 def without(
@@ -215,7 +219,7 @@ def test_cameras_of_another_model_are_held_and_what_it_says_of_them_holds(
     (outside,) = names.keys() - inside
     assert all(set(start.focals_px) <= {outside} for start in starts(held))
     mapper = Recorder(lambda _: without(scene, 0))
-    (summary,) = map_database(mapper, held, tmp_path / "sparse", lambda _: None)  # type: ignore[arg-type]
+    (summary,) = map_task(mapper, held, tmp_path)
     assert {(focals[0], focals[1]) for focals in mapper.focals} == {(1100.0, 1200.0)}
     assert FOCAL_DOUBT in summary.doubtful[names[1]]
     assert not any(FOCAL_DOUBT in summary.doubtful.get(names[key], "") for key in inside - {1})
