@@ -95,7 +95,8 @@ def dispensable(wrong: Iterable[Ids], weights: Mapping[Ids, int]) -> list[Ids]:
     Where these hang on single pairs else, the loop says no more than that one of them is wrong: the
     weakest goes.
     """
-    graph, dropped = nx.Graph(list(weights)), []
+    graph, dropped = nx.Graph(), []
+    graph.add_edges_from(weights)
     for ids in wrong:
         if not graph.has_edge(*ids):
             continue
