@@ -177,7 +177,7 @@ FILTERS = {
     "differ": "Methods differ",
     "seeds": "Seeds disagree",
     "wrong": "Registered wrongly",
-    "doubtful": "Doubtful",
+    "uncertain": "Doubtful",
     "none": "Registered by none",
 }
 
@@ -185,7 +185,7 @@ FILTERS = {
 KINDS = {
     "shared": "registered by other methods, too",
     "only": "registered by this method only",
-    "doubtful": "contradicts other seeds or methods",
+    "uncertain": "doubtful, or contradicts other seeds or methods",
     "wrong": "at a wrong place",
 }
 """How cameras are drawn; each has a colour of this name."""
@@ -196,8 +196,8 @@ class Mark(Node):
     """What one method does with one photograph."""
 
     column: Column
-    # registered in poses that contradict those of other seeds, or of most other methods
-    is_doubtful: bool
+    # doubtful, or in a pose that contradicts those of other seeds or of most other methods
+    is_uncertain: bool
     is_only: bool  # usually registered by no other method
 
     @property
@@ -205,7 +205,7 @@ class Mark(Node):
         """One of ``KINDS``."""
         if self.is_wrong:
             return "wrong"
-        return "doubtful" if self.is_doubtful else "only" if self.is_only else "shared"
+        return "uncertain" if self.is_uncertain else "only" if self.is_only else "shared"
 
 
 @dataclass(frozen=True)
@@ -220,8 +220,7 @@ class Card:
 
 def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
     """Return the contact sheet."""
-    scores = [seed.scores for column in columns for seed in column.method.seeds if seed.scores]
-    with_truth = {name for item in scores for pair in item.pair_errors_deg for name in pair}
+    with_truth = comparison.names_with_truth
     usually_registered = [column.method.usually_registered for column in columns]
     only = comparison.only_registered_by if len(columns) > 1 else {}
     registered_by_none = set(comparison.registered_by_none)
@@ -239,7 +238,7 @@ def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
             "differ": len({name in names for names in usually_registered}) > 1,
             "seeds": any(mark.state == "sometimes" for mark in marks),
             "wrong": any(mark.is_wrong for mark in marks),
-            "doubtful": any(mark.is_doubtful for mark in marks),
+            "uncertain": any(mark.is_uncertain for mark in marks),
             "none": name in registered_by_none,
         }
         groups = tuple(group for group, passes in tests.items() if passes)
@@ -252,7 +251,8 @@ def _mark(
 ) -> Mark:
     """Mark what a method does with a photograph that some other methods place, too.
 
-    It is doubtful in a method that contradicts most of these, not in all that one contradicts.
+    It is uncertain in a method that contradicts most of these, not in all that one contradicts, and
+    nowhere that ground truth calls it right.
     """
     method, seeds = column.method, column.method.seeds
     registering = [seed for seed in seeds if name in seed.registered_names]
@@ -268,13 +268,17 @@ def _mark(
         text += f", correctly with {len(correct)}" if correct else ", wrongly"
     elif correct:
         text += ", correctly"
-    is_unstable = name in method.unstable_names
     others = [other for other, names in method.disagreements.items() if name in names]
-    is_odd = 2 * len(others) > max(0, num_others)
-    if is_unstable:
-        text += ", in poses that contradict each other from seed to seed"
-    if others:
-        text += f", in a pose that contradicts that of {' and '.join(others)}"
+    is_uncertain = False
+    if not has_truth or is_wrong:
+        doubt, is_unstable = method.usually_doubted.get(name), name in method.unstable_names
+        is_uncertain = bool(doubt) or is_unstable or 2 * len(others) > max(0, num_others)
+        if doubt:
+            text += f", doubtful: {doubt}"
+        if is_unstable:
+            text += ", in poses that contradict each other from seed to seed"
+        if others:
+            text += f", in a pose that contradicts that of {' and '.join(others)}"
     return Mark(
         number,
         name,
@@ -282,7 +286,7 @@ def _mark(
         is_wrong,
         f"{column.name}: {text}",
         column=column,
-        is_doubtful=is_unstable or is_odd,
+        is_uncertain=is_uncertain,
         is_only=is_only,
     )
 

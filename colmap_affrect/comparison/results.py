@@ -95,6 +95,12 @@ class SeedResult:
         """Images registered correctly; without ground truth those registered."""
         return self.registered_names if self.scores is None else self.scores.correct_names
 
+    @property
+    def reasons_to_doubt(self) -> dict[str, str]:
+        """Registered images that cannot be trusted, with the reason: their own or the model's."""
+        of_model = dict.fromkeys(self.registered_names, ", ".join(self.doubts))
+        return (of_model if self.doubts else {}) | dict(self.doubtful)
+
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON, ``MEASURES`` first."""
         measures = {key: measure(self) for key, measure in MEASURES.items()}
@@ -108,7 +114,7 @@ class SeedResult:
 
 MEASURES: dict[str, Callable[[SeedResult], float]] = {
     "registered": lambda seed: len(seed.registered_names),
-    "num_doubtful": lambda seed: len(seed.registered_names if seed.doubts else seed.doubtful),
+    "num_doubtful": lambda seed: len(seed.reasons_to_doubt),
     "num_models": lambda seed: len(seed.model_names),
     "verified_pairs": lambda seed: len(seed.pair_inliers),
     "inliers": lambda seed: sum(seed.pair_inliers.values()),
@@ -188,6 +194,13 @@ class MethodResult:
     def usually_correct(self) -> frozenset[str]:
         """Images that more than half of the seeds register correctly (without truth: register)."""
         return in_most([seed.correct_names for seed in self.seeds])
+
+    @property
+    def usually_doubted(self) -> dict[str, str]:
+        """Images that cannot be trusted in more than half of the seeds, with a reason."""
+        seeds = [seed.reasons_to_doubt for seed in self.seeds]
+        found = in_most([list(reasons) for reasons in seeds])
+        return {name: next(r[name] for r in seeds if name in r) for name in sorted(found)}
 
     @property
     def stage_seconds(self) -> dict[str, float]:
@@ -291,6 +304,12 @@ class Comparison:
     def has_ground_truth(self) -> bool:
         """Whether models were measured against ground truth."""
         return any(seed.scores for method in self.finished for seed in method.seeds)
+
+    @property
+    def names_with_truth(self) -> frozenset[str]:
+        """Images whose poses were measured against ground truth, by any method."""
+        scores = [seed.scores for method in self.finished for seed in method.seeds if seed.scores]
+        return frozenset(name for each in scores for pair in each.pair_errors_deg for name in pair)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON."""

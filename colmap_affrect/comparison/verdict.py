@@ -246,10 +246,14 @@ def unstable_poses(comparison: Comparison) -> list[str]:
 
 
 def contradictions(comparison: Comparison) -> list[str]:
-    """Doubt poses that differ between methods; the method with most contradictions comes first."""
-    images_of = {
-        m.name: {k: v for k, v in m.disagreements.items() if v} for m in comparison.finished
-    }
+    """Doubt poses that differ between methods; the method with most contradictions comes first.
+
+    Where ground truth knows the pose, it says who is right.
+    """
+    known, images_of = comparison.names_with_truth, {}
+    for method in comparison.finished:
+        unknown = {name: set(v) - known for name, v in method.disagreements.items()}
+        images_of[method.name] = {name: images for name, images in unknown.items() if images}
     texts = []
     while any(images_of.values()):
         worst = max(images_of, key=lambda name: len(images_of[name]))

@@ -168,14 +168,33 @@ def test_of_methods_that_contradict_each_other_the_odd_one_is_marked(
     odd = replace(default, name="odd", disagreements={"sift": (name,), "default": (name,)})
     others = [replace(each, disagreements={"odd": (name,)}) for each in (sift, default)]
 
-    def marked(*methods: MethodResult) -> list[str]:
-        columns = columns_of(replace(comparison, methods=methods))
-        cards = cards_of(columns, comparison)
-        return [mark.column.name for card in cards for mark in card.marks if mark.is_doubtful]
-
-    assert marked(odd, *others) == ["odd"]
+    assert uncertain(comparison, odd, *others) == []  # ground truth calls all of them right
+    odd, *others = map(without_truth, (odd, *others))
+    assert uncertain(comparison, odd, *others) == [(name, "odd")]
     two = replace(odd, disagreements={"sift": (name,)}), others[0]
-    assert sorted(marked(*two)) == ["odd", "sift"]
+    assert sorted(uncertain(comparison, *two)) == [(name, "odd"), (name, "sift")]
+
+
+def test_photographs_that_their_method_doubts_are_marked(comparison: Comparison) -> None:
+    method = without_truth(comparison.methods[2])
+    loose = [replace(seed, doubtful={NAMES[1]: "any focal length fits"}) for seed in method.seeds]
+    assert uncertain(comparison, replace(method, seeds=tuple(loose))) == [(NAMES[1], "default")]
+    flat = [replace(seed, doubts=("no parallax",)) for seed in method.seeds]
+    names = [name for name, _ in uncertain(comparison, replace(method, seeds=tuple(flat)))]
+    assert names == [name for name in NAMES if name in method.usually_registered]
+    assert len(names) > 1
+
+
+def without_truth(method: MethodResult) -> MethodResult:
+    """The same, measured against nothing."""
+    return replace(method, seeds=tuple(replace(seed, scores=None) for seed in method.seeds))
+
+
+def uncertain(comparison: Comparison, *methods: MethodResult) -> list[tuple[str, str]]:
+    """Photographs and methods that the contact sheet marks so."""
+    compared = replace(comparison, methods=methods)
+    cards = cards_of(columns_of(compared), compared)
+    return [(c.name, mark.column.name) for c in cards for mark in c.marks if mark.is_uncertain]
 
 
 def test_names_of_images_are_never_markup(page: Page) -> None:

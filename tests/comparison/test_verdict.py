@@ -183,6 +183,17 @@ def test_contradictions_are_told_once_and_with_the_odd_one_first():
     )
 
 
+def test_ground_truth_says_who_is_right_where_methods_contradict():
+    scores = PoseScores(("a", "b"), {("a", "b"): (1.0, 2.0)}, 1, {}, None)
+    seeds = (replace(seed_result("abcd"), scores=scores),)
+    methods = (
+        replace(method("sift"), seeds=seeds, disagreements={"default": ("a", "d")}),
+        replace(default("abcd"), disagreements={"sift": ("a", "d")}),
+    )
+    (text,) = rules.contradictions(comparison(*methods))
+    assert "about the pose of d;" in text
+
+
 def test_failures_come_last_and_affine_sift_is_the_second_reference():
     failed = MethodResult("default", failed="no weights")
     assert verdict(comparison(failed)) == ("No method finished.", "default failed: no weights")
