@@ -4,15 +4,17 @@ Doubts have two degrees: what is certainly wrong leaves the model, the rest is t
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
 from colmap_affrect.mappers.arrivals import MIN_THREE_VIEW_POINTS
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
@@ -40,6 +42,10 @@ goes through hardly more than the four points that chance brings."""
 MIN_AGREEMENT, NO_AGREEMENT = 0.5, 0.25
 """Share of the inliers of an image's verified pairs. Of right images of sparse sets at least three
 quarters agree."""
+
+MIN_AGREEMENT_OF_TIE = 0.87
+"""Share of the exact inliers of a pair that alone ties images to the others: nothing else says
+where they are, so a right one agrees nearly whole."""
 
 MAX_ERROR = 0.003
 """Of a match that a rotation explains, in longer sides: 3 px of 1000, as in verification."""
@@ -169,6 +175,13 @@ def _image_doubts(
         for image_id in pair.ids:
             totals[image_id] += agreeing_of[pair.ids], count
     originals = _originals(graph, agreeing_of)
+
+    def exact_agreement(pair: VerifiedPair) -> float:
+        guided = rows_in(pair.matches, task.guided.get(pair.ids, pair.matches[:0]))
+        exact = replace(pair, matches=pair.matches[~guided])
+        return graph.agreement(pair if guided.all() else exact, poses, cameras)
+
+    hanging = _hanging(reconstruction, graph, known, exact_agreement)
     reasons: dict[str, str] = {}
     angles, near = _angles_deg(reconstruction), _images_nearby(reconstruction)
     impossible: list[tuple[float, int, str]] = []
@@ -179,6 +192,7 @@ def _image_doubts(
         found = [
             *([] if image.camera_id in given else _camera_doubts(cameras[image_id])),
             *_support_doubts(image.num_points3D, agreement),
+            *_tie_doubts(hanging.get(image_id)),
             *_angle_doubts(reconstruction, image, [nearest for nearest, _ in angles[image_id]]),
             *_place_doubts(near[image_id], len(registered) - 1),
             *_copy_doubts(graph.names.get(originals.get(image_id, -1))),
@@ -213,6 +227,45 @@ def _support_doubts(num: int, agreement: float) -> Iterator[tuple[str, bool]]:
     if agreement < MIN_AGREEMENT:
         text = f"only {agreement:.0%} of the matches of verified pairs agree with the pose"
         yield text, agreement < NO_AGREEMENT
+
+
+def _tie_doubts(reason: str | None) -> Iterator[tuple[str, bool]]:
+    if reason:
+        yield reason, False
+
+
+def _hanging(
+    model: pycolmap.Reconstruction,
+    graph: PairGraph,
+    agreements: Mapping[Ids, float],
+    exact_agreement: Callable[[VerifiedPair], float],
+) -> dict[int, str]:
+    """Return the images that one pair alone ties to the others, and that not well, with the reason.
+
+    They are the smaller part, of equal ones both. Pairs without which no part falls off confirm
+    each other; images of a rig that were taken at once hold together anyway.
+    """
+    frame_of = {i: model.images[i].frame_id for i in model.reg_image_ids()}
+    ties: dict[frozenset[int], list[VerifiedPair]] = defaultdict(list)
+    for pair in graph.pairs_inside(frame_of):
+        if agreements[pair.ids] >= MIN_AGREEMENT:
+            ties[frozenset(frame_of[image_id] for image_id in pair.ids)].append(pair)
+    frames = nx.Graph()
+    frames.add_edges_from(tuple(ids) for ids in ties if len(ids) == 2)
+    found: dict[int, str] = {}
+    for ids in list(nx.bridges(frames)):
+        pair, *more = ties[frozenset(ids)]
+        if more or (agreement := exact_agreement(pair)) >= MIN_AGREEMENT_OF_TIE:
+            continue
+        frames.remove_edge(*ids)
+        parts = [nx.node_connected_component(frames, frame_id) for frame_id in ids]
+        frames.add_edge(*ids)
+        size = min(map(len, parts))
+        hanging = set().union(*(part for part in parts if len(part) == size))
+        names = " and ".join(graph.names[image_id] for image_id in pair.ids)
+        why = f"hangs on the pair {names} alone, of whose matches only {agreement:.0%} agree"
+        found.update({i: why for i, frame_id in frame_of.items() if frame_id in hanging})
+    return found
 
 
 def _angle_doubts(

@@ -106,6 +106,52 @@ def test_image_that_contradicts_its_pairs_leaves_and_the_others_stay(tmp_path: P
     assert find_doubts(kept, task).images == {}
 
 
+def hang_on_one_pair(task: MappingTask, part: set[int], share_wrong: float) -> tuple[int, int]:
+    """Leave one pair between some images and the others, of whose matches some are wrong."""
+    between = [
+        ids for ids in inlier_matches(task.database_path, 1) if len(part.intersection(ids)) == 1
+    ]
+    with open_database(task.database_path) as database:
+        for ids in between[1:]:
+            database.delete_two_view_geometry(*ids)
+        geometry = database.read_two_view_geometry(*between[0])
+        matches = np.array(geometry.inlier_matches)
+        num = round(share_wrong * len(matches))
+        matches[:num, 1] = np.roll(matches[:num, 1], 5)
+        geometry.inlier_matches = matches
+        database.update_two_view_geometry(*between[0], geometry)
+    return between[0]
+
+
+@pytest.mark.parametrize(
+    ("num_images", "share_wrong", "num_doubted"), [(5, 0.25, 2), (5, 0.05, 0), (4, 0.25, 4)]
+)
+def test_images_that_one_pair_alone_ties_to_the_others(
+    tmp_path: Path, num_images: int, share_wrong: float, num_doubted: int
+) -> None:
+    model, task = scene(tmp_path, num_images)
+    names = {i: model.reconstruction.images[i].name for i in model.reconstruction.reg_image_ids()}
+    part = set(sorted(names)[-2:])
+    ids = hang_on_one_pair(task, part, share_wrong)
+    found = find_doubts(model, task).images
+    doubted = part if num_doubted == 2 else set(names) if num_doubted else set()
+    assert set(found) == {names[i] for i in doubted}
+    expected = f"hangs on the pair {names[ids[0]]} and {names[ids[1]]} alone, of whose matches only"
+    assert all(why.startswith(expected) for why in found.values())
+
+
+def test_guided_matches_of_a_pair_do_not_tell_whether_it_ties_images_well(tmp_path: Path) -> None:
+    """Neither for nor against: guided ones are where the geometry wants them, or on repetitions."""
+    model, task = scene(tmp_path, 5)
+    part = set(sorted(model.reconstruction.reg_image_ids())[-2:])
+    ids = hang_on_one_pair(task, part, 0.25)
+    matches = inlier_matches(task.database_path, 1)[ids]
+    wrong = round(0.25 * len(matches))
+    assert find_doubts(model, replace(task, guided={ids: matches[wrong:]})).images.keys()
+    assert find_doubts(model, replace(task, guided={ids: matches[:wrong]})).images == {}
+    assert find_doubts(model, replace(task, guided={ids: matches})).images.keys()
+
+
 def test_agreement_of_a_pair_is_measured_once_however_many_images_leave(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
