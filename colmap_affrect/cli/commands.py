@@ -443,9 +443,19 @@ def weights(options: argparse.Namespace) -> None:
 
 
 def _weight_keys(names: Sequence[str]) -> list[str]:
-    """Return keys of weights once each, with those of recipes in the place of their names."""
+    """Return keys of weights once each.
+
+    Names of recipes stand for what these need, ``aliked`` and ``lightglue`` for all of that name.
+    """
+    from colmap_affrect.features.weights import WEIGHT_FILES
     from colmap_affrect.recipes import load_recipe, recipe_names
 
-    recipes = recipe_names()
-    keys = (load_recipe(name).weights if name in recipes else (name,) for name in names)
-    return list(dict.fromkeys(key for some in keys for key in some))
+    keys: list[str] = []
+    for name in names:
+        if name in recipe_names():
+            keys += load_recipe(name).weights
+        elif name in WEIGHT_FILES:
+            keys.append(name)
+        else:
+            keys += [key for key in WEIGHT_FILES if key.startswith(f"{name}-")] or [name]
+    return list(dict.fromkeys(keys))

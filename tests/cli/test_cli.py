@@ -375,9 +375,12 @@ def test_unknown_weights_are_wrong_usage(call: Call) -> None:
 
 
 def test_weights_of_recipes_are_listed_by_their_names(call: Call) -> None:
-    listed = call("weights", "list", "aliked-lightglue", "aliked-n16").stdout
-    keys = [line.split()[0] for line in listed.splitlines() if not line.startswith(" ")]
-    assert keys == ["aliked-n16", "lightglue-aliked"]
+    def keys(*names: str) -> list[str]:
+        lines = call("weights", "list", *names).stdout.splitlines()
+        return [line.split()[0] for line in lines if not line.startswith(" ")]
+
+    assert keys("aliked-lightglue", "aliked-n16") == ["aliked-n16", "lightglue-aliked"]
+    assert keys("aliked") == ["aliked-n16", "aliked-n16rot", "aliked-n32"]
     done = call("weights", "fetch", "default")
     assert (done.code, done.stdout) == (0, "default: no weights are needed\n")
 
