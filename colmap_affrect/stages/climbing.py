@@ -3,7 +3,7 @@
 import heapq
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from colmap_affrect.colmap.verification import connected_parts, num_in_tracks
@@ -33,6 +33,7 @@ class ClimbingGraph:
     num_consistent: Mapping[Pair, int]  # that confirm each other; of each not verified
     insecure: Set[str]  # images that mapping may well lose
     stalled: Set[Pair] = frozenset()  # to which the last level brought nothing
+    num_raw: Mapping[Pair, int] = field(default_factory=dict)  # matches of each not verified
 
     @cached_property
     def components(self) -> dict[str, int]:
@@ -73,6 +74,23 @@ class ClimbingGraph:
             for pair, count in self.num_inliers.items()
             if not self.insecure.isdisjoint(pair) and (count or self._is_promising(pair, options))
         ]
+
+    def blind(self, options: EscalateOptions) -> list[Pair]:
+        """Return the best pairs that are not verified of images that are not secure.
+
+        Whatever their matches hint at: where light or age differ the right ones hint at nothing.
+        """
+        of_image: defaultdict[str, list[Pair]] = defaultdict(list)
+        for pair in self.num_consistent:
+            for name in self.insecure & set(pair):
+                of_image[name].append(pair)
+        best: set[Pair] = set()
+        for own in of_image.values():
+            best.update(heapq.nlargest(options.num_blind_pairs, own, self._rank))
+        return [pair for pair in self.num_consistent if pair in best]
+
+    def _rank(self, pair: Pair) -> tuple[int, int]:
+        return self.num_consistent[pair], self.num_raw.get(pair, 0)
 
     def _is_promising(self, pair: Pair, options: EscalateOptions) -> bool:
         enough = self.num_consistent[pair] >= options.min_num_consistent

@@ -10,7 +10,8 @@ in the same way:
 - First pairs between images that no verified pairs connect, then those of an image that is not
   secure: without a strong pair, or with few features in tracks through three images.
 - Of pairs that are not verified only those whose matches hint at a common surface
-  (:mod:`colmap_affrect.geometry.consistency`), and the best few of an image that is left outside.
+  (:mod:`colmap_affrect.geometry.consistency`), and the best few of an image that is left outside;
+  to the first level of learned features the best ten of any image that is not secure.
 - Then the verified pairs of the images that gained, while one of the two is not secure: new
   features that two images alone have cannot be tied to the rest.
 """
@@ -237,6 +238,8 @@ class Escalation:
         self.path = context.workspace.database
         self.levels = range(1, len(self.extraction.levels))
         self._is_measured = [level.features.has_shapes for level in self.extraction.levels]
+        # Where no level before has features of its kind, none can hint at what it would match.
+        self._blind_level = self._is_measured.index(False) if self.has_both_kinds else 0
         self._consistent: dict[Pair, tuple[bytes, int]] = {}
 
     @property
@@ -289,9 +292,11 @@ class Escalation:
         failed = [pair for pair, count in num_inliers.items() if not count]
         reached, tried = self.matches.levels(failed), self.matches.tried_levels(failed)
         stalled = {pair for pair in failed if reached[pair] < tried[pair]}
-        return ClimbingGraph(num_inliers, self._num_consistent(failed), insecure, stalled)
+        num_consistent, num_raw = self._num_matches(failed)
+        return ClimbingGraph(num_inliers, num_consistent, insecure, stalled, num_raw)
 
-    def _num_consistent(self, pairs: Sequence[Pair]) -> dict[Pair, int]:
+    def _num_matches(self, pairs: Sequence[Pair]) -> tuple[dict[Pair, int], dict[Pair, int]]:
+        """Return how many raw matches of pairs confirm each other, and how many there are."""
         ids = colmap_database.image_ids(self.path)
         with colmap_database.open_database(self.path) as database:
             matches = {(a, b): database.read_matches(ids[a], ids[b]) for a, b in pairs}
@@ -300,7 +305,8 @@ class Escalation:
             key = indices.tobytes()
             if pair not in known or known[pair][0] != key:
                 known[pair] = key, num_consistent_matches(*self._frames(pair, indices))
-        return {pair: known[pair][1] for pair in pairs}
+        counts = {pair: len(indices) for pair, indices in matches.items()}
+        return {pair: known[pair][1] for pair in pairs}, counts
 
     def _frames(self, pair: Pair, indices: NDArray[np.integer]) -> tuple[Singles, Singles]:
         first, second = self._all_frames(pair)
@@ -316,7 +322,8 @@ class Escalation:
         joining, hanging = graph.joining(self.options), graph.hanging(self.options)
         for level in self.levels:
             unwritten = {pair for pair in self._unwritten if tried[pair] == level}
-            for pairs in (joining, hanging, graph.links(levels, level)):
+            blind = graph.blind(self.options) if level == self._blind_level else []
+            for pairs in (joining, hanging, blind, graph.links(levels, level)):
                 todo = [pair for pair in pairs if tried[pair] < level]
                 if todo or unwritten.intersection(pairs):
                     return level, todo
