@@ -25,7 +25,7 @@ from colmap_affrect.mappers.base import MAPPERS, Mapper, MappingTask
 from colmap_affrect.mappers.doubts import FOCAL_DOUBT
 from colmap_affrect.progress import Advance
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import load_recipe
+from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import map as stage
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import (
@@ -109,6 +109,24 @@ def test_matches_of_both_kinds_of_frames_are_united(
         num_measured = np.count_nonzero(escalation.measured(pair, inliers))
         assert 0.5 * len(inliers) < 2 * num_measured < 1.5 * len(inliers)
     assert all(after[ids] > 1.5 * before[ids] for ids in before)
+
+
+def test_pairs_that_nothing_hints_at_climb_to_features_of_another_kind(context: Context) -> None:
+    """Those of an image that no measured frames match, and not those of the others."""
+    escalation_of(context).undo()
+    own = [pair for pair in escalation_of(context).pairs if NAMES[3] in pair]
+    for found in list(context.matches.read(own)):
+        none = replace(found, indices=found.indices[:0], scores=found.scores[:0])
+        context.matches.write([none], own, 0)
+    escalation_of(context).write()
+    options = EscalateOptions(strong_num_inliers=1, min_num_tracks=0, num_best_pairs=0)
+    none_blind = options.changed(num_blind_pairs=0)
+    assert Escalation(context, none_blind).next_work() is None
+    escalation = Escalation(context, options)
+    assert escalation.next_work() == (1, own)
+    escalation.climb(own, 1)
+    assert min(escalation.num_inliers()[pair] for pair in own) > 30
+    assert escalation.next_work() is None
 
 
 class OneKind:
