@@ -145,9 +145,9 @@ class EscalateOptions(Options):
     """So many pairs of an image that no verified pairs connect to the others, those with the most
     such matches, climb all the same."""
     num_blind_pairs: Annotated[int, within(0, 1_000_000)] = 10
-    """So many of the pairs of an image that hangs loosely climb to the first level of learned
-    features, though nothing hints at a common surface: of photographs of other light or age
-    gradients do not."""
+    """So many of the pairs of an image that hangs loosely, whatever has been tried, climb to the
+    first level of learned features in the end, though nothing hints at a common surface: where
+    light or age differ, gradients do not."""
 
 
 class RecipeOptions(ExtractionOptions):

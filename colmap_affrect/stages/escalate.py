@@ -10,10 +10,11 @@ in the same way:
 - First pairs between images that no verified pairs connect, then those of an image that is not
   secure: without a strong pair, or with few features in tracks through three images.
 - Of pairs that are not verified only those whose matches hint at a common surface
-  (:mod:`colmap_affrect.geometry.consistency`), and the best few of an image that is left outside;
-  to the first level of learned features the best ten of any image that is not secure.
+  (:mod:`colmap_affrect.geometry.consistency`), and the best few of an image that is left outside.
 - Then the verified pairs of the images that gained, while one of the two is not secure: new
   features that two images alone have cannot be tied to the rest.
+- When nothing else is left to do, the best ten pairs of each image that is still not secure, at the
+  first level of learned features: no level before has features of that kind, to hint at anything.
 """
 
 import math
@@ -238,7 +239,6 @@ class Escalation:
         self.path = context.workspace.database
         self.levels = range(1, len(self.extraction.levels))
         self._is_measured = [level.features.has_shapes for level in self.extraction.levels]
-        # Where no level before has features of its kind, none can hint at what it would match.
         self._blind_level = self._is_measured.index(False) if self.has_both_kinds else 0
         self._consistent: dict[Pair, tuple[bytes, int]] = {}
 
@@ -320,13 +320,18 @@ class Escalation:
         graph, levels = self.graph(), self.matches.levels(self.pairs)
         tried = self.matches.tried_levels(self.pairs)
         joining, hanging = graph.joining(self.options), graph.hanging(self.options)
-        for level in self.levels:
+        steps = [
+            (level, pairs)
+            for level in self.levels
+            for pairs in (joining, hanging, graph.links(levels, level))
+        ]
+        if self._blind_level:
+            steps.append((self._blind_level, graph.blind(self.options)))
+        for level, pairs in steps:
             unwritten = {pair for pair in self._unwritten if tried[pair] == level}
-            blind = graph.blind(self.options) if level == self._blind_level else []
-            for pairs in (joining, hanging, blind, graph.links(levels, level)):
-                todo = [pair for pair in pairs if tried[pair] < level]
-                if todo or unwritten.intersection(pairs):
-                    return level, todo
+            todo = [pair for pair in pairs if tried[pair] < level]
+            if todo or unwritten.intersection(pairs):
+                return level, todo
         return None
 
     def climb(self, pairs: Sequence[Pair], level: int) -> None:
