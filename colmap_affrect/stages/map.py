@@ -321,8 +321,9 @@ def advice(
                 "run again with --mask-path, if things move, repeat or are written on the "
                 "photographs"
             )
+    if (missing or is_inconsistent) and not is_copy(workspace):
+        texts += _other_recipes(context)
     if missing:
-        texts += [] if is_copy(workspace) else _other_recipes(context)
         texts.append(f"more photographs {_missing_places(workspace, missing)}")
     return tuple(texts)
 
@@ -331,8 +332,8 @@ def _other_recipes(context: Context) -> list[str]:
     recipe, texts = context.workspace.recipe(), []
     if recipe not in (STRONGER_RECIPE, LEARNED_RECIPE):
         texts.append(
-            f"run again with --recipe {STRONGER_RECIPE}, which tries more warps for the missing "
-            "photographs"
+            f"run again with --recipe {STRONGER_RECIPE}, which tries more warps where photographs "
+            "are missing or hang loosely"
         )
     if recipe != LEARNED_RECIPE:
         weights = load_recipe(LEARNED_RECIPE).weights
