@@ -198,6 +198,9 @@ def test_advice_is_about_what_is_wrong(finished: tuple[Workspace, Reconstruction
     masks = "run again with --mask-path, if things move, repeat or are written on the photographs"
     contradicted = replace(loose, loose=())
     assert masks in advice(context, ["unreadable.png"], [contradicted])
+    stronger = "run again with --recipe on-demand,"
+    assert any(text.startswith(stronger) for text in advice(context, [], [contradicted]))
+    assert not any(text.startswith(stronger) for text in advice(context, [], [loose]))
     assert masks in advice(context, [NAMES[0]], [model])
     assert advice(context, [NAMES[0]], [loose])[-1].startswith("more photographs between")
 
