@@ -145,9 +145,9 @@ class EscalateOptions(Options):
     """So many pairs of an image that no verified pairs connect to the others, those with the most
     such matches, climb all the same."""
     num_blind_pairs: Annotated[int, within(0, 1_000_000)] = 10
-    """So many of the pairs of an image that hangs loosely, whatever has been tried, climb to the
-    first level of learned features in the end, though nothing hints at a common surface: where
-    light or age differ, gradients do not."""
+    """In the end so many pairs of an image that still hangs loosely have climbed to the first level
+    whose frames are not measured (ALIKED, DISK, XFeat), though nothing hints at a common surface:
+    where light or age differ, gradients do not."""
 
 
 class RecipeOptions(ExtractionOptions):

@@ -337,8 +337,8 @@ WEIGHTS = (
     _choice("action", ["list", "fetch"],
         "fetch downloads what is missing or damaged, for a machine without network (default: list)",
         nargs="?", default="list"),
-    _value("keys", "KEY", "which files, or recipes whose files (default: list all, fetch affnet, "
-        "orinet and hardnet)",
+    _value("keys", "KEY", "which files, all of a name (aliked, lightglue), or those of a recipe "
+        "(default: list all, fetch affnet, orinet and hardnet)",
         nargs="*"),
     _path("--weights", "FOLDER",
         "look there first, and fetch into it (default: torch's cache)"),

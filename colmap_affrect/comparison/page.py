@@ -251,8 +251,8 @@ def _mark(
 ) -> Mark:
     """Mark what a method does with a photograph that some other methods place, too.
 
-    It is uncertain in a method that contradicts most of these, not in all that one contradicts, and
-    nowhere that ground truth calls it right.
+    Where ground truth does not know its pose it is uncertain in a method that doubts it, and in one
+    that contradicts most others, not in all that one contradicts.
     """
     method, seeds = column.method, column.method.seeds
     registering = [seed for seed in seeds if name in seed.registered_names]
@@ -269,10 +269,9 @@ def _mark(
     elif correct:
         text += ", correctly"
     others = [other for other, names in method.disagreements.items() if name in names]
-    is_uncertain = False
+    doubt, is_unstable = method.usually_doubted.get(name), name in method.unstable_names
+    is_odd = 2 * len(others) > max(0, num_others)
     if not has_truth or is_wrong:
-        doubt, is_unstable = method.usually_doubted.get(name), name in method.unstable_names
-        is_uncertain = bool(doubt) or is_unstable or 2 * len(others) > max(0, num_others)
         if doubt:
             text += f", doubtful: {doubt}"
         if is_unstable:
@@ -286,7 +285,7 @@ def _mark(
         is_wrong,
         f"{column.name}: {text}",
         column=column,
-        is_uncertain=is_uncertain,
+        is_uncertain=not has_truth and (bool(doubt) or is_unstable or is_odd),
         is_only=is_only,
     )
 

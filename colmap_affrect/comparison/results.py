@@ -7,6 +7,7 @@ seeds, so that terminal, page, JSON and CSV cannot disagree.
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Self
@@ -98,8 +99,10 @@ class SeedResult:
     @property
     def reasons_to_doubt(self) -> dict[str, str]:
         """Registered images that cannot be trusted, with the reason: their own or the model's."""
-        of_model = dict.fromkeys(self.registered_names, ", ".join(self.doubts))
-        return (of_model if self.doubts else {}) | dict(self.doubtful)
+        of_model = ", ".join(self.doubts)
+        return dict.fromkeys(self.registered_names if of_model else (), of_model) | {
+            **self.doubtful
+        }
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON, ``MEASURES`` first."""
@@ -195,7 +198,7 @@ class MethodResult:
         """Images that more than half of the seeds register correctly (without truth: register)."""
         return in_most([seed.correct_names for seed in self.seeds])
 
-    @property
+    @cached_property
     def usually_doubted(self) -> dict[str, str]:
         """Images that cannot be trusted in more than half of the seeds, with a reason."""
         seeds = [seed.reasons_to_doubt for seed in self.seeds]

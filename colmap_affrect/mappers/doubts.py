@@ -4,7 +4,7 @@ Doubts have two degrees: what is certainly wrong leaves the model, the rest is t
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -122,8 +122,14 @@ def find_doubts(model: MappedModel, task: MappingTask, loose: Collection[str] = 
         loose: images whose points do not tell the focal length.
     """
     graph = graph_of(task)
-    images = _image_doubts(model, graph, task, loose)
-    return replace(images, model=tuple(_model_doubts(model, graph)))
+    agreements: dict[Ids, float] = {}
+    doubts = _image_doubts(model, graph, task, loose, agreements)
+    images = dict(doubts.images)
+    for name, why in _hanging(model.reconstruction, graph, task, agreements).items():
+        images[name] = "; ".join(filter(None, [images.get(name), why]))
+    return replace(
+        doubts, images=dict(sorted(images.items())), model=tuple(_model_doubts(model, graph))
+    )
 
 
 def without_impossible(model: MappedModel, task: MappingTask) -> MappedModel | None:
@@ -175,13 +181,6 @@ def _image_doubts(
         for image_id in pair.ids:
             totals[image_id] += agreeing_of[pair.ids], count
     originals = _originals(graph, agreeing_of)
-
-    def exact_agreement(pair: VerifiedPair) -> float:
-        guided = rows_in(pair.matches, task.guided.get(pair.ids, pair.matches[:0]))
-        exact = replace(pair, matches=pair.matches[~guided])
-        return graph.agreement(pair if guided.all() else exact, poses, cameras)
-
-    hanging = _hanging(reconstruction, graph, known, exact_agreement)
     reasons: dict[str, str] = {}
     angles, near = _angles_deg(reconstruction), _images_nearby(reconstruction)
     impossible: list[tuple[float, int, str]] = []
@@ -192,7 +191,6 @@ def _image_doubts(
         found = [
             *([] if image.camera_id in given else _camera_doubts(cameras[image_id])),
             *_support_doubts(image.num_points3D, agreement),
-            *_tie_doubts(hanging.get(image_id)),
             *_angle_doubts(reconstruction, image, [nearest for nearest, _ in angles[image_id]]),
             *_place_doubts(near[image_id], len(registered) - 1),
             *_copy_doubts(graph.names.get(originals.get(image_id, -1))),
@@ -229,42 +227,56 @@ def _support_doubts(num: int, agreement: float) -> Iterator[tuple[str, bool]]:
         yield text, agreement < NO_AGREEMENT
 
 
-def _tie_doubts(reason: str | None) -> Iterator[tuple[str, bool]]:
-    if reason:
-        yield reason, False
-
-
 def _hanging(
     model: pycolmap.Reconstruction,
     graph: PairGraph,
+    task: MappingTask,
     agreements: Mapping[Ids, float],
-    exact_agreement: Callable[[VerifiedPair], float],
-) -> dict[int, str]:
-    """Return the images that one pair alone ties to the others, and that not well, with the reason.
+) -> dict[str, str]:
+    """Return the images that nothing ties well to the others, with the reason.
 
-    They are the smaller part, of equal ones both. Pairs without which no part falls off confirm
-    each other; images of a rig that were taken at once hold together anyway.
+    They are the smaller part where one pair alone ties two parts, and is at odds with itself, or
+    where all pairs between them disagree; of equal parts both. Pairs without which no part falls
+    off confirm each other, and so do those that the graph leaves out; images of a rig that were
+    taken at once hold together anyway.
     """
+    poses, cameras = poses_of(model), cameras_of(model)
+
+    def exact_agreement(pair: VerifiedPair) -> float:
+        guided = rows_in(pair.matches, task.guided.get(pair.ids, pair.matches[:0]))
+        exact = replace(pair, matches=pair.matches[~guided])
+        return graph.agreement(pair if guided.all() else exact, poses, cameras)
+
     frame_of = {i: model.images[i].frame_id for i in model.reg_image_ids()}
-    ties: dict[frozenset[int], list[VerifiedPair]] = defaultdict(list)
+    pairs_of: dict[frozenset[int], list[VerifiedPair]] = defaultdict(list)
     for pair in graph.pairs_inside(frame_of):
-        if agreements[pair.ids] >= MIN_AGREEMENT:
-            ties[frozenset(frame_of[image_id] for image_id in pair.ids)].append(pair)
+        pairs_of[frozenset(frame_of[image_id] for image_id in pair.ids)].append(pair)
     frames = nx.Graph()
-    frames.add_edges_from(tuple(ids) for ids in ties if len(ids) == 2)
-    found: dict[int, str] = {}
+    frames.add_nodes_from(frame_of.values())
+    frames.add_edges_from(
+        tuple(ids)
+        for ids, pairs in pairs_of.items()
+        if len(ids) == 2 and max(agreements[pair.ids] for pair in pairs) >= MIN_AGREEMENT
+    )
+    unknown = [ids for ids in graph.left_out if ids[0] in frame_of and ids[1] in frame_of]
+    frames.add_edges_from((frame_of[first], frame_of[second]) for first, second in unknown)
+    frames.remove_edges_from(list(nx.selfloop_edges(frames)))
     for ids in list(nx.bridges(frames)):
-        pair, *more = ties[frozenset(ids)]
-        if more or (agreement := exact_agreement(pair)) >= MIN_AGREEMENT_OF_TIE:
+        tie = pairs_of.get(frozenset(ids), [])
+        if len(tie) == 1 and exact_agreement(tie[0]) < MIN_AGREEMENT_OF_TIE:
+            frames.remove_edge(*ids)
+    parts = sorted(nx.connected_components(frames), key=len)
+    found: dict[str, str] = {}
+    for part in parts if len(parts) > 1 else ():
+        between = [p for ids, pairs in pairs_of.items() if len(ids & part) == 1 for p in pairs]
+        if not between or len(part) == len(parts[-1]) > len(parts[-2]):
             continue
-        frames.remove_edge(*ids)
-        parts = [nx.node_connected_component(frames, frame_id) for frame_id in ids]
-        frames.add_edge(*ids)
-        size = min(map(len, parts))
-        hanging = set().union(*(part for part in parts if len(part) == size))
-        names = " and ".join(graph.names[image_id] for image_id in pair.ids)
-        why = f"hangs on the pair {names} alone, of whose matches only {agreement:.0%} agree"
-        found.update({i: why for i, frame_id in frame_of.items() if frame_id in hanging})
+        why = f"none of the {len(between)} pairs that tie it to the others agrees well"
+        if len(between) == 1:
+            names = " and ".join(graph.names[image_id] for image_id in between[0].ids)
+            share = f"{exact_agreement(between[0]):.0%}"
+            why = f"hangs on the pair {names} alone, of whose inliers only {share} agree"
+        found.update({graph.names[i]: why for i, frame_id in frame_of.items() if frame_id in part})
     return found
 
 

@@ -98,6 +98,7 @@ class PairGraph:
         keypoints: (N, 2) px by image id.
         pairs: sorted by ids.
         depth_at: depth maps of the images, where there are any.
+        left_out: ids of the verified pairs that are not among the strongest.
     """
 
     cache: pycolmap.DatabaseCache
@@ -106,6 +107,7 @@ class PairGraph:
     keypoints: Mapping[int, NDArray[np.float32]]
     pairs: tuple[VerifiedPair, ...]
     depth_at: DepthLookup | None = None
+    left_out: frozenset[tuple[int, int]] = frozenset()
 
     @classmethod
     def read(
@@ -119,7 +121,7 @@ class PairGraph:
             images = {image.image_id: image for image in database.read_all_images()}
             cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
             pair_ids, geometries = database.read_two_view_geometries()
-            pairs = _strongest(
+            verified = [
                 VerifiedPair(
                     pycolmap.pair_id_to_image_pair(pair_id),
                     np.asarray(geometry.inlier_matches, np.int64),
@@ -127,7 +129,8 @@ class PairGraph:
                 )
                 for pair_id, geometry in zip(pair_ids, geometries, strict=True)
                 if len(geometry.inlier_matches) >= min_num_matches
-            )
+            ]
+            pairs = _strongest(verified)
             options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches)
             cache = pycolmap.DatabaseCache.create(database, options)
             used = {image_id for pair in pairs for image_id in pair.ids}
@@ -142,6 +145,7 @@ class PairGraph:
             keypoints,
             tuple(sorted(pairs, key=lambda pair: pair.ids)),
             depth_at,
+            frozenset(pair.ids for pair in verified).difference(pair.ids for pair in pairs),
         )
 
     def without(self, ids: Collection[tuple[int, int]]) -> Self:

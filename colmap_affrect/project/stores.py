@@ -26,6 +26,7 @@ from colmap_affrect.project.group_store import GroupStore, complete_groups, is_c
 
 MAX_INT16 = 32767
 STATIONARY = "stationary_cells"
+STEP = "step"
 FINISHED = "finished_list"
 
 
@@ -245,7 +246,7 @@ class MatchStore(GroupStore):
         names = {pair_key(name, "")[:-1] for name in images}
         keys = {pair_key(*pair) for pair in pairs}
         with self._open("a") as file:
-            file.attrs[FINISHED] = ""
+            file.attrs.update({FINISHED: "", STEP: ""})
             for key, group in list(complete_groups(file)):
                 is_asked = key in keys or not names.isdisjoint(key.split("/"))
                 if is_asked or group.attrs.get("tried_level"):
@@ -283,6 +284,15 @@ class MatchStore(GroupStore):
     def record_finished_list(self, digest: str) -> None:
         """Keep the digest of the list that is finished, empty while there is none."""
         self._record_text(FINISHED, digest)
+
+    def step(self) -> tuple[int, list[tuple[str, str]]] | None:
+        """Return the level and the pairs of the step of escalation that has begun and not ended."""
+        level, pairs = json.loads(self._text(STEP) or "[0, []]")
+        return (level, [(first, second) for first, second in pairs]) if level else None
+
+    def record_step(self, level: int = 0, pairs: Sequence[tuple[str, str]] = ()) -> None:
+        """Keep a step that begins; without one, that it has ended."""
+        self._record_text(STEP, json.dumps([level, list(pairs)]))
 
     def levels(self, pairs: Iterable[tuple[str, str]]) -> dict[tuple[str, str], int]:
         """Return the level of escalation that the matches of each pair are from."""

@@ -75,18 +75,23 @@ class ClimbingGraph:
             if not self.insecure.isdisjoint(pair) and (count or self._is_promising(pair, options))
         ]
 
-    def blind(self, options: EscalateOptions) -> list[Pair]:
-        """Return the best pairs that are not verified of images that are not secure.
+    def blind(self, options: EscalateOptions, tried: Mapping[Pair, int], level: int) -> list[Pair]:
+        """Return pairs of images that are not secure whatever their matches hint at, the best few.
 
-        Whatever their matches hint at: where light or age differ the right ones hint at nothing.
+        Where light or age differ the matches of right ones hint at nothing. Those for which this
+        level has been ``tried`` count among the few.
         """
         of_image: defaultdict[str, list[Pair]] = defaultdict(list)
-        for pair in self.num_consistent:
+        num_left = dict.fromkeys(self.insecure, options.num_blind_pairs)
+        for pair in self.num_inliers:
             for name in self.insecure & set(pair):
-                of_image[name].append(pair)
+                if tried[pair] >= level:
+                    num_left[name] -= 1
+                elif pair in self.num_consistent:
+                    of_image[name].append(pair)
         best: set[Pair] = set()
-        for own in of_image.values():
-            best.update(heapq.nlargest(options.num_blind_pairs, own, self._rank))
+        for name, own in of_image.items():
+            best.update(heapq.nlargest(max(0, num_left[name]), own, self._rank))
         return [pair for pair in self.num_consistent if pair in best]
 
     def _rank(self, pair: Pair) -> tuple[int, int]:

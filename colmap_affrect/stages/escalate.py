@@ -4,8 +4,8 @@ Level by level (the recipe's ``escalation``; Mishkin, Matas, Perdoch, MODS, 2015
 features that the level adds, and pairs are matched again. New matches take the place of the old
 ones only when their two-view geometry has more inliers, or, where neither is verified, when more of
 them confirm each other. Which pairs climb is decided anew after every step, by what the database
-holds then, and the lowest level that has something to do comes first, so that a killed run goes on
-in the same way:
+holds then, and the lowest level that has something to do comes first; the step that has begun is on
+record, so that a killed run goes on in the same way:
 
 - First pairs between images that no verified pairs connect, then those of an image that is not
   secure: without a strong pair, or with few features in tracks through three images.
@@ -13,8 +13,9 @@ in the same way:
   (:mod:`colmap_affrect.geometry.consistency`), and the best few of an image that is left outside.
 - Then the verified pairs of the images that gained, while one of the two is not secure: new
   features that two images alone have cannot be tied to the rest.
-- When nothing else is left to do, the best ten pairs of each image that is still not secure, at the
-  first level of learned features: no level before has features of that kind, to hint at anything.
+- When nothing else is left to do, the best pairs of each image that is still not secure, ten at
+  most, at the first level whose frames are not measured, where frames of others are: gradients
+  cannot hint at what learned features match.
 """
 
 import math
@@ -239,6 +240,7 @@ class Escalation:
         self.path = context.workspace.database
         self.levels = range(1, len(self.extraction.levels))
         self._is_measured = [level.features.has_shapes for level in self.extraction.levels]
+        # Beside measured ones there are others, at which these cannot hint; 0 if there are not.
         self._blind_level = self._is_measured.index(False) if self.has_both_kinds else 0
         self._consistent: dict[Pair, tuple[bytes, int]] = {}
 
@@ -246,23 +248,6 @@ class Escalation:
     def has_both_kinds(self) -> bool:
         """Whether frames of some levels are measured and those of others are not."""
         return len(set(self._is_measured)) > 1
-
-    @cached_property
-    def _unwritten(self) -> set[Pair]:
-        """Pairs whose matches a killed run has stored and not put into the database."""
-        pairs = list(self.num_inliers())
-        if not pairs:
-            return set()
-        ids = colmap_database.image_ids(self.path)
-        stored = zip(pairs, self.matches.read(pairs), strict=True)
-        with colmap_database.open_database(self.path) as database:
-            return {
-                pair
-                for pair, found in stored
-                if not np.array_equal(
-                    database.read_matches(ids[pair[0]], ids[pair[1]]), found.indices
-                )
-            }
 
     @cached_property
     def extractor(self) -> ImageExtractor:
@@ -313,29 +298,37 @@ class Escalation:
         return first[indices[:, 0]], second[indices[:, 1]]
 
     def next_work(self) -> tuple[int, list[Pair]] | None:
-        """Return the lowest level with something to do, and the pairs to match at it now.
+        """Return a level, and the pairs to match at it now; None when nothing is left to do.
 
-        There are none when all have been matched before a kill and only the database lacks it.
+        There are no pairs where a killed run has matched all of a step, and only the database lacks
+        them.
         """
-        graph, levels = self.graph(), self.matches.levels(self.pairs)
         tried = self.matches.tried_levels(self.pairs)
+        if step := self.matches.step():
+            level, pairs = step
+            return level, [pair for pair in pairs if tried.get(pair, level) < level]
+        graph, levels = self.graph(), self.matches.levels(self.pairs)
         joining, hanging = graph.joining(self.options), graph.hanging(self.options)
-        steps = [
-            (level, pairs)
-            for level in self.levels
-            for pairs in (joining, hanging, graph.links(levels, level))
-        ]
-        if self._blind_level:
-            steps.append((self._blind_level, graph.blind(self.options)))
-        for level, pairs in steps:
-            unwritten = {pair for pair in self._unwritten if tried[pair] == level}
-            todo = [pair for pair in pairs if tried[pair] < level]
-            if todo or unwritten.intersection(pairs):
+
+        def steps() -> Iterator[tuple[int, list[Pair]]]:
+            for level in self.levels:
+                for pairs in (joining, hanging, graph.links(levels, level)):
+                    yield level, pairs
+            if self._blind_level:
+                yield self._blind_level, graph.blind(self.options, tried, self._blind_level)
+
+        for level, pairs in steps():
+            if todo := [pair for pair in pairs if tried[pair] < level]:
                 return level, todo
         return None
 
     def climb(self, pairs: Sequence[Pair], level: int) -> None:
-        """Match pairs with the features of a level and keep what has more inliers."""
+        """Match pairs with the features of a level and keep what has more inliers.
+
+        What is to be done is on record meanwhile: a killed run could not tell it else.
+        """
+        if pairs:
+            self.matches.record_step(level, pairs)
         images = sorted({name for pair in pairs for name in pair})
         names = [name for name in images if len(self.features.level_ends(name)) <= level]
         title, total = f"escalate, level {level}", len(names) + len(pairs)
@@ -344,6 +337,7 @@ class Escalation:
             if pairs:
                 self._match_again(pairs, level, advance)
         self.write()
+        self.matches.record_step()
 
     def write(self) -> None:
         """Bring the database up to what is stored."""
@@ -352,7 +346,6 @@ class Escalation:
         if pairs := [pair for pair in self.pairs if pair[0] in ids and pair[1] in ids]:
             _replace_matches(self.path, ids, self.matches.read(pairs))
         verify_new(self.context)
-        self._unwritten = set()
 
     def undo(self) -> None:
         """Bring all pairs back to level 0."""
@@ -361,6 +354,7 @@ class Escalation:
         with self.context.progress.stage("match", len(higher), "pairs") as advance:
             match_pairs(self.context, higher, self.matching, advance)
         self.matches.write((), self.pairs, 0)
+        self.matches.record_step()
         self.write()
 
     def match_first_level(self, pairs: Sequence[Pair], path: Path) -> None:

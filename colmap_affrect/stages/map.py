@@ -321,7 +321,7 @@ def advice(
                 "run again with --mask-path, if things move, repeat or are written on the "
                 "photographs"
             )
-    if (missing or is_inconsistent) and not is_copy(workspace):
+    if (missing or (models and models[0].num_contradicted)) and not is_copy(workspace):
         texts += _other_recipes(context)
     if missing:
         texts.append(f"more photographs {_missing_places(workspace, missing)}")

@@ -124,7 +124,8 @@ def hang_on_one_pair(task: MappingTask, part: set[int], share_wrong: float) -> t
 
 
 @pytest.mark.parametrize(
-    ("num_images", "share_wrong", "num_doubted"), [(5, 0.25, 2), (5, 0.05, 0), (4, 0.25, 4)]
+    ("num_images", "share_wrong", "num_doubted"),
+    [(5, 0.25, 2), (5, 0.05, 0), (4, 0.25, 4), (5, 0.6, 2), (5, 0.9, 2)],
 )
 def test_images_that_one_pair_alone_ties_to_the_others(
     tmp_path: Path, num_images: int, share_wrong: float, num_doubted: int
@@ -136,8 +137,49 @@ def test_images_that_one_pair_alone_ties_to_the_others(
     found = find_doubts(model, task).images
     doubted = part if num_doubted == 2 else set(names) if num_doubted else set()
     assert set(found) == {names[i] for i in doubted}
-    expected = f"hangs on the pair {names[ids[0]]} and {names[ids[1]]} alone, of whose matches only"
-    assert all(why.startswith(expected) for why in found.values())
+    expected = f"hangs on the pair {names[ids[0]]} and {names[ids[1]]} alone, of whose inliers only"
+    assert all(expected in why for why in found.values())
+
+
+def test_parts_that_weak_pairs_tie_beside_the_strongest_do_not_hang(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The graph has the strongest pairs of each image only; what it leaves out counts here."""
+    model, task = scene(tmp_path, 5)
+    part = set(sorted(model.reconstruction.reg_image_ids())[-2:])
+    hang_on_one_pair(task, part, 0.25)
+    graph = PairGraph.read(task.database_path)
+    between = [pair.ids for pair in graph.pairs if len(part.intersection(pair.ids)) == 1]
+    weak = next(i for i in graph.names if i not in part and i not in between[0])
+    for left_out, num_doubted in ((frozenset(), 2), (frozenset({(weak, max(part))}), 0)):
+        changed = replace(graph, left_out=left_out)
+        monkeypatch.setattr("colmap_affrect.mappers.doubts.graph_of", lambda _, g=changed: g)
+        assert len(find_doubts(model, task).images) == num_doubted
+    monkeypatch.setattr("colmap_affrect.mappers.pair_graph.MAX_PAIRS_OF_IMAGE", 1)
+    strongest = PairGraph.read(task.database_path)
+    assert strongest.left_out == {p.ids for p in graph.pairs} - {p.ids for p in strongest.pairs}
+    assert strongest.left_out
+
+
+def test_images_that_several_pairs_contradict_hang_on_none(tmp_path: Path) -> None:
+    model, task = scene(tmp_path, 6)
+    part = set(sorted(model.reconstruction.reg_image_ids())[-2:])
+    between = [
+        ids for ids in inlier_matches(task.database_path, 1) if len(part.intersection(ids)) == 1
+    ]
+    with open_database(task.database_path) as database:
+        for ids in between[:2]:
+            geometry = database.read_two_view_geometry(*ids)
+            matches = np.array(geometry.inlier_matches)
+            matches[:, 1] = np.roll(matches[:, 1], 5)
+            geometry.inlier_matches = matches
+            database.update_two_view_geometry(*ids, geometry)
+        for ids in between[2:]:
+            database.delete_two_view_geometry(*ids)
+    found = find_doubts(model, task).images
+    assert set(found) >= {model.reconstruction.images[i].name for i in part}
+    why = "none of the 2 pairs that tie it to the others agrees well"
+    assert all(why in found[model.reconstruction.images[i].name] for i in part)
 
 
 def test_guided_matches_of_a_pair_do_not_tell_whether_it_ties_images_well(tmp_path: Path) -> None:

@@ -425,17 +425,21 @@ def test_killed_run_goes_on_to_the_same_result(
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("number", [1, 2, 3])
 def test_run_killed_between_two_changes_of_its_matches_goes_on_to_the_same_result(
     before: Workspace,
     climbed: tuple[Workspace, StageReport],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    number: int,
 ) -> None:
     workspace, commit = copy(before, tmp_path / "killed"), FileTransaction.commit
+    changed: list[Path] = []
 
     def killed(changes: FileTransaction) -> None:
         commit(changes)
-        if changes._path == workspace.matches:
+        changed.append(changes._path)
+        if changed.count(workspace.matches) == number:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:

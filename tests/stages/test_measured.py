@@ -24,6 +24,7 @@ from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MappingTask
 from colmap_affrect.mappers.doubts import FOCAL_DOUBT
 from colmap_affrect.progress import Advance
+from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import map as stage
@@ -111,7 +112,9 @@ def test_matches_of_both_kinds_of_frames_are_united(
     assert all(after[ids] > 1.5 * before[ids] for ids in before)
 
 
-def test_pairs_that_nothing_hints_at_climb_to_features_of_another_kind(context: Context) -> None:
+def test_pairs_that_nothing_hints_at_climb_to_features_of_another_kind(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Those of an image that no measured frames match, and not those of the others."""
     escalation_of(context).undo()
     own = [pair for pair in escalation_of(context).pairs if NAMES[3] in pair]
@@ -124,7 +127,21 @@ def test_pairs_that_nothing_hints_at_climb_to_features_of_another_kind(context: 
     assert Escalation(context, none_blind).next_work() is None
     escalation = Escalation(context, options)
     assert escalation.next_work() == (1, own)
-    escalation.climb(own, 1)
+
+    written = escalation.matches.write
+
+    def killed(found: list[PairMatches], tried: list[tuple[str, str]], level: int) -> None:
+        written(found[:2], tried[:2], level)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(escalation.matches, "write", killed)
+        with pytest.raises(KeyboardInterrupt):
+            escalation.climb(own, 1)
+    # The matches that are stored look different now; what is left of the step is not decided anew.
+    escalation = Escalation(context, options)
+    assert escalation.next_work() == (1, own[2:])
+    escalation.climb(own[2:], 1)
     assert min(escalation.num_inliers()[pair] for pair in own) > 30
     assert escalation.next_work() is None
 
