@@ -43,7 +43,7 @@ MIN_AGREEMENT, NO_AGREEMENT = 0.5, 0.25
 """Share of the inliers of an image's verified pairs. Of right images of sparse sets at least three
 quarters agree."""
 
-MIN_AGREEMENT_OF_TIE = 0.87
+MIN_AGREEMENT_OF_TIE = 0.85
 """Share of the exact inliers of a pair that alone ties images to the others: nothing else says
 where they are, so a right one agrees nearly whole."""
 
