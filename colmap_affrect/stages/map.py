@@ -297,10 +297,13 @@ def advice(
     if not missing and not is_doubtful:
         return ()
     is_inconsistent = bool(models and (models[0].doubts or models[0].num_contradicted))
+    recipes = [] if is_copy(workspace) else _other_recipes(context)
     texts = []
     if any(record.is_contradicted for record in read_camera_records(workspace.cameras).values()):
         texts.append("run again without the given focal lengths, or with others: pairs contradict "
                      "them")  # fmt: skip
+    if missing:
+        texts += recipes
     has_cameras = is_copy(workspace) or Inputs.recorded(workspace).from_database
     if models and (models[0].rival_focals_px or models[0].loose) and not has_cameras:
         texts.append(
@@ -321,8 +324,8 @@ def advice(
                 "run again with --mask-path, if things move, repeat or are written on the "
                 "photographs"
             )
-    if (missing or (models and models[0].num_contradicted)) and not is_copy(workspace):
-        texts += _other_recipes(context)
+    if models and models[0].num_contradicted and not missing:
+        texts += recipes
     if missing:
         texts.append(f"more photographs {_missing_places(workspace, missing)}")
     return tuple(texts)

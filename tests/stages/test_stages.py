@@ -202,7 +202,9 @@ def test_advice_is_about_what_is_wrong(finished: tuple[Workspace, Reconstruction
     assert any(text.startswith(stronger) for text in advice(context, [], [contradicted]))
     assert not any(text.startswith(stronger) for text in advice(context, [], [loose]))
     assert masks in advice(context, [NAMES[0]], [model])
-    assert advice(context, [NAMES[0]], [loose])[-1].startswith("more photographs between")
+    first, *_, last = advice(context, [NAMES[0]], [loose])
+    assert first.startswith(stronger)
+    assert last.startswith("more photographs between")
 
 
 def test_advice_says_how_weights_are_had_here(
