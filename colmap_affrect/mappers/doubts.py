@@ -266,18 +266,25 @@ def _hanging(
         if len(tie) == 1 and exact_agreement(tie[0]) < MIN_AGREEMENT_OF_TIE:
             frames.remove_edge(*ids)
     parts = sorted(nx.connected_components(frames), key=len)
-    found: dict[str, str] = {}
-    for part in parts if len(parts) > 1 else ():
-        between = [p for ids, pairs in pairs_of.items() if len(ids & part) == 1 for p in pairs]
-        if not between or len(part) == len(parts[-1]) > len(parts[-2]):
+    part_of = {frame_id: number for number, part in enumerate(parts) for frame_id in part}
+    between: dict[int, list[VerifiedPair]] = defaultdict(list)
+    for ids, pairs in pairs_of.items():
+        numbers = {part_of[frame_id] for frame_id in ids}
+        for number in numbers if len(numbers) > 1 else ():
+            between[number] += pairs
+    reasons: dict[int, str] = {}
+    for number, ties in between.items():
+        if len(parts[number]) == len(parts[-1]) > len(parts[-2]):
             continue
-        why = f"none of the {len(between)} pairs that tie it to the others agrees well"
-        if len(between) == 1:
-            names = " and ".join(graph.names[image_id] for image_id in between[0].ids)
-            share = f"{exact_agreement(between[0]):.0%}"
-            why = f"hangs on the pair {names} alone, of whose inliers only {share} agree"
-        found.update({graph.names[i]: why for i, frame_id in frame_of.items() if frame_id in part})
-    return found
+        reasons[number] = f"none of the {len(ties)} pairs that tie it to the others agrees well"
+        if len(ties) == 1:
+            names = " and ".join(graph.names[image_id] for image_id in ties[0].ids)
+            share = f"{exact_agreement(ties[0]):.0%}"
+            reasons[number] = (
+                f"hangs on the pair {names} alone, of whose inliers only {share} agree"
+            )
+    numbers_of = {graph.names[i]: part_of[frame_id] for i, frame_id in frame_of.items()}
+    return {name: reasons[part] for name, part in numbers_of.items() if part in reasons}
 
 
 def _angle_doubts(
