@@ -163,6 +163,8 @@ def resolve(
             if path == _find_installed(key):
                 raise unusable(path, "not the file that was published (sha256 differs)")
             _warn_once(key, path)
+        elif path and path == _find_installed(key):
+            _warn_of_unused(key)
     try:
         return {k: path or _download(k, cache_folder(), progress) for k, path in found.items()}
     except WeightsError as error:
@@ -428,6 +430,18 @@ def _warn_once(key: str, path: Path) -> None:
         "%s: not the published file of %s (sha256 differs); unless it is your own, %s",
         path, key, remedy(path),
     )  # fmt: skip
+
+
+@cache
+def _warn_of_unused(key: str) -> None:
+    """Say so of files in the cache that give way to the published one of a distribution."""
+    for path in (cache_folder() / name for name in WEIGHT_FILES[key].names):
+        if path.is_file():
+            logger.warning(
+                "%s: not the published file of %s (sha256 differs), and not used, as an installed "
+                "package has that; to use it nevertheless, give --weights %s",
+                path, key, shlex.quote(str(path.parent)),
+            )  # fmt: skip
 
 
 def _find_installed(key: str) -> Path | None:

@@ -153,11 +153,16 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_resolve_looks_into_installed_distributions_last(
-    installed: Path, folders: dict[str, Path]
+    installed: Path, folders: dict[str, Path], caplog: pytest.LogCaptureFixture
 ) -> None:
     assert resolve(["xfeat"]) == {"xfeat": installed}
+    assert caplog.messages == []
+    weights._warn_of_unused.cache_clear()  # it is said once
     (folders["cache"] / "xfeat.pt").write_bytes(b"damaged")
     assert resolve(["xfeat"]) == {"xfeat": installed}
+    (message,) = caplog.messages
+    assert message.startswith(f"{folders['cache'] / 'xfeat.pt'}: not the published file of xfeat")
+    assert message.endswith(f"give --weights {folders['cache']}")
     (folders["cache"] / "xfeat.pt").write_bytes(b"published")
     assert resolve(["xfeat"]) == {"xfeat": folders["cache"] / "xfeat.pt"}
     (folders["given"] / "xfeat.pt").write_bytes(b"the user's own")
