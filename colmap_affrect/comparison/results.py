@@ -99,10 +99,8 @@ class SeedResult:
     @property
     def reasons_to_doubt(self) -> dict[str, str]:
         """Registered images that cannot be trusted, with the reason: their own or the model's."""
-        of_model = ", ".join(self.doubts)
-        return dict.fromkeys(self.registered_names if of_model else (), of_model) | {
-            **self.doubtful
-        }
+        doubted = self.registered_names if self.doubts else ()
+        return {**dict.fromkeys(doubted, ", ".join(self.doubts)), **self.doubtful}
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON, ``MEASURES`` first."""

@@ -8,13 +8,11 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
-from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
 from colmap_affrect.mappers.arrivals import MIN_THREE_VIEW_POINTS
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
@@ -25,6 +23,7 @@ from colmap_affrect.mappers.pair_graph import (
     graph_of,
     poses_of,
 )
+from colmap_affrect.mappers.ties import hanging_images
 from colmap_affrect.project.report import ModelSummary
 
 FOCAL_LENGTHS = (0.3, 10.0)
@@ -42,10 +41,6 @@ goes through hardly more than the four points that chance brings."""
 MIN_AGREEMENT, NO_AGREEMENT = 0.5, 0.25
 """Share of the inliers of an image's verified pairs. Of right images of sparse sets at least three
 quarters agree."""
-
-MIN_AGREEMENT_OF_TIE = 0.85
-"""Share of the exact inliers of a pair that alone ties images to the others: nothing else says
-where they are, so a right one agrees nearly whole."""
 
 MAX_ERROR = 0.003
 """Of a match that a rotation explains, in longer sides: 3 px of 1000, as in verification."""
@@ -123,9 +118,9 @@ def find_doubts(model: MappedModel, task: MappingTask, loose: Collection[str] = 
     """
     graph = graph_of(task)
     agreements: dict[Ids, float] = {}
-    doubts = _image_doubts(model, graph, task, loose, agreements)
+    doubts = _image_doubts(model, graph, task, agreements, loose)
     images = dict(doubts.images)
-    for name, why in _hanging(model.reconstruction, graph, task, agreements).items():
+    for name, why in hanging_images(model.reconstruction, graph, task, agreements).items():
         images[name] = "; ".join(filter(None, [images.get(name), why]))
     return replace(
         doubts, images=dict(sorted(images.items())), model=tuple(_model_doubts(model, graph))
@@ -142,7 +137,7 @@ def without_impossible(model: MappedModel, task: MappingTask) -> MappedModel | N
     taken: dict[str, str] = {}
     agreements: dict[Ids, float] = {}  # of pairs; what stays keeps its pose
     while reconstruction.num_reg_images():
-        doubts = _image_doubts(model, graph, task, agreements=agreements)
+        doubts = _image_doubts(model, graph, task, agreements)
         if not doubts.impossible:
             break
         name = doubts.impossible[0]
@@ -161,8 +156,8 @@ def _image_doubts(
     model: MappedModel,
     graph: PairGraph,
     task: MappingTask,
+    agreements: dict[Ids, float],
     loose: Collection[str] = (),
-    agreements: dict[Ids, float] | None = None,
 ) -> Doubts:
     """Judge the images one by one; ``agreements`` of pairs are taken if known, and added to."""
     reconstruction = model.reconstruction
@@ -171,13 +166,12 @@ def _image_doubts(
     poses, cameras = poses_of(reconstruction), cameras_of(reconstruction)
     given = {key for key, record in task.cameras.items() if record.is_fixed}
     totals = {image_id: np.zeros(2) for image_id in registered}
-    known = {} if agreements is None else agreements
     agreeing_of: dict[Ids, float] = {}
     for pair in graph.pairs_inside(registered):
-        if pair.ids not in known:
-            known[pair.ids] = graph.agreement(pair, poses, cameras)
+        if pair.ids not in agreements:
+            agreements[pair.ids] = graph.agreement(pair, poses, cameras)
         count = len(pair.matches)
-        agreeing_of[pair.ids] = count * known[pair.ids]
+        agreeing_of[pair.ids] = count * agreements[pair.ids]
         for image_id in pair.ids:
             totals[image_id] += agreeing_of[pair.ids], count
     originals = _originals(graph, agreeing_of)
@@ -225,66 +219,6 @@ def _support_doubts(num: int, agreement: float) -> Iterator[tuple[str, bool]]:
     if agreement < MIN_AGREEMENT:
         text = f"only {agreement:.0%} of the matches of verified pairs agree with the pose"
         yield text, agreement < NO_AGREEMENT
-
-
-def _hanging(
-    model: pycolmap.Reconstruction,
-    graph: PairGraph,
-    task: MappingTask,
-    agreements: Mapping[Ids, float],
-) -> dict[str, str]:
-    """Return the images that nothing ties well to the others, with the reason.
-
-    They are the smaller part where one pair alone ties two parts, and is at odds with itself, or
-    where all pairs between them disagree; of equal parts both. Pairs without which no part falls
-    off confirm each other, and so do those that the graph leaves out; images of a rig that were
-    taken at once hold together anyway.
-    """
-    poses, cameras = poses_of(model), cameras_of(model)
-
-    def exact_agreement(pair: VerifiedPair) -> float:
-        guided = rows_in(pair.matches, task.guided.get(pair.ids, pair.matches[:0]))
-        exact = replace(pair, matches=pair.matches[~guided])
-        return graph.agreement(pair if guided.all() else exact, poses, cameras)
-
-    frame_of = {i: model.images[i].frame_id for i in model.reg_image_ids()}
-    pairs_of: dict[frozenset[int], list[VerifiedPair]] = defaultdict(list)
-    for pair in graph.pairs_inside(frame_of):
-        pairs_of[frozenset(frame_of[image_id] for image_id in pair.ids)].append(pair)
-    frames = nx.Graph()
-    frames.add_nodes_from(frame_of.values())
-    frames.add_edges_from(
-        tuple(ids)
-        for ids, pairs in pairs_of.items()
-        if len(ids) == 2 and max(agreements[pair.ids] for pair in pairs) >= MIN_AGREEMENT
-    )
-    unknown = [ids for ids in graph.left_out if ids[0] in frame_of and ids[1] in frame_of]
-    frames.add_edges_from((frame_of[first], frame_of[second]) for first, second in unknown)
-    frames.remove_edges_from(list(nx.selfloop_edges(frames)))
-    for ids in list(nx.bridges(frames)):
-        tie = pairs_of.get(frozenset(ids), [])
-        if len(tie) == 1 and exact_agreement(tie[0]) < MIN_AGREEMENT_OF_TIE:
-            frames.remove_edge(*ids)
-    parts = sorted(nx.connected_components(frames), key=len)
-    part_of = {frame_id: number for number, part in enumerate(parts) for frame_id in part}
-    between: dict[int, list[VerifiedPair]] = defaultdict(list)
-    for ids, pairs in pairs_of.items():
-        numbers = {part_of[frame_id] for frame_id in ids}
-        for number in numbers if len(numbers) > 1 else ():
-            between[number] += pairs
-    reasons: dict[int, str] = {}
-    for number, ties in between.items():
-        if len(parts[number]) == len(parts[-1]) > len(parts[-2]):
-            continue
-        reasons[number] = f"none of the {len(ties)} pairs that tie it to the others agrees well"
-        if len(ties) == 1:
-            names = " and ".join(graph.names[image_id] for image_id in ties[0].ids)
-            share = f"{exact_agreement(ties[0]):.0%}"
-            reasons[number] = (
-                f"hangs on the pair {names} alone, of whose inliers only {share} agree"
-            )
-    numbers_of = {graph.names[i]: part_of[frame_id] for i, frame_id in frame_of.items()}
-    return {name: reasons[part] for name, part in numbers_of.items() if part in reasons}
 
 
 def _angle_doubts(

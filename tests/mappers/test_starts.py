@@ -140,7 +140,7 @@ def mapped(
 
 
 def map_task(mapper: object, task: MappingTask, tmp_path: Path) -> list[ModelSummary]:
-    summaries = map_database(mapper, task, tmp_path / "sparse", lambda _: None)  # type: ignore[arg-type]
+    summaries = map_database(mapper, task, tmp_path / "sparse", lambda _: None)
     assert not (tmp_path / "sparse.partial").exists()
     return summaries
 

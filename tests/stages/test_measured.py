@@ -58,7 +58,7 @@ min_num_consistent = 0
 @pytest.fixture(scope="module", autouse=True)
 def _shapeless() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(EXTRACTORS.built_in, "shapeless", "shapeless_features:Shapeless")  # type: ignore[arg-type]
+        patch.setitem(EXTRACTORS.built_in, "shapeless", "shapeless_features:Shapeless")
         yield
 
 
