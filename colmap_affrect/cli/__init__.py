@@ -107,7 +107,12 @@ def _logging(options: argparse.Namespace) -> Iterator[None]:
     COLMAP and image decoders write to file descriptor 2: it leads to the log while the
     command runs, and Python's ``sys.stderr`` to the terminal.
     """
-    log_path = Workspace(options.output_path).log if options.output_path else Path(os.devnull)
+    log_path = Path(os.devnull)
+    if options.output_path:
+        workspace = Workspace(options.output_path)
+        photographs = getattr(options, "image_path", None) or getattr(options, "dataset_path", None)
+        workspace.require_own(photographs)
+        log_path = workspace.log
     log_path.parent.mkdir(parents=True, exist_ok=True)
     python_stderr, terminal_fd = sys.stderr, os.dup(2)
     terminal = os.fdopen(terminal_fd, "w", buffering=1, encoding="utf-8", errors="replace")

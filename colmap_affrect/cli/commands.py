@@ -378,11 +378,6 @@ def inspect(options: argparse.Namespace) -> None:
     recipe = given.recipe(options)
     if not options.image.is_file():
         raise OptionError(f"{options.image}: no such file; give a photograph")
-    if options.output_path.resolve() == options.image.parent.resolve():
-        raise OptionError(
-            f"--output-path {options.output_path}: give another folder than that of the "
-            "photographs; the drawing would be taken for one"
-        )
     photographs = Photographs(options.image.parent, given.masks(options))
     photographs.check()
     mask = photographs.mask(options.image.name)

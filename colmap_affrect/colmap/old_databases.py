@@ -4,7 +4,6 @@ Their tables hold no rigs, frames or types of descriptors, and positions are col
 """
 
 import sqlite3
-import tempfile
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -17,6 +16,8 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
+from colmap_affrect.project.outputs import new_results
+from colmap_affrect.project.workspace import Workspace
 
 VERSION = 3800  # ``user_version`` of COLMAP 3.8; newer ones take the tables over by it
 
@@ -79,15 +80,14 @@ def export_database(source: Path, target: Path) -> list[str]:
     """Write a database as COLMAP 3.8 makes them; ids stay, and the source is only read.
 
     Returns what COLMAP 3.8 has no place for and is left out, a line each. DatabaseError when the
-    source cannot be used or has a camera model that COLMAP 3.8 does not know, or the target exists.
+    source cannot be used or has a camera model that COLMAP 3.8 does not know, OptionError when the
+    target exists.
     """
-    if target.exists():
-        raise DatabaseError(f"{target}: exists already and is not overwritten; give another name")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".export-", dir=target.parent) as folder:
-        new, old = Path(folder) / "new.db", Path(folder) / "old.db"
+    photographs = Workspace(source.parent).photographs()
+    with new_results(target, photographs=photographs) as (old,):
+        new = old.with_name("new.db")
         copy_database(source, new, FATAL)
-        require_space(old, new.stat().st_size)
+        require_space(target, new.stat().st_size)
         with open_database(new) as database:
             _refuse_new_models(database, source)
             priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
@@ -102,7 +102,6 @@ def export_database(source: Path, target: Path) -> list[str]:
                 connection.commit()
         except sqlite3.Error as error:
             raise cannot_write(target, error) from error
-        old.replace(target)
     return notes
 
 

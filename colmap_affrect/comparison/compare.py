@@ -6,7 +6,6 @@ masks, pairs, verification, mapping and seeds are the same for all.
 
 import hashlib
 import json
-import shutil
 import signal
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -37,6 +36,7 @@ from colmap_affrect.pipeline import InputOptions, installed_versions
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import Contents
+from colmap_affrect.project.outputs import new_results, remove_own
 from colmap_affrect.project.workspace import Workspace, first_difference
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 
@@ -79,6 +79,7 @@ def compare(
     before any method is run.
     """
     options = options or CompareOptions()
+    Workspace(output_path).require_own(image_path)
     plan = _Plan.checked(image_path, Layout(output_path), options)
     requests = plan.requests()
     todo = [item.method.recipe for item in requests if overwrite or not _finished(item)]
@@ -258,8 +259,7 @@ def _share(plan: _Plan, *, overwrite: bool) -> dict[str, str]:
                     f"{layout.path}: methods were compared there with {difference}; use "
                     "--overwrite to discard these results, or another --output-path"
                 )
-            shutil.rmtree(layout.methods, ignore_errors=True)
-            shutil.rmtree(layout.shared)
+            remove_own([layout.methods, layout.shared])
     elif layout.shared.exists() or layout.methods.exists():
         raise StaleStoreError(
             f"{layout.path}: has a folder named shared or methods that was not made here; it is "
@@ -274,18 +274,16 @@ def _share(plan: _Plan, *, overwrite: bool) -> dict[str, str]:
 
 def _make_shared(plan: _Plan, inputs: Mapping[str, Any]) -> None:
     """Make the shared folder, which appears as a whole."""
-    partial = plan.layout.shared.with_name("shared.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    new = Layout(plan.layout.path, shared_name=partial.name)
-    try:
-        partial.mkdir()
+    with new_results(plan.layout.shared) as (folder,):
+        new = Layout(folder.parent)
+        folder.mkdir()
         if plan.options.from_database:
             copy_without_features(plan.options.from_database, new.database)
         else:
             cameras = plan.options.cameras
             import_images(new.database, plan.image_path, plan.names, cameras)
             initial = InitialCameras(plan.image_path, cameras)
-            record_cameras(new.database, Workspace(partial).cameras, initial)
+            record_cameras(new.database, new.cameras, initial)
         taken = image_ids(new.database)
         names = [name for name in plan.names if name in taken]
         pairs = [pair for pair in plan.pairs if set(pair) <= taken.keys()]
@@ -297,22 +295,19 @@ def _make_shared(plan: _Plan, inputs: Mapping[str, Any]) -> None:
         replace_text(new.images, "".join(f"{name}\n" for name in names))
         write_pairs(new.pairs, pairs)
         replace_text(new.inputs, json.dumps(inputs, indent=1))
-        partial.rename(plan.layout.shared)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _record(request: Request, *, overwrite: bool) -> None:
     folder, path, name = request.folder, request.path, request.method.label
     if path.exists() and overwrite:
-        shutil.rmtree(folder)
+        remove_own([folder])
     known = Request.read(path).decisive() if path.exists() else request.decisive()
     if difference := first_difference(known, request.decisive()):
         raise StaleStoreError(
             f"{folder}: {name} was run there with {difference}; use --overwrite to redo the "
             "methods that are named, another name (NAME=RECIPE), or another --output-path"
         )
-    folder.mkdir(parents=True, exist_ok=True)
+    Workspace(folder).begin()
     replace_text(path, request.to_json())
 
 

@@ -27,9 +27,9 @@ class Layout:
     ``inputs`` records what ``shared`` was made from, and the options that all methods have.
     """
 
-    def __init__(self, path: Path, shared_name: str = "shared") -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self.shared = path / shared_name
+        self.shared = path / "shared"
         self.inputs = self.shared / "inputs.json"
         self.database = self.shared / "database.db"
         self.cameras = self.shared / "cameras.json"

@@ -7,6 +7,7 @@ from pathlib import Path
 from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.errors import ComparisonError, ImageError
 from colmap_affrect.images.reading import encode_jpeg, read_color
+from colmap_affrect.project.outputs import new_results
 from colmap_affrect.report.scene import CAMERA_DEPTH, read_models
 
 FILE_NAME = "comparison.rrd"
@@ -30,8 +31,11 @@ def log_comparison(comparison: Comparison, output_path: Path) -> Path:
 
     path = output_path / FILE_NAME
     models, _ = read_models(comparison.model_paths(output_path))
-    with rerun.RecordingStream("colmap_affrect") as recording:
-        recording.save(path)
+    with (
+        new_results(path, replaces=True) as (new,),
+        rerun.RecordingStream("colmap_affrect") as recording,
+    ):
+        recording.save(new)
         recording.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for method, model in models.items():
             root = f"/{rerun.escape_entity_path_part(method)}"

@@ -48,6 +48,7 @@ from colmap_affrect.parallel.subprocesses import end_with_parent
 from colmap_affrect.pipeline import map_guided
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.stopwatch import Stopwatch
 from colmap_affrect.project.workspace import Workspace
@@ -176,11 +177,19 @@ def _pair(names: Mapping[int, str], ids: tuple[int, int]) -> Pair:
 def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
     """Verify and map a copy of the database of the method, unless that is done."""
     folder = request.folder / f"seed-{seed}"
-    result_path, database_path = folder / "result.json", folder / "database.db"
+    result_path = folder / "result.json"
     if result_path.exists():
         return SeedResult.from_mapping(json.loads(result_path.read_text(encoding="utf-8")))
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
+    with new_results(folder) as (new,):
+        new.mkdir()
+        result = _seed_result(request, seed, new, progress)
+        replace_text(new / result_path.name, json.dumps(result.to_mapping(), ensure_ascii=False))
+    return result
+
+
+def _seed_result(request: Request, seed: int, folder: Path, progress: Progress) -> SeedResult:
+    """Verify and map in a folder that is called after the seed when all is done."""
+    database_path = folder / "database.db"
     copy_database(request.folder / "database.db", database_path)
     with open_database(database_path) as database:
         database.clear_two_view_geometries()
@@ -213,10 +222,11 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
     model_path = folder / "sparse" / "0" if models else None
     model = pycolmap.Reconstruction(model_path) if model_path else pycolmap.Reconstruction()
     inliers = verified_pairs(database_path, request.verification.min_num_inliers)
-    result = SeedResult(
+    shown_path = request.folder.relative_to(request.output_path) / folder.name / "sparse" / "0"
+    return SeedResult(
         seed=seed,
         model_names=tuple(item.registered_names for item in models),
-        model_path=model_path.relative_to(request.output_path).as_posix() if model_path else "",
+        model_path=shown_path.as_posix() if models else "",
         num_points3D=largest.num_points3D,
         mean_track_length=largest.mean_track_length,
         mean_observations=float(model.compute_mean_observations_per_reg_image()) if models else 0.0,
@@ -231,8 +241,6 @@ def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
         doubtful=largest.doubtful,
         doubts=largest.doubts,
     )
-    replace_text(result_path, json.dumps(result.to_mapping(), ensure_ascii=False))
-    return result
 
 
 def _vote(

@@ -132,6 +132,7 @@ def evaluate(
     methods = _methods(options)
     if not dataset_path.is_dir():
         raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
+    Workspace(output_path).require_own(dataset_path)
     with Workspace(output_path).locked():
         dataset = _loaded(chosen, dataset_path, progress)
         settings = {

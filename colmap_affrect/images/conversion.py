@@ -14,7 +14,7 @@ from colmap_affrect.images.headers import pages
 from colmap_affrect.images.photographs import TIFF_SUFFIXES, photograph_files, require_folder
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.atomic_files import replace_bytes
+from colmap_affrect.project.outputs import new_results
 
 AS_STORED = ("1", "L", "I;16", "RGB")  # Pillow's modes that PNG holds and COLMAP reads
 
@@ -64,7 +64,7 @@ def convert_images(
         for name in names:
             try:
                 _convert(image_path / name, output_path, name, report)
-            except ImageError as error:
+            except (ImageError, OptionError) as error:
                 report.failures[name] = str(error)
             advance(1)
     return report
@@ -74,17 +74,22 @@ def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> N
     suffix = PurePosixPath(name).suffix.lower()
     numbers = pages(path) if suffix in TIFF_SUFFIXES else [0]
     as_it_is = suffix in IMAGE_SUFFIXES and not foreign_format(path) and numbers == [0]
-    made = [_page_name(name, k, len(numbers)) for k in range(1, len(numbers) + 1)]
-    (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    if all((folder / target).exists() for target in ([name] if as_it_is else made)):
+    names = [_page_name(name, k, len(numbers)) for k in range(1, len(numbers) + 1)]
+    places = {k: folder / n for k, n in zip(numbers, [name] if as_it_is else names, strict=True)}
+    missing = {k: place for k, place in places.items() if place.is_symlink() or not place.exists()}
+    if not missing:
         report.kept.append(name)
-    elif as_it_is:
-        shutil.copy2(path, folder / name)
+        return
+    with new_results(*missing.values(), folder=folder) as made:
+        if as_it_is:
+            shutil.copy2(path, made[0])
+        else:
+            for new, content in zip(made, _as_png(path, list(missing)), strict=True):
+                new.write_bytes(content)
+    if as_it_is:
         report.copied.append(name)
     else:
-        for target, content in zip(made, _as_png(path, numbers), strict=True):
-            replace_bytes(folder / target, content)
-        report.written[name] = made
+        report.written[name] = names
 
 
 def _page_name(name: str, page: int, num_pages: int) -> str:

@@ -15,7 +15,9 @@ from colmap_affrect.colmap.model_files import read_given_model, write_model
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.interop.georeference import Georeference
+from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.tables import read_table
+from colmap_affrect.project.workspace import Workspace
 
 MIN_WIDTH = 0.01
 """Of positions, across the line that fits them best, in units of the length along it: with less
@@ -84,8 +86,6 @@ def align(model_path: Path, output_path: Path, reference: Reference) -> Alignmen
     Raises:
         AffrectError: when the reference is unreadable, or leaves open how the model lies.
     """
-    if output_path.exists():
-        raise OptionError(f"{output_path}: exists, and is left as it is; use another folder")
     if reference.distances and (reference.gps_database or reference.positions_path):
         raise OptionError("--distance: gives the scale alone; leave it out, or the positions")
     model, place = read_given_model(model_path), None
@@ -95,10 +95,11 @@ def align(model_path: Path, output_path: Path, reference: Reference) -> Alignmen
         names, old, new, place = _positions(model, reference)
         new_from_old, residuals = _similarity(names, old, new)
     model.transform(new_from_old)
-    output_path.parent.mkdir(parents=True, exist_ok=True)
-    write_model(model, output_path)
-    if place:
-        place.write(output_path)
+    photographs = Workspace.of_model(model_path).photographs()
+    with new_results(output_path, photographs=photographs) as (folder,):
+        write_model(model, folder)
+        if place:
+            place.write(folder)
     return Alignment(float(new_from_old.scale), residuals, place)
 
 

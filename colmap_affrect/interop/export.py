@@ -1,7 +1,6 @@
 """A COLMAP model for other programs: points, text, NVM, Bundler, flat photographs, tables."""
 
 import json
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.poses import model_poses
 from colmap_affrect.errors import ImageError, OptionError
@@ -17,6 +17,7 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.interop.georeference import Georeference
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.outputs import leads_outside, new_results
 from colmap_affrect.project.report import csv_text
 from colmap_affrect.project.workspace import Workspace
 
@@ -80,41 +81,25 @@ def export(
             raise OptionError(f"--format {name}: unknown{suggestion(name, FORMATS)}")
     if image_path is not None and not image_path.is_dir():
         raise OptionError(f"--image-path {image_path}: no such folder")
-    source = Source(
-        model_path, read_given_model(model_path), image_path or _recorded_images(model_path)
-    )
-    is_new = not output_path.exists()
-    output_path.mkdir(parents=True, exist_ok=True)
-    known = set(output_path.iterdir())
-    try:
-        return {name: FORMATS[name](source, output_path) for name in dict.fromkeys(formats)}
-    except BaseException:
-        for path in set(output_path.iterdir()) - known:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
-        if is_new:
-            output_path.rmdir()
-        raise
-
-
-def _recorded_images(model_path: Path) -> Path | None:
-    recorded = Workspace(model_path.resolve().parent.parent).planned("extract") or {}
-    return Path(recorded["image_path"]) if "image_path" in recorded else None
-
-
-def _new(path: Path) -> Path:
-    if path.exists():
-        raise OptionError(f"{path}: exists, and is left as it is; use another --output-path")
-    return path
+    photographs = image_path or Workspace.of_model(model_path).photographs()
+    source = Source(model_path, read_given_model(model_path), photographs)
+    chosen = {name: FORMATS[name] for name in FORMATS if name in formats}
+    names = dict.fromkeys(name for _, made in chosen.values() for name in made)
+    targets = [output_path / name for name in names]
+    with new_results(*targets, photographs=photographs) as made:
+        folder = made[0].parent
+        written = {name: write(source, folder) for name, (write, _) in chosen.items()}
+    return {name: output_path / path.relative_to(folder) for name, path in written.items()}
 
 
 def _points(source: Source, folder: Path) -> Path:
-    path = _new(folder / "points3D.ply")
+    path = folder / "points3D.ply"
     source.model.export_PLY(path)
     return path
 
 
 def _text(source: Source, folder: Path) -> Path:
-    path = _new(folder / "text")
+    path = folder / "text"
     path.mkdir()
     source.model.write_text(path)
     return path
@@ -139,7 +124,7 @@ def _radial(
 
 def _nvm(source: Source, folder: Path) -> Path:
     """Write VisualSFM's file: keypoints from the principal point, k with the other sign."""
-    path, images = _new(folder / "model.nvm"), source.images()
+    path, images = folder / "model.nvm", source.images()
     lines, centers = ["NVM_V3", "", str(len(images))], []
     for image in images:
         focal, terms, center = _radial(source, image, NVM_TERMS, "NVM")
@@ -164,7 +149,7 @@ def _nvm(source: Source, folder: Path) -> Path:
 
 def _bundler(source: Source, folder: Path) -> Path:
     """Write Bundler's file, whose cameras look along -z, and the list of its photographs."""
-    path, images = _new(folder / "bundle.out"), source.images()
+    path, images = folder / "bundle.out", source.images()
     lines = ["# Bundle file v0.3", f"{len(images)} {source.model.num_points3D()}"]
     centers = []
     for image in images:
@@ -191,22 +176,31 @@ def _numbers(values: Any) -> str:
 
 def _undistorted(source: Source, folder: Path) -> Path:
     """Write undistorted photographs with their model, ready for COLMAP's patch_match_stereo."""
-    path = _new(folder / DENSE)
-    if source.image_path is None:
+    path, photographs = folder / DENSE, source.image_path
+    if photographs is None:
         raise OptionError("--image-path: give the folder of the photographs, to undistort them")
     for image in source.images():
-        if not (source.image_path / image.name).is_file():
-            raise ImageError(
-                f"{source.image_path / image.name}: no such photograph; give --image-path"
+        if leads_outside(image.name):
+            raise OptionError(
+                f"{source.path}: the image name {image.name} leads out of the folder of the "
+                "photographs; rename it, no undistorted picture can be written for it"
             )
-    pycolmap.undistort_images(path, source.path, source.image_path)
+        if not (photographs / image.name).is_file():
+            raise ImageError(f"{photographs / image.name}: no such photograph; give --image-path")
+    run_cancellable(
+        lambda token: pycolmap.undistort_images(
+            path, source.path, photographs, cancellation_token=token
+        )
+    )
+    for image in source.images():
+        if not (picture := path / "images" / image.name).is_file():
+            raise ImageError(f"{picture.name}: COLMAP cannot undistort it, or write it")
     return path
 
 
 def _nerfstudio(source: Source, folder: Path) -> Path:
     """Add to undistorted photographs what nerfstudio and Gaussian splatting read."""
     path = folder / DENSE if (folder / DENSE).exists() else _undistorted(source, folder)
-    _new(path / "transforms.json")
     flat = Source(path, pycolmap.Reconstruction(path / "sparse"), None)
     frames = []
     for image in flat.images():
@@ -230,7 +224,7 @@ def _nerfstudio(source: Source, folder: Path) -> Path:
 
 def _cameras(source: Source, folder: Path) -> Path:
     """Write a table: a row for each photograph, with its camera, where it stands and looks."""
-    path, place = _new(folder / "cameras.csv"), Georeference.read(source.path)
+    path, place = folder / "cameras.csv", Georeference.read(source.path)
     rows: list[dict[str, Any]] = []
     for image in source.images():
         camera, pose = source.model.cameras[image.camera_id], image.cam_from_world()
@@ -253,7 +247,7 @@ def _cameras(source: Source, folder: Path) -> Path:
 
 def _geojson(source: Source, folder: Path) -> Path:
     """Write where photographs were taken, for maps, with the direction that they look to."""
-    path, place = _new(folder / "cameras.geojson"), Georeference.read(source.path)
+    path, place = folder / "cameras.geojson", Georeference.read(source.path)
     if place is None:
         raise OptionError(
             f"{source.path}: has no place on earth, which GeoJSON needs; align it first by "
@@ -272,14 +266,15 @@ def _geojson(source: Source, folder: Path) -> Path:
     return path
 
 
-FORMATS: dict[str, Callable[[Source, Path], Path]] = {
-    "ply": _points,
-    "text": _text,
-    "nvm": _nvm,
-    "bundler": _bundler,
-    "undistorted": _undistorted,
-    "nerfstudio": _nerfstudio,
-    "cameras": _cameras,
-    "geojson": _geojson,
+FORMATS: dict[str, tuple[Callable[[Source, Path], Path], tuple[str, ...]]] = {
+    "ply": (_points, ("points3D.ply",)),
+    "text": (_text, ("text",)),
+    "nvm": (_nvm, ("model.nvm",)),
+    "bundler": (_bundler, ("bundle.out", "bundle.list.txt")),
+    "undistorted": (_undistorted, (DENSE,)),
+    "nerfstudio": (_nerfstudio, (DENSE,)),
+    "cameras": (_cameras, ("cameras.csv",)),
+    "geojson": (_geojson, ("cameras.geojson",)),
 }
-"""What writes each format; ``undistorted`` comes before ``nerfstudio``, which uses its folder."""
+"""What writes each format into a folder, and what it leaves there; ``undistorted`` comes before
+``nerfstudio``, which uses its folder."""

@@ -44,8 +44,9 @@ from colmap_affrect.interop.hdf5_layouts import (
 )
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.stores import PairMatches, frame_datasets
-from colmap_affrect.project.workspace import Workspace, temporary_folder
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.pairs import listed_pairs
 
@@ -101,7 +102,7 @@ def import_h5(
 
     Keypoints get 6 columns where the file has ``lafs``, 4 where it has ``scales`` and ``oris``,
     else 2. All images of the folder are imported, with or without features. The database, which
-    must not be there (DatabaseError), appears when it is complete; nothing else is written. Files
+    must not be there (OptionError), appears when it is complete; nothing else is written. Files
     that cannot be read, or contradict the photographs or each other, are a StoreError.
 
     ``layout`` is ``hloc``, ``dim``, or ``auto``: as the matches are stored. ``pixel_origin`` is
@@ -111,16 +112,14 @@ def import_h5(
     """
     _check_choice("layout", layout, ("auto", *LAYOUTS))
     _check_choice("pixel_origin", pixel_origin, PIXEL_ORIGINS)
-    _refuse_existing(database_path, DatabaseError)
     cameras = cameras or CameraOptions()
     names = list_images(image_path)
     InitialCameras(image_path, cameras).check(names)
     with (
-        open_files(features_path, matches_path, layout, names, image_path) as files,
         # Verification may take hours, and half a database must not be left behind.
-        temporary_folder(database_path.parent) as folder,
+        new_results(database_path, photographs=image_path) as (new,),
+        open_files(features_path, matches_path, layout, names, image_path) as files,
     ):
-        new = folder / "new.db"
         rejected = import_images(new, image_path, names, cameras)
         if lost := sorted(files.keys.keys() & set(rejected)):
             raise ImageError(
@@ -141,7 +140,6 @@ def import_h5(
             with progress.stage("verify", len(files.pairs), "pairs") as advance:
                 verify(new, options, advance=advance)
             num_verified = len(verified_pairs(new, options.min_num_inliers))
-        new.replace(database_path)
     return InterchangeReport(
         "imported", files.layout, len(names) - len(rejected), sum(counts.values()),
         len(files.pairs), num_matches, num_verified, tuple(notes),
@@ -202,19 +200,24 @@ def export_h5(
     then. The database is copied first and stays as it is.
 
     ``layout`` is ``hloc`` or ``dim``; with ``half`` all real numbers are float16, coordinates too.
-    Raises StoreError when a file exists, cannot be written, or its layout cannot hold the content,
-    DatabaseError when the database cannot be used.
+    Raises OptionError when a file exists, StoreError when it cannot be written, or its layout
+    cannot hold the content, DatabaseError when the database cannot be used.
     """
     _check_choice("layout", layout, LAYOUTS)
     if features_path.resolve() == matches_path.resolve():
         raise StoreError(f"{features_path}: features and matches need a file each")
-    for path in (features_path, matches_path):
-        _refuse_existing(path, StoreError)
+    photographs = output_path and Workspace(output_path).photographs()
     counts: dict[str, int] = {}
     num_matches, num_lost = 0, 0
-    with _content(output_path, database_path) as content:
+    with (
+        new_results(features_path, matches_path, photographs=photographs) as (new, new_matches),
+        _content(output_path, database_path) as content,
+    ):
         check_names(content.names, layout)
-        with created(features_path) as features, created(matches_path) as matches:
+        with (
+            created(new, features_path) as features,
+            created(new_matches, matches_path) as matches,
+        ):
             with progress.stage("features", len(content.names), "images") as advance:
                 for name in content.names:
                     size, data = content.features(name)
@@ -246,13 +249,6 @@ def export_h5(
 def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     if value not in choices:
         raise OptionError(f"{name} {value!r}: not one of {', '.join(choices)}")
-
-
-def _refuse_existing(path: Path, error: type[StoreError | DatabaseError]) -> None:
-    """Refuse a file that is there, and make the folder of one that is not."""
-    if path.exists():
-        raise error(f"{path}: exists already and is not overwritten; give another name")
-    path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def _check_range(

@@ -162,21 +162,16 @@ class Target:
 
 
 @contextmanager
-def created(path: Path) -> Iterator[Target]:
-    """Make a file, under another name until it is complete."""
-    new = path.with_name(path.name + ".partial")
+def created(new: Path, path: Path) -> Iterator[Target]:
+    """Make a file in a temporary place, whose own name is told of when it cannot be written."""
     require_space(path, SPARE_BYTES)
+    with _writing(path):
+        file = h5py.File(new, "w")
     try:
-        with _writing(path):
-            file = h5py.File(new, "w")
-        try:
-            yield Target(path, file)
-        finally:
-            with _writing(path):
-                file.close()
-        new.replace(path)
+        yield Target(path, file)
     finally:
-        new.unlink(missing_ok=True)
+        with _writing(path):
+            file.close()
 
 
 @contextmanager

@@ -28,8 +28,9 @@ from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.progress import SILENT, Advance, Progress
+from colmap_affrect.project.outputs import temporary_folder
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.workspace import Workspace, temporary_folder
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.stages import verify as verify_stage
 from colmap_affrect.stages.cameras import hold_vote

@@ -1,6 +1,5 @@
 """``incremental_mapping`` with pycolmap's signature, by our mapper; on any verified database."""
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from colmap_affrect.interop.pycolmap_api import CANCELLED, Native, PathLike, Tok
 from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
-from colmap_affrect.project.workspace import temporary_folder
+from colmap_affrect.project.outputs import new_results, temporary_folder
 
 
 def incremental_mapping(
@@ -55,7 +54,6 @@ def incremental_mapping(
         cancellation=cancellation_token,
     )
     callbacks = _Callbacks(initial_image_pair_callback, next_image_callback, existing is not None)
-    output.mkdir(parents=True, exist_ok=True)
     with temporary_folder(output) as folder:
         found = folder / "sparse"
         try:
@@ -65,9 +63,13 @@ def incremental_mapping(
                 raise InterruptedError(CANCELLED) from error
             raise
         models = {int(path.name): pycolmap.Reconstruction(path) for path in found.iterdir()}
-        for index in models:
-            target = output if existing else output / str(index)
-            shutil.copytree(found / str(index), target, dirs_exist_ok=True)
+        files = {
+            path: (output if existing else output / path.parent.name) / path.name
+            for path in found.glob("*/*")
+        }
+        with new_results(*files.values(), replaces=True) as made:
+            for path, new in zip(files, made, strict=True):
+                path.replace(new)
     return dict(sorted(models.items()))
 
 

@@ -9,15 +9,22 @@ from contextlib import ExitStack, contextmanager, suppress
 from copy import deepcopy
 from functools import lru_cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Self
 
 import tomli_w
 from filelock import FileLock, Timeout
 
+from colmap_affrect import __version__
 from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
 from colmap_affrect.options import digest_of, flat
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
+from colmap_affrect.project.outputs import (
+    LOCK,
+    TEMPORARY_PREFIX,
+    is_output_folder,
+    refuse_link,
+    remove_own,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -32,8 +39,16 @@ GIVEN = "given"  # what stands in the place of such an option when options are c
 INPUTS = "inputs.sha256"  # in sparse/: digests of what it was made from
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
 COPY_STAGES = ("copy", "verify", "map")  # of a folder in which another program's database is mapped
-BYTES_OF_MARK = 200  # at the beginning of our files, in which they tell what they are
-TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
+LOCK_WAIT_S = 1.0  # for one that a killed process still has while it ends
+OWN_STEMS = {
+    "", "cameras", "config", "contents", "database", "depth", "features", "guided", "matches",
+    "methods", "pairs", "report", "run", "shared", "sparse",
+}  # fmt: skip
+"""How names of files and folders begin that are written here; the empty one is of hidden ones."""
+
+OF_SYSTEMS = {".DS_Store", "Thumbs.db", "desktop.ini", "lost+found"}
+"""What file managers and file systems put into folders that are empty for their user."""
+
 WEIGHTS = "weights"  # of a record: the digests of files, beside the options of a stage
 FORMAT_VERSION = 6  # of ``config.toml``: counts up when a stage records other options than before
 
@@ -78,6 +93,11 @@ class Workspace:
         """Return the workspace of a user's database: ``x.affrect`` beside ``x.db``."""
         return cls(database_path.with_suffix(".affrect"), database_path)
 
+    @classmethod
+    def of_model(cls, model_path: Path) -> Self:
+        """Return the workspace that a model in ``sparse/0`` belongs to, if it is one of ours."""
+        return cls(model_path.resolve().parent.parent)
+
     def branch(self, path: Path) -> "Workspace":
         """Make another folder with the same features, pairs, raw matches and records of cameras.
 
@@ -97,22 +117,60 @@ class Workspace:
         made._write_record(record)
         return made
 
-    @contextmanager
-    def locked(self) -> Iterator[Self]:
-        """Create the folder and keep other runs out; WorkspaceError when that cannot be done."""
+    def require_own(self, photographs: Path | None = None) -> None:
+        """Refuse a folder that is not empty and not ours, and links that would be followed.
+
+        So is the folder of the photographs itself; one in it is allowed. Raises OptionError.
+        """
+        if photographs and self.path.resolve() == photographs.resolve():
+            raise OptionError(
+                f"{self.path}: is the folder of the photographs; give another one as --output-path"
+            )
+        with suppress(OSError):  # not there, or refused when it is to be used
+            names = {path.name: path for path in self.path.iterdir()}
+            for name, path in names.items():
+                if name.partition(".")[0] in OWN_STEMS:
+                    refuse_link(path)
+            foreign = [name for name, path in names.items() if not _may_be_ours(path)]
+            if foreign and not is_output_folder(self.path):
+                raise OptionError(
+                    f"{self.path}: is not empty ({min(foreign)}) and was not made by "
+                    "colmap-affrect; give a new or an empty folder as --output-path"
+                )
+
+    def begin(self) -> None:
+        """Make the folder, unless it is there, and say in its log whose it is."""
+        self.require_own()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            lock = FileLock(self.path / ".lock")
-            lock.acquire(timeout=0)
+            if not is_output_folder(self.path):
+                with self.log.open("a", encoding="utf-8") as log:
+                    log.write(f"colmap-affrect {__version__}: output folder\n")
+        except OSError as error:
+            raise self._unusable(error) from error
+
+    def _unusable(self, error: OSError) -> WorkspaceError:
+        return WorkspaceError(
+            f"{self.path}: cannot be used as output folder ({error.strerror or error})"
+        )
+
+    @contextmanager
+    def locked(self) -> Iterator[Self]:
+        """Make the folder and keep other runs out.
+
+        Raises OptionError for a folder of somebody else, WorkspaceError when it cannot be used.
+        """
+        self.begin()
+        try:
+            lock = FileLock(self.path / LOCK)
+            lock.acquire(timeout=LOCK_WAIT_S)
         except Timeout as error:
             raise WorkspaceError(
                 f"{self.path}: another colmap-affrect is working in this folder; wait for it "
                 "or use another --output-path"
             ) from error
         except OSError as error:
-            raise WorkspaceError(
-                f"{self.path}: cannot be used as output folder ({error.strerror or error})"
-            ) from error
+            raise self._unusable(error) from error
         try:
             yield self
         finally:
@@ -156,6 +214,15 @@ class Workspace:
         """Return the options on record for a stage, begun or not; None if there are none."""
         options = self.recorded().get(stage)
         return None if options is None else without_digests(options)
+
+    def photographs(self) -> Path | None:
+        """Return the folder of the photographs on record, None where none is known."""
+        with suppress(WorkspaceError):
+            record = self.recorded()
+            for stage in ("extract", "copy"):
+                if path := record.get(stage, {}).get("image_path"):
+                    return Path(path)
+        return None
 
     def record_options(
         self,
@@ -281,34 +348,15 @@ class Workspace:
         for path in paths:
             if path.exists():
                 logger.info("removing %s", path)
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
+            remove_own([path])
 
 
-@contextmanager
-def temporary_folder(parent: Path) -> Iterator[Path]:
-    """Yield a new folder in a folder, in which those that killed processes left are removed."""
-    for left in parent.glob(f"{TEMPORARY_PREFIX}*"):
-        with suppress(WorkspaceError, OSError):
-            if not left.is_symlink():
-                with Workspace(left).locked():  # its process has ended
-                    shutil.rmtree(left)
-    with (
-        TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=parent) as folder,
-        Workspace(Path(folder)).locked() as workspace,
-    ):
-        yield workspace.path
-
-
-def is_output_folder(path: Path) -> bool:
-    """Tell whether this program has written its record or its log into a folder."""
-    for name, mark in (("config.toml", b"format_version"), ("run.log", b"colmap-affrect")):
-        with suppress(OSError), (path / name).open("rb") as file:
-            if mark in file.read(BYTES_OF_MARK):
-                return True
-    return False
+def _may_be_ours(path: Path) -> bool:
+    """Tell whether a file may be in an empty folder, or in that of a run that was killed early."""
+    name = path.name
+    is_temporary = name.startswith(TEMPORARY_PREFIX) or name.endswith(NEW_SUFFIX)
+    is_empty_log = name == "run.log" and not path.stat().st_size
+    return name in OF_SYSTEMS or name == LOCK or is_temporary or is_empty_log
 
 
 def database_files(path: Path) -> list[Path]:

@@ -38,6 +38,7 @@ def copy_verified(
     workspace = context.workspace
     if image_path and not image_path.is_dir():
         raise OptionError(f"--image-path {image_path}: no such folder")
+    workspace.require_own(image_path)
     contents = Contents(workspace.contents)
     digest, before = contents.digest(source_files(source)), contents.recorded("copy")
     if digest != before or not workspace.database.exists():

@@ -38,9 +38,10 @@ from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.consistency import num_consistent_matches
 from colmap_affrect.mappers.pair_graph import MIN_SHARE
 from colmap_affrect.pairs.base import Pair
+from colmap_affrect.project.outputs import temporary_folder
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
-from colmap_affrect.project.workspace import Workspace, temporary_folder
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images, weakly_connected_images
 from colmap_affrect.stages.context import Context

@@ -173,6 +173,7 @@ def extract(
     start = time.perf_counter()
     workspace, folder = context.workspace, Path(inputs.image_path)
     inputs.check()
+    workspace.require_own(folder)
     _require_usable_cameras(workspace, inputs)
     names = inputs.names()
     names = checked_names(folder, image_names, "image_names") if image_names else names

@@ -428,7 +428,9 @@ def test_matcher_with_weights_goes_on_and_is_taken_from_the_record(
     assert record["weights"]
     assert record["min_score"] == 0.2
     monkeypatch.setattr(pipeline, "run", keep)
-    done = call("run", "--config", tmp_path / "out" / "config.toml", "--output-path", tmp_path)
+    done = call(
+        "run", "--config", tmp_path / "out" / "config.toml", "--output-path", tmp_path / "b"
+    )
     assert done.stderr == ["error: enough"]
     changed = load_recipe("sift-lightglue", ["matching.min_score=0.2"]).matching
     assert [options.recipe.matching for options in taken] == [changed]

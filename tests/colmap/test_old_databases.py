@@ -18,7 +18,7 @@ from colmap_affrect.colmap.database_copy import copy_with_frames, copy_without_f
 from colmap_affrect.colmap.old_databases import MAPPER_OPTIONS, export_database
 from colmap_affrect.doctor.database import examine_database
 from colmap_affrect.doctor.findings import Findings
-from colmap_affrect.errors import DatabaseError
+from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.progress import SILENT
 
 GPS = np.array([47.5, 8.25, 400.0])
@@ -89,8 +89,8 @@ def test_command_takes_an_output_folder(source: Path, tmp_path: Path, call: Call
     assert done.stdout.startswith(f"{tmp_path / 'old.db'}: for COLMAP 3.8 to 3.13\n1 rigs are left")
     assert MAPPER_OPTIONS in done.stdout
     again = call("export-database", tmp_path / "out", tmp_path / "old.db")
-    assert (again.code, len(again.errors)) == (1, 1)
-    assert "exists already" in again.errors[0]
+    assert (again.code, len(again.errors)) == (2, 1)
+    assert "exists, and is left as it is" in again.errors[0]
 
 
 def test_what_is_exported_comes_back(source: Path, tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_what_the_old_colmap_has_no_place_for(source: Path, tmp_path: Path) -> N
         )  # fmt: skip
     with pytest.raises(DatabaseError, match="camera 1 is of model EUCM, which COLMAP"):
         export_database(changed, tmp_path / "other.db")
-    with pytest.raises(DatabaseError, match="exists already"):
+    with pytest.raises(OptionError, match="exists, and is left"):
         export_database(source, tmp_path / "old.db")
     assert not (tmp_path / "other.db").exists()
 

@@ -140,8 +140,11 @@ def test_what_a_format_cannot_hold_is_said(tmp_path: Path) -> None:
         export(tmp_path / "model", tmp_path / "out", ["bundle"])
     with pytest.raises(OptionError, match="--image-path: give the folder"):
         export(tmp_path / "model", tmp_path / "out", ["undistorted"])
+    (tmp_path / "photos").mkdir()
     with pytest.raises(ImageError, match=r"a\.png: no such photograph"):
-        export(tmp_path / "model", tmp_path / "out", ["undistorted"], image_path=tmp_path)
+        export(
+            tmp_path / "model", tmp_path / "out", ["undistorted"], image_path=tmp_path / "photos"
+        )
     with pytest.raises(OptionError, match="no place on earth"):
         export(tmp_path / "model", tmp_path / "out", ["ply", "text", "geojson"])
     assert not (tmp_path / "out").exists()  # the same command with what it lacked can be given

@@ -30,7 +30,7 @@ from h5_files import (
 from numpy.testing import assert_allclose, assert_array_equal
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import DatabaseError, OptionError, StoreError
+from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.interop.hdf5 import export_h5
 from colmap_affrect.interop.hdf5_layouts import ForeignFiles, Source
 
@@ -182,7 +182,7 @@ def test_import_writes_the_database_only_and_leaves_an_existing_one(files: Files
     assert after.pop(files.database)
     assert after == before
     content = files.database.read_bytes()
-    with pytest.raises(DatabaseError, match=r"new\.db: exists already"):
+    with pytest.raises(OptionError, match=r"new\.db: exists"):
         files.import_all()
     assert files.database.read_bytes() == content
 

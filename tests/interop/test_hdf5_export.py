@@ -229,7 +229,7 @@ def test_export_overwrites_nothing_and_needs_one_source(
     features, matches = targets
     _, out = finished
     matches.write_bytes(b"mine")
-    with pytest.raises(StoreError, match=r"matches\.h5: exists already"):
+    with pytest.raises(OptionError, match=r"matches\.h5: exists"):
         export_h5(features, matches, output_path=out)
     assert matches.read_bytes() == b"mine"
     assert not features.exists()
@@ -246,15 +246,21 @@ def test_export_overwrites_nothing_and_needs_one_source(
 def test_folder_that_cannot_be_written_is_exported(
     finished: tuple[Path, Path], targets: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(*_: Any, **__: Any) -> None:
-        raise OSError(errno.EROFS, "Read-only file system")
-
     _, out = finished
+    acquire = FileLock.acquire
+
+    def refuse(lock: FileLock, *arguments: Any, **options: Any) -> Any:
+        if Path(lock.lock_file).parent == out:
+            raise OSError(errno.EROFS, "Read-only file system")
+        return acquire(lock, *arguments, **options)
+
     monkeypatch.setattr(FileLock, "acquire", refuse)
     assert export_h5(*targets, output_path=out).num_pairs == 6
 
-    def be_late(*_: Any, **__: Any) -> None:
-        raise Timeout("out")
+    def be_late(lock: FileLock, *arguments: Any, **options: Any) -> Any:
+        if Path(lock.lock_file).parent == out:
+            raise Timeout("out")
+        return acquire(lock, *arguments, **options)
 
     monkeypatch.setattr(FileLock, "acquire", be_late)
     with pytest.raises(WorkspaceError, match="another colmap-affrect is working"):

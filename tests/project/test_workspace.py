@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
-from colmap_affrect.project.workspace import COPY_STAGES, Workspace, temporary_folder
+from colmap_affrect.project.outputs import temporary_folder
+from colmap_affrect.project.workspace import COPY_STAGES, Workspace
 from colmap_affrect.project.workspace import STAGES as ALL_STAGES
 
 STAGES = tuple(stage for stage in ALL_STAGES if stage != "copy")
@@ -279,11 +280,17 @@ def test_branch_copies_where_files_cannot_be_shared(
 
 def test_temporary_folders_of_killed_processes_are_removed_and_no_others(tmp_path: Path) -> None:
     (tmp_path / ".affrect-killed" / "sub").mkdir(parents=True)
+    (tmp_path / ".affrect-killed" / ".lock").touch()
+    (tmp_path / ".affrect-of-somebody").mkdir()
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / ".affrect-link").symlink_to(tmp_path / "elsewhere")
     with temporary_folder(tmp_path) as first, temporary_folder(tmp_path) as second:
         assert first != second
         assert first.is_dir()
         assert not (tmp_path / ".affrect-killed").exists()
-    assert {path.name for path in tmp_path.iterdir()} == {".affrect-link", "elsewhere"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        ".affrect-link",
+        ".affrect-of-somebody",
+        "elsewhere",
+    }
     assert not list((tmp_path / "elsewhere").iterdir())

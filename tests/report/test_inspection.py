@@ -237,8 +237,8 @@ def test_json_describes_a_known_plan(tmp_path: Path, photo: Path) -> None:
 
 def test_sizes_are_those_of_processing(tmp_path: Path, photo: Path) -> None:
     plan = RectificationPlan((150, 100), (affine_warp(2.0, 0.3, (10, 5, 60, 40)),))
-    inspect_image(extractor_of(plan, max_image_size_px=150), photo, tmp_path)
-    data = json.loads((tmp_path / "photo-plan.json").read_text(encoding="utf-8"))
+    inspect_image(extractor_of(plan, max_image_size_px=150), photo, tmp_path / "out")
+    data = json.loads((tmp_path / "out" / "photo-plan.json").read_text(encoding="utf-8"))
     assert (data["stored_size"], data["levels"][0]["size"]) == ([300, 200], [150, 100])
     assert data["levels"][0]["warps"][0]["region"]["share"] == pytest.approx(2400 / 15_000)
 
@@ -252,6 +252,7 @@ def test_each_level_has_a_sheet_and_an_entry(tmp_path: Path, photo: Path) -> Non
         "photo-inspection-level-1.png",
         "photo-inspection.png",
         "photo-plan.json",
+        "run.log",
     ]
     assert [level["level"] for level in levels] == [0, 1]
     escalated = levels[1]
@@ -260,7 +261,7 @@ def test_each_level_has_a_sheet_and_an_entry(tmp_path: Path, photo: Path) -> Non
 
 
 def test_missing_depth_is_a_warning_as_in_extraction(tmp_path: Path, photo: Path) -> None:
-    (level,), _ = inspect(extractor_with(DepthPlanesOptions(), Planned()), photo, tmp_path)
+    (level,), _ = inspect(extractor_with(DepthPlanesOptions(), Planned()), photo, tmp_path / "out")
     assert level["warning"].startswith("not rectified: photo.png: no depth map")
     assert level["totals"]["keypoints"] == 150
 
@@ -303,7 +304,7 @@ PLANS = {
     ],
 )
 def test_sheet_of_plan(kind: str, extractor: GridFeatures, tmp_path: Path, photo: Path) -> None:
-    (level,), _ = inspect(extractor_of(PLANS[kind], extractor=extractor), photo, tmp_path)
+    (level,), _ = inspect(extractor_of(PLANS[kind], extractor=extractor), photo, tmp_path / "out")
     assert (level["totals"]["keypoints"] == 0) == (extractor is NO_FEATURES)
     assert len(level["warps"]) == len(PLANS[kind].items)
 
@@ -319,7 +320,7 @@ def test_sheet_of_a_rectifier_that_reads_shapes(
     assert level.plan.items
     assert level.shapes is not None
     assert len(level.shapes.points) > 100
-    inspect(extractor, photo, tmp_path)
+    inspect(extractor, photo, tmp_path / "out")
 
 
 def test_sheet_of_a_rectifier_that_reads_depth(tmp_path: Path, photo: Path) -> None:
@@ -336,7 +337,7 @@ def test_sheet_of_a_rectifier_that_reads_depth(tmp_path: Path, photo: Path) -> N
 def test_sheet_of_small_and_flat_images(size: tuple[int, int], tmp_path: Path) -> None:
     path = write_image(tmp_path / "flat.png", np.full(size[::-1], 90, np.uint8))
     options = DenseShapesOptions()
-    inspect(extractor_with(options, RECTIFIERS.make(options, SHAPES)), path, tmp_path)
+    inspect(extractor_with(options, RECTIFIERS.make(options, SHAPES)), path, tmp_path / "out")
 
 
 def test_names_of_every_kind_are_written_and_drawn(tmp_path: Path) -> None:
@@ -350,7 +351,7 @@ def test_names_of_every_kind_are_written_and_drawn(tmp_path: Path) -> None:
 def test_region_is_tinted_where_it_lies(tmp_path: Path) -> None:
     path = write_image(tmp_path / "photo.png", np.full(SIZE[::-1], 100, np.uint8))
     plan = RectificationPlan(SIZE, (affine_warp(2.0, 0.3, (150, 20, 120, 50)),))
-    _, image = inspect(extractor_of(plan, extractor=NO_FEATURES), path, tmp_path)
+    _, image = inspect(extractor_of(plan, extractor=NO_FEATURES), path, tmp_path / "out")
     top = MARGIN_PX + NAME_PX + 3 * LINE_PX + MARGIN_PX + HEAD_PX
     scale = fitted(SIZE, sheet.MAP_BOX_PX)[0] / SIZE[0]
 
@@ -369,7 +370,7 @@ def test_features_beyond_the_image_do_not_move_it(tmp_path: Path) -> None:
     path = write_image(tmp_path / "photo.png", np.full(SIZE[::-1], 100, np.uint8))
     # 6 sigma are 900 px, the 2 sigma that are drawn 300 px: far beyond the left and the top.
     extractor = GridFeatures(step_px=500, radius_px=900.0)
-    _, image = inspect(extractor_of(PLANS["no warps"], extractor=extractor), path, tmp_path)
+    _, image = inspect(extractor_of(PLANS["no warps"], extractor=extractor), path, tmp_path / "out")
     bottom = image.shape[0] - MARGIN_PX
     width, height = fitted(SIZE, sheet.FEATURES_BOX_PX)
     faded = 255 - 0.5 * (255 - 100)

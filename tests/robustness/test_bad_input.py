@@ -185,8 +185,8 @@ def test_database_of_another_program_is_refused_and_left_as_it_is(
         code, stdout, stderr = call(
             command, "--image-path", trio, "--output-path", out, *FAST, *overwrite
         )
-        assert (code, stdout, len(stderr)) == (1, "", 1)
-        assert "database.db: exists and was not made here" in stderr[0]
+        assert (code, stdout, len(stderr)) == (2, "", 1)
+        assert "is not empty (database.db) and was not made by colmap-affrect" in stderr[0]
         assert (out / "database.db").read_bytes() == before
 
 

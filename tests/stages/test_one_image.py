@@ -228,7 +228,8 @@ def test_extractor_in_another_process_refuses_other_weights(
 
 
 def test_digests_continue_the_record_of_an_older_version(tmp_path: Path) -> None:
-    workspace, files = Workspace(tmp_path), {"affnet": tmp_path / "here", "disk": tmp_path / "here"}
+    here = tmp_path / "here"
+    workspace, files = Workspace(tmp_path / "out"), {"affnet": here, "disk": here}
     files["disk"].write_bytes(b"content")
     digest = hashlib.sha256(b"content").hexdigest()
     assert digests_to_record(workspace, "extract", files, overwrite=False) == {

@@ -1,0 +1,195 @@
+"""The one door for what is written outside of a work folder: exports, copies, pictures.
+
+What is made stands in a hidden folder beside its place until all of it is whole, and gets its name
+then. So there is never half of it under a name of the user's, also when the program is killed, and
+nothing but what this call has made is ever taken away.
+"""
+
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from tempfile import TemporaryDirectory
+
+from filelock import FileLock, Timeout
+
+from colmap_affrect.errors import OptionError
+from colmap_affrect.project.atomic_files import cannot_write, require_space, uninterrupted
+
+TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
+LOCK = ".lock"  # in such a folder, and in a work folder, while somebody works there
+MARKS = (("config.toml", b"format_version"), ("run.log", b"colmap-affrect"))
+SPARE_BYTES = 1 << 16  # a disk with less room may have cut off what was written last
+BYTES_OF_MARK = 200  # at the beginning of these files, in which they tell whose they are
+
+
+def is_output_folder(path: Path) -> bool:
+    """Tell whether this program has written its record or its log into a folder."""
+    for name, mark in MARKS:
+        with suppress(OSError), (path / name).open("rb") as file:
+            if mark in file.read(BYTES_OF_MARK):
+                return True
+    return False
+
+
+def leads_outside(name: str) -> bool:
+    r"""Tell whether a file of this name, taken from a model or a database, may leave its folder.
+
+    >>> [leads_outside(name) for name in ("a/b.jpg", "/a.jpg", "a/../../b.jpg", "C:a", "..\\b")]
+    [False, True, True, True, True]
+    """
+    path = PurePosixPath(name.replace("\\", "/"))
+    return path.is_absolute() or ".." in path.parts or bool(PureWindowsPath(name).drive)
+
+
+def refuse_link(path: Path) -> None:
+    """Refuse to write where a symbolic link stands: it would be followed; OptionError."""
+    if path.is_symlink():
+        raise OptionError(
+            f"{path}: is a symbolic link, and nothing is written where it leads; remove it, or "
+            "give another name or folder"
+        )
+
+
+def refuse_photographs(target: Path, photographs: Path) -> None:
+    """Refuse to write among photographs, where results would be taken for some; OptionError.
+
+    A work folder of ours in their folder is passed over when they are looked for.
+    """
+    place, folder = _resolved(target), photographs.resolve()
+    inside = [p for p in (place, *place.parents) if folder in p.parents]
+    if place != folder and not inside:
+        return
+    if not any(map(is_output_folder, inside)):
+        raise OptionError(
+            f"{target}: lies in the folder of the photographs, {photographs}; give another name or "
+            "folder"
+        )
+
+
+def _resolved(target: Path) -> Path:
+    """Return where a file or folder will be; if it is a link itself, where that is."""
+    return target.parent.resolve() / target.name
+
+
+@contextmanager
+def new_results(
+    *targets: Path,
+    folder: Path | None = None,
+    photographs: Path | None = None,
+    replaces: bool = False,
+) -> Iterator[list[Path]]:
+    """Yield paths for files or folders to be made, which get their names when all are whole.
+
+    When the block fails or is interrupted nothing of it stays.
+
+    Args:
+        *targets: what is to be made; missing folders above are made.
+        folder: what they have to lie in, where some have folders of their own.
+        photographs: folder in which nothing may be made.
+        replaces: files that are there give way; else nothing is overwritten.
+
+    Raises:
+        OptionError: before anything is made, where a target is there already, is a symbolic link,
+            lies among the photographs, or leaves its folder by a link.
+        WorkspaceError: when something cannot be written.
+    """
+    for target in targets:
+        refuse_link(target)
+        if folder and folder.resolve() not in _resolved(target).parents:
+            raise OptionError(f"{target}: a link leads out of {folder}; remove it")
+        if photographs:
+            refuse_photographs(target, photographs)
+        if not replaces:
+            _refuse_existing(target)
+    with ExitStack() as stack:
+        folders = {}
+        for parent in dict.fromkeys(target.parent for target in targets):
+            stack.enter_context(_folder_made(parent))
+            folders[parent] = stack.enter_context(temporary_folder(parent))
+        made = [folders[target.parent] / target.name for target in targets]
+        yield made
+        for temporary in folders.values():  # native writers say nothing of a full disk
+            require_space(temporary / "rest", SPARE_BYTES)
+        with uninterrupted():
+            _publish(list(zip(made, targets, strict=True)), replaces=replaces)
+
+
+def _refuse_existing(target: Path) -> None:
+    if os.path.lexists(target):
+        raise OptionError(f"{target}: exists, and is left as it is; give another name or folder")
+
+
+@contextmanager
+def _folder_made(folder: Path) -> Iterator[None]:
+    """Make a folder and those above it; those that are new go again if nothing comes into them."""
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    try:
+        yield
+    finally:
+        for path in new:
+            with suppress(OSError):
+                path.rmdir()
+
+
+def _publish(made: list[tuple[Path, Path]], *, replaces: bool) -> None:
+    """Give everything its name; on failure nothing new has it."""
+    done: list[tuple[Path, Path]] = []
+    try:
+        for path, target in made:
+            if replaces:
+                path.replace(target)
+            else:
+                _move(path, target)
+                done.append((path, target))
+    except (OSError, OptionError) as error:
+        for path, target in reversed(done):
+            target.rename(path)
+        if isinstance(error, OptionError):
+            raise
+        raise cannot_write(target, error) from error
+
+
+def _move(path: Path, target: Path) -> None:
+    """Rename a file or folder; what has come to be there meanwhile is not overwritten."""
+    _refuse_existing(target)
+    if path.is_file():
+        try:
+            os.link(path, target)
+        except FileExistsError:
+            _refuse_existing(target)
+        except OSError:  # no hard links on this file system
+            path.rename(target)
+        else:
+            path.unlink()
+    else:
+        path.rename(target)
+
+
+@contextmanager
+def temporary_folder(parent: Path) -> Iterator[Path]:
+    """Yield a new folder in a folder, in which those that killed processes left are removed."""
+    parent.mkdir(parents=True, exist_ok=True)
+    for left in parent.glob(f"{TEMPORARY_PREFIX}*"):
+        if (left / LOCK).is_file() and not left.is_symlink():
+            with suppress(Timeout, OSError), FileLock(left / LOCK, timeout=0):
+                shutil.rmtree(left)  # its process has ended
+    with (
+        TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=parent, ignore_cleanup_errors=True) as name,
+        FileLock(Path(name) / LOCK),
+    ):
+        yield Path(name)
+
+
+def remove_own(paths: Iterable[Path]) -> None:
+    """Remove what is ours in a work folder; of a link itself, not what it leads to."""
+    for path in paths:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
