@@ -1,6 +1,111 @@
-"""``python -m colmap_affrect``."""
+"""The command line as a process: ``python -m colmap_affrect``, or ``colmap-affrect``.
 
-from colmap_affrect.cli import main_of_process
+A second process does the work and the first one waits for it, so that Ctrl-C ends a command
+whatever native code is in the middle of, and a crash in it is told of in one line. Nothing heavy is
+imported here: a Ctrl-C while the rest is loaded finds its handler in place.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import NoReturn
+
+from colmap_affrect.errors import INTERRUPTED
+
+PATIENCE_S = 4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
+PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent dies
+SIGNALS = {signal.SIGINT, signal.SIGTERM}
+
+
+def main() -> NoReturn:
+    """Run the command line in a process of its own, where the system can do that, and end."""
+    if not hasattr(os, "fork"):
+        _work()
+    told: list[int] = []
+
+    def stop(number: int, _: object) -> None:
+        told.append(number)
+        os.kill(worker, signal.SIGTERM)
+        signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+
+    parent = os.getpid()
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    worker = os.fork()
+    if not worker:
+        _end_with(parent)
+        _work()
+    signal.signal(signal.SIGALRM, lambda *_: os.kill(worker, signal.SIGKILL))
+    _handle(stop)
+    _, status = os.waitpid(worker, 0)
+    sys.exit(_exit_code(os.waitstatus_to_exitcode(status), told))
+
+
+def _handle(handler: Callable[[int, object], None]) -> None:
+    """Call a function for Ctrl-C and SIGTERM, where they are not ignored as in the background."""
+    for number in SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+
+
+def _exit_code(code: int, told: list[int]) -> int:
+    """Return the exit code of the command, and say why it ended where it could not do that."""
+    if told and (code < 0 or code == 128 + signal.SIGINT):
+        if code < 0:
+            print(INTERRUPTED, file=sys.stderr)
+        return 128 + told[0]
+    if code < 0:
+        cause = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
+        print(
+            f"error: ended by {signal.Signals(-code).name}{cause}; run.log may say why, and what "
+            "was done before is kept: run the same command again, or 'colmap-affrect doctor'",
+            file=sys.stderr,
+        )
+        return 1
+    return code
+
+
+def _end_with(parent: int) -> None:
+    """Let the system kill this process when its parent is killed."""
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    else:
+        import threading
+        import time
+
+        def watch() -> None:
+            while os.getppid() == parent:
+                time.sleep(0.2)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        threading.Thread(target=watch, daemon=True).start()
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def _work() -> NoReturn:
+    """Run the command in this process, which Ctrl-C and SIGTERM interrupt."""
+    told: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        if number == signal.SIGTERM and told:
+            return  # of the first process, for a Ctrl-C that came here, too
+        told.append(number)
+        raise KeyboardInterrupt
+
+    try:
+        _handle(interrupt)
+        from colmap_affrect.cli import main_of_process
+
+        main_of_process()
+    except KeyboardInterrupt:
+        print(INTERRUPTED, file=sys.stderr, flush=True)
+        os._exit(128 + signal.SIGINT)
+
 
 if __name__ == "__main__":
-    main_of_process()
+    main()

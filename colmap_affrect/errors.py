@@ -1,5 +1,7 @@
 """Errors that a user can act on: one line that says what, where, and what to do."""
 
+INTERRUPTED = "interrupted; run the same command again to go on"
+
 
 class AffrectError(Exception):
     """Base of all errors that the command line prints as one line (exit code 1)."""

@@ -14,7 +14,7 @@ from typing import NoReturn, TextIO
 
 from colmap_affrect import __version__
 from colmap_affrect.cli.parser import build_parser
-from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.errors import INTERRUPTED, AffrectError, OptionError
 from colmap_affrect.project.report import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.shown import one_line
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "run the same command again: what was done before is kept"
         )
     except KeyboardInterrupt:
-        print("interrupted; run the same command again to go on", file=sys.stderr)
+        print(INTERRUPTED, file=sys.stderr)
         return EXIT_INTERRUPTED
 
 
@@ -58,7 +58,8 @@ def main_of_process() -> NoReturn:
         code: int | str | None = main()
     except SystemExit as end:  # argparse: help, or wrong usage
         code = end.code
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     try:
         sys.stdout.flush()
     except BrokenPipeError:

@@ -10,13 +10,14 @@ from colmap_affrect.parallel.executor import return_freed_memory
 
 Result = TypeVar("Result")
 POLL_S = 0.2
+LEAVE_AFTER_S = 3.0  # that a call has to end after it was cancelled; some never look
 
 
 def run_cancellable(
     call: Callable[[pycolmap.CancellationToken], Result],
     token: pycolmap.CancellationToken | None = None,
 ) -> Result:
-    """Run ``call`` in a thread; on Ctrl-C cancel it, wait until it has ended, and re-raise.
+    """Run ``call`` in a thread; on Ctrl-C cancel it, and leave it if it does not end soon.
 
     First, memory that this process has freed goes back to the system. ``call`` takes the token that
     pycolmap's call must be given; the caller may have one too, to cancel by.
@@ -36,12 +37,12 @@ def run_cancellable(
         finally:
             ended.set()
 
-    threading.Thread(target=work).start()
+    threading.Thread(target=work, daemon=True).start()
     try:
         while not ended.wait(POLL_S):
             pass
     except KeyboardInterrupt:
         token.cancel()
-        ended.wait()
+        ended.wait(LEAVE_AFTER_S)
         raise
     return outcome.result()

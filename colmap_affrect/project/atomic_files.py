@@ -132,22 +132,25 @@ def cannot_write(path: Path, error: Exception) -> WorkspaceError:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Postpone Ctrl-C until the block has ended.
+    """Postpone Ctrl-C and SIGTERM until the block has ended.
 
     A ``KeyboardInterrupt`` inside a callback of a C library would leave it in disorder.
     """
-    handler = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or handler is None:
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    known = {number: handler for number, handler in handlers.items() if handler is not None}
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    interrupts = []
-    signal.signal(signal.SIGINT, lambda *arguments: interrupts.append(arguments))
+    told: list[int] = []
+    for number in known:
+        signal.signal(number, lambda told_of, _: told.append(told_of))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, handler)
-        if interrupts:
-            signal.raise_signal(signal.SIGINT)
+        for number, handler in known.items():
+            signal.signal(number, handler)
+        for again in dict.fromkeys(told):
+            signal.raise_signal(again)
 
 
 class FileTransaction(io.RawIOBase):

@@ -162,3 +162,52 @@ def test_terminal_gets_bars(photos: Path, tmp_path: Path) -> None:
     assert process.returncode == 0
     assert b"extract: 100%" in shown
     assert b"3/3" in shown
+
+
+AS_PROCESS = """
+import collections, ctypes, itertools
+from colmap_affrect import __main__, cli
+cli.main_of_process = lambda: (print("begun", flush=True), WORK)
+__main__.main()
+"""
+STUCK = "collections.deque(itertools.repeat(0), maxlen=0)"  # holds Python's lock for ever
+
+
+def start_stuck(work: str) -> subprocess.Popen[str]:
+    """Start the command line with other work, and wait until that has begun."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", AS_PROCESS.replace("WORK", work)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    assert process.stdout.readline() == "begun\n"
+    return process
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("send", [os.kill, os.killpg])
+def test_native_code_that_does_not_return_is_left(number: signal.Signals, send) -> None:
+    with start_stuck(STUCK) as process:
+        begin = time.monotonic()
+        send(process.pid, number)
+        _, stderr = process.communicate(timeout=TIMEOUT_S)
+    assert time.monotonic() - begin < 5.0
+    assert (process.returncode, stderr.splitlines()) == (
+        128 + number,
+        ["interrupted; run the same command again to go on"],
+    )
+
+
+@pytest.mark.long
+def test_crash_in_native_code_is_one_line() -> None:
+    with start_stuck("ctypes.string_at(1)") as process:
+        _, stderr = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 1
+    assert [line.startswith("error: ended by SIGSEGV; ") for line in stderr.splitlines()] == [True]
+
+
+@pytest.mark.long
+def test_worker_ends_with_the_process_that_was_started() -> None:
+    with start_stuck(STUCK) as process:
+        process.kill()
+        process.communicate(timeout=5.0)  # which the worker's end of the pipe would keep open

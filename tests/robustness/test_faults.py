@@ -232,15 +232,6 @@ def test_hdf5_file_that_was_damaged_later_is_named(disturbed: Disturbed) -> None
     assert num_refused > 2
 
 
-def test_log_that_cannot_be_written_stops_nothing(disturbed: Disturbed) -> None:
-    disturbed.out.mkdir()
-    disturbed.workspace.log.symlink_to("/dev/full")
-    arguments = ["extract", "--image-path", disturbed.photos, "--output-path", disturbed.out]
-    ended = disturbed.call(*arguments, "-q", *FAST)
-    assert (ended.code, ended.stderr) == (0, [])
-    assert ended.stdout.startswith("extract: 4 done")
-
-
 @pytest.mark.skipif(os.geteuid() == 0, reason="permissions do not stop root")
 def test_output_folder_that_may_not_be_written_is_refused(disturbed: Disturbed) -> None:
     disturbed.out.mkdir(mode=0o555)
