@@ -2,6 +2,20 @@
 
 INTERRUPTED = "interrupted; run the same command again to go on"
 
+MEMORY_HINT = (
+    "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "
+    "photographs, or --set max_image_size_px=1600"
+)
+NO_MEMORY = (
+    "insufficient memory", "out of memory", "can't allocate memory", "cannot allocate memory",
+    "bad_alloc", "can't start new thread", "failed to allocate", "unable to allocate",
+)  # fmt: skip
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Tell whether Python, numpy, OpenCV, torch or COLMAP has found no memory."""
+    return isinstance(error, MemoryError) or any(t in str(error).lower() for t in NO_MEMORY)
+
 
 class AffrectError(Exception):
     """Base of all errors that the command line prints as one line (exit code 1)."""

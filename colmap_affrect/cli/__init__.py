@@ -3,7 +3,6 @@
 import argparse
 import logging
 import os
-import shutil
 import signal
 import sys
 import threading
@@ -14,7 +13,14 @@ from typing import NoReturn, TextIO
 
 from colmap_affrect import __version__
 from colmap_affrect.cli.parser import build_parser
-from colmap_affrect.errors import INTERRUPTED, AffrectError, OptionError
+from colmap_affrect.errors import (
+    INTERRUPTED,
+    MEMORY_HINT,
+    AffrectError,
+    OptionError,
+    lacks_memory,
+)
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.shown import one_line
@@ -43,6 +49,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{error.filename or 'input/output'}: {error.strerror or error}; when that is mended, "
             "run the same command again: what was done before is kept"
         )
+    except Exception as error:
+        if not lacks_memory(error):
+            raise
+        return _fail(f"{MEMORY_HINT}: what was done before is kept")
     except KeyboardInterrupt:
         print(INTERRUPTED, file=sys.stderr)
         return EXIT_INTERRUPTED
@@ -95,7 +105,7 @@ def _no_empty_folder(path: Path | None) -> Iterator[None]:
         yield
     except AffrectError:
         if path and is_new and {file.name for file in path.glob("*")} <= {".lock", "run.log"}:
-            shutil.rmtree(path, ignore_errors=True)
+            remove_own([path])
         raise
 
 

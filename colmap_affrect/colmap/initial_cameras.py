@@ -24,6 +24,7 @@ from colmap_affrect.colmap.camera_records import (
     read_camera_records,
     write_camera_records,
 )
+from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.database import (
     camera_matrix,
     cameras_of_images,
@@ -247,7 +248,8 @@ def import_images(
     if missing:
         require_database_space(new, 2 * len(missing))
         image_ids(read)  # makes it
-        pycolmap.import_images(read, image_path, pycolmap.CameraMode.PER_IMAGE, missing)
+        mode = pycolmap.CameraMode.PER_IMAGE
+        run_cancellable(lambda _: pycolmap.import_images(read, image_path, mode, missing))
         with open_database(read) as found, open_database(new) as database:
             _take_over(initial, found, database)
         remove_database(read)

@@ -1,7 +1,6 @@
 """COLMAP's SIFT through pycolmap, on the images and pairs of a database that has no features."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from colmap_affrect.colmap.native_options import differences
 from colmap_affrect.images.photographs import MaskOptions, Photographs
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.outputs import temporary_folder
 
 ROWS_PER_IMAGE = 400  # of 4 KiB, for 8192 features of 128 bytes and their positions
 ROWS_PER_PAIR = 8
@@ -69,30 +69,29 @@ def extract_sift(
     return impossible | dict.fromkeys(failed, "COLMAP cannot read it or its mask")
 
 
-def match_sift(database_path: Path, pairs: Sequence[Pair], list_path: Path) -> None:
+def match_sift(database_path: Path, pairs: Sequence[Pair]) -> None:
     """Match pairs of images by COLMAP's defaults, without verification; matched ones are kept.
 
     COLMAP's lists of pairs cannot hold names with spaces: while it matches, the images have other
-    ones. If the process is killed then, :func:`rename_images` brings the names back. ``list_path``
-    is a file for the time of the call.
+    ones. If the process is killed then, :func:`rename_images` brings the names back.
     """
     ids = image_ids(database_path)
     temporary = {image_id: TEMPORARY_NAME.format(image_id) for image_id in ids.values()}
     lines = [f"{temporary[ids[first]]} {temporary[ids[second]]}\n" for first, second in pairs]
-    replace_text(list_path, "".join(lines))
     require_database_space(database_path, len(pairs) * ROWS_PER_PAIR)
     names = {image_id: name for name, image_id in ids.items()}
-    try:
-        rename_images(database_path, temporary)
-        pycolmap.match_image_pairs(
-            database_path,
-            matching_options=pycolmap.FeatureMatchingOptions(skip_geometric_verification=True),
-            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=list_path),
-        )
-    finally:
-        rename_images(database_path, names)
-        with suppress(OSError):
-            list_path.unlink()
+    with temporary_folder(database_path.parent) as folder:
+        list_path = folder / "pairs.txt"
+        replace_text(list_path, "".join(lines))
+        try:
+            rename_images(database_path, temporary)
+            pycolmap.match_image_pairs(
+                database_path,
+                matching_options=pycolmap.FeatureMatchingOptions(skip_geometric_verification=True),
+                pairing_options=pycolmap.ImportedPairingOptions(match_list_path=list_path),
+            )
+        finally:
+            rename_images(database_path, names)
 
 
 def rename_images(database_path: Path, names: Mapping[int, str]) -> None:

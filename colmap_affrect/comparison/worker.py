@@ -130,7 +130,7 @@ def _match_sift(request: Request, costs: "_Costs", progress: Progress, *, affine
 
     def match_all() -> None:
         with progress.stage("match", len(pairs), "pairs") as advance:
-            match_sift(path, pairs, request.folder / "pairs-by-id.txt")
+            match_sift(path, pairs)
             advance(len(pairs))
 
     costs.stage("extract", extract_all)

@@ -58,6 +58,7 @@ from colmap_affrect.options import digest_of
 from colmap_affrect.pipeline import installed_versions
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.context import Resources
@@ -233,8 +234,7 @@ class _Run:
         }
         path = output_path / "pairs" / f"{method.folder_name}-{digest_of(decisive)[:8]}.jsonl"
         if overwrite:
-            for old in path.parent.glob(f"{method.folder_name}-????????.jsonl"):
-                old.unlink()
+            remove_own(path.parent.glob(f"{method.folder_name}-????????.jsonl"))
         self.records = RecordFile(path, decisive)
 
     def results(self, progress: Progress) -> list[PairResult]:

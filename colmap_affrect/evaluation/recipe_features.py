@@ -15,6 +15,7 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import digest_of
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import cannot_write, replace_bytes
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.stopwatch import Stopwatch
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import WEIGHTS, first_difference
@@ -195,8 +196,7 @@ class RecipeFeatures:
         self._extractor = prepare(options, resources, list(images))
         features_path, costs_path = (path.with_name(path.name + s) for s in (".h5", ".jsonl"))
         if overwrite:
-            features_path.unlink(missing_ok=True)
-            costs_path.unlink(missing_ok=True)
+            remove_own([features_path, costs_path])
         recorded = RecordFile.settings_in(costs_path).get(WEIGHTS)
         weights = digests(self._extractor.weights, recorded)
         self.settings = {**inputs, **options.to_mapping(), WEIGHTS: weights}

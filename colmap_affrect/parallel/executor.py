@@ -73,6 +73,13 @@ def available_memory_bytes() -> int:
     with suppress(OSError, ValueError):  # no container, or one without a limit
         limit = Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")
         available = min(available, int(limit))
+    with suppress(ImportError, OSError):  # other systems
+        import resource
+
+        limited, _ = resource.getrlimit(resource.RLIMIT_AS)  # ulimit -v
+        if limited != resource.RLIM_INFINITY:
+            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+            available = min(available, max(0, limited - pages * resource.getpagesize()))
     return available
 
 

@@ -24,7 +24,7 @@ from colmap_affrect.data import (
     RectificationPlan,
     in_mask,
 )
-from colmap_affrect.errors import DepthError, ImageError
+from colmap_affrect.errors import MEMORY_HINT, DepthError, ImageError, lacks_memory
 from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, NetworkContext
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.affine import transform_frames
@@ -142,6 +142,10 @@ class ImageExtractor:
                 )
         except ImageError as error:
             return error
+        except Exception as error:
+            if not lacks_memory(error):
+                raise
+            return ImageError(f"{task.photographs.folder / task.name}: {MEMORY_HINT}")
         size, expected = found.image_size, task.camera_size
         if expected and expected != size:
             return ImageError(

@@ -91,7 +91,7 @@ def run_sift(folder: Path, image_path: Path, names: Sequence[str], *, affine: bo
     times = [time.perf_counter()]
     extract_sift(database_path, image_path, names, MaskOptions(), affine=affine)
     times.append(time.perf_counter())
-    match_sift(database_path, exhaustive_pairs(names), folder / "pairs.txt")
+    match_sift(database_path, exhaustive_pairs(names))
     times.append(time.perf_counter())
     verify(database_path, VerificationOptions(random_seed=SEED))
     times.append(time.perf_counter())

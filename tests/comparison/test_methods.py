@@ -93,7 +93,7 @@ def test_sift_looks_at_the_masks_and_matches_the_pairs_of_the_list(tmp_path):
             assert keypoints[:, 0].min() >= 160
     first, second, third = names
     assert second == "b c.png"
-    match_sift(path, [(first, second), (second, third)], tmp_path / "pairs.txt")
+    match_sift(path, [(first, second), (second, third)])
     assert image_ids(path) == ids
     assert not (tmp_path / "pairs.txt").exists()
     with open_database(path) as database:

@@ -1,0 +1,173 @@
+"""The one door for what is written outside of a work folder."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import colmap_affrect
+from colmap_affrect.errors import OptionError
+from colmap_affrect.project.outputs import new_results, refuse_photographs
+from colmap_affrect.project.workspace import Workspace
+
+PACKAGE = Path(colmap_affrect.__file__).parent
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b""
+        for path in folder.rglob("*")
+    }
+
+
+def write_all(paths: list[Path]) -> None:
+    for path in paths:
+        if path.suffix:
+            path.write_text("new")
+        else:
+            path.mkdir()
+            (path / "inside.txt").write_text("new")
+
+
+def make(*targets: Path, then: Callable[[], object]) -> None:
+    with new_results(*targets) as made:
+        write_all(made)
+        then()
+
+
+def test_results_appear_together(tmp_path: Path) -> None:
+    targets = [tmp_path / "out" / "a.txt", tmp_path / "out" / "b", tmp_path / "c.txt"]
+    with new_results(*targets) as made:
+        write_all(made)
+        assert not any(target.exists() for target in targets)
+    assert content(tmp_path) == {
+        "out": b"", "out/a.txt": b"new", "out/b": b"", "out/b/inside.txt": b"new", "c.txt": b"new",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_failure_takes_away_what_was_made_and_nothing_else(tmp_path: Path, error: type) -> None:
+    def fail() -> None:
+        raise error
+
+    def save_and_fail() -> None:
+        (tmp_path / "new" / "of the user.txt").write_text("mine")
+        raise error
+
+    with pytest.raises(error):
+        make(tmp_path / "new" / "a.txt", tmp_path / "b.txt", then=fail)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(error):
+        make(tmp_path / "new" / "a.txt", then=save_and_fail)
+    assert content(tmp_path) == {"new": b"", "new/of the user.txt": b"mine"}
+
+
+@pytest.mark.parametrize("name", ["a.txt", "b"])
+def test_what_comes_to_be_there_meanwhile_stays_and_nothing_is_half_there(
+    tmp_path: Path, name: str
+) -> None:
+    targets = [tmp_path / other for other in ("c.txt", "d", "a.txt", "b")]
+    with pytest.raises(OptionError, match="exists, and is left"):
+        make(*targets, then=lambda: (tmp_path / name).write_text("mine"))
+    assert content(tmp_path) == {name: b"mine"}
+
+
+def make_link(folder: Path) -> None:
+    (folder / "a.txt").symlink_to(folder / "elsewhere.txt")
+
+
+def make_file(folder: Path) -> None:
+    (folder / "a.txt").write_text("mine")
+
+
+@pytest.mark.parametrize(
+    ("prepare", "why"), [(make_link, "is a symbolic link"), (make_file, "exists, and is left")]
+)
+def test_what_is_in_the_way_is_refused_before_anything_is_made(
+    tmp_path: Path, prepare: Callable[[Path], None], why: str
+) -> None:
+    prepare(tmp_path)
+    before = content(tmp_path)
+    with pytest.raises(OptionError, match=why), new_results(tmp_path / "a.txt"):
+        pytest.fail("nothing may be made")
+    assert content(tmp_path) == before
+
+
+def test_links_may_not_lead_out_of_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "box").symlink_to(tmp_path)
+    target = tmp_path / "out" / "box" / "a.txt"
+    with (
+        pytest.raises(OptionError, match="leads out of"),
+        new_results(target, folder=tmp_path / "out"),
+    ):
+        pytest.fail("nothing may be made")
+
+
+def test_among_photographs_only_work_folders_are_written(tmp_path: Path) -> None:
+    photographs = tmp_path / "photographs"
+    work = Workspace(photographs / "out")
+    refuse_photographs(tmp_path / "photographs2", photographs)
+    for target in (photographs, photographs / "a.ply", work.path / "export" / "a.ply"):
+        with pytest.raises(OptionError, match="lies in the folder of the photographs"):
+            refuse_photographs(target, photographs)
+    work.begin()
+    refuse_photographs(work.path / "export" / "a.ply", photographs)
+    (tmp_path / "link").symlink_to(photographs)
+    with pytest.raises(OptionError, match="lies in the folder of the photographs"):
+        refuse_photographs(tmp_path / "link" / "a.ply", photographs)
+
+
+OUTSIDE = ("interop", "comparison", "evaluation", "report", "cli", "images/conversion.py",
+           "colmap/old_databases.py")  # fmt: skip
+"""Where results are made for other folders than those of runs."""
+
+CHANGING = {
+    "copy", "copy2", "copyfile", "copytree", "hardlink_to", "mkdir", "move", "rename", "rmdir",
+    "rmtree", "savefig", "symlink_to", "touch", "unlink", "write_bytes", "write_text",
+}  # fmt: skip
+
+IN_TEMPORARY_FOLDERS = {
+    ("export.py", "_nerfstudio"), ("export.py", "_text"), ("hdf5_layouts.py", "created"), ("inspection.py", "inspect_image"),
+    ("sheet.py", "figure_page"), ("conversion.py", "_convert"), ("compare.py", "_make_shared"),
+    ("worker.py", "_run_seed"), ("worker.py", "_seed_result"),
+}  # fmt: skip
+"""Functions that write where the door lets them."""
+
+IN_WORK_FOLDERS = {
+    ("compare.py", "_run"), ("recipe_features.py", "__init__"), ("recipe_features.py", "append"),
+    ("__init__.py", "_logging"), ("plots.py", "write_plots"),
+}  # fmt: skip
+"""Functions that write where the door has refused folders of others, and links."""
+
+
+def changes(call: ast.Call) -> bool:
+    """Tell whether a call changes files: by its name, or as an open for writing."""
+    name = getattr(call.func, "attr", getattr(call.func, "id", ""))
+    values = [*call.args, *(word.value for word in call.keywords)]
+    texts = [value.value for value in values if isinstance(value, ast.Constant)]
+    if name in ("open", "File"):
+        return any(isinstance(text, str) and set("wax+") & set(text) for text in texts)
+    # shutil.copy, not the copy of an array
+    return name in CHANGING and not (name == "copy" and not values)
+
+
+def writing_functions(path: Path) -> Iterator[tuple[str, str]]:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for function in ast.walk(tree):
+        if isinstance(function, ast.FunctionDef):
+            calls = [node for node in ast.walk(function) if isinstance(node, ast.Call)]
+            if any(map(changes, calls)):
+                yield path.name, function.name
+
+
+def test_nothing_else_writes_outside_of_work_folders() -> None:
+    places = [PACKAGE / place for place in OUTSIDE]
+    files = [
+        file for place in places for file in (place.rglob("*.py") if place.is_dir() else [place])
+    ]
+    found = {function for file in files for function in writing_functions(file)}
+    assert found == IN_TEMPORARY_FOLDERS | IN_WORK_FOLDERS
