@@ -138,9 +138,6 @@ MATCHER = _value("--matcher", "NAME",
 GUIDED = _choice("--guided", ["auto", "always", "never"],
     "match verified pairs again, guided by their geometry: those of images that are missing or "
     "hang on few tracks, all, or none (default: auto)")  # fmt: skip
-BY_MODEL = _path("--model-path", "MODEL",
-    "match pairs that are not verified instead, where views overlap by this COLMAP model, "
-    "e.g. out/sparse/0")  # fmt: skip
 DEVICE = _value("--device", "DEVICE",
     "for networks and matching: auto, cpu, cuda, cuda:1, mps (default: auto)",
     default="auto")  # fmt: skip

@@ -115,20 +115,14 @@ def escalate(options: argparse.Namespace) -> None:
 
 
 def guide(options: argparse.Namespace) -> None:
-    from colmap_affrect.colmap.model_files import read_given_model
     from colmap_affrect.matchers.guided import GuidedOptions
     from colmap_affrect.stages.guide import guide, guided_counts
-    from colmap_affrect.stages.guide_by_model import guide_by_model
 
-    path: Path | None = options.model_path
-    model = read_given_model(path, "--model-path ") if path else None
     with given.context(options) as context:
         values = given.changed(context, "guide", "guided", options.set)
         values |= {"enabled": options.guided} if options.guided else {}
         chosen = GuidedOptions.from_mapping(values, "guided")
-        report = guide(context, chosen, () if model else None, overwrite=options.overwrite)
-        if model:
-            report = guide_by_model(context, model)
+        report = guide(context, chosen, overwrite=options.overwrite)
         counts = guided_counts(context)
     show(report.summary())
     if counts:

@@ -166,7 +166,7 @@ COMMANDS: dict[str, Command] = {
             args.SCHEDULER)),
     "guide": (commands.guide,
         "match verified pairs again, guided by their geometry",
-        (*args.RESULTS, args.GUIDED, args.BY_MODEL, args.setting("guided.band_px=2"),
+        (*args.RESULTS, args.GUIDED, args.setting("guided.band_px=2"),
             args.SCHEDULER)),
     "map": (commands.map, "COLMAP models into sparse/",
         (*args.RESULTS, *args.COPIED, *args.EXTEND, args.PRESET, args.FOCAL_VOTE,

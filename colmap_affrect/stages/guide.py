@@ -185,20 +185,13 @@ class Guiding:
         done = {pair.names for pair in known}
         return [pair for pair in chosen if pair not in done], sum(p in done for p in chosen)
 
-    def guide(
-        self,
-        pairs: Sequence[Pair],
-        advance: Callable[[int], None],
-        tasks: Callable[[Sequence[Pair]], list[GuidedTask]] | None = None,
-    ) -> None:
-        """Match pairs again, batch by batch, and keep what has more inliers.
+    def guide(self, pairs: Sequence[Pair], advance: Callable[[int], None]) -> None:
+        """Match verified pairs again, batch by batch, and keep what has more inliers.
 
-        Of each pair the image with the lower id comes first. ``tasks`` makes the tasks of a batch,
-        by default from the geometries of verified pairs.
+        Of each pair the image with the lower id comes first.
         """
         if not pairs:
             return
-        tasks = tasks or self._tasks
         features, executor = self.context.features, self.context.executor
         if executor is None or not executor.sees([features.path]):
             executor = Threads(available_cores())
@@ -208,7 +201,7 @@ class Guiding:
         for begin in range(0, len(ordered), PAIRS_PER_WRITE):
             batch = ordered[begin : begin + PAIRS_PER_WRITE]
             found = []
-            for pair in executor.map(matcher, tasks(batch), [features.path]):
+            for pair in executor.map(matcher, self._tasks(batch), [features.path]):
                 left = stationary.left(pair.names, pair.candidates)
                 found.append(replace(pair, candidates=pair.candidates[left]))
                 advance(1)
@@ -260,10 +253,7 @@ class Guiding:
         with colmap_database.open_database(self.path) as database:
             for pair, geometry in geometries.items():
                 first, second = (self.ids[name] for name in pair)
-                if database.exists_two_view_geometry(first, second):
-                    database.update_two_view_geometry(first, second, geometry)
-                else:
-                    database.write_two_view_geometry(first, second, geometry)
+                database.update_two_view_geometry(first, second, geometry)
 
 
 def _is_better(geometry: pycolmap.TwoViewGeometry, pair: GuidedPair, before: int | None) -> bool:

@@ -17,7 +17,6 @@ from small_scene import write_photographs
 from colmap_affrect import __version__, pipeline
 from colmap_affrect.cli import main
 from colmap_affrect.cli.parser import EXAMPLES, build_parser, epilog
-from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features import weights
 from colmap_affrect.mappers import attempts
@@ -143,20 +142,6 @@ def test_long_options_are_accepted_with_underscores(
     assert "--image_path" in underscored
     done = call("extract", *underscored, "--max_failures", 0, "--quiet")
     assert (done.code, done.stderr) == (0, [])
-
-
-def test_guide_by_model_takes_text_and_says_what_is_no_model(
-    verified: Path, tmp_path: Path, call: Call
-) -> None:
-    out, text = tmp_path / "out", tmp_path / "text"
-    shutil.copytree(verified, out)
-    text.mkdir()
-    missing = call("guide", "--output-path", out, "--model-path", tmp_path / "none", "-q")
-    assert missing.code == 2
-    assert f"--model-path {tmp_path / 'none'}: no such folder" in missing.errors[-1]
-    pycolmap.Reconstruction(out / "sparse" / "0").write_text(text)
-    done = call("guide", "--output-path", out, "--model-path", text, "-q")
-    assert (done.code, done.errors) == (0, [])
 
 
 def test_failure_prints_one_line_and_leaves_the_traceback_in_the_log(

@@ -131,9 +131,9 @@ CHANGING = {
 }  # fmt: skip
 
 IN_TEMPORARY_FOLDERS = {
-    ("export.py", "_nerfstudio"), ("export.py", "_text"), ("hdf5_layouts.py", "created"), ("inspection.py", "inspect_image"),
-    ("sheet.py", "figure_page"), ("conversion.py", "_convert"), ("compare.py", "_make_shared"),
-    ("worker.py", "_run_seed"), ("worker.py", "_seed_result"),
+    ("export.py", "_nerfstudio"), ("export.py", "_text"), ("hdf5_layouts.py", "created"),
+    ("inspection.py", "inspect_image"), ("sheet.py", "figure_page"), ("conversion.py", "_convert"),
+    ("compare.py", "_make_shared"), ("worker.py", "_run_seed"), ("worker.py", "_seed_result"),
 }  # fmt: skip
 """Functions that write where the door lets them."""
 

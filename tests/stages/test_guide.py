@@ -37,7 +37,6 @@ from colmap_affrect.stages.guide import (
     guided_matches,
     restore_exact,
 )
-from colmap_affrect.stages.guide_by_model import guide_by_model
 from colmap_affrect.stages.map import agreement, map_images
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
@@ -359,38 +358,6 @@ def test_models_with_more_images_agree_better(context: Context, tmp_path: Path) 
     (tmp_path / "none").mkdir()
     fewer, none = (agreement(context, tmp_path / name) for name in ("fewer", "none"))
     assert agreement(context, whole) > fewer > none == 0.0
-
-
-def test_pairs_that_never_matched_are_guided_by_a_model(context: Context) -> None:
-    pairs = sorted(verified_inliers(context))
-    map_images(context, mapper())
-    model = pycolmap.Reconstruction(context.workspace.sparse / "0")
-    lost, ids = pairs[2], image_ids(context.workspace.database)
-    true = verified_inliers(context)[lost]
-    with open_database(context.workspace.database) as database:
-        database.delete_two_view_geometry(*(ids[name] for name in lost))
-        database.delete_matches(*(ids[name] for name in lost))
-    assert lost not in verified_inliers(context)
-    assert guide_by_model(context, model).num_done == 1
-    found = verified_inliers(context)[lost]
-    assert len({*map(tuple, true)} & {*map(tuple, found)}) > 0.8 * len(true)
-    assert guide_by_model(context, model).num_done == 0
-    restore_exact(context)
-    assert lost not in verified_inliers(context)
-
-
-def test_a_wrong_model_gives_nothing(context: Context) -> None:
-    map_images(context, mapper())
-    model = pycolmap.Reconstruction(context.workspace.sparse / "0")
-    pair, ids = sorted(verified_inliers(context))[2], image_ids(context.workspace.database)
-    wrong = next(image for image in model.images.values() if image.name == pair[0])
-    turn = pycolmap.Rigid3d(pycolmap.Rotation3d([0, 0, 0.3, 0.954]), [0.4, 0, 0])
-    wrong.frame.set_cam_from_world(wrong.camera_id, turn * wrong.cam_from_world())
-    with open_database(context.workspace.database) as database:
-        database.delete_two_view_geometry(*(ids[name] for name in pair))
-        database.delete_matches(*(ids[name] for name in pair))
-    assert guide_by_model(context, model).num_done == 1
-    assert pair not in verified_inliers(context)
 
 
 def test_ids_of_a_pair_are_in_order(context: Context) -> None:
