@@ -228,7 +228,6 @@ INPUTS = {
     "pairs --output-path OUT": "--match-list-path",
     "match --output-path OUT": "--recipe",
     "escalate --output-path OUT": "--weights",
-    "guide --output-path OUT": "--model-path",
     "map --output-path NEW --from-database OUT/database.db": "--image-path --extend",
     "map --output-path OUT": "--extend",
     "evaluate pairs --dataset-path PHOTOS --output-path NEW": "--recipes --weights --depth-path",
