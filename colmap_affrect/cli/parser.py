@@ -61,8 +61,8 @@ EXAMPLES = (
 ENDING = """
 What computes goes on where it stopped when it is run again. Exit codes: 0 done, 1 failed (one
 line says why; also when images could not be read, see --max-failures), 2 wrong usage, or an option
-names a file or folder that is not there, 3 finished without a model that can be trusted, 130
-interrupted.
+names a file or folder that is not there, or where something of yours lies, 3 finished without a
+model that can be trusted, 130 interrupted (143 by SIGTERM).
 """
 
 
