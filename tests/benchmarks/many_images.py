@@ -28,12 +28,15 @@ PROGRESS = re.compile(r"^([\w ()-]+): \d+/\d+ \w+")
 
 
 def resident_mib(process_id: int) -> int:
-    """Return the resident memory of a process, 0 when it has ended."""
+    """Return the resident memory of a process and the one that works for it, 0 when both ended."""
+    place = Path(f"/proc/{process_id}")
     try:
-        status = Path(f"/proc/{process_id}/status").read_text(encoding="ascii", errors="replace")
+        status = (place / "status").read_text(encoding="ascii", errors="replace")
+        workers = (place / "task" / str(process_id) / "children").read_text().split()
     except OSError:
         return 0
-    return next((int(s.split()[1]) >> 10 for s in status.splitlines() if s[:5] == "VmRSS"), 0)
+    own = next((int(s.split()[1]) >> 10 for s in status.splitlines() if s[:5] == "VmRSS"), 0)
+    return own + sum(resident_mib(int(worker)) for worker in workers)
 
 
 def watch(command: Sequence[str]) -> dict[str, list[tuple[float, int]]]:
