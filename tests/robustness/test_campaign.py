@@ -1,0 +1,703 @@
+"""A campaign of attacks on the command line: nothing of the user's is ever harmed.
+
+    pytest -m long --dist load tests/robustness/test_campaign.py
+    CAMPAIGN=10 pytest -m long --dist load tests/robustness/test_campaign.py
+
+The second line makes ten times as many trials by chance. Each trial has a number, which seeds it,
+stands alone, and says what it did when it fails. Moments depend on how fast the machine is. Kills
+at system calls and full disks: tests/benchmarks/campaign.py.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import pytest
+from attacks import (
+    HARMS, MEANT, STATEMENTS, Command, assert_clear, damage, differences, ended, execute, rows,
+    tell, tree,
+)  # fmt: skip
+from command import CAMERA, FAST, Ended
+from planar_pairs import TRUTH, write_pair
+from results import database_content, results
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.interop.export import FORMATS
+from colmap_affrect.interop.georeference import Georeference
+
+pytestmark = pytest.mark.long
+
+TIMES = int(os.environ.get("CAMPAIGN", "1"))
+PLAIN = ["--recipe", "unrectified-rootsift"]
+COMPARED = ["--methods", "unrectified-rootsift", "--seeds", "0", *CAMERA]
+INTERRUPTED = "interrupted; run the same command again to go on"
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -signal.SIGKILL}
+
+
+def trials(count: int) -> pytest.MarkDecorator:
+    """Parametrize a test with the numbers of its trials."""
+    return pytest.mark.parametrize("number", range(count * TIMES))
+
+
+@dataclass
+class Scene:
+    """A finished run of the small scene, and what commands need beside it.
+
+    Attributes:
+        folder: has ``photos``; ``out``, all stages; the model as it is and with a lens that
+            distorts, both with a place on earth; files of hloc; a dataset; scans to be converted.
+    """
+
+    folder: Path
+    undisturbed: dict[str, tuple[dict[str, Any], float]] = field(default_factory=dict)
+
+    @property
+    def out(self) -> Path:
+        return self.folder / "out"
+
+    def run(self, out: Path) -> list[object]:
+        """Arguments of the run."""
+        given = ["--image-path", self.folder / "photos", "--output-path", out]
+        return ["run", "-q", *given, *FAST, "--guided", "always"]
+
+    def copy(self, folder: Path) -> Path:
+        """Copy the output folder; times stay."""
+        return Path(shutil.copytree(self.out, folder / "copy", symlinks=True))
+
+    def ended(self, label: str, out: Path) -> tuple[dict[str, Any], float]:
+        """What an undisturbed command leaves in its output folder, and how long it takes."""
+        if label not in self.undisturbed:
+            out.mkdir()
+            begun = time.monotonic()
+            end = ended(*placed(exports(self.folder)[label][0], out))
+            assert end.code == 0, end
+            self.undisturbed[label] = tree(out, times=False), time.monotonic() - begun
+            shutil.rmtree(out)
+        return self.undisturbed[label]
+
+
+@pytest.fixture(scope="session")
+def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    made = Scene(tmp_path_factory.mktemp("scene"))
+    folder = made.folder
+    shutil.copytree(photos, folder / "photos")
+    assert ended(*made.run(made.out)).code == 0
+    files = ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
+    assert ended("export-h5", "--output-path", made.out, *files).code == 0
+    shutil.copy(made.out / "database.db", folder / "any.db")
+    for name in ("plain", "lens"):
+        model = pycolmap.Reconstruction(made.out / "sparse" / "0")
+        for camera in model.cameras.values() if name == "lens" else ():
+            camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+            camera.params = [300.0, 160.0, 120.0, 0.05]
+        (folder / name).mkdir()
+        model.write(folder / name)
+        Georeference(50.0, 14.0, 200.0).write(folder / name)
+    shutil.copytree(photos, folder / "scans")
+    picture = cv2.imread(str(photos / "a.png"))
+    for number in range(6):
+        cv2.imwrite(str(folder / "scans" / f"{number}.webp"), picture)
+    write_pair(folder / "pairs" / "a.png", folder / "pairs" / "b.png", seed=3)
+    pair = {"image1": "a.png", "image2": "b.png", "homography": TRUTH.tolist()}
+    (folder / "pairs" / "pairs.json").write_text(json.dumps({"pairs": [pair]}))
+    return made
+
+
+def exports(folder: Path, photograph: str = "a.png") -> dict[str, tuple[list[object], str]]:
+    """All commands that write beside the output folder: arguments, and the name of a result."""
+    files = ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
+    images = ["--image-path", folder / "photos"]
+    new_files = ["--features-path", "{out}/features.h5", "--matches-path", "{out}/matches.h5"]
+    names = {
+        "ply": "points3D.ply", "text": "text", "nvm": "model.nvm", "bundler": "bundle.list.txt",
+        "undistorted": "dense", "nerfstudio": "dense", "cameras": "cameras.csv",
+        "geojson": "cameras.geojson",
+    }  # fmt: skip
+    assert names.keys() == FORMATS.keys()
+    found: dict[str, tuple[list[object], str]] = {}
+    for form, name in [*names.items(), ("ply,text,cameras,bundler,nerfstudio,geojson", "text")]:
+        for model in ("plain", "lens"):
+            given = ["--model-path", folder / model, *images, "--format", form]
+            found[f"{form} of {model}"] = (["export", *given, "--output-path", "{out}"], name)
+    distance = ["--distance", "b c.png,side/d.png,2.0", "--output-path", "{out}/new"]
+    found["align"] = (["align", "--model-path", folder / "plain", *distance], "new")
+    source = ["--database-path", folder / "any.db"]
+    found["export-h5"] = (["export-h5", *source, *new_files], "features.h5")
+    found["export-database"] = (["export-database", folder / "any.db", "{out}/old.db"], "old.db")
+    imported = ["import-h5", *images, *files, *CAMERA, "--database-path", "{out}/new.db"]
+    found["import-h5"] = (imported, "new.db")
+    scans = folder / "scans" if (folder / "scans").exists() else folder / "photos"
+    found["convert"] = (["convert", "--image-path", scans, "--output-path", "{out}"], "a.png")
+    image = folder / "photos" / photograph
+    plan = f"{image.stem}-plan.json"
+    found["inspect"] = (["inspect", image, *PLAIN, "--output-path", "{out}"], plan)
+    listed = ["--image-list-path", folder / "list.txt"] if (folder / "list.txt").exists() else []
+    compared = ["compare", *images, *listed, *COMPARED, "--output-path", "{out}"]
+    found["compare"] = (compared, "report.html")
+    return found
+
+
+def placed(arguments: list[object], out: Path) -> list[object]:
+    """Arguments with the output folder in its place, and no progress on stderr."""
+    return [*(str(word).replace("{out}", str(out)) for word in arguments), "-q"]
+
+
+def is_temporary(key: str) -> bool:
+    """Whether a path is of something that is not finished, or of a lock."""
+    return any(part.startswith(".") or ".affrect" in part for part in Path(key).parts)
+
+
+def finished(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Only what has a final name."""
+    return {key: value for key, value in found.items() if not is_temporary(key)}
+
+
+# Part 1: names and links that lead astray.
+
+NAMES = (
+    "{photos}/b c.png", "{world}/elsewhere/new.png", "//{photos}/b c.png", "../../x.png",
+    "../b c.png", "../photos/b c.png", "../../../photos/b c.png", "../../../../photos/b c.png", "side/../../../../../photos/x.png",
+    "side/../b c.png", "x.png/..", "..", ".", "./x.png", "side//x.png", "side/", "x.png/",
+    "C:\\x.png", "C:x.png", "\\\\server\\share\\x.png", "..\\..\\x.png", "x.png.", "x.png ",
+    "\u202egnp.x", "side/c\u030c.png", "\U0001f4f7/x.png", "line\nbreak.png", "\x1b[31mred\x7f.png",
+    "x" * 296 + ".png", "ž" * 148 + ".png", "/".join(["deep" * 12] * 20) + "/x.png", "~/x.png",
+    "-rf.png", "dense/images/x.png", "sparse/0/cameras.bin", "",
+)  # fmt: skip
+"""Of an image in the place of a.png; a photograph is where a name leads, where that can be."""
+
+
+def make_world(scene: Scene, folder: Path) -> Path:
+    """Copy what exports read to where a few steps up lead to folders that are watched."""
+    base = folder / "world" / "one" / "two" / "three"
+    base.mkdir(parents=True)
+    for name in ("photos", "plain", "lens"):
+        shutil.copytree(scene.folder / name, base / name)
+    for name in ("any.db", "features.h5", "matches.h5"):
+        shutil.copy(scene.folder / name, base / name)
+    for name in ("one/photos", "photos", "elsewhere", "home"):
+        shutil.copytree(base / "photos", folder / "world" / name, dirs_exist_ok=True)
+    return base
+
+
+def rename_image(base: Path, name: str) -> None:
+    """Give an image a name in all that exports read, and make a photograph where it leads."""
+    world, path = base.parents[2], Path(os.path.normpath(base / "photos" / name))
+    with suppress(OSError):
+        if path.is_relative_to(world) and not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(base / "photos" / "a.png", path)
+    for model_path in (base / "plain", base / "lens"):
+        model = pycolmap.Reconstruction(model_path)
+        model.find_image_with_name("a.png").name = name
+        model.write(model_path)
+    quoted = name.replace("'", "''")
+    execute(base / "any.db", f"UPDATE images SET name = '{quoted}' WHERE name = 'a.png'")
+    with suppress(ValueError, RuntimeError), h5py.File(base / "features.h5", "a") as file:
+        file.copy("a.png", name)
+    (base / "list.txt").write_text(f"{name}\nb c.png\nside/č.png\nside/d.png\n", encoding="utf-8")
+
+
+def num_registered(model_path: Path) -> int:
+    """Count the images of a model that was written a moment ago."""
+    try:
+        return pycolmap.Reconstruction(model_path).num_reg_images()
+    except (ValueError, IndexError, RuntimeError) as error:
+        raise AssertionError(f"{model_path.name}: a model that cannot be read: {error}") from error
+
+
+def assert_whole(label: str, out: Path) -> None:
+    """A command that ended well has all of its results inside of its folder."""
+    found = tree(out)
+    assert not [key for key, value in found.items() if value[0] == "link"], found
+    temporary = [key for key in found if is_temporary(key) and Path(key).name != ".lock"]
+    assert not temporary, f"left over: {temporary}"
+    assert any(value[0] != "folder" for value in found.values()), "nothing was written"
+    if "undistorted" in label or "nerfstudio" in label:
+        pictures = [path for path in (out / "dense" / "images").rglob("*") if path.is_file()]
+        assert (len(pictures), num_registered(out / "dense" / "sparse")) == (4, 4)
+    if "text" in label:
+        assert num_registered(out / "text") == 4
+
+
+def attack_exports(
+    base: Path, photograph: str, prepare: Callable[[Path, str], list[Path]]
+) -> list[str]:
+    """Call all exports, each into a folder that is prepared; return what went wrong.
+
+    ``prepare`` gets the folder and the name of a result, and returns what may be changed.
+    """
+    world, wrong = base.parents[2], []
+    for label, (arguments, result) in exports(base, photograph).items():
+        out = base / "outputs" / label.replace(",", " ")
+        allowed = prepare(out, result)
+        before = tree(world, *allowed)
+        try:
+            end = ended(*placed(arguments, out), HOME=str(world / "home"))
+            harmed = differences(before, tree(world, *allowed))
+            assert not harmed, f"{harmed}, exit code {end.code}"
+            assert_clear(end, 0, 1, 2)
+            if end.code == 0 and out in allowed:
+                assert_whole(label, out)
+        except AssertionError as error:
+            wrong.append(f"{label}: {str(error)[:600]}")
+    return wrong
+
+
+def empty_folder(out: Path, _: str) -> list[Path]:
+    out.mkdir(parents=True)
+    return [out]
+
+
+@pytest.mark.parametrize("name", NAMES, ids=lambda name: ascii(name)[1:25])
+def test_names_of_images_lead_nowhere_else(scene: Scene, tmp_path: Path, name: str) -> None:
+    base = make_world(scene, tmp_path)
+    name = name.format(photos=base / "photos", world=base.parents[2])
+    rename_image(base, name)
+    photograph = "b c.png"
+    with suppress(OSError):
+        photograph = name if (base / "photos" / name).is_file() else photograph
+    wrong = attack_exports(base, photograph, empty_folder)
+    assert not wrong, "\n".join([f"image named {name!r}", *wrong])
+
+
+def linked(target: str) -> Callable[[Path, str], list[Path]]:
+    """A result is there already as a link; only the rest of the folder may change."""
+
+    def prepare(out: Path, result: str) -> list[Path]:
+        out.mkdir(parents=True)
+        (out / result).symlink_to(out.parents[1] / target)
+        return [out]
+
+    return prepare
+
+
+def linked_folder(out: Path, _: str) -> list[Path]:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.symlink_to(out.parents[1] / "photos")
+    return []
+
+
+def hard_link(out: Path, result: str) -> list[Path]:
+    out.mkdir(parents=True)
+    os.link(out.parents[1] / "photos" / "a.png", out / result)
+    return [out]
+
+
+def a_file(out: Path, _: str) -> list[Path]:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_bytes(b"mine")
+    return []
+
+
+TRAPS = {
+    "dangling link": linked("../new.png"),
+    "link to a photograph": linked("photos/a.png"),
+    "link to a folder": linked("../photos"),
+    "link to the photographs": linked("photos"),
+    "link to nothing beside the photographs": linked("photos/new"),
+    "output folder is a link to the photographs": linked_folder,
+    "output folder is a file": a_file,
+    "hard link to a photograph": hard_link,
+}
+
+
+@pytest.mark.parametrize("trap", TRAPS)
+def test_links_in_output_folders_are_not_followed(scene: Scene, tmp_path: Path, trap: str) -> None:
+    base = make_world(scene, tmp_path)
+    wrong = attack_exports(base, "a.png", TRAPS[trap])
+    assert not wrong, "\n".join([trap, *wrong])
+
+
+# Part 2: exports that are interrupted, with something of the user in their folder.
+
+ALL_FORMATS = "ply,text,cameras,bundler,nerfstudio,geojson of lens"
+WRITERS = (ALL_FORMATS, "align", "export-h5", "export-database", "convert", "compare")
+MINE = {"mine.txt": ("file",), "mine": ("folder",), "mine/report.html": ("file",)}
+
+
+def plant(out: Path) -> bool:
+    """Put a file and a folder of the user into an output folder, if it is there."""
+    with suppress(FileNotFoundError):
+        (out / "mine.txt").write_text("mine")
+        (out / "mine").mkdir()
+        (out / "mine" / "report.html").write_text("mine")
+    return (out / "mine").exists()
+
+
+def left(out: Path, is_planted: bool) -> dict[str, Any]:
+    """What is in a folder beside the files of the user, which have to be there."""
+    found = tree(out, times=False)
+    for name in ("mine.txt", "mine/report.html") if is_planted else ():
+        assert (out / name).exists(), f"{name} was removed"
+        assert (out / name).read_text() == "mine", f"{name} was changed"
+    return {key: value for key, value in found.items() if key not in MINE}
+
+
+def models_only(label: str, found: Mapping[str, Any]) -> dict[str, Any]:
+    """All that has a final name; of a comparison, which has times in its files, the models."""
+    kept = finished(found)
+    if label != "compare":
+        return kept
+    return {key: value for key, value in kept.items() if "/seed-0/sparse/" in key}
+
+
+def assert_final_is_whole(found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Whatever stands under a final name is that of the undisturbed command, and all of it."""
+    tops = {key.split("/")[0] for key in found}
+    for key in found.keys() | {key for key in expected if key.split("/")[0] in tops}:
+        assert key in expected, f"{key} is not of the undisturbed command"
+        assert key in found, f"{key} is missing under a final name"
+        assert found[key] == expected[key], f"{key} is not whole"
+
+
+def assert_ended_by(end: Ended, number: signal.Signals) -> None:
+    """Exit code and one line, or the command was done before the signal came."""
+    assert_no_traceback(end)
+    assert end.code in (0, CODES[number]), end
+    if end.code in (130, 143):
+        assert len(end.stderr) == 1, end
+        assert number == signal.SIGTERM or end.stderr == [INTERRUPTED], end
+
+
+@trials(60)
+def test_interrupted_export_takes_away_its_own_only(
+    scene: Scene, tmp_path: Path, number: int
+) -> None:
+    chance, label = random.Random(f"interrupt {number}"), WRITERS[number % len(WRITERS)]
+    sent = chance.choice(list(CODES))
+    expected, seconds = scene.ended(label, tmp_path / "undisturbed")
+    out = tmp_path / "out"
+    if is_there := label in ("export-h5", "export-database") or chance.random() < 0.6:
+        out.mkdir()
+    moments = sorted(chance.uniform(0.01, 1.1 * seconds) for _ in range(2))
+    command = Command(*placed(exports(scene.folder)[label][0], out))
+    time.sleep(moments[0])
+    is_planted = plant(out)
+    time.sleep(moments[1] - moments[0])
+    command.send(sent)
+    end = command.ended()
+    tell(f"{label}, {sent.name} at {moments[1]:.3f} of {seconds:.3f} s, planted: {is_planted}")
+    assert_ended_by(end, sent)
+    found = left(out, is_planted)
+    assert_final_is_whole(models_only(label, found), models_only(label, expected))
+    assert {path.name for path in tmp_path.iterdir() if not is_temporary(path.name)} <= {"out"}
+    if end.code in (130, 143) and label != "compare":
+        assert not found, f"left over: {sorted(found)}"
+        assert out.exists() == (is_there or is_planted), "the output folder is left over"
+        assert {path.name for path in tmp_path.iterdir()} <= {"out"}
+    assert_goes_on(scene, label, out, is_planted)
+
+
+def assert_goes_on(scene: Scene, label: str, out: Path, is_planted: bool) -> None:
+    """The same command again works, or refuses what is whole already."""
+    expected = models_only(label, scene.undisturbed[label][0])
+    before = models_only(label, left(out, is_planted))
+    out.parent.mkdir(exist_ok=True)
+    if label in ("export-h5", "export-database"):
+        out.mkdir(exist_ok=True)
+    again = ended(*placed(exports(scene.folder)[label][0], out))
+    assert_clear(again, 0, 1, 2)
+    found = models_only(label, left(out, is_planted))
+    if again.code == 0:
+        assert found == expected, differences(expected, found)
+    else:
+        assert before, f"refused, and nothing is there: {again.errors}"
+        assert found == before, differences(before, found)
+
+
+# Part 3: damaged files.
+
+FILES = (
+    "features.h5", "matches.h5", "guided.h5", "database.db", "pairs.txt", "config.toml",
+    "cameras.json", "contents.json", "report.json", "report.html", "run.log",
+    "sparse/inputs.sha256", "sparse/0/cameras.bin", "sparse/0/rigs.bin", "sparse/0/frames.bin",
+    "sparse/0/images.bin", "sparse/0/points3D.bin", "sparse/0/summary.json",
+)  # fmt: skip
+READERS = ("run", "map", "export", "align", "doctor")
+WRITTEN = ["--format", "ply,text,cameras,bundler,undistorted"]
+
+
+def reader(name: str, scene: Scene, out: Path, target: Path) -> list[object]:
+    """Arguments of a command that reads an output folder."""
+    model = ["--model-path", out / "sparse" / "0", "--output-path", target, "-q"]
+    return {
+        "run": scene.run(out),
+        "map": ["map", "-q", "--output-path", out],
+        "export": ["export", *model, *WRITTEN],
+        "align": ["align", *model, "--distance", "b c.png,side/d.png,2.0"],
+        "doctor": ["doctor", "-q", out],
+    }[name]
+
+
+@pytest.fixture(scope="session")
+def expected(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What each command leaves when nothing is damaged."""
+    found: dict[str, Any] = {}
+    for name in READERS:
+        folder = tmp_path_factory.mktemp(name)
+        out = scene.copy(folder)
+        end = ended(*reader(name, scene, out, folder / "target"))
+        assert_clear(end, 0)
+        found[name] = outcome(name, out, folder / "target")
+    return found
+
+
+def outcome(name: str, out: Path, target: Path) -> dict[str, Any]:
+    """What a command makes, or goes on with: that has to be right."""
+    if name in ("export", "align"):
+        return tree(target, times=False)
+    if name == "doctor":
+        return {}
+    models = {key: value for key, value in tree(out, times=False).items() if key.endswith(".bin")}
+    if name == "map":
+        return database_content(out / "database.db") | models
+    return results(out) | rows(out / "database.db") | models
+
+
+def assert_right(name: str, out: Path, target: Path, expected: Mapping[str, Any]) -> None:
+    try:
+        found = outcome(name, out, target)
+    except (OSError, RuntimeError, ValueError, KeyError, sqlite3.Error) as error:
+        raise AssertionError(f"success with a result that cannot be read: {error}") from error
+    wrong = differences(expected[name], found)
+    assert not wrong, f"success with a wrong result: {wrong}"
+
+
+@trials(300)
+def test_damaged_file_is_mended_or_named(
+    scene: Scene, expected: dict[str, Any], tmp_path: Path, number: int
+) -> None:
+    chance = random.Random(f"damage {number}")
+    name, command = FILES[number % len(FILES)], chance.choice(READERS)
+    out, target = scene.copy(tmp_path), tmp_path / "target"
+    done = damage(out / name, chance, others=[scene.out / other for other in FILES])
+    tell(f"{done}; then {command}")
+    before = tree(out)
+    end = ended(*reader(command, scene, out, target))
+    if command == "doctor":
+        assert_no_traceback(end)
+        assert end.code in (0, 1), end
+        assert differences(before, tree(out)) == []
+        return
+    assert_clear(end, 0, 1, 2)
+    if end.code == 0:
+        assert_right(command, out, target, expected)
+    elif command == "run":
+        doctor = ended("doctor", "-q", out)
+        assert_no_traceback(doctor)
+        assert doctor.code == 1, (end.errors, doctor)
+        assert Path(name).name in doctor.stdout, (end.errors, doctor)
+
+
+# Part 4: the database between two runs.
+
+
+@pytest.mark.parametrize("statement", STATEMENTS)
+def test_edited_database_is_made_again_or_refused(
+    scene: Scene, expected: dict[str, Any], tmp_path: Path, statement: str
+) -> None:
+    out = scene.copy(tmp_path)
+    execute(out / "database.db", statement.format(id=2))
+    end = ended(*scene.run(out))
+    assert_clear(end, 0, 1, 2)
+    if end.code == 0:
+        assert_right("run", out, tmp_path, expected)
+
+
+@pytest.mark.parametrize("statement", MEANT)
+def test_meant_edit_is_kept_and_said(
+    scene: Scene, expected: dict[str, Any], tmp_path: Path, statement: str
+) -> None:
+    out = scene.copy(tmp_path)
+    execute(out / "database.db", statement)
+    edited = rows(out / "database.db")
+    end = ended(*[word for word in scene.run(out) if word != "-q"])
+    assert_no_traceback(end)
+    assert end.code in (0, 1, 2), end
+    if end.code:
+        assert len(end.errors) == 1, end
+    elif (now := rows(out / "database.db")) != rows(scene.out / "database.db"):
+        assert all(now[key] == edited[key] for key in now if key != "two_view_geometries"), now
+        warnings = [line for line in end.stderr if line.lower().startswith("warning")]
+        assert any("database" in line for line in warnings), f"kept silently: {end.stderr}"
+    else:
+        assert_right("run", out, tmp_path, expected)
+
+
+@trials(10)
+def test_damaged_database_is_made_again_or_refused(
+    scene: Scene, expected: dict[str, Any], tmp_path: Path, number: int
+) -> None:
+    chance, out = random.Random(f"database {number}"), scene.copy(tmp_path)
+    tell(damage(out / "database.db", chance, [HARMS[number % len(HARMS)]]))
+    end = ended(*scene.run(out))
+    assert_clear(end, 0, 1, 2)
+    if end.code == 0:
+        assert_right("run", out, tmp_path, expected)
+
+
+@trials(10)
+def test_damaged_database_of_others_is_read_or_refused(
+    scene: Scene, tmp_path: Path, number: int
+) -> None:
+    chance = random.Random(f"others {number}")
+    path = Path(shutil.copy(scene.folder / "any.db", tmp_path))
+    if number % 2:
+        execute(path, done := chance.choice(STATEMENTS).format(id=2))
+    else:
+        done = damage(path, chance)
+    before, images = path.read_bytes(), ["--image-path", scene.folder / "photos"]
+    for command in ("map", "extract", "doctor"):
+        given = ["--from-database", path, "--output-path", tmp_path / command]
+        given += images if command == "extract" else []
+        end = ended(command, "-q", *([path] if command == "doctor" else given))
+        tell(f"{done}; {command}: {end}")
+        if command == "doctor":
+            assert_no_traceback(end)
+            assert end.code in (0, 1), end
+        elif end.code != 3:
+            assert_clear(end, 0, 1)
+        assert path.read_bytes() == before, "the database was changed"
+
+
+# Part 5: Ctrl-C at any moment.
+
+AT_ONCE_S = 5.0
+BEFORE_PYTHON_S = 0.05
+
+
+def begun(scene: Scene, command: str, folder: Path) -> list[object]:
+    """Arguments of a command that is to be interrupted, whose input is ready."""
+    out, database = folder / "out", folder / "hanging.db"
+    images = ["--image-path", scene.folder / "photos", "--output-path", out]
+    if command == "match":
+        for stage in (["extract", "-q", *images, *FAST], ["pairs", "-q", "--output-path", out]):
+            assert ended(*stage).code == 0
+    if command == "hanging map":
+        shutil.copy(scene.folder / "any.db", database)
+        at_zero = "UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = 1"
+        execute(database, at_zero)
+    return {
+        "run": ["run", "-q", *images, *FAST],
+        "map": ["map", "-q", "--from-database", scene.folder / "any.db", *images[2:]],
+        "hanging map": ["map", "-q", "--from-database", database, *images[2:]],
+        "extract": ["extract", "-q", *images, *FAST],
+        "match": ["match", "-q", "--output-path", out],
+        "compare": ["compare", "-q", *images, *COMPARED],
+        "export": placed(exports(scene.folder)[ALL_FORMATS][0], out),
+        "import-h5": placed(exports(scene.folder)["import-h5"][0], folder),
+    }[command]
+
+
+LONGEST_S = {"run": 1.4, "map": 1.0, "hanging map": 4.0, "extract": 0.9, "match": 0.9,
+             "compare": 2.2, "export": 0.8, "import-h5": 0.9}  # fmt: skip
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=lambda sent: sent.name)
+@trials(40)
+def test_signal_ends_any_command_at_once(
+    scene: Scene, tmp_path: Path, number: int, sent: signal.Signals
+) -> None:
+    if sent == signal.SIGTERM and number % 2:
+        pytest.skip("half as many of them are enough")
+    chance = random.Random(f"at once {number}")
+    name = sorted(LONGEST_S)[number // 2 % len(LONGEST_S)]
+    delay_s = chance.uniform(0.0, LONGEST_S[name])
+    command = Command(*begun(scene, name, tmp_path), fresh=True)
+    time.sleep(delay_s)
+    command.send(sent)
+    end = command.ended(AT_ONCE_S)
+    tell(f"{name}, {sent.name} after {delay_s:.3f} s")
+    if delay_s > BEFORE_PYTHON_S:
+        assert_ended_by(end, sent)
+
+
+# Part 6: folders that are not ours.
+
+
+def folder_commands(scene: Scene, photos: Path) -> dict[str, list[object]]:
+    """Commands that fill an output folder, all but its name."""
+    images = ["--image-path", photos]
+    dataset = ["--dataset-path", scene.folder / "pairs", "--recipes", "unrectified-rootsift"]
+    return {
+        "run": ["run", "-q", *images, *FAST],
+        "extract": ["extract", "-q", *images, *FAST],
+        "compare": ["compare", "-q", *images, *COMPARED],
+        "evaluate": ["evaluate", "-q", "pairs", *dataset],
+        "inspect": ["inspect", "-q", photos / "a.png", *PLAIN],
+        "map": ["map", "-q", "--from-database", scene.folder / "any.db"],
+        "convert": ["convert", "-q", *images],
+    }
+
+
+def foreign_folder(kind: str, folder: Path) -> Path:
+    """Make a folder of the user's, which is not empty."""
+    made = folder / "mine"
+    made.mkdir()
+    (made / "notes.txt").write_text("mine")
+    for name in ("report.html", "database.db", "run.log") if kind == "report" else ():
+        (made / name).write_text("mine")
+    if kind == "database":
+        execute(made / "database.db", "CREATE TABLE mine (number)")
+    return {"photographs": folder / "photos", "above the photographs": folder}.get(kind, made)
+
+
+FOLDERS = ("report", "notes", "database", "photographs", "above the photographs")
+FILLERS = ("run", "extract", "compare", "evaluate", "inspect", "map", "convert")
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
+@pytest.mark.parametrize("name", FILLERS)
+def test_foreign_folder_is_refused(scene: Scene, tmp_path: Path, name: str, kind: str) -> None:
+    photos = Path(shutil.copytree(scene.folder / "photos", tmp_path / "photos"))
+    out = foreign_folder(kind, tmp_path)
+    before = tree(tmp_path)
+    end = ended(*folder_commands(scene, photos)[name], "--output-path", out)
+    assert not (harmed := differences(before, tree(tmp_path))), (harmed, end.code)
+    assert_clear(end, 1, 2)
+
+
+@pytest.mark.parametrize("name", FILLERS)
+def test_empty_folder_and_one_of_ours_are_taken(scene: Scene, tmp_path: Path, name: str) -> None:
+    photos = Path(shutil.copytree(scene.folder / "photos", tmp_path / "photos"))
+    out = (photos if name == "run" else tmp_path) / "new"
+    out.mkdir()
+    before = tree(tmp_path, out)
+    for _ in range(2):
+        assert_clear(ended(*folder_commands(scene, photos)[name], "--output-path", out), 0)
+        assert differences(before, tree(tmp_path, out)) == []
+
+
+@pytest.mark.parametrize("target", ["nothing", "photograph", "folder", "moved"])
+@pytest.mark.parametrize("name", ["run.log", "database.db", "features.h5", "sparse", ".lock"])
+def test_link_in_a_folder_of_ours_is_not_followed(
+    scene: Scene, expected: dict[str, Any], tmp_path: Path, name: str, target: str
+) -> None:
+    out, outside = scene.copy(tmp_path), tmp_path / "outside"
+    shutil.copytree(scene.folder / "photos", outside)
+    (out / name).touch()
+    (out / name).rename(outside / "moved")
+    places = {"photograph": "a.png", "folder": "side"}
+    (out / name).symlink_to(outside / places.get(target, target))
+    before = tree(outside)
+    for more in ([], ["--overwrite"]):
+        end = ended(*scene.run(out), *more)
+        harmed = differences(before, tree(outside))
+        assert not harmed, f"{harmed}, exit code {end.code}, {more}"
+        assert_clear(end, 0, 1, 2)
+        if end.code == 0:
+            assert not (out / name).is_symlink(), more
+            assert_right("run", out, tmp_path, expected)
