@@ -3,26 +3,35 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import multiprocessing
 import os
-import random
 import runpy
 import shutil
 import signal
-import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from command import Ended
+import cv2
+import h5py
+from command import CAMERA, FAST, Ended
+from damaged import execute
+from planar_pairs import TRUTH, write_pair
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.interop.export import FORMATS
+from colmap_affrect.interop.georeference import Georeference
 
 HANGING_S = 30.0
-PAGE_BYTES = 4096
+PLAIN = ["--recipe", "unrectified-rootsift"]
+COMPARED = ["--methods", "unrectified-rootsift", "--seeds", "0", *CAMERA]
 
 PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload([
@@ -73,9 +82,21 @@ class Command:
 
     def send(self, number: signal.Signals) -> None:
         """Send a signal: Ctrl-C to the whole group, as terminals do, others to the process."""
-        process_id = (self.fresh or self.forked).pid or 0
         with suppress(ProcessLookupError):
-            (os.killpg if number == signal.SIGINT else os.kill)(process_id, number)
+            (os.killpg if number == signal.SIGINT else os.kill)(self.group, number)
+
+    @property
+    def group(self) -> int:
+        """The process, and the group that it leads."""
+        return (self.fresh or self.forked).pid or 0
+
+    def others(self) -> list[str]:
+        """Processes that it started and that are still at work."""
+        shown = subprocess.run(
+            ["ps", "-eo", "pgid=,stat=,args="], capture_output=True, text=True, check=True
+        )
+        rows = [line.split(None, 2) for line in shown.stdout.splitlines()]
+        return [args for group, state, args in rows if int(group) == self.group and state[0] != "Z"]
 
     def _code(self, timeout_s: float) -> int | None:
         if self.fresh:
@@ -88,7 +109,7 @@ class Command:
     def ended(self, timeout_s: float = HANGING_S) -> Ended:
         """Wait for the end; a command that does not come to one is killed, and the test fails."""
         if (code := self._code(timeout_s)) is None:
-            self.send(signal.SIGKILL)
+            os.killpg(self.group, signal.SIGKILL)
             self._code(HANGING_S)
         text = [(self.said / name).read_text(errors="replace") for name in ("out", "err")]
         shutil.rmtree(self.said)
@@ -150,151 +171,179 @@ def differences(before: Mapping[str, object], after: Mapping[str, object]) -> li
     )
 
 
-# Damage to the bytes of a file; each returns what it did.
+@dataclass
+class Scene:
+    """A finished run of the small scene, and what commands need beside it.
 
-
-def bits(data: bytearray, chance: random.Random) -> str:
-    places = [chance.randrange(len(data)) for _ in range(chance.choice((1, 4, 32)))]
-    for place in places:
-        data[place] ^= 1 << chance.randrange(8)
-    return f"bits flipped in {len(places)} bytes, the first at {places[0]}"
-
-
-def _page(data: bytearray, chance: random.Random) -> slice:
-    start = chance.randrange(-(-len(data) // PAGE_BYTES)) * PAGE_BYTES
-    return slice(start, min(len(data), start + PAGE_BYTES))
-
-
-def zeros(data: bytearray, chance: random.Random) -> str:
-    page = _page(data, chance)
-    data[page] = bytes(page.stop - page.start)
-    return f"page at {page.start} zeroed"
-
-
-def noise(data: bytearray, chance: random.Random) -> str:
-    page = _page(data, chance)
-    data[page] = chance.randbytes(page.stop - page.start)
-    return f"page at {page.start} is noise"
-
-
-def header(data: bytearray, chance: random.Random) -> str:
-    place = chance.randrange(min(100, len(data)))
-    data[place] ^= chance.randrange(1, 256)
-    return f"header changed at {place}"
-
-
-def exchanged(data: bytearray, chance: random.Random) -> str:
-    source, target = _page(data, chance), _page(data, chance)
-    data[target] = data[source][: target.stop - target.start]
-    return f"page at {source.start} written over that at {target.start}"
-
-
-def cut(data: bytearray, chance: random.Random) -> str:
-    del data[chance.randrange(len(data)) :]
-    return f"cut off at {len(data)}"
-
-
-def emptied(data: bytearray, _: random.Random) -> str:
-    data.clear()
-    return "emptied"
-
-
-def random_bytes(data: bytearray, chance: random.Random) -> str:
-    data[:] = chance.randbytes(len(data))
-    return "all bytes random"
-
-
-HARMS: tuple[Callable[[bytearray, random.Random], str], ...] = (
-    bits, zeros, noise, header, exchanged, cut, emptied, random_bytes,
-)  # fmt: skip
-
-
-def damage(
-    path: Path, chance: random.Random, harms: Sequence[Any] = HARMS, others: Sequence[Path] = ()
-) -> str:
-    """Damage a file, or give it the content of another one; return what was done.
-
-    Its times stay as they were half of the times: disks fail, too.
+    Attributes:
+        folder: has ``photos``; ``out``, all stages; the model as it is and with a lens that
+            distorts, both with a place on earth; files of hloc; a dataset; scans to be converted.
     """
-    stat, data = path.stat(), bytearray(path.read_bytes())
-    before = bytes(data)
-    while data == before:
-        if others and chance.randrange(len(harms) + 1) == 0:
-            other = chance.choice([other for other in others if other.name != path.name])
-            data, done = bytearray(other.read_bytes()), f"content of {other.name}"
-        else:
-            done = chance.choice(harms)(data, chance)
-    path.write_bytes(data)
-    if keeps_times := chance.random() < 0.5:
-        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-    return f"{path.name}: {done}{', times kept' if keeps_times else ''}"
+
+    folder: Path
+    undisturbed: dict[str, tuple[dict[str, Any], float]] = field(default_factory=dict)
+
+    @property
+    def out(self) -> Path:
+        return self.folder / "out"
+
+    def run(self, out: Path) -> list[object]:
+        """Arguments of the run."""
+        given = ["--image-path", self.folder / "photos", "--output-path", out]
+        return ["run", "-q", *given, *FAST, "--guided", "always"]
+
+    def copy(self, folder: Path) -> Path:
+        """Copy the output folder; times stay."""
+        return Path(shutil.copytree(self.out, folder / "copy", symlinks=True))
+
+    def ended(self, label: str, out: Path) -> tuple[dict[str, Any], float]:
+        """What an undisturbed command leaves in its output folder, and how long it takes."""
+        if label not in self.undisturbed:
+            out.mkdir()
+            begun = time.monotonic()
+            end = ended(*placed(exports(self.folder)[label][0], out))
+            assert end.code == 0, end
+            self.undisturbed[label] = tree(out, times=False), time.monotonic() - begun
+            shutil.rmtree(out)
+        return self.undisturbed[label]
 
 
-STATEMENTS = (
-    "UPDATE images SET camera_id = 999 WHERE image_id = {id}",
-    "UPDATE images SET name = '' WHERE image_id = {id}",
-    "UPDATE images SET name = x'ff00fe' WHERE image_id = {id}",
-    "UPDATE images SET name = 'renamed.png' WHERE image_id = {id}",
-    "DELETE FROM images WHERE image_id = {id}",
-    "INSERT INTO images (name, camera_id) VALUES ('more.png', 1)",
-    "UPDATE keypoints SET rows = 100000 WHERE image_id = {id}",
-    "UPDATE keypoints SET rows = -1 WHERE image_id = {id}",
-    "UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = {id}",
-    "UPDATE keypoints SET data = substr(data, 1, 101) WHERE image_id = {id}",
-    "UPDATE keypoints SET data = NULL WHERE image_id = {id}",
-    "DELETE FROM keypoints WHERE image_id = {id}",
-    "UPDATE matches SET rows = 100000",
-    "UPDATE matches SET data = x'ffffffffffffffff', rows = 1",
-    "UPDATE two_view_geometries SET config = 77",
-    "UPDATE two_view_geometries SET qvec = zeroblob(32)",
-    "UPDATE two_view_geometries SET data = x'ffffffffffffffff', rows = 1",
-    "DELETE FROM two_view_geometries",
-    "UPDATE cameras SET width = 100",
-    "UPDATE cameras SET params = x'00'",
-    "UPDATE frames SET rig_id = 99",
-    "DELETE FROM rigs",
-    "DELETE FROM cameras",
-    "DROP TABLE frame_data",
-    "DROP TABLE two_view_geometries",
-    "ALTER TABLE images RENAME COLUMN camera_id TO camera",
-    "CREATE TRIGGER nosy AFTER INSERT ON matches BEGIN DELETE FROM images; END",
-    "PRAGMA user_version = 2147483647",
-)
-"""What nobody means to do to the rows of a database; ``{id}`` is one of the images."""
-
-MEANT = (
-    "DELETE FROM two_view_geometries WHERE pair_id = (SELECT min(pair_id) FROM matches)",
-    "DELETE FROM matches WHERE pair_id = (SELECT min(pair_id) FROM matches)",
-    "INSERT INTO pose_priors SELECT 1, data_id, sensor_id, sensor_type, "
-    "x'000000000000F03F000000000000F03F000000000000F03F', NULL, NULL, 1 FROM frame_data LIMIT 1",
-    "UPDATE cameras SET params = "
-    "x'00000000008072400000000000C0724000000000000064400000000000005E40' WHERE camera_id = 1",
-)
-"""Edits that a user may mean; the second takes the matches of a pair and leaves its geometry."""
-
-PROBES = (
-    "SELECT image_id, name, camera_id FROM images ORDER BY name",
-    "SELECT * FROM cameras ORDER BY camera_id",
-    "SELECT count(*), total(length(data)), total(rows) FROM keypoints",
-    "SELECT pair_id, rows FROM matches ORDER BY pair_id",
-    "SELECT pair_id, rows, config FROM two_view_geometries ORDER BY pair_id",
-    "SELECT * FROM pose_priors",
-    "SELECT * FROM frames ORDER BY frame_id",
-    "SELECT count(*) FROM rigs",
-    "SELECT type, name FROM sqlite_master ORDER BY type, name",
-    "PRAGMA user_version",
-)
+def make_scene(photos: Path, folder: Path) -> Scene:
+    """Run the small scene, and put beside it what commands need."""
+    made = Scene(folder)
+    shutil.copytree(photos, folder / "photos")
+    assert ended(*made.run(made.out)).code == 0
+    files = ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
+    assert ended("export-h5", "--output-path", made.out, *files).code == 0
+    shutil.copy(made.out / "database.db", folder / "any.db")
+    for name in ("plain", "lens"):
+        model = pycolmap.Reconstruction(made.out / "sparse" / "0")
+        for camera in model.cameras.values() if name == "lens" else ():
+            camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+            camera.params = [300.0, 160.0, 120.0, 0.05]
+        (folder / name).mkdir()
+        model.write(folder / name)
+        Georeference(50.0, 14.0, 200.0).write(folder / name)
+    shutil.copytree(photos, folder / "scans")
+    picture = cv2.imread(str(photos / "a.png"))
+    for number in range(6):
+        cv2.imwrite(str(folder / "scans" / f"{number}.webp"), picture)
+    write_pair(folder / "pairs" / "a.png", folder / "pairs" / "b.png", seed=3)
+    pair = {"image1": "a.png", "image2": "b.png", "homography": TRUTH.tolist()}
+    (folder / "pairs" / "pairs.json").write_text(json.dumps({"pairs": [pair]}))
+    return made
 
 
-def execute(path: Path, statement: str) -> None:
-    """Execute a statement on a database."""
-    with closing(sqlite3.connect(path)) as connection:
-        connection.execute("PRAGMA foreign_keys = OFF")
-        connection.execute(statement)
-        connection.commit()
+def exports(folder: Path, photograph: str = "a.png") -> dict[str, tuple[list[object], str]]:
+    """All commands that write beside the output folder: arguments, and the name of a result."""
+    files = ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
+    images = ["--image-path", folder / "photos"]
+    new_files = ["--features-path", "{out}/features.h5", "--matches-path", "{out}/matches.h5"]
+    names = {
+        "ply": "points3D.ply", "text": "text", "nvm": "model.nvm", "bundler": "bundle.list.txt",
+        "undistorted": "dense", "nerfstudio": "dense", "cameras": "cameras.csv",
+        "geojson": "cameras.geojson",
+    }  # fmt: skip
+    assert names.keys() == FORMATS.keys()
+    found: dict[str, tuple[list[object], str]] = {}
+    for form, name in [*names.items(), ("ply,text,cameras,bundler,nerfstudio,geojson", "text")]:
+        for model in ("plain", "lens"):
+            given = ["--model-path", folder / model, *images, "--format", form]
+            found[f"{form} of {model}"] = (["export", *given, "--output-path", "{out}"], name)
+    distance = ["--distance", "b c.png,side/d.png,2.0", "--output-path", "{out}/new"]
+    found["align"] = (["align", "--model-path", folder / "plain", *distance], "new")
+    source = ["--database-path", folder / "any.db"]
+    found["export-h5"] = (["export-h5", *source, *new_files], "features.h5")
+    found["export-database"] = (["export-database", folder / "any.db", "{out}/old.db"], "old.db")
+    imported = ["import-h5", *images, *files, *CAMERA, "--database-path", "{out}/new.db"]
+    found["import-h5"] = (imported, "new.db")
+    scans = folder / "scans" if (folder / "scans").exists() else folder / "photos"
+    found["convert"] = (["convert", "--image-path", scans, "--output-path", "{out}"], "a.png")
+    image = folder / "photos" / photograph
+    plan = f"{image.stem}-plan.json"
+    found["inspect"] = (["inspect", image, *PLAIN, "--output-path", "{out}"], plan)
+    listed = ["--image-list-path", folder / "list.txt"] if (folder / "list.txt").exists() else []
+    compared = ["compare", *images, *listed, *COMPARED, "--output-path", "{out}"]
+    found["compare"] = (compared, "report.html")
+    return found
 
 
-def rows(path: Path) -> dict[str, list[Any]]:
-    """What a database answers to the probes."""
-    with closing(sqlite3.connect(path)) as connection:
-        return {probe: connection.execute(probe).fetchall() for probe in PROBES}
+def placed(arguments: list[object], out: Path) -> list[object]:
+    """Arguments with the output folder in its place, and no progress on stderr."""
+    return [*(str(word).replace("{out}", str(out)) for word in arguments), "-q"]
+
+
+def is_temporary(key: str) -> bool:
+    """Whether a path is of something that is not finished, or of a lock."""
+    return any(part.startswith(".") or ".affrect" in part for part in Path(key).parts)
+
+
+def finished(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Only what has a final name."""
+    return {key: value for key, value in found.items() if not is_temporary(key)}
+
+
+def folder_commands(scene: Scene, photos: Path) -> dict[str, list[object]]:
+    """Commands that fill an output folder, all but its name."""
+    images = ["--image-path", photos]
+    dataset = ["--dataset-path", scene.folder / "pairs", "--recipes", "unrectified-rootsift"]
+    return {
+        "run": ["run", "-q", *images, *FAST],
+        "extract": ["extract", "-q", *images, *FAST],
+        "compare": ["compare", "-q", *images, *COMPARED],
+        "evaluate": ["evaluate", "-q", "pairs", *dataset],
+        "inspect": ["inspect", "-q", photos / "a.png", *PLAIN],
+        "map": ["map", "-q", "--from-database", scene.folder / "any.db"],
+        "convert": ["convert", "-q", *images],
+    }
+
+
+def foreign_folder(kind: str, folder: Path) -> Path:
+    """Make a folder of the user's, which is not empty."""
+    made = folder / "mine"
+    made.mkdir()
+    (made / "notes.txt").write_text("mine")
+    for name in ("report.html", "database.db", "run.log") if kind == "report" else ():
+        (made / name).write_text("mine")
+    if kind == "database":
+        execute(made / "database.db", "CREATE TABLE mine (number)")
+    return {"photographs": folder / "photos", "above the photographs": folder}.get(kind, made)
+
+
+def make_world(scene: Scene, folder: Path) -> Path:
+    """Copy what exports read to where a few steps up lead to folders that are watched."""
+    base = folder / "world" / "one" / "two" / "three"
+    base.mkdir(parents=True)
+    for name in ("photos", "plain", "lens"):
+        shutil.copytree(scene.folder / name, base / name)
+    for name in ("any.db", "features.h5", "matches.h5"):
+        shutil.copy(scene.folder / name, base / name)
+    for name in ("one/photos", "photos", "elsewhere", "home"):
+        shutil.copytree(base / "photos", folder / "world" / name, dirs_exist_ok=True)
+    return base
+
+
+def rename_image(base: Path, name: str) -> None:
+    """Give an image a name in all that exports read, and make a photograph where it leads."""
+    world, path = base.parents[2], Path(os.path.normpath(base / "photos" / name))
+    with suppress(OSError):
+        if path.is_relative_to(world) and not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(base / "photos" / "a.png", path)
+    for model_path in (base / "plain", base / "lens"):
+        model = pycolmap.Reconstruction(model_path)
+        model.find_image_with_name("a.png").name = name
+        model.write(model_path)
+    quoted = name.replace("'", "''")
+    execute(base / "any.db", f"UPDATE images SET name = '{quoted}' WHERE name = 'a.png'")
+    with suppress(ValueError, RuntimeError), h5py.File(base / "features.h5", "a") as file:
+        file.copy("a.png", name)
+    (base / "list.txt").write_text(f"{name}\nb c.png\nside/č.png\nside/d.png\n", encoding="utf-8")
+
+
+def num_registered(model_path: Path) -> int:
+    """Count the images of a model that was written a moment ago."""
+    try:
+        return pycolmap.Reconstruction(model_path).num_reg_images()
+    except (ValueError, IndexError, RuntimeError) as error:
+        raise AssertionError(f"{model_path.name}: a model that cannot be read: {error}") from error
