@@ -26,11 +26,14 @@ from typing import Any
 import pytest
 from attacks import (
     COMPARED,
+    TRAPS,
     Command,
     Scene,
     assert_clear,
     assert_no_traceback,
+    assert_whole,
     differences,
+    empty_folder,
     ended,
     exports,
     finished,
@@ -39,7 +42,6 @@ from attacks import (
     is_temporary,
     make_scene,
     make_world,
-    num_registered,
     placed,
     rename_image,
     tell,
@@ -71,32 +73,18 @@ def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
 NAMES = (
     "{photos}/b c.png", "{world}/elsewhere/new.png", "//{photos}/b c.png", "../../x.png",
     "../b c.png", "../photos/b c.png", "../../../photos/b c.png", "../../../../photos/b c.png",
-    "side/../../../../../photos/x.png",
-    "side/../b c.png", "x.png/..", "..", ".", "./x.png", "side//x.png", "side/", "x.png/",
-    "C:\\x.png", "C:x.png", "\\\\server\\share\\x.png", "..\\..\\x.png", "x.png.", "x.png ",
+    "side/../../../../../photos/x.png", "x.png", "side/../b c.png", "x.png/..",
+    "..", ".", "./x.png", "side//x.png", "side/", "x.png/", "C:\\x.png", "C:x.png",
+    "\\\\server\\share\\x.png", "..\\..\\x.png", "x.png.", "x.png ",
     "\u202egnp.x", "side/c\u030c.png", "\U0001f4f7/x.png", "line\nbreak.png", "\x1b[31mred\x7f.png",
     "x" * 296 + ".png", "ž" * 148 + ".png", "/".join(["deep" * 12] * 20) + "/x.png", "~/x.png",
     "-rf.png", "dense/images/x.png", "sparse/0/cameras.bin", "",
 )  # fmt: skip
-"""Of an image in the place of a.png; a photograph is where a name leads, where that can be."""
-
-
-def assert_whole(label: str, out: Path) -> None:
-    """A command that ended well has all of its results inside of its folder."""
-    found = tree(out)
-    assert not [key for key, value in found.items() if value[0] == "link"], found
-    temporary = [key for key in found if is_temporary(key) and Path(key).name != ".lock"]
-    assert not temporary, f"left over: {temporary}"
-    assert any(value[0] != "folder" for value in found.values()), "nothing was written"
-    if "undistorted" in label or "nerfstudio" in label:
-        pictures = [path for path in (out / "dense" / "images").rglob("*") if path.is_file()]
-        assert (len(pictures), num_registered(out / "dense" / "sparse")) == (4, 4)
-    if "text" in label:
-        assert num_registered(out / "text") == 4
+"""Of an image in the place of a.png; x.png is harmless. A photograph is where a name leads."""
 
 
 def attack_exports(
-    base: Path, photograph: str, prepare: Callable[[Path, str], list[Path]]
+    base: Path, photograph: str, prepare: Callable[[Path, str], list[Path]], *codes: int
 ) -> list[str]:
     """Call all exports, each into a folder that is prepared; return what went wrong.
 
@@ -111,7 +99,7 @@ def attack_exports(
             end = ended(*placed(arguments, out), HOME=str(world / "home"))
             harmed = differences(before, tree(world, *allowed))
             assert not harmed, f"{harmed}, exit code {end.code}"
-            assert_clear(end, 0, 1, 2)
+            assert_clear(end, *codes, *((2,) if "nvm" in label else ()))  # spaces in other names
             if end.code == 0 and out in allowed:
                 assert_whole(label, out)
         except AssertionError as error:
@@ -119,12 +107,7 @@ def attack_exports(
     return wrong
 
 
-def empty_folder(out: Path, _: str) -> list[Path]:
-    out.mkdir(parents=True)
-    return [out]
-
-
-@pytest.mark.parametrize("name", NAMES, ids=lambda name: ascii(name)[1:25])
+@pytest.mark.parametrize("name", NAMES, ids=lambda name: ascii(name)[1:-1][:24])
 def test_names_of_images_lead_nowhere_else(scene: Scene, tmp_path: Path, name: str) -> None:
     base = make_world(scene, tmp_path)
     name = name.format(photos=base / "photos", world=base.parents[2])
@@ -132,55 +115,15 @@ def test_names_of_images_lead_nowhere_else(scene: Scene, tmp_path: Path, name: s
     photograph = "b c.png"
     with suppress(OSError):
         photograph = name if (base / "photos" / name).is_file() else photograph
-    wrong = attack_exports(base, photograph, empty_folder)
+    codes = (0,) if name == "x.png" else (0, 1, 2)
+    wrong = attack_exports(base, photograph, empty_folder, *codes)
     assert not wrong, "\n".join([f"image named {name!r}", *wrong])
-
-
-def linked(target: str) -> Callable[[Path, str], list[Path]]:
-    """A result is there already as a link; only the rest of the folder may change."""
-
-    def prepare(out: Path, result: str) -> list[Path]:
-        out.mkdir(parents=True)
-        (out / result).symlink_to(out.parents[1] / target)
-        return [out]
-
-    return prepare
-
-
-def linked_folder(out: Path, _: str) -> list[Path]:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.symlink_to(out.parents[1] / "photos")
-    return []
-
-
-def hard_link(out: Path, result: str) -> list[Path]:
-    out.mkdir(parents=True)
-    os.link(out.parents[1] / "photos" / "a.png", out / result)
-    return [out]
-
-
-def a_file(out: Path, _: str) -> list[Path]:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_bytes(b"mine")
-    return []
-
-
-TRAPS = {
-    "dangling link": linked("../new.png"),
-    "link to a photograph": linked("photos/a.png"),
-    "link to a folder": linked("../photos"),
-    "link to the photographs": linked("photos"),
-    "link to nothing beside the photographs": linked("photos/new"),
-    "output folder is a link to the photographs": linked_folder,
-    "output folder is a file": a_file,
-    "hard link to a photograph": hard_link,
-}
 
 
 @pytest.mark.parametrize("trap", TRAPS)
 def test_links_in_output_folders_are_not_followed(scene: Scene, tmp_path: Path, trap: str) -> None:
     base = make_world(scene, tmp_path)
-    wrong = attack_exports(base, "a.png", TRAPS[trap])
+    wrong = attack_exports(base, "a.png", TRAPS[trap], 0, 1, 2)
     assert not wrong, "\n".join([trap, *wrong])
 
 
@@ -375,7 +318,7 @@ def test_damaged_file_is_mended_or_named(
 # Part 4: the database between two runs.
 
 
-@pytest.mark.parametrize("statement", STATEMENTS)
+@pytest.mark.parametrize("statement", STATEMENTS, ids=lambda text: text[:70])
 def test_edited_database_is_made_again_or_refused(
     scene: Scene, expected: dict[str, Any], tmp_path: Path, statement: str
 ) -> None:
@@ -387,7 +330,7 @@ def test_edited_database_is_made_again_or_refused(
         assert_right("run", out, tmp_path, expected)
 
 
-@pytest.mark.parametrize("statement", MEANT)
+@pytest.mark.parametrize("statement", MEANT, ids=lambda text: text[:70])
 def test_meant_edit_is_kept_and_said(
     scene: Scene, expected: dict[str, Any], tmp_path: Path, statement: str
 ) -> None:
