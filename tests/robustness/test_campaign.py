@@ -451,7 +451,6 @@ def test_signal_ends_any_command_at_once(
 
 # Part 6: folders that are not ours.
 
-
 FOLDERS = ("report", "notes", "database", "photographs", "above the photographs")
 FILLERS = ("run", "extract", "compare", "evaluate", "inspect", "map", "convert")
 
