@@ -1,13 +1,13 @@
-"""What happens to runs that are killed, disks that are full, databases that are damaged. Usage:
+"""What happens to runs that are killed and disks that are full. Usage:
 
     python tests/benchmarks/campaign.py --output-path out/campaign --kills 150 --calls 100
 
 Each trial disturbs a small run (of the sample scene, or of the folders given) by chance, lets it
 end undisturbed, and compares features, matches, database and models byte by byte with those of a
-run that nothing disturbed. Trials with a database let commands read one that is damaged: they have
-to refuse it in one line, or to read it. Prints a line for each trial and a table; exits with 1 if
-anything was lost or went wrong, and leaves the folders of such trials. Every second folder is run
-with all stages, escalation and guided matches included.
+run that nothing disturbed. Prints a line for each trial and a table; exits with 1 if anything was
+lost or went wrong, and leaves the folders of such trials. Every second folder is run with all
+stages, escalation and guided matches included. Damaged files and databases, exports and all other
+commands: tests/robustness/test_campaign.py.
 
 Calls are those of the system that change files, found and killed at by ``strace``; full disks are
 file systems in memory, which only root can mount. The same seed makes the same choices, but
@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import os
 import random
 import re
 import shutil
@@ -26,7 +25,6 @@ import signal
 import subprocess
 import sys
 import time
-import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -36,13 +34,11 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from attacks import ended
 from command import Ended, start
-from damaged import BYTES, STATEMENTS, damage_bytes, damage_rows, pages
 from ended import assert_readable, end_again_and_again
 from machine import describe_machine, table
 from results import Undisturbed, results, run_arguments, run_undisturbed
-
-from colmap_affrect.cli import main as main_of_package
 
 SAMPLE = Path(__file__).parents[2] / "sample_scenes" / "courtyard" / "images"
 KILLS_IN_ONE_FOLDER = 3
@@ -95,8 +91,8 @@ class Case:
 
     def assert_finishes(self, out: Path) -> None:
         """Run again without disturbance and have the same results."""
-        ended = forked(*self.arguments(out), output=self.folder / "output")
-        assert ended.code == 0, ended.stderr
+        end = ended(*self.arguments(out))
+        assert end.code == 0, end.stderr
         found = content(out)
         different = [key for key in self.content if found.get(key) != self.content[key]]
         assert found.keys() == self.content.keys(), set(found) ^ set(self.content)
@@ -107,26 +103,6 @@ def ended_in(process: subprocess.Popen[str], timeout_s: float = 300) -> Ended:
     with process:
         stdout, stderr = process.communicate(timeout=timeout_s)
     return Ended(process.returncode, stdout, stderr.splitlines())
-
-
-def forked(*arguments: object, output: Path) -> Ended:
-    """Run a command in a fork of this process, which has all modules already."""
-    paths = [output.with_suffix(suffix) for suffix in (".out", ".err")]
-    if not (child := os.fork()):
-        for number, path in enumerate(paths, 1):
-            os.dup2(os.open(path, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
-        try:
-            code = main_of_package([str(argument) for argument in arguments])
-        except SystemExit as end:
-            code = int(end.code or 0)
-        except BaseException:  # noqa: BLE001 - this process must not go on as its parent
-            traceback.print_exc()
-            code = 1
-        sys.stdout.flush()
-        os._exit(code)
-    _, status = os.waitpid(child, 0)
-    stdout, stderr = (path.read_text(encoding="utf-8") for path in paths)
-    return Ended(os.waitstatus_to_exitcode(status), stdout, stderr.splitlines())
 
 
 def run_traced(options: Sequence[object], arguments: Sequence[str]) -> int:
@@ -170,65 +146,22 @@ def disks(case: Case, out: Path, chance: random.Random) -> str:
     disk.mkdir(exist_ok=True)
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={num_kib}k", "none", disk], check=True)
     try:
-        ended = ended_in(start(*case.arguments(disk / "out")))
-        if ended.code:
-            assert ended.code == 1, (ended.code, ended.stderr)
-            assert len(ended.stderr) == 1, ended.stderr
-            assert "free space" in ended.stderr[0], ended.stderr
+        end = ended_in(start(*case.arguments(disk / "out")))
+        if end.code:
+            assert end.code == 1, (end.code, end.stderr)
+            assert len(end.stderr) == 1, end.stderr
+            assert "free space" in end.stderr[0], end.stderr
         subprocess.run(["mount", "-o", "remount,size=2g", disk], check=True)
         case.assert_finishes(disk / "out")
     finally:
         subprocess.run(["umount", disk], check=True)
-    return f"{num_kib} KiB, exit code {ended.code}"
-
-
-def reads(path: Path, case: Case, out: Path) -> str:
-    """Let commands read a database; each has to refuse it in one line, or to do its work."""
-    before, codes = path.read_bytes(), []
-    inputs = ["--image-path", case.photos, *SMALL]
-    for command in (
-        ["map", "-q", "--from-database", path, "--output-path", out / "map"],
-        ["extract", "-q", "--from-database", path, "--output-path", out / "extract", *inputs],
-        ["doctor", path],
-    ):
-        ended = forked(*command, output=out / "output")
-        codes.append(ended.code)
-        assert ended.code in (0, 1, 3), (command[0], ended)
-        assert "Traceback" not in "".join(ended.stderr), (command[0], ended)
-        if ended.code == 1 and command[0] != "doctor":
-            assert len(ended.errors) == len(ended.stderr) == 1, (command[0], ended)
-    assert path.read_bytes() == before, "the database was changed"
-    return f"exit codes of map, extract, doctor: {codes}"
-
-
-def damaged_pages(case: Case, out: Path, chance: random.Random) -> str:
-    """Read a database of which one page is noise."""
-    path = copy_of_database(case, out)
-    done = damage_bytes(path, pages, chance)
-    return f"{done}; {reads(path, case, out)}"
-
-
-def databases(case: Case, out: Path, chance: random.Random) -> str:
-    """Read a database with something else wrong."""
-    path = copy_of_database(case, out)
-    if chance.random() < 0.5:
-        done = damage_rows(path, chance.choice(STATEMENTS), chance)
-    else:
-        done = damage_bytes(path, chance.choice(BYTES), chance)
-    return f"{done}; {reads(path, case, out)}"
-
-
-def copy_of_database(case: Case, out: Path) -> Path:
-    out.mkdir(parents=True)
-    return Path(shutil.copy(case.undisturbed.out / "database.db", out / "any.db"))
+    return f"{num_kib} KiB, exit code {end.code}"
 
 
 TRIALS: dict[str, tuple[Callable[[Case, Path, random.Random], str], int]] = {
     "kills": (kills, KILLS_IN_ONE_FOLDER),
     "calls": (calls, 1),
     "disks": (disks, 1),
-    "pages": (damaged_pages, 1),
-    "databases": (databases, 1),
 }
 """Kinds of trials, and how many disturbances each has."""
 
@@ -261,8 +194,6 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=0, help="at random moments")
     parser.add_argument("--calls", type=int, default=0, help="kills at system calls")
     parser.add_argument("--disks", type=int, default=0, help="that are full")
-    parser.add_argument("--pages", type=int, default=0, help="of noise, in databases")
-    parser.add_argument("--databases", type=int, default=0, help="with other damage")
     arguments = parser.parse_args()
     folder = arguments.output_path.resolve()
     cases = []

@@ -1,6 +1,6 @@
 """Runs that are killed, ended and interrupted at random moments, and run again.
 
-Many more, and what else can happen to a run: tests/benchmarks/campaign.py.
+Many more: tests/benchmarks/campaign.py; of other commands: test_campaign.py.
 """
 
 from __future__ import annotations

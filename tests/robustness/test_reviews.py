@@ -227,7 +227,8 @@ ROWS: list[tuple[str, str, tuple[str, ...]]] = [
     ),
     (
         "kills at random moments and single system calls, full disks, damaged pages and databases",
-        "all resumed to identical results or refused in one line: tests/benchmarks/campaign.py. A "
+        "all resumed to identical results or refused in one line: test_campaign.py here, and "
+        "tests/benchmarks/campaign.py. A "
         "kill between two changes of the matches, which lost climbed pairs, is a test of its own",
         (
             "stages/test_escalate.py::"

@@ -1,0 +1,413 @@
+"""Attacks: commands in processes that can be ended, damage to files, and what is there then."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import runpy
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+from command import CAMERA, FAST, Ended
+from damaged import execute
+from planar_pairs import TRUTH, write_pair
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.interop.export import FORMATS
+from colmap_affrect.interop.georeference import Georeference
+
+HANGING_S = 30.0
+PLAIN = ["--recipe", "unrectified-rootsift"]
+COMPARED = ["--methods", "unrectified-rootsift", "--seeds", "0", *CAMERA]
+
+PROCESSES = multiprocessing.get_context("forkserver")
+PROCESSES.set_forkserver_preload([
+    "colmap_affrect.cli.commands", "colmap_affrect.doctor", "colmap_affrect.evaluation.evaluate",
+    "colmap_affrect.interop.align", "colmap_affrect.interop.export", "colmap_affrect.interop.hdf5",
+    "colmap_affrect.pipeline", "colmap_affrect.comparison.compare", "colmap_affrect.mappers.sparse",
+    "colmap_affrect.report.run_page", "torch", "kornia", "matplotlib.pyplot",
+])  # fmt: skip
+
+
+def _be_the_command(arguments: Sequence[str], said: Path, variables: Mapping[str, str]) -> None:
+    """Turn this process into the command line, and end it."""
+    os.setsid()
+    os.environ.update(variables)
+    os.fsync = lambda _: None
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number, name in enumerate(("out", "err"), 1):
+        os.dup2(os.open(said / name, os.O_CREAT | os.O_WRONLY), number)
+    sys.argv = ["colmap-affrect", *arguments]
+    (said / "begun").touch()
+    runpy.run_module("colmap_affrect", run_name="__main__", alter_sys=True)
+
+
+class Command:
+    """The command line at work in a process and a group of its own.
+
+    The process is forked from one that has all modules; a ``fresh`` one starts from nothing, as
+    for a user.
+    """
+
+    def __init__(self, *arguments: object, fresh: bool = False, **variables: str) -> None:
+        self.words = [str(argument) for argument in arguments]
+        self.said = Path(tempfile.mkdtemp(prefix="said-"))
+        self.fresh: subprocess.Popen[bytes] | None = None
+        if fresh:
+            with (self.said / "out").open("wb") as out, (self.said / "err").open("wb") as err:
+                self.fresh = subprocess.Popen(
+                    [sys.executable, "-m", "colmap_affrect", *self.words],
+                    stdout=out, stderr=err, start_new_session=True,
+                    preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
+                )  # fmt: skip
+            return
+        arguments = (self.words, self.said, variables)
+        self.forked = PROCESSES.Process(target=_be_the_command, args=arguments)
+        self.forked.start()
+        while not (self.said / "begun").exists() and self.forked.is_alive():
+            time.sleep(0.001)
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal: Ctrl-C to the whole group, as terminals do, others to the process."""
+        with suppress(ProcessLookupError):
+            (os.killpg if number == signal.SIGINT else os.kill)(self.group, number)
+
+    @property
+    def group(self) -> int:
+        """The process, and the group that it leads."""
+        return (self.fresh or self.forked).pid or 0
+
+    def others(self) -> list[str]:
+        """Processes that it started and that are still at work."""
+        shown = subprocess.run(
+            ["ps", "-eo", "pgid=,stat=,args="], capture_output=True, text=True, check=True
+        )
+        rows = [line.split(None, 2) for line in shown.stdout.splitlines()]
+        return [args for group, state, args in rows if int(group) == self.group and state[0] != "Z"]
+
+    def _code(self, timeout_s: float) -> int | None:
+        if self.fresh:
+            with suppress(subprocess.TimeoutExpired):
+                return self.fresh.wait(timeout_s)
+            return None
+        self.forked.join(timeout_s)
+        return self.forked.exitcode
+
+    def ended(self, timeout_s: float = HANGING_S) -> Ended:
+        """Wait for the end; a command that does not come to one is killed, and the test fails."""
+        if (code := self._code(timeout_s)) is None:
+            os.killpg(self.group, signal.SIGKILL)
+            self._code(HANGING_S)
+        text = [(self.said / name).read_text(errors="replace") for name in ("out", "err")]
+        shutil.rmtree(self.said)
+        assert code is not None, f"no end after {timeout_s:g} s: {self.words} {text[1][-500:]}"
+        return Ended(code, text[0], text[1].splitlines())
+
+
+def ended(*arguments: object, **variables: str) -> Ended:
+    """Run a command to its end."""
+    return Command(*arguments, **variables).ended()
+
+
+def assert_no_traceback(end: Ended) -> None:
+    """Nobody sees where in the program something went wrong."""
+    lines = [*end.stdout.splitlines(), *end.stderr]
+    assert not any("Traceback" in line for line in lines), f"traceback: {lines[-1]}"
+
+
+def assert_clear(end: Ended, *codes: int) -> None:
+    """No traceback, one of these exit codes, and one line that says why if it is not 0."""
+    assert_no_traceback(end)
+    assert end.code in codes, end
+    if end.code:
+        assert len(end.errors) == len(end.stderr) == 1, end
+    else:
+        assert not end.errors, end
+
+
+def tell(text: str) -> None:
+    """Say what a trial does; pytest shows it when the trial fails."""
+    sys.stdout.write(f"{text}\n")
+
+
+def tree(folder: Path, *without: Path, times: bool = True) -> dict[str, tuple[object, ...]]:
+    """What is in a folder, by its path there: files by digest and time; links are not followed."""
+    found: dict[str, tuple[object, ...]] = {}
+    for path in folder.rglob("*"):
+        if any(path.is_relative_to(other) for other in without):
+            continue
+        key = str(path.relative_to(folder))
+        if path.is_symlink():
+            found[key] = ("link", str(path.readlink()))
+        elif path.is_file():
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            found[key] = (digest, path.stat().st_mtime_ns) if times else (digest,)
+        else:
+            found[key] = ("folder",)
+    return found
+
+
+def differences(before: Mapping[str, object], after: Mapping[str, object]) -> list[str]:
+    """What was made, changed or removed between two looks at a folder."""
+    keys = before.keys() | after.keys()
+    told = {(False, True): "made", (True, False): "removed", (True, True): "changed"}
+    return sorted(
+        f"{told[key in before, key in after]} {key!r}"
+        for key in keys
+        if before.get(key) != after.get(key)
+    )
+
+
+@dataclass
+class Scene:
+    """A finished run of the small scene, and what commands need beside it.
+
+    Attributes:
+        folder: has ``photos``; ``out``, all stages; the model as it is and with a lens that
+            distorts, both with a place on earth; files of hloc; a dataset; scans to be converted.
+    """
+
+    folder: Path
+    undisturbed: dict[str, tuple[dict[str, Any], float]] = field(default_factory=dict)
+
+    @property
+    def out(self) -> Path:
+        return self.folder / "out"
+
+    def run(self, out: Path) -> list[object]:
+        """Arguments of the run."""
+        given = ["--image-path", self.folder / "photos", "--output-path", out]
+        return ["run", "-q", *given, *FAST, "--guided", "always"]
+
+    def copy(self, folder: Path) -> Path:
+        """Copy the output folder; times stay."""
+        return Path(shutil.copytree(self.out, folder / "copy", symlinks=True))
+
+    def ended(self, label: str, out: Path) -> tuple[dict[str, Any], float]:
+        """What an undisturbed command leaves in its output folder, and how long it takes."""
+        for _ in range(2 if label not in self.undisturbed else 0):  # the first one is slow
+            out.mkdir()
+            begun = time.monotonic()
+            end = ended(*placed(exports(self.folder)[label][0], out))
+            assert end.code == 0, end
+            self.undisturbed[label] = tree(out, times=False), time.monotonic() - begun
+            shutil.rmtree(out)
+        return self.undisturbed[label]
+
+
+def make_scene(photos: Path, folder: Path) -> Scene:
+    """Run the small scene, and put beside it what commands need."""
+    made = Scene(folder)
+    shutil.copytree(photos, folder / "photos")
+    assert ended(*made.run(made.out)).code == 0
+    files = ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
+    assert ended("export-h5", "--output-path", made.out, *files).code == 0
+    shutil.copy(made.out / "database.db", folder / "any.db")
+    for name in ("plain", "lens"):
+        model = pycolmap.Reconstruction(made.out / "sparse" / "0")
+        for camera in model.cameras.values() if name == "lens" else ():
+            camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+            camera.params = [300.0, 160.0, 120.0, 0.05]
+        (folder / name).mkdir()
+        model.write(folder / name)
+        Georeference(50.0, 14.0, 200.0).write(folder / name)
+    shutil.copytree(photos, folder / "scans")
+    picture = cv2.imread(str(photos / "a.png"))
+    for number in range(6):
+        cv2.imwrite(str(folder / "scans" / f"{number}.webp"), picture)
+    write_pair(folder / "pairs" / "a.png", folder / "pairs" / "b.png", seed=3)
+    pair = {"image1": "a.png", "image2": "b.png", "homography": TRUTH.tolist()}
+    (folder / "pairs" / "pairs.json").write_text(json.dumps({"pairs": [pair]}))
+    return made
+
+
+def exports(folder: Path, photograph: str = "a.png") -> dict[str, tuple[list[object], str]]:
+    """All commands that write beside the output folder: arguments, and the name of a result."""
+    files = ["--features-path", folder / "features.h5", "--matches-path", folder / "matches.h5"]
+    images = ["--image-path", folder / "photos"]
+    new_files = ["--features-path", "{out}/features.h5", "--matches-path", "{out}/matches.h5"]
+    names = {
+        "ply": "points3D.ply", "text": "text", "nvm": "model.nvm", "bundler": "bundle.list.txt",
+        "undistorted": "dense", "nerfstudio": "dense", "cameras": "cameras.csv",
+        "geojson": "cameras.geojson",
+    }  # fmt: skip
+    assert names.keys() == FORMATS.keys()
+    found: dict[str, tuple[list[object], str]] = {}
+    for form, name in [*names.items(), ("ply,text,cameras,bundler,nerfstudio,geojson", "text")]:
+        for model in ("plain", "lens"):
+            given = ["--model-path", folder / model, *images, "--format", form]
+            found[f"{form} of {model}"] = (["export", *given, "--output-path", "{out}"], name)
+    distance = ["--distance", "b c.png,side/d.png,2.0", "--output-path", "{out}/new"]
+    found["align"] = (["align", "--model-path", folder / "plain", *distance], "new")
+    source = ["--database-path", folder / "any.db"]
+    found["export-h5"] = (["export-h5", *source, *new_files], "features.h5")
+    found["export-database"] = (["export-database", folder / "any.db", "{out}/old.db"], "old.db")
+    imported = ["import-h5", *images, *files, *CAMERA, "--database-path", "{out}/new.db"]
+    found["import-h5"] = (imported, "new.db")
+    scans = folder / "scans" if (folder / "scans").exists() else folder / "photos"
+    found["convert"] = (["convert", "--image-path", scans, "--output-path", "{out}"], "a.png")
+    image = folder / "photos" / photograph
+    plan = f"{image.stem}-plan.json"
+    found["inspect"] = (["inspect", image, *PLAIN, "--output-path", "{out}"], plan)
+    listed = ["--image-list-path", folder / "list.txt"] if (folder / "list.txt").exists() else []
+    compared = ["compare", *images, *listed, *COMPARED, "--output-path", "{out}"]
+    found["compare"] = (compared, "report.html")
+    return found
+
+
+def placed(arguments: list[object], out: Path) -> list[object]:
+    """Arguments with the output folder in its place, and no progress on stderr."""
+    return [*(str(word).replace("{out}", str(out)) for word in arguments), "-q"]
+
+
+def is_temporary(key: str) -> bool:
+    """Whether a path is of something that is not finished, or of a lock."""
+    return any(part.startswith(".") or ".affrect" in part for part in Path(key).parts)
+
+
+def finished(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Only what has a final name."""
+    return {key: value for key, value in found.items() if not is_temporary(key)}
+
+
+def folder_commands(scene: Scene, photos: Path) -> dict[str, list[object]]:
+    """Commands that fill an output folder, all but its name."""
+    images = ["--image-path", photos]
+    dataset = ["--dataset-path", scene.folder / "pairs", "--recipes", "unrectified-rootsift"]
+    return {
+        "run": ["run", "-q", *images, *FAST],
+        "extract": ["extract", "-q", *images, *FAST],
+        "compare": ["compare", "-q", *images, *COMPARED],
+        "evaluate": ["evaluate", "-q", "pairs", *dataset],
+        "inspect": ["inspect", "-q", photos / "a.png", *PLAIN],
+        "map": ["map", "-q", "--from-database", scene.folder / "any.db"],
+        "convert": ["convert", "-q", *images],
+    }
+
+
+def foreign_folder(kind: str, folder: Path) -> Path:
+    """Make a folder of the user's, which is not empty."""
+    made = folder / "mine"
+    made.mkdir()
+    (made / "notes.txt").write_text("mine")
+    for name in ("report.html", "database.db", "run.log") if kind == "report" else ():
+        (made / name).write_text("mine")
+    if kind == "database":
+        execute(made / "database.db", "CREATE TABLE mine (number)")
+    return {"photographs": folder / "photos", "above the photographs": folder}.get(kind, made)
+
+
+def make_world(scene: Scene, folder: Path) -> Path:
+    """Copy what exports read to where a few steps up lead to folders that are watched."""
+    base = folder / "world" / "one" / "two" / "three"
+    base.mkdir(parents=True)
+    for name in ("photos", "plain", "lens"):
+        shutil.copytree(scene.folder / name, base / name)
+    for name in ("any.db", "features.h5", "matches.h5"):
+        shutil.copy(scene.folder / name, base / name)
+    for name in ("one/photos", "photos", "elsewhere", "home"):
+        shutil.copytree(base / "photos", folder / "world" / name, dirs_exist_ok=True)
+    return base
+
+
+def rename_image(base: Path, name: str) -> None:
+    """Give an image a name in all that exports read, and make a photograph where it leads."""
+    world, path = base.parents[2], Path(os.path.normpath(base / "photos" / name))
+    with suppress(OSError):
+        if path.is_relative_to(world) and not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(base / "photos" / "a.png", path)
+    for model_path in (base / "plain", base / "lens"):
+        model = pycolmap.Reconstruction(model_path)
+        model.find_image_with_name("a.png").name = name
+        model.write(model_path)
+    quoted = name.replace("'", "''")
+    execute(base / "any.db", f"UPDATE images SET name = '{quoted}' WHERE name = 'a.png'")
+    with suppress(ValueError, RuntimeError), h5py.File(base / "features.h5", "a") as file:
+        file.copy("a.png", name)
+    (base / "list.txt").write_text(f"{name}\nb c.png\nside/č.png\nside/d.png\n", encoding="utf-8")
+
+
+def num_registered(model_path: Path) -> int:
+    """Count the images of a model that was written a moment ago."""
+    try:
+        return pycolmap.Reconstruction(model_path).num_reg_images()
+    except (ValueError, IndexError, RuntimeError) as error:
+        raise AssertionError(f"{model_path.name}: a model that cannot be read: {error}") from error
+
+
+def assert_whole(label: str, out: Path) -> None:
+    """A command that ended well has all of its results inside of its folder."""
+    found = tree(out)
+    links = {key: value for key, value in found.items() if value[0] == "link"}
+    assert not links, f"links are taken for results: {links}"
+    temporary = [key for key in found if "affrect" in key]
+    assert not temporary, f"left over: {temporary}"
+    assert any(value[0] != "folder" for value in found.values()), "nothing was written"
+    if "undistorted" in label or "nerfstudio" in label:
+        pictures = [path for path in (out / "dense" / "images").rglob("*") if path.is_file()]
+        assert (len(pictures), num_registered(out / "dense" / "sparse")) == (4, 4)
+    if "text" in label:
+        assert num_registered(out / "text") == 4
+
+
+# Output folders before an export; each function returns what may be changed then.
+
+
+def empty_folder(out: Path, _: str) -> list[Path]:
+    out.mkdir(parents=True)
+    return [out]
+
+
+def linked(target: str) -> Callable[[Path, str], list[Path]]:
+    """A result is there already as a link; only the rest of the folder may change."""
+
+    def prepare(out: Path, result: str) -> list[Path]:
+        out.mkdir(parents=True)
+        (out / result).symlink_to(out.parents[1] / target)
+        return [out]
+
+    return prepare
+
+
+def linked_folder(out: Path, _: str) -> list[Path]:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.symlink_to(out.parents[1] / "photos")
+    return []
+
+
+def hard_link(out: Path, result: str) -> list[Path]:
+    out.mkdir(parents=True)
+    os.link(out.parents[1] / "photos" / "a.png", out / result)
+    return [out]
+
+
+def a_file(out: Path, _: str) -> list[Path]:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_bytes(b"mine")
+    return []
+
+
+TRAPS = {
+    "dangling link": linked("../new.png"),
+    "link to a photograph": linked("photos/a.png"),
+    "link to a folder": linked("../photos"),
+    "link to the photographs": linked("photos"),
+    "link to nothing beside the photographs": linked("photos/new"),
+    "output folder is a link to the photographs": linked_folder,
+    "output folder is a file": a_file,
+    "hard link to a photograph": hard_link,
+}

@@ -1,0 +1,162 @@
+"""Damage to files by chance, and edits of COLMAP databases."""
+
+from __future__ import annotations
+
+import os
+import random
+import sqlite3
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+PAGE_BYTES = 4096
+
+# Damage to the bytes of a file; each returns what it did.
+
+
+def bits(data: bytearray, chance: random.Random) -> str:
+    places = [chance.randrange(len(data)) for _ in range(chance.choice((1, 4, 32)))]
+    for place in places:
+        data[place] ^= 1 << chance.randrange(8)
+    return f"bits flipped in {len(places)} bytes, the first at {places[0]}"
+
+
+def _page(data: bytearray, chance: random.Random) -> slice:
+    start = chance.randrange(-(-len(data) // PAGE_BYTES)) * PAGE_BYTES
+    return slice(start, min(len(data), start + PAGE_BYTES))
+
+
+def zeros(data: bytearray, chance: random.Random) -> str:
+    page = _page(data, chance)
+    data[page] = bytes(page.stop - page.start)
+    return f"page at {page.start} zeroed"
+
+
+def noise(data: bytearray, chance: random.Random) -> str:
+    page = _page(data, chance)
+    data[page] = chance.randbytes(page.stop - page.start)
+    return f"page at {page.start} is noise"
+
+
+def header(data: bytearray, chance: random.Random) -> str:
+    place = chance.randrange(min(100, len(data)))
+    data[place] ^= chance.randrange(1, 256)
+    return f"header changed at {place}"
+
+
+def exchanged(data: bytearray, chance: random.Random) -> str:
+    source, target = _page(data, chance), _page(data, chance)
+    data[target] = data[source][: target.stop - target.start]
+    return f"page at {source.start} written over that at {target.start}"
+
+
+def cut(data: bytearray, chance: random.Random) -> str:
+    del data[chance.randrange(len(data)) :]
+    return f"cut off at {len(data)}"
+
+
+def emptied(data: bytearray, _: random.Random) -> str:
+    data.clear()
+    return "emptied"
+
+
+def random_bytes(data: bytearray, chance: random.Random) -> str:
+    data[:] = chance.randbytes(len(data))
+    return "all bytes random"
+
+
+HARMS: tuple[Callable[[bytearray, random.Random], str], ...] = (
+    bits, zeros, noise, header, exchanged, cut, emptied, random_bytes,
+)  # fmt: skip
+
+
+def damage(
+    path: Path, chance: random.Random, harms: Sequence[Any] = HARMS, others: Sequence[Path] = ()
+) -> str:
+    """Damage a file, or give it the content of another one; return what was done.
+
+    Its times stay as they were half of the times: disks fail, too.
+    """
+    stat, data = path.stat(), bytearray(path.read_bytes())
+    before = bytes(data)
+    while data == before:
+        if others and chance.randrange(len(harms) + 1) == 0:
+            other = chance.choice([other for other in others if other.name != path.name])
+            data, done = bytearray(other.read_bytes()), f"content of {other.name}"
+        else:
+            done = chance.choice(harms)(data, chance)
+    path.write_bytes(data)
+    if keeps_times := chance.random() < 0.5:
+        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    return f"{path.name}: {done}{', times kept' if keeps_times else ''}"
+
+
+STATEMENTS = (
+    "UPDATE images SET camera_id = 999 WHERE image_id = {id}",
+    "UPDATE images SET name = '' WHERE image_id = {id}",
+    "UPDATE images SET name = x'ff00fe' WHERE image_id = {id}",
+    "UPDATE images SET name = 'renamed.png' WHERE image_id = {id}",
+    "DELETE FROM images WHERE image_id = {id}",
+    "INSERT INTO images (name, camera_id) VALUES ('more.png', 1)",
+    "UPDATE keypoints SET rows = 100000 WHERE image_id = {id}",
+    "UPDATE keypoints SET rows = -1 WHERE image_id = {id}",
+    "UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = {id}",
+    "UPDATE keypoints SET data = substr(data, 1, 101) WHERE image_id = {id}",
+    "UPDATE keypoints SET data = NULL WHERE image_id = {id}",
+    "DELETE FROM keypoints WHERE image_id = {id}",
+    "UPDATE matches SET rows = 100000",
+    "UPDATE matches SET data = x'ffffffffffffffff', rows = 1",
+    "UPDATE two_view_geometries SET config = 77",
+    "UPDATE two_view_geometries SET qvec = zeroblob(32)",
+    "UPDATE two_view_geometries SET data = x'ffffffffffffffff', rows = 1",
+    "DELETE FROM two_view_geometries",
+    "UPDATE cameras SET width = 100",
+    "UPDATE cameras SET params = x'00'",
+    "UPDATE frames SET rig_id = 99",
+    "DELETE FROM rigs",
+    "DELETE FROM cameras",
+    "DROP TABLE frame_data",
+    "DROP TABLE two_view_geometries",
+    "ALTER TABLE images RENAME COLUMN camera_id TO camera",
+    "CREATE TRIGGER nosy AFTER INSERT ON matches BEGIN DELETE FROM images; END",
+    "PRAGMA user_version = 2147483647",
+)
+"""What nobody means to do to the rows of a database; ``{id}`` is one of the images."""
+
+MEANT = (
+    "DELETE FROM two_view_geometries WHERE pair_id = (SELECT min(pair_id) FROM matches)",
+    "DELETE FROM matches WHERE pair_id = (SELECT min(pair_id) FROM matches)",
+    "INSERT INTO pose_priors SELECT 1, data_id, sensor_id, sensor_type, "
+    "x'000000000000F03F000000000000F03F000000000000F03F', NULL, NULL, 1 FROM frame_data LIMIT 1",
+    "UPDATE cameras SET params = "
+    "x'00000000008072400000000000C0724000000000000064400000000000005E40' WHERE camera_id = 1",
+)
+"""Edits that a user may mean; the second takes the matches of a pair and leaves its geometry."""
+
+PROBES = (
+    "SELECT image_id, name, camera_id FROM images ORDER BY name",
+    "SELECT * FROM cameras ORDER BY camera_id",
+    "SELECT count(*), total(length(data)), total(rows) FROM keypoints",
+    "SELECT pair_id, rows FROM matches ORDER BY pair_id",
+    "SELECT pair_id, rows, config FROM two_view_geometries ORDER BY pair_id",
+    "SELECT * FROM pose_priors",
+    "SELECT * FROM frames ORDER BY frame_id",
+    "SELECT count(*) FROM rigs",
+    "SELECT type, name FROM sqlite_master ORDER BY type, name",
+    "PRAGMA user_version",
+)
+
+
+def execute(path: Path, statement: str) -> None:
+    """Execute a statement on a database."""
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA foreign_keys = OFF")
+        connection.execute(statement)
+        connection.commit()
+
+
+def rows(path: Path) -> dict[str, list[Any]]:
+    """What a database answers to the probes."""
+    with closing(sqlite3.connect(path)) as connection:
+        return {probe: connection.execute(probe).fetchall() for probe in PROBES}
