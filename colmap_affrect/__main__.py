@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NoReturn
 
 from colmap_affrect.errors import INTERRUPTED
@@ -26,7 +27,7 @@ def main() -> NoReturn:
 
     def stop(number: int, _: object) -> None:
         told.append(number)
-        os.kill(worker, signal.SIGTERM)
+        _kill(worker, signal.SIGTERM)
         signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
 
     parent = os.getpid()
@@ -35,9 +36,11 @@ def main() -> NoReturn:
     if not worker:
         _end_with(parent)
         _work()
-    signal.signal(signal.SIGALRM, lambda *_: os.kill(worker, signal.SIGKILL))
+    signal.signal(signal.SIGALRM, lambda *_: _kill(worker, signal.SIGKILL))
     _handle(stop)
     _, status = os.waitpid(worker, 0)
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     sys.exit(_exit_code(os.waitstatus_to_exitcode(status), told))
 
 
@@ -48,6 +51,11 @@ def _handle(handler: Callable[[int, object], None]) -> None:
             signal.signal(number, handler)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+
+
+def _kill(worker: int, number: int) -> None:
+    with suppress(ProcessLookupError):  # it has just ended
+        os.kill(worker, number)
 
 
 def _exit_code(code: int, told: list[int]) -> int:

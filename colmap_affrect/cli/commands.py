@@ -19,6 +19,7 @@ from colmap_affrect.errors import ComparisonError, OptionError
 from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK, by_level
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.shown import such_as
 
 if TYPE_CHECKING:
     from colmap_affrect.comparison.results import Comparison
@@ -384,7 +385,11 @@ def convert(options: argparse.Namespace) -> int:
 
     report = convert_images(options.image_path, options.converted_path, given.progress(options))
     show(report.summary())
-    return EXIT_FAILED if report.failures else EXIT_OK
+    if not report.failures:
+        return EXIT_OK
+    names = such_as(sorted(report.failures))
+    show(f"error: could not convert {len(report.failures)} files: {names}", file=sys.stderr)
+    return EXIT_FAILED
 
 
 def recipes(options: argparse.Namespace) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.colmap.database_copy import copy_database, read_names
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.outputs import new_results
@@ -84,7 +84,7 @@ def export_database(source: Path, target: Path) -> list[str]:
     target exists.
     """
     photographs = Workspace(source.parent).photographs()
-    with new_results(target, photographs=photographs) as (old,):
+    with new_results(target, photographs=photographs, names=read_names(source)) as (old,):
         new = old.with_name("new.db")
         copy_database(source, new, FATAL)
         require_space(target, new.stat().st_size)

@@ -60,6 +60,7 @@ def convert_images(
     names, report = photograph_files(image_path), ConversionReport()
     if not names:
         raise ImageError(f"{image_path}: holds no photographs")
+    _refuse_other_content(output_path, names)
     with progress.stage("convert", len(names), "images") as advance:
         for name in names:
             try:
@@ -68,6 +69,18 @@ def convert_images(
                 report.failures[name] = str(error)
             advance(1)
     return report
+
+
+def _refuse_other_content(folder: Path, names: Sequence[str]) -> None:
+    """Refuse a folder with other things than what an earlier call has made; OptionError."""
+    known = {PurePosixPath(name).parts[0] for name in names}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        original = path.name.partition("-page")[0].removesuffix(".png")
+        if not {path.name, original} & known and not path.name.startswith("."):
+            raise OptionError(
+                f"{folder}: is not empty ({path.name}), and that is not made of these photographs; "
+                "give a new or an empty folder"
+            )
 
 
 def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> None:

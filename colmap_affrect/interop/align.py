@@ -96,7 +96,7 @@ def align(model_path: Path, output_path: Path, reference: Reference) -> Alignmen
         new_from_old, residuals = _similarity(names, old, new)
     model.transform(new_from_old)
     photographs = Workspace.of_model(model_path).photographs()
-    with new_results(output_path, photographs=photographs) as (folder,):
+    with new_results(output_path, photographs=photographs, names=_images(model)) as (folder,):
         write_model(model, folder)
         if place:
             place.write(folder)

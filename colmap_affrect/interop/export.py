@@ -86,7 +86,8 @@ def export(
     chosen = {name: FORMATS[name] for name in FORMATS if name in formats}
     names = dict.fromkeys(name for _, made in chosen.values() for name in made)
     targets = [output_path / name for name in names]
-    with new_results(*targets, photographs=photographs) as made:
+    images = [image.name for image in source.images()]
+    with new_results(*targets, photographs=photographs, names=images) as made:
         folder = made[0].parent
         written = {name: write(source, folder) for name, (write, _) in chosen.items()}
     return {name: output_path / path.relative_to(folder) for name, path in written.items()}
@@ -100,6 +101,9 @@ def _points(source: Source, folder: Path) -> Path:
 
 def _text(source: Source, folder: Path) -> Path:
     path = folder / "text"
+    for image in source.images():
+        if not image.name or not image.name.isprintable():
+            raise OptionError(f"text: cannot hold the image name {image.name!r}; rename it")
     path.mkdir()
     source.model.write_text(path)
     return path

@@ -209,12 +209,11 @@ def export_h5(
     photographs = output_path and Workspace(output_path).photographs()
     counts: dict[str, int] = {}
     num_matches, num_lost = 0, 0
-    with (
-        new_results(features_path, matches_path, photographs=photographs) as (new, new_matches),
-        _content(output_path, database_path) as content,
-    ):
+    with _content(output_path, database_path) as content:
         check_names(content.names, layout)
+        targets, names = (features_path, matches_path), content.names
         with (
+            new_results(*targets, photographs=photographs, names=names) as (new, new_matches),
             created(new, features_path) as features,
             created(new_matches, matches_path) as matches,
         ):

@@ -7,7 +7,7 @@ nothing but what this call has made is ever taken away.
 
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from tempfile import TemporaryDirectory
@@ -52,6 +52,17 @@ def refuse_link(path: Path) -> None:
         )
 
 
+def folder_of(names: Collection[str], target: Path) -> Path | None:
+    """Return the folder above a file to be written in which photographs of these names lie."""
+    inner = [name for name in names if not leads_outside(name)]
+    for folder in _resolved(target).parents:
+        for name in inner:
+            with suppress(OSError):  # a name that is too long, for one
+                if (folder / name).is_file():
+                    return folder
+    return None
+
+
 def refuse_photographs(target: Path, photographs: Path) -> None:
     """Refuse to write among photographs, where results would be taken for some; OptionError.
 
@@ -78,6 +89,7 @@ def new_results(
     *targets: Path,
     folder: Path | None = None,
     photographs: Path | None = None,
+    names: Collection[str] = (),
     replaces: bool = False,
 ) -> Iterator[list[Path]]:
     """Yield paths for files or folders to be made, which get their names when all are whole.
@@ -88,6 +100,7 @@ def new_results(
         *targets: what is to be made; missing folders above are made.
         folder: what they have to lie in, where some have folders of their own.
         photographs: folder in which nothing may be made.
+        names: of the photographs; nothing may be made where files of these names lie, either.
         replaces: files that are there give way; else nothing is overwritten.
 
     Raises:
@@ -99,8 +112,8 @@ def new_results(
         refuse_link(target)
         if folder and folder.resolve() not in _resolved(target).parents:
             raise OptionError(f"{target}: a link leads out of {folder}; remove it")
-        if photographs:
-            refuse_photographs(target, photographs)
+        for place in filter(None, (photographs, folder_of(names, target))):
+            refuse_photographs(target, place)
         if not replaces:
             _refuse_existing(target)
     with ExitStack() as stack:
