@@ -200,7 +200,7 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
     "model damaged": (
         lambda f: lengthen(f.out / "sparse" / "0" / "points3D.bin"),
         Finding("error", "{out}/sparse/0", "points3D.bin: damaged",
-                "run 'colmap-affrect map --output-path {out}' --overwrite"),
+                "run 'colmap-affrect map --output-path {out} --overwrite'"),
     ),
     "pairs verified anew": (
         lambda f: f.execute(
@@ -211,7 +211,7 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
     ),
     "config.toml damaged": (
         lambda f: (f.out / "config.toml").write_text("no [toml"),
-        Finding("error", "{out}/config.toml", "cannot be used (damaged", "restore it"),
+        Finding("error", "{out}/config.toml", "damaged (Expected", "restore it"),
     ),
     "config.toml lacks an entry": (
         lambda f: f.change_record(lambda r: r["extract"].pop("image_path")),
