@@ -10,14 +10,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
-from pydantic import TypeAdapter
-
 from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.colmap.database_copy import schema_version
-from colmap_affrect.colmap.model_files import read_given_model, require_intact
+from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
-from colmap_affrect.errors import DAMAGE, ImageError, MappingError, damage, made_again
+from colmap_affrect.errors import DAMAGE, ImageError, MappingError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.forecast import Forecast
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
@@ -26,8 +24,8 @@ from colmap_affrect.mappers.doubts import loose_names
 from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.mappers.starts import MIN_SHARE_OF_RIVAL
-from colmap_affrect.mappers.summaries import model_folders, read_summary
-from colmap_affrect.pairs.base import Pair, PairOptions
+from colmap_affrect.mappers.summaries import GUIDED_BEFORE, guided_before, read_summary
+from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
@@ -65,7 +63,6 @@ from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed
 from colmap_affrect.stages.verify import recorded_verification, verify_matches
 
 FocalVote = Literal["auto", "always", "never"]
-GUIDED_BEFORE = "guided-before.json"  # beside models that wait: the pairs guided then
 
 REPORTED_PACKAGES = (
     "colmap-affrect", "pycolmap", "opencv-python-headless", "numpy", "h5py", "torch", "kornia",
@@ -379,16 +376,6 @@ def map_guided(
     (sparse / GUIDED_BEFORE).unlink()
     report, models = map_images(context, mapper)  # which reads them
     return reports or [report], models
-
-
-def guided_before(aside: Path) -> set[Pair]:
-    """Return the pairs that were guided before; StoreError if that or a model is damaged."""
-    path = aside / GUIDED_BEFORE
-    with damage(path, made_again("verify", aside.parent)):
-        known = TypeAdapter(set[Pair]).validate_json(path.read_bytes())
-    for folder in model_folders(aside):
-        require_intact(folder)
-    return known
 
 
 def _are_better(context: Context, models: Sequence[ModelSummary], aside: Path) -> bool:

@@ -85,14 +85,6 @@ class _Image(NamedTuple):
     keypoints: NDArray[Any]  # (N,) KEYPOINT
 
 
-class _Points(NamedTuple):
-    ids: NDArray[np.uint64]  # (N,)
-    places: NDArray[np.float64]  # (N, 3)
-    lengths: Indices  # (N,) of the tracks
-    image_ids: NDArray[np.uint32]  # (M,) of all tracks one after the other
-    keypoints: Indices  # (M,)
-
-
 def _camera(reader: _Reader) -> _Camera:
     camera_id, model, width, height = reader.take("IiQQ")
     like = camera_like(model)
@@ -192,7 +184,7 @@ def require_consistent(folder: Path) -> None:
                 case "images.bin":
                     _check_images(found, cameras)
                 case "points3D.bin":
-                    _check_points(_points(reader, found), images)
+                    _check_points(reader, found, images)
 
 
 def _check_unique(ids: Iterable[object], what: str) -> None:
@@ -255,38 +247,27 @@ def _check_images(images: Sequence[_Image], cameras: Sequence[_Camera]) -> None:
         _require(np.isfinite(image.keypoints["xy"]).all(), "keypoints that are not finite")
 
 
-def _points(reader: _Reader, found: Sequence[tuple[int, int]]) -> _Points:
-    starts, lengths = np.array(found, np.int64).reshape(-1, 2).T
-    first = np.cumsum(lengths) - lengths
-    within = np.arange(lengths.sum()) - np.repeat(first, lengths)
-    elements = np.repeat(starts + POINT.size, lengths) + 8 * within
-    places = np.stack([reader.at("<f8", starts + 8 * axis) for axis in (1, 2, 3)], axis=1)
-    return _Points(
-        reader.at("<u8", starts),
-        places,
-        lengths,
-        reader.at("<u4", elements),
-        reader.at("<u4", elements + 4).astype(np.int64),
-    )
-
-
-def _check_points(points: _Points, images: Sequence[_Image]) -> None:
+def _check_points(
+    reader: _Reader, found: Sequence[tuple[int, int]], images: Sequence[_Image]
+) -> None:
     """Tracks name keypoints that see their point, each once, and no other keypoint sees one."""
-    _require(len(np.unique(points.ids)) == len(points.ids), "two ids are the same")
-    _require(np.isfinite(points.places).all(), "points that are not finite")
+    starts, lengths = np.array(found, np.int64).reshape(-1, 2).T
+    points = reader.at("<u8", starts)
+    _require(len(np.unique(points)) == len(points), "two ids are the same")
+    places = [reader.at("<f8", starts + 8 * axis) for axis in (1, 2, 3)]
+    _require(np.isfinite(places).all(), "points that are not finite")
+    within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    elements = np.repeat(starts + POINT.size, lengths) + 8 * within
+    image_ids, keypoints = reader.at("<u4", elements), reader.at("<u4", elements + 4)
     ordered = sorted(images, key=lambda image: image.id)
     ids = np.array([image.id for image in ordered], np.uint32)
-    counts = np.array([len(image.keypoints) for image in ordered], np.int64)
+    ends = np.cumsum([0, *(len(image.keypoints) for image in ordered)])
+    _require(np.isin(image_ids, ids).all(), "a track has an image that is not there")
+    image = np.searchsorted(ids, image_ids)
+    number = ends[image] + keypoints
+    _require((number < ends[image + 1]).all(), "a track has a keypoint that is not there")
     seen = np.concatenate([np.zeros(0, np.uint64), *(i.keypoints["point"] for i in ordered)])
-    image = np.searchsorted(ids, points.image_ids)
-    is_known = image < len(ids)
-    is_known[is_known] = ids[image[is_known]] == points.image_ids[is_known]
-    _require(is_known.all(), "a track has an image that is not there")
-    _require((points.keypoints < counts[image]).all(), "a track has a keypoint that is not there")
-    keypoints = (np.cumsum(counts) - counts)[image] + points.keypoints
-    same = seen[keypoints] == np.repeat(points.ids, points.lengths)
+    same = seen[number] == np.repeat(points, lengths)
     _require(same.all(), "a track has a keypoint that sees another point")
-    _require(np.bincount(keypoints).max(initial=0) <= 1, "a track has a keypoint twice")
-    _require(
-        len(keypoints) == (seen != NO_POINT).sum(), "a keypoint sees a point that is not there"
-    )
+    _require(np.bincount(number).max(initial=0) <= 1, "a track has a keypoint twice")
+    _require(len(number) == (seen != NO_POINT).sum(), "a keypoint sees a point that is not there")

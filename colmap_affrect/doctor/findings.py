@@ -21,6 +21,7 @@ MATCH = "run 'colmap-affrect match --output-path {folder}'"
 MATCH_AGAIN = "run 'colmap-affrect match --output-path {folder} --overwrite', verify and map"
 VERIFY_AGAIN = "run 'colmap-affrect verify --output-path {folder} --overwrite' and map"
 MAP = "run 'colmap-affrect map --output-path {folder}'"
+MAP_AGAIN = "run 'colmap-affrect map --output-path {folder} --overwrite'"
 
 TEXTS: dict[str, Check] = CHECKS | {
     # the installation
@@ -107,7 +108,7 @@ TEXTS: dict[str, Check] = CHECKS | {
     "map-stale": ("warning", "the models were made before pairs were verified anew", MAP),
     "summary-damaged": ("error",
         "is missing or damaged: how the model came about is not known any more",
-        f"{MAP} --overwrite"),
+        MAP_AGAIN),
     "no-model": ("warning", "mapping found no model",
         "see 'unregistered' in report.json for reasons"),
 }  # fmt: skip

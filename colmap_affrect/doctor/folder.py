@@ -20,10 +20,15 @@ from colmap_affrect.doctor.findings import (
     without_path,
 )
 from colmap_affrect.errors import AffrectError, WorkspaceError
-from colmap_affrect.mappers.summaries import made_from, model_folders, read_summary
+from colmap_affrect.mappers.summaries import (
+    GUIDED_BEFORE,
+    guided_before,
+    made_from,
+    model_folders,
+    read_summary,
+)
 from colmap_affrect.pairs.base import PairList
 from colmap_affrect.pairs.lists import read_pairs
-from colmap_affrect.pipeline import GUIDED_BEFORE, guided_before
 from colmap_affrect.project.atomic_files import NEW_SUFFIX
 from colmap_affrect.project.contents import Contents, sha256_of
 from colmap_affrect.project.workspace import COPY_STAGES, INPUTS, STAGES, Workspace

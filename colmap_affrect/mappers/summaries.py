@@ -14,6 +14,8 @@ from colmap_affrect.project.checked_json import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import INPUTS
 
+GUIDED_BEFORE = "guided-before.json"  # beside models that wait: the pairs guided then
+
 
 @dataclass(frozen=True)
 class _Kept:
@@ -71,3 +73,13 @@ def made_from(sparse_path: Path) -> str:
         if not re.fullmatch("[0-9a-f]{64}( own| [0-9a-f]{64})?", text):
             raise ValueError("no digests")
         return text
+
+
+def guided_before(aside: Path) -> set[tuple[str, str]]:
+    """Return the pairs guided before models were put aside; StoreError if these are damaged."""
+    path = aside / GUIDED_BEFORE
+    with damage(path, made_again("verify", aside.parent)):
+        known = TypeAdapter(set[tuple[str, str]]).validate_json(path.read_bytes())
+    for folder in model_folders(aside):
+        require_intact(folder)
+    return known

@@ -22,12 +22,7 @@ from colmap_affrect.mappers.doubts import loose_names
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
 from colmap_affrect.mappers.starts import holding
-from colmap_affrect.mappers.summaries import (
-    made_from,
-    model_folders,
-    read_summary,
-    refuse_edited,
-)
+from colmap_affrect.mappers.summaries import made_from, model_folders, read_summary, refuse_edited
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
