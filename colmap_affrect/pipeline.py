@@ -24,7 +24,12 @@ from colmap_affrect.mappers.doubts import loose_names
 from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.mappers.starts import MIN_SHARE_OF_RIVAL
-from colmap_affrect.mappers.summaries import GUIDED_BEFORE, guided_before, read_summary
+from colmap_affrect.mappers.summaries import (
+    GUIDED_BEFORE,
+    guided_before,
+    read_summary,
+    write_guided_before,
+)
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import Executor
@@ -358,8 +363,7 @@ def map_guided(
             return reports, models
         if not pairs_to_guide(context, images_in_need(context, sparse, min_num_tracks)):
             return reports, models
-        before = [pair.names for pair in current(context)]
-        replace_text(sparse / GUIDED_BEFORE, json.dumps(before))
+        write_guided_before([pair.names for pair in current(context)], sparse)
         sparse.rename(aside)
     known = guided_before(aside)
     guided = guide(context, images=images_in_need(context, aside, min_num_tracks))

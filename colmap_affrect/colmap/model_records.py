@@ -47,7 +47,7 @@ class _Reader:
         end = self.data.find(b"\0", self.position)
         if end < 0:
             raise EOFError
-        text = self.data[self.position : end].decode("utf-8", "replace")
+        text = self.data[self.position : end].decode("utf-8")
         self.position = end + 1
         return text
 

@@ -20,6 +20,7 @@ from colmap_affrect.doctor.findings import (
     without_path,
 )
 from colmap_affrect.errors import AffrectError, WorkspaceError
+from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.summaries import (
     GUIDED_BEFORE,
     guided_before,
@@ -27,11 +28,12 @@ from colmap_affrect.mappers.summaries import (
     model_folders,
     read_summary,
 )
-from colmap_affrect.pairs.base import PairList
+from colmap_affrect.pairs.base import PairList, PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.atomic_files import NEW_SUFFIX
 from colmap_affrect.project.contents import Contents, sha256_of
 from colmap_affrect.project.workspace import COPY_STAGES, INPUTS, STAGES, Workspace
+from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
 from colmap_affrect.stages.guide import recorded_guiding
@@ -110,6 +112,7 @@ class _FolderExamination:
             return read()
         except AffrectError as error:
             what, _, usual = without_path(path, error).partition("; ")
+            usual = usual.replace("{", "{{").replace("}", "}}")  # of a path
             self._add("damaged", path, error=what, advice=advice or usual)
             return None
 
@@ -123,6 +126,10 @@ class _FolderExamination:
         if "extract" in record.get("begun", []):
             Inputs.recorded(workspace)
             recorded_extraction(workspace)
+        where = str(workspace.config)
+        PairOptions.from_mapping(workspace.planned("pairs") or {}, where)
+        EscalateOptions.from_mapping(workspace.planned("escalate") or {}, where)
+        MAPPERS.options(workspace.planned("map") or {}, where=where)
         recorded_matching(workspace)
         recorded_verification(workspace)
         recorded_guiding(workspace)

@@ -1,6 +1,7 @@
 """What is known of finished models, kept beside them: COLMAP's files cannot hold it all."""
 
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ class _Kept:
 
 
 _KEPT = TypeAdapter(_Kept)
+_PAIRS = TypeAdapter(dict[str, list[tuple[str, str]]])
 
 
 def write_summary(summary: ModelSummary, folder: Path) -> None:
@@ -75,11 +77,18 @@ def made_from(sparse_path: Path) -> str:
         return text
 
 
+def write_guided_before(pairs: Sequence[tuple[str, str]], sparse_path: Path) -> None:
+    """Keep which pairs are guided beside models that are going to be put aside."""
+    text = _PAIRS.dump_json({"pairs": list(pairs)}).decode()
+    replace_text(sparse_path / GUIDED_BEFORE, with_checksum(text))
+
+
 def guided_before(aside: Path) -> set[tuple[str, str]]:
     """Return the pairs guided before models were put aside; StoreError if these are damaged."""
     path = aside / GUIDED_BEFORE
     with damage(path, made_again("verify", aside.parent)):
-        known = TypeAdapter(set[tuple[str, str]]).validate_json(path.read_bytes())
+        known = set(_PAIRS.validate_json(without_checksum(path.read_bytes()))["pairs"])
+    made_from(aside)
     for folder in model_folders(aside):
         require_intact(folder)
     return known

@@ -118,8 +118,8 @@ class GroupStore:
         with self._open("r") as file:
             count = 0
             for _, group in complete_groups(file):
-                for name, item in group.items():
-                    if isinstance(item, h5py.Dataset):
+                for name in group:  # items() has None for what cannot be opened
+                    if isinstance(group[name], h5py.Dataset):
                         checked(group, name)
                 count += 1
             return count
