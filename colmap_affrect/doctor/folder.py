@@ -240,8 +240,7 @@ class _FolderExamination:
         """Read what is beside features, matches and models."""
         cameras, guided = self.workspace.cameras, Context(self.workspace).guided
         self._read(cameras, lambda: read_camera_records(cameras))
-        if guided.path.exists():
-            self._read(guided.path, guided.check_all)
+        self._read(guided.path, guided.check_all)
         if Contents(self.workspace.contents).is_damaged:
             self._add("damaged-cache", self.workspace.contents)
 

@@ -115,6 +115,8 @@ class GroupStore:
 
     def check_all(self) -> int:
         """Read all that is there, and return how many groups; StoreError if it is damaged."""
+        if not self.path.exists():
+            return 0
         with self._open("r") as file:
             count = 0
             for _, group in complete_groups(file):
