@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import NoReturn
 
-from colmap_affrect.errors import INTERRUPTED
+from colmap_affrect.shown import INTERRUPTED
 
 PATIENCE_S = 4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
 PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent dies

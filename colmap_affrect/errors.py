@@ -1,7 +1,20 @@
 """Errors that a user can act on: one line that says what, where, and what to do."""
 
-INTERRUPTED = "interrupted; run the same command again to go on"
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
+from colmap_affrect.shown import one_line
+
+DAMAGE = (
+    OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError,
+    OverflowError,
+)  # fmt: skip
+"""What h5py, pycolmap and readers of JSON and TOML raise where a file is damaged, or of another
+shape than ours."""
+
+MAX_REASON = 200  # characters of what a reader says
 MEMORY_HINT = (
     "not enough memory; close other programs or raise the limit (ulimit -v), give smaller "
     "photographs, or --set max_image_size_px=1600"
@@ -75,3 +88,29 @@ class ComparisonError(AffrectError):
 
 class EvaluationError(AffrectError):
     """A dataset cannot be evaluated as asked."""
+
+
+@contextmanager
+def damage(path: Path, mend: str, error_class: type[AffrectError] = StoreError) -> Iterator[None]:
+    """Say of a file that cannot be read in one line that it is damaged, and what mends it."""
+    try:
+        yield
+    except AffrectError:
+        raise
+    except DAMAGE as error:
+        raise error_class(f"{path}: damaged ({reason(error)}); {mend}") from error
+
+
+def reason(error: Exception) -> str:
+    """Return why something cannot be read, in one short line: pydantic takes several."""
+    first = getattr(error, "errors", None)
+    text = first()[0]["msg"] if callable(first) else str(error)
+    return one_line(" ".join(text.split()))[:MAX_REASON] or type(error).__name__
+
+
+def made_again(stage: str, folder: Path) -> str:
+    """Say how what a stage has left in an output folder is made again."""
+    if stage == "extract":
+        return "run the same 'extract' or 'run' with --overwrite (run.log has the command)"
+    again = f"run 'colmap-affrect {stage} --output-path {shlex.quote(str(folder))} --overwrite'"
+    return again if stage == "map" else f"{again}, then the same 'run' again"

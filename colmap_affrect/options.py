@@ -214,11 +214,6 @@ def _descriptions(cls: type) -> dict[str, str]:
     return found
 
 
-def reason(error: Exception) -> str:
-    """Return why something cannot be read, in one line: pydantic takes several."""
-    return error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
-
-
 def digest_of(values: Any) -> str:
     """Return a sha256 of plain values, the same for equal ones."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

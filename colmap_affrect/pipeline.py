@@ -15,7 +15,7 @@ from colmap_affrect.colmap.database import num_matched_pairs
 from colmap_affrect.colmap.database_copy import schema_version
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
-from colmap_affrect.errors import ImageError, MappingError
+from colmap_affrect.errors import DAMAGE, ImageError, MappingError
 from colmap_affrect.features.weights import resolve
 from colmap_affrect.forecast import Forecast
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
@@ -24,7 +24,12 @@ from colmap_affrect.mappers.doubts import loose_names
 from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.mappers.starts import MIN_SHARE_OF_RIVAL
-from colmap_affrect.mappers.summaries import read_summary
+from colmap_affrect.mappers.summaries import (
+    GUIDED_BEFORE,
+    guided_before,
+    read_summary,
+    write_guided_before,
+)
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import Executor
@@ -63,7 +68,6 @@ from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed
 from colmap_affrect.stages.verify import recorded_verification, verify_matches
 
 FocalVote = Literal["auto", "always", "never"]
-GUIDED_BEFORE = "guided-before.json"  # beside models that wait: the pairs guided then
 
 REPORTED_PACKAGES = (
     "colmap-affrect", "pycolmap", "opencv-python-headless", "numpy", "h5py", "torch", "kornia",
@@ -319,7 +323,7 @@ def map_and_report(
 
 def _says_the_same(path: Path, report: str) -> bool:
     """Tell whether a run had nothing to do and a report of before differs only in its stages."""
-    with suppress(OSError, ValueError):
+    with suppress(*DAMAGE):
         known, new = json.loads(path.read_text(encoding="utf-8")), json.loads(report)
         done = [stage["num_done"] for stage in new["stages"] if stage["name"] != "pairs"]
         return not any(done) and {**known, "stages": ()} == {**new, "stages": ()}
@@ -359,10 +363,9 @@ def map_guided(
             return reports, models
         if not pairs_to_guide(context, images_in_need(context, sparse, min_num_tracks)):
             return reports, models
-        before = [pair.names for pair in current(context)]
-        replace_text(sparse / GUIDED_BEFORE, json.dumps(before))
+        write_guided_before([pair.names for pair in current(context)], sparse)
         sparse.rename(aside)
-    known = {tuple(names) for names in json.loads((aside / GUIDED_BEFORE).read_text())}
+    known = guided_before(aside)
     guided = guide(context, images=images_in_need(context, aside, min_num_tracks))
     new = {pair.names for pair in current(context)} - known
     if new:

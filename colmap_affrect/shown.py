@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 
 MAX_NAMES = 3  # examples in a line
+INTERRUPTED = "interrupted; run the same command again to go on"
 
 
 def shown(text: str) -> str:

@@ -14,7 +14,6 @@ from typing import NoReturn, TextIO
 from colmap_affrect import __version__
 from colmap_affrect.cli.parser import build_parser
 from colmap_affrect.errors import (
-    INTERRUPTED,
     MEMORY_HINT,
     AffrectError,
     OptionError,
@@ -23,7 +22,7 @@ from colmap_affrect.errors import (
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.shown import one_line
+from colmap_affrect.shown import INTERRUPTED, one_line
 
 logger = logging.getLogger("colmap_affrect")
 

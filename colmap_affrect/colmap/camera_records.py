@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
-from colmap_affrect.errors import WorkspaceError
-from colmap_affrect.options import reason
+from colmap_affrect.errors import WorkspaceError, damage, made_again
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.checked_json import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.shown import such_as
 
@@ -89,18 +89,16 @@ _RECORDS = TypeAdapter(dict[int, CameraRecord])
 
 def read_camera_records(path: Path) -> dict[int, CameraRecord]:
     """Return the records by camera id; none without the file, WorkspaceError if it is damaged."""
-    try:
-        return _RECORDS.validate_json(path.read_bytes())
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValidationError) as error:
-        raise WorkspaceError(f"{path}: damaged ({reason(error)}); remove it") from error
+    with damage(path, made_again("verify", path.parent), WorkspaceError):
+        if not path.exists():
+            return {}
+        return _RECORDS.validate_json(without_checksum(path.read_bytes()))
 
 
 def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
     """Replace the file as a whole."""
     content = _RECORDS.dump_json(dict(sorted(records.items())), indent=1)
-    replace_text(path, content.decode() + "\n")
+    replace_text(path, with_checksum(content.decode()))
 
 
 def notable_lines(records: Iterable[CameraRecord]) -> list[str]:

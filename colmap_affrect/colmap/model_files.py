@@ -1,72 +1,88 @@
-"""The binary files of a COLMAP model, walked through without building the model.
+"""Files of COLMAP models: read when they are intact, written, and what is asked of models.
 
-pycolmap's reader never ends, or takes all memory, on some damaged files. Here every record is
-followed to the end of its file, which damage seldom leaves in its place.
+Models of ours have a digest of their files beside them.
 """
 
-import struct
+import hashlib
 from collections import Counter
-from collections.abc import Callable, Mapping
-from functools import cache
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import AffrectError, OptionError, StoreError
+from colmap_affrect.colmap.model_records import (
+    OLD_RECORDS,
+    RECORDS,
+    mend,
+    read_records,
+    require_consistent,
+)
+from colmap_affrect.errors import (
+    DAMAGE,
+    AffrectError,
+    OptionError,
+    StoreError,
+    damage,
+    reason,
+)
 from colmap_affrect.geometry.arrays import Bools, Indices
 from colmap_affrect.project.atomic_files import cannot_write
+from colmap_affrect.project.checked_json import without_checksum
 
-SENSOR_BYTES = 8  # type and id of a sensor
-POSE_BYTES = 7 * 8  # quaternion and translation
-
-
-class _Reader:
-    def __init__(self, data: bytes) -> None:
-        self.data = data
-        self.position = 0
-
-    def skip(self, num_bytes: int) -> None:
-        self.position += num_bytes
-        if self.position > len(self.data):
-            raise EOFError
-
-    def number(self, code: str) -> int:
-        """Read an unsigned number: B, I or Q of :mod:`struct`."""
-        start = self.position
-        self.skip(struct.calcsize(code))
-        (value,) = struct.unpack_from(f"<{code}", self.data, start)
-        return int(value)
-
-    def text(self) -> str:
-        """Read a text that ends with a 0."""
-        end = self.data.find(b"\0", self.position)
-        if end < 0:
-            raise EOFError
-        text = self.data[self.position : end].decode("utf-8", "replace")
-        self.position = end + 1
-        return text
+SUMMARY = "summary.json"  # beside a model of ours; has the digest of its files as ``model``
 
 
 def registered_names(model_path: Path) -> list[str]:
-    """Return the sorted names of the images of a model; StoreError unless its files are intact."""
-    names: list[str] = []
-    for file_name, walk in RECORDS.items():
-        path = model_path / file_name
+    """Return the sorted names of the images of a model; StoreError unless its files are whole."""
+    records = {name: read_records(model_path / name)[1] for name in RECORDS}
+    return sorted(image.name for image in records["images.bin"])
+
+
+def require_intact(folder: Path) -> None:
+    """Refuse a model that was damaged, or one of ours that is not as it was written.
+
+    Models of others are followed record by record, and what one says of another must be so. Text
+    files are left to pycolmap.
+    """
+    known = kept_digest(folder)
+    if known and known == model_digest(folder):
+        return
+    if known or all((folder / name).exists() for name in OLD_RECORDS):
+        require_consistent(folder)
+    if known:
+        raise StoreError(
+            f"{folder}: is not as it was written (see {SUMMARY} in it); if you have edited it, "
+            f"copy it to a folder of its own without {SUMMARY} and use that; else {mend(folder)}"
+        )
+
+
+class _Kept(BaseModel):
+    """What of the summary of a model tells whether it has changed since."""
+
+    model: str
+
+
+def kept_digest(folder: Path) -> str:
+    """Return the digest of the files of a model of ours when it was written, else an empty text."""
+    try:
+        content = without_checksum((folder / SUMMARY).read_bytes())
+        return _Kept.model_validate_json(content).model
+    except (OSError, ValueError):
+        return ""
+
+
+def model_digest(folder: Path) -> str:
+    """Return a sha256 of the files of a model, empty if one is missing."""
+    digest = hashlib.sha256()
+    for name in sorted(RECORDS):
         try:
-            reader = _Reader(path.read_bytes())
-        except OSError as error:
-            raise StoreError(f"{path}: cannot be read ({error.strerror})") from error
-        try:
-            for _ in range(reader.number("Q")):
-                name = walk(reader)
-                if name:
-                    names.append(name)
-        except EOFError as error:
-            raise StoreError(f"{path}: damaged, it ends within a record") from error
-        if reader.position != len(reader.data):
-            raise StoreError(f"{path}: damaged, something follows its last record")
-    return sorted(names)
+            with (folder / name).open("rb") as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
+        except OSError:
+            return ""
+    return digest.hexdigest()
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
@@ -76,10 +92,17 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     _require_written(folder)
 
 
-def read_model(folder: Path) -> pycolmap.Reconstruction:
+def read_written_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a model that pycolmap has just written."""
     _require_written(folder)
     return pycolmap.Reconstruction(folder)
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a model; StoreError if it is damaged, or of ours and not as it was written."""
+    require_intact(folder)
+    with damage(folder, mend(folder)):
+        return pycolmap.Reconstruction(folder)
 
 
 def read_given_model(
@@ -89,13 +112,12 @@ def read_given_model(
     wanted = "give the folder that holds cameras, images and points3D as .bin or .txt"
     if not folder.is_dir():
         raise OptionError(f"{option}{folder}: no such folder; {wanted}")
-    if all((folder / name).exists() for name in RECORDS):
-        registered_names(folder)  # pycolmap's reader may never end on a damaged file
+    require_intact(folder)
     try:
         return pycolmap.Reconstruction(folder)
-    except (RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise error_class(f"{option}{folder}: not a COLMAP model; {wanted} ({reason})") from error
+    except DAMAGE as error:
+        why = f"not a COLMAP model; {wanted} ({reason(error)})"
+        raise error_class(f"{option}{folder}: {why}") from error
 
 
 def _require_written(folder: Path) -> None:
@@ -103,60 +125,6 @@ def _require_written(folder: Path) -> None:
         registered_names(folder)
     except StoreError as error:
         raise cannot_write(folder, error) from error
-
-
-def _walk_camera(reader: _Reader) -> None:
-    reader.skip(4)
-    model = reader.number("I")
-    like = camera_like(model)
-    reader.skip(16 + 8 * (len(like.params) if like else 0))
-
-
-@cache
-def camera_like(model: int) -> pycolmap.Camera | None:
-    """Return a camera of a model of COLMAP by its number, None if there is no such model."""
-    try:
-        return pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
-    except (ValueError, RuntimeError, TypeError):
-        return None
-
-
-def _walk_rig(reader: _Reader) -> None:
-    reader.skip(4)
-    num_sensors = reader.number("I")
-    if num_sensors:
-        reader.skip(SENSOR_BYTES)  # the reference sensor, which has no pose
-    for _ in range(num_sensors - 1):
-        reader.skip(SENSOR_BYTES)
-        if reader.number("B"):
-            reader.skip(POSE_BYTES)
-
-
-def _walk_frame(reader: _Reader) -> None:
-    reader.skip(8 + POSE_BYTES)
-    reader.skip(reader.number("I") * (SENSOR_BYTES + 8))
-
-
-def _walk_image(reader: _Reader) -> str:
-    reader.skip(4 + POSE_BYTES + 4)
-    name = reader.text()
-    reader.skip(reader.number("Q") * 24)
-    return name
-
-
-def _walk_point(reader: _Reader) -> None:
-    reader.skip(8 + 3 * 8 + 3 + 8)
-    reader.skip(reader.number("Q") * 8)
-
-
-RECORDS: dict[str, Callable[[_Reader], str | None]] = {
-    "cameras.bin": _walk_camera,
-    "rigs.bin": _walk_rig,
-    "frames.bin": _walk_frame,
-    "images.bin": _walk_image,
-    "points3D.bin": _walk_point,
-}
-"""The files of a model, and what steps over one record of each."""
 
 
 def num_long_tracks(

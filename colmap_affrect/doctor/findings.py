@@ -21,6 +21,7 @@ MATCH = "run 'colmap-affrect match --output-path {folder}'"
 MATCH_AGAIN = "run 'colmap-affrect match --output-path {folder} --overwrite', verify and map"
 VERIFY_AGAIN = "run 'colmap-affrect verify --output-path {folder} --overwrite' and map"
 MAP = "run 'colmap-affrect map --output-path {folder}'"
+MAP_AGAIN = "run 'colmap-affrect map --output-path {folder} --overwrite'"
 
 TEXTS: dict[str, Check] = CHECKS | {
     # the installation
@@ -79,11 +80,10 @@ TEXTS: dict[str, Check] = CHECKS | {
     "in-use": ("warning", "{error}", "run doctor again when it is done"),
     "read-only": ("warning", "{error}", "make it writable before running anything in it"),
     "leftover": ("note", "left behind by a run that was killed", "remove it: rm -r {path}"),
-    "record-unusable": ("error", "cannot be used ({error})",
-        "restore it, or use another --output-path than {folder}"),
+    "damaged": ("error", "{error}", "restore it, or use another --output-path than {folder}"),
+    "damaged-cache": ("note", "damaged", "nothing to do: the next run reads photographs again"),
     "stages-missing": ("note", "not run yet: {stages}", "run the same 'run' again"),
     "features-missing": ("error", "is missing", SAME_RUN),
-    "features-unusable": ("error", "cannot be used ({error})", EXTRACT_AGAIN),
     "photographs-gone": ("warning", "its photographs are not there ({error})",
         "put them back before running another stage"),
     "no-features": ("warning",
@@ -100,13 +100,15 @@ TEXTS: dict[str, Check] = CHECKS | {
         "images with features of escalation that the database lacks",
         "run 'colmap-affrect escalate --output-path {folder}'"),
     "other-keypoints": ("error", "images with other keypoints than in features.h5", EXTRACT_AGAIN),
-    "pairs-unusable": ("error", "cannot be used ({error})", PAIRS_AGAIN),
-    "matches-unusable": ("error", "cannot be used ({error})", MATCH_AGAIN),
+    "pairs-changed": ("error", "is not the list whose pairs were matched",
+        f"if you have edited it, {MATCH}; else {PAIRS_AGAIN}"),
     "pairs-not-matched": ("warning", "listed pairs that are not matched", MATCH),
     "matches-not-in-database": ("warning", "pairs whose matches are not in the database", MATCH),
     "map-unfinished": ("warning", "mapping did not finish", MAP),
     "map-stale": ("warning", "the models were made before pairs were verified anew", MAP),
-    "model-damaged": ("error", "{error}", f"{MAP} --overwrite"),
+    "summary-damaged": ("error",
+        "is missing or damaged: how the model came about is not known any more",
+        MAP_AGAIN),
     "no-model": ("warning", "mapping found no model",
         "see 'unregistered' in report.json for reasons"),
 }  # fmt: skip

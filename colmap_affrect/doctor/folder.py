@@ -1,30 +1,46 @@
 """Examines an output folder."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import geometry_digest
-from colmap_affrect.colmap.model_files import registered_names
+from colmap_affrect.colmap.model_files import SUMMARY, registered_names
 from colmap_affrect.colmap.tables import Tables
 from colmap_affrect.doctor.database import examine_database, examined_copy
-from colmap_affrect.doctor.findings import OWN_ADVICE, SAME_RUN, Findings, without_path
+from colmap_affrect.doctor.findings import (
+    MATCH_AGAIN,
+    OWN_ADVICE,
+    PAIRS_AGAIN,
+    SAME_RUN,
+    Findings,
+    without_path,
+)
 from colmap_affrect.errors import AffrectError, WorkspaceError
+from colmap_affrect.mappers.base import MAPPERS
+from colmap_affrect.mappers.summaries import (
+    GUIDED_BEFORE,
+    guided_before,
+    made_from,
+    model_folders,
+    read_summary,
+)
+from colmap_affrect.pairs.base import PairList, PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.atomic_files import NEW_SUFFIX
-from colmap_affrect.project.contents import Contents
+from colmap_affrect.project.contents import Contents, sha256_of
 from colmap_affrect.project.workspace import COPY_STAGES, INPUTS, STAGES, Workspace
+from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
+from colmap_affrect.stages.guide import recorded_guiding
 from colmap_affrect.stages.match import recorded_matching
 from colmap_affrect.stages.verify import recorded_verification
 
-DAMAGED_HDF5 = (OSError, RuntimeError, KeyError, ValueError, TypeError)
-"""What h5py raises on damaged files that it could open."""
-
-DAMAGED_RECORD = (KeyError, TypeError, ValueError, AttributeError)
-"""What reading a record of options of another shape than ours raises."""
+Read = TypeVar("Read")
 
 LEFTOVERS = ("*.new", "*.partial", f"*{NEW_SUFFIX}")
 
@@ -64,12 +80,14 @@ class _FolderExamination:
             self._add("leftover", path, path=path)
         done = self._stages()
         database = self.workspace.database
-        if "extract" not in done:
+        if not done:
             if database.exists():
                 examine_database(self.found, database, image_path)
             return
-        features = self._features()
-        images = self._photographs(features)
+        self._records()
+        features = self._features() if "extract" in done else None
+        images = self._photographs(features) if "extract" in done else set()
+        inputs = self._models() if "map" in done else ""
         if not database.exists():
             self._add("database-missing", database)
             return
@@ -82,36 +100,52 @@ class _FolderExamination:
                 self._compare_keypoints(features, tables)
                 if "match" in done:
                     self._matches(tables, sorted(images.union(features)))
-            if "map" in done:
-                self._models(geometry_digest(copy))
+            if inputs and not inputs.startswith(geometry_digest(copy)):
+                self._add("map-stale", self.workspace.sparse)
 
     def _add(self, kind: str, where: Path, **values: Any) -> None:
         self.found.add(kind, where, folder=self.workspace.path, **values)
 
-    def _add_unusable(self, kind: str, where: Path, error: Exception) -> None:
-        self._add(kind, where, error=without_path(where, error))
+    def _read(self, path: Path, read: Callable[[], Read], advice: str = "") -> Read | None:
+        """Read a file as runs do; None, and what the reader says, if that cannot be done."""
+        try:
+            return read()
+        except AffrectError as error:
+            what, _, usual = without_path(path, error).partition("; ")
+            usual = usual.replace("{", "{{").replace("}", "}}")  # of a path
+            self._add("damaged", path, error=what, advice=advice or usual)
+            return None
 
     def _add_items(self, kind: str, where: Path | str, items: Sequence[str]) -> None:
         if items:
             self.found.add(kind, where, items, folder=self.workspace.path)
 
+    def _record(self) -> dict[str, Any]:
+        """Return the record, with options that later stages would take."""
+        record, workspace = self.workspace.recorded(), self.workspace
+        if "extract" in record.get("begun", []):
+            Inputs.recorded(workspace)
+            recorded_extraction(workspace)
+        where = str(workspace.config)
+        PairOptions.from_mapping(workspace.planned("pairs") or {}, where)
+        EscalateOptions.from_mapping(workspace.planned("escalate") or {}, where)
+        MAPPERS.options(workspace.planned("map") or {}, where=where)
+        recorded_matching(workspace)
+        recorded_verification(workspace)
+        recorded_guiding(workspace)
+        return record
+
     def _stages(self) -> list[str]:
         """Return the stages on record, none if the record cannot be used."""
         workspace = self.workspace
-        try:
-            record = workspace.recorded()
-            done = [stage for stage in STAGES if stage in record.get("begun", [])]
-            wanted = list(COPY_STAGES if "copy" in done else STAGES[1:])
-            wanted = [stage for stage in wanted if stage != "guide"]  # map does that when needed
-            if "extract" in done:
-                Inputs.recorded(workspace)
-                if not recorded_extraction(workspace).escalation:
-                    wanted.remove("escalate")
-            recorded_matching(workspace)
-            recorded_verification(workspace)
-        except (AffrectError, OSError, *DAMAGED_RECORD) as error:
-            self._add_unusable("record-unusable", workspace.config, error)
+        record = self._read(workspace.config, self._record)
+        if record is None:
             return []
+        done = [stage for stage in STAGES if stage in record.get("begun", [])]
+        wanted = list(COPY_STAGES if "copy" in done else STAGES[1:])
+        wanted = [stage for stage in wanted if stage != "guide"]  # map does that when needed
+        if "extract" in done and not recorded_extraction(workspace).escalation:
+            wanted.remove("escalate")
         self.found.checked.append(
             f"{workspace.path}: stages on record: {', '.join(done) or 'none'}; recipe "
             f"{record.get('recipe', '')}"
@@ -126,14 +160,12 @@ class _FolderExamination:
 
     def _features(self) -> dict[str, int] | None:
         """Return the number of features by image name, None if the file cannot be used."""
-        path = self.workspace.features
+        path, store = self.workspace.features, Context(self.workspace).features
         if not path.exists():
             self._add("features-missing", path)
             return None
-        try:
-            counts = Context(self.workspace).features.num_keypoints()
-        except (AffrectError, *DAMAGED_HDF5) as error:
-            self._add_unusable("features-unusable", path, error)
+        counts = self._read(path, store.num_keypoints)
+        if counts is None or self._read(path, store.check_all) is None:
             return None
         self.found.checked.append(f"{path}: features of {len(counts)} images")
         return counts
@@ -180,17 +212,19 @@ class _FolderExamination:
         self._add_items("other-keypoints", database, differ)
 
     def _matches(self, tables: Tables, names: Sequence[str]) -> None:
-        path = self.workspace.matches
-        try:
-            pairs = read_pairs(self.workspace.pairs, names) if len(names) > 1 else []
-        except AffrectError as error:
-            self._add_unusable("pairs-unusable", self.workspace.pairs, error)
+        path, listed = self.workspace.matches, self.workspace.pairs
+        store = Context(self.workspace).matches
+        pairs = self._read(
+            listed, lambda: read_pairs(listed, names) if len(names) > 1 else PairList.of(()),
+            PAIRS_AGAIN,
+        )  # fmt: skip
+        if pairs is None:
             return
-        try:
-            is_there = Context(self.workspace).matches.has(pairs)
-        except (AffrectError, *DAMAGED_HDF5) as error:
-            self._add_unusable("matches-unusable", path, error)
+        is_there = self._read(path, lambda: store.has(pairs), MATCH_AGAIN)
+        if is_there is None or self._read(path, store.check_all, MATCH_AGAIN) is None:
             return
+        if store.finished_list() not in (None, "", sha256_of(listed)):
+            self._add("pairs-changed", listed)
         self.found.checked.append(f"{path}: matches of {is_there.sum()} pairs of {len(pairs)}")
         known, written = set(tables.names.values()), tables.matched_pairs()
         missing, lost = [], []
@@ -202,23 +236,32 @@ class _FolderExamination:
         self._add_items("pairs-not-matched", path, missing)
         self._add_items("matches-not-in-database", self.workspace.database, lost)
 
-    def _models(self, inputs: str) -> None:
-        sparse = self.workspace.sparse
-        try:
-            made_from = (sparse / INPUTS).read_text()
-        except (OSError, UnicodeDecodeError):
+    def _records(self) -> None:
+        """Read what is beside features, matches and models."""
+        cameras, guided = self.workspace.cameras, Context(self.workspace).guided
+        self._read(cameras, lambda: read_camera_records(cameras))
+        self._read(guided.path, guided.check_all)
+        if Contents(self.workspace.contents).is_damaged:
+            self._add("damaged-cache", self.workspace.contents)
+
+    def _models(self) -> str | None:
+        """Return the digests of what the models were made from, if that can be read."""
+        sparse, aside = self.workspace.sparse, self.workspace.aside
+        inputs = self._read(sparse / INPUTS, lambda: made_from(sparse))
+        if inputs == "":
             self._add("map-unfinished", sparse)
-            return
-        if made_from.partition(" ")[0] != inputs:
-            self._add("map-stale", sparse)
-        folders = [path for path in sparse.iterdir() if path.name.isdigit()]
-        sizes = []
-        for folder in sorted(folders, key=lambda path: int(path.name)):
-            try:
-                sizes.append(len(registered_names(folder)))
-            except AffrectError as error:
-                self._add_unusable("model-damaged", folder, error)
-        listed = ", ".join(map(str, sizes)) or "no"
+        folders = model_folders(sparse)
+        sizes = [self._read(folder, partial(self._size, folder)) for folder in folders]
+        listed = ", ".join(str(size) for size in sizes if size) or "no"
         self.found.checked.append(f"{sparse}: models of {listed} images")
-        if not folders:
+        if sparse.exists() and not folders:
             self._add("no-model", sparse)
+        if aside.exists():
+            self._read(aside / GUIDED_BEFORE, lambda: guided_before(aside))
+        return inputs
+
+    def _size(self, folder: Path) -> int:
+        """Return how many images a model has; StoreError if it is damaged."""
+        if not read_summary(folder):
+            self._add("summary-damaged", folder / SUMMARY)
+        return len(registered_names(folder))

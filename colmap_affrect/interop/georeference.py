@@ -6,12 +6,11 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.errors import StoreError
+from colmap_affrect.errors import damage
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.options import reason
 from colmap_affrect.project.atomic_files import replace_text
 
 FILE_NAME = "georeference.json"
@@ -37,10 +36,8 @@ class Georeference:
         path = model_path / FILE_NAME
         if not path.exists():
             return None
-        try:
+        with damage(path, "align the model again"):
             return TypeAdapter(cls).validate_json(path.read_bytes())
-        except (OSError, ValidationError) as error:
-            raise StoreError(f"{path}: damaged ({reason(error)}); align the model again") from error
 
     def write(self, model_path: Path) -> None:
         """Put it on record beside a model."""

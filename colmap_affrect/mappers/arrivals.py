@@ -1,12 +1,10 @@
 """How the images of a model came in."""
 
-from collections.abc import Mapping
-
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import num_long_tracks, seen_points
 from colmap_affrect.colmap.verification import inlier_matches, num_in_tracks
 from colmap_affrect.geometry.arrays import rows_in
-from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
+from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.project.report import Arrival
 
 MIN_THREE_VIEW_POINTS = 12
@@ -33,15 +31,6 @@ def arrivals(model: MappedModel, task: MappingTask) -> dict[str, Arrival]:
         name: bridged.get(name, Arrival("guided" if image_id in guided else "tracks"))
         for image_id, name in sorted(names.items(), key=lambda item: item[1])
     }
-
-
-def bridges_of(known: Mapping[str, Arrival]) -> tuple[Bridge, ...]:
-    """Return the bridges by which images came in, one for each image."""
-    return tuple(
-        Bridge((item.by, name), (name,), item.num_agreeing, item.num_ratios, item.scale_error_frac)
-        for name, item in known.items()
-        if item.how == "bridged"
-    )
 
 
 def _tied_by_guided_matches(model: pycolmap.Reconstruction, task: MappingTask) -> set[int]:

@@ -1,5 +1,6 @@
 """From a verified database to a folder of models, by any mapper."""
 
+import logging
 import shutil
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
@@ -8,10 +9,9 @@ from typing import Any
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import all_cameras, image_ids
-from colmap_affrect.colmap.model_files import num_long_tracks, registered_names, write_model
+from colmap_affrect.colmap.model_files import SUMMARY, num_long_tracks, read_model, write_model
 from colmap_affrect.colmap.verification import inlier_matches, num_tied
-from colmap_affrect.errors import StoreError
-from colmap_affrect.mappers.arrivals import arrivals, bridges_of
+from colmap_affrect.mappers.arrivals import arrivals
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.doubts import (
     FOCAL_DOUBT,
@@ -34,8 +34,10 @@ from colmap_affrect.mappers.starts import (
     starts,
     unknown_cameras,
 )
-from colmap_affrect.mappers.summaries import read_summary, write_summary
+from colmap_affrect.mappers.summaries import model_folders, read_summary, write_summary
 from colmap_affrect.project.report import ModelSummary
+
+logger = logging.getLogger(__name__)
 
 ATTEMPT_SEED_STEP = 1_000_003
 """Distance of the seeds of repeated attempts, so that those of runs 0, 1, 2, ... differ."""
@@ -282,30 +284,14 @@ def better(
 def read_models(sparse_path: Path, task: MappingTask) -> list[ModelSummary]:
     """Return the summaries of the models that :func:`map_database` wrote for a task.
 
-    A model that somebody has changed since is judged anew; how it came about is still known.
+    A model whose summary is damaged is judged anew; how it came about is not known any more.
     """
-    folders = sorted(
-        (p for p in sparse_path.iterdir() if p.name.isdigit()), key=lambda p: int(p.name)
-    )
-    return [read_summary(folder) or _judged_anew(folder, task) for folder in folders]
+    return [read_summary(path) or _judged_anew(path, task) for path in model_folders(sparse_path)]
 
 
 def _judged_anew(folder: Path, task: MappingTask) -> ModelSummary:
-    try:
-        registered_names(folder)  # pycolmap's reader may never end on a damaged file
-    except StoreError as error:
-        raise StoreError(f"{error}; run map again with --overwrite") from error
-    model, before = MappedModel(pycolmap.Reconstruction(folder)), read_summary(folder, of_any=True)
-    if before:
-        model = replace(
-            model,
-            bridges=bridges_of(before.arrivals),
-            taken_out=before.taken_out,
-            rival_focals_px=before.rival_focals_px,
-        )
-    summary = summarize(model, task, is_largest=folder.name == "0")
-    write_summary(summary, folder)
-    return summary
+    logger.warning("%s: %s is missing or damaged; the model is judged anew", folder, SUMMARY)
+    return summarize(MappedModel(read_model(folder)), task, is_largest=folder.name == "0")
 
 
 def _sharing_cameras(model: pycolmap.Reconstruction, names: Collection[str]) -> set[str]:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import all_cameras
-from colmap_affrect.colmap.model_files import read_model
+from colmap_affrect.colmap.model_files import read_written_model
 from colmap_affrect.colmap.native_options import Plain, differences, resolve, set_values
 from colmap_affrect.errors import MappingError
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
@@ -68,7 +68,7 @@ class GlobalMapper:
         native = self.native(task, random_seed)
         values = differences(native, pycolmap.GlobalPipelineOptions())
         map_globally(task.database_path, task.colors_path, output_path, values)
-        models = [read_model(path) for path in sorted(output_path.iterdir())]
+        models = [read_written_model(path) for path in sorted(output_path.iterdir())]
         for model in models:
             self._hold_cameras(model, task, native.mapper.bundle_adjustment)
         show(max((model.num_reg_images() for model in models), default=0))

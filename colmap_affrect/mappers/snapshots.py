@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from colmap_affrect.colmap.database import geometry_digest
-from colmap_affrect.colmap.model_files import registered_names
+from colmap_affrect.colmap.model_files import registered_names, require_intact
 from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.base import MapperOptions, MappingTask
 from colmap_affrect.options import digest_of
@@ -47,7 +47,7 @@ def with_snapshots(
     made_from = [geometry_digest(task.database_path), options.to_mapping(), given]
     digest = digest_of(made_from)
     record = folder / INPUTS
-    if not (record.exists() and record.read_text() == digest):
+    if not (record.exists() and record.read_bytes() == digest.encode()):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         replace_text(record, digest)
@@ -65,6 +65,7 @@ def largest_snapshot(folder: Path) -> Path | None:
     found: list[tuple[int, str, Path]] = []
     for path in folder.iterdir():
         try:
+            require_intact(path)
             found.append((len(registered_names(path)), path.name, path))
         except StoreError:
             continue

@@ -1,17 +1,21 @@
-"""What is known of a finished model, kept beside it: COLMAP's files cannot hold it all."""
+"""What is known of finished models, kept beside them: COLMAP's files cannot hold it all."""
 
-import hashlib
+import re
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
-from colmap_affrect.colmap.model_files import RECORDS
+from colmap_affrect.colmap.model_files import SUMMARY, model_digest, require_intact
+from colmap_affrect.errors import DAMAGE, StoreError, damage, made_again
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.checked_json import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
+from colmap_affrect.project.workspace import INPUTS
 
-FILE_NAME = "summary.json"
-"""Beside cameras.bin; other programs ignore it."""
+GUIDED_BEFORE = "guided-before.json"  # beside models that wait: the pairs guided then
 
 
 @dataclass(frozen=True)
@@ -24,26 +28,67 @@ class _Kept:
 
 
 _KEPT = TypeAdapter(_Kept)
+_PAIRS = TypeAdapter(dict[str, list[tuple[str, str]]])
 
 
 def write_summary(summary: ModelSummary, folder: Path) -> None:
     """Keep the summary of the model in a folder."""
-    text = _KEPT.dump_json(_Kept(_digest(folder), summary), indent=2).decode()
-    replace_text(folder / FILE_NAME, text + "\n")
+    text = _KEPT.dump_json(_Kept(model_digest(folder), summary), indent=2).decode()
+    replace_text(folder / SUMMARY, with_checksum(text))
 
 
-def read_summary(folder: Path, *, of_any: bool = False) -> ModelSummary | None:
-    """Return the summary in a folder; None if damaged or, unless ``of_any``, of another model."""
-    try:
-        kept = _KEPT.validate_json((folder / FILE_NAME).read_bytes())
-        return kept.summary if of_any or kept.model == _digest(folder) else None
-    except (OSError, ValidationError):
-        return None
+def read_summary(folder: Path) -> ModelSummary | None:
+    """Return the summary of the model in a folder, None if there is none or it is damaged.
+
+    StoreError if the model is damaged, or not the one that the summary is of.
+    """
+    require_intact(folder)
+    with suppress(*DAMAGE):
+        return _KEPT.validate_json(without_checksum((folder / SUMMARY).read_bytes())).summary
+    return None
 
 
-def _digest(folder: Path) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(RECORDS):
-        with (folder / name).open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest()
+def model_folders(sparse_path: Path) -> list[Path]:
+    """Return the folders of the models that mapping has written, 0, 1, ..."""
+    folders = sparse_path.iterdir() if sparse_path.is_dir() else ()
+    return sorted((p for p in folders if p.name.isdecimal()), key=lambda p: int(p.name))
+
+
+def refuse_edited(sparse_path: Path) -> None:
+    """Refuse to replace models that are not as they were written; StoreError names the first."""
+    for folder in model_folders(sparse_path):
+        if not read_summary(folder):
+            raise StoreError(
+                f"{folder}: may have been edited (it has no {SUMMARY}, or a damaged one) and would "
+                "be replaced; if you need it copy it to a folder of its own, then "
+                f"{made_again('map', sparse_path.parent)}"
+            )
+
+
+def made_from(sparse_path: Path) -> str:
+    """Return the digests of what models were made from; empty where that was not finished."""
+    path = sparse_path / INPUTS
+    if not path.exists():
+        return ""
+    with damage(path, made_again("map", sparse_path.parent)):
+        text = path.read_text(encoding="ascii")
+        if not re.fullmatch("[0-9a-f]{64}( own| [0-9a-f]{64})?", text):
+            raise ValueError("no digests")
+        return text
+
+
+def write_guided_before(pairs: Sequence[tuple[str, str]], sparse_path: Path) -> None:
+    """Keep which pairs are guided beside models that are going to be put aside."""
+    text = _PAIRS.dump_json({"pairs": list(pairs)}).decode()
+    replace_text(sparse_path / GUIDED_BEFORE, with_checksum(text))
+
+
+def guided_before(aside: Path) -> set[tuple[str, str]]:
+    """Return the pairs guided before models were put aside; StoreError if these are damaged."""
+    path = aside / GUIDED_BEFORE
+    with damage(path, made_again("verify", aside.parent)):
+        known = set(_PAIRS.validate_json(without_checksum(path.read_bytes()))["pairs"])
+    made_from(aside)
+    for folder in model_folders(aside):
+        require_intact(folder)
+    return known

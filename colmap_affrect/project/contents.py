@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from colmap_affrect.errors import DAMAGE
 from colmap_affrect.project.atomic_files import replace_text
 
 
@@ -25,9 +26,10 @@ class Contents:
 
     def __init__(self, path: Path) -> None:
         """Read a record; one that is missing or damaged only means that files are read again."""
-        self._path, self._known = path, dict[str, Any]()
-        with suppress(OSError, ValueError, TypeError):
+        self._path, self._known, self.is_damaged = path, dict[str, Any](), path.exists()
+        with suppress(*DAMAGE):
             self._known = dict(json.loads(path.read_text(encoding="utf-8")))
+            self.is_damaged = False
         self._is_saved = True
 
     def sha256(self, path: Path) -> str:

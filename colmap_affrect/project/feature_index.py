@@ -2,11 +2,12 @@
 
 import json
 import time
+import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from colmap_affrect.errors import WorkspaceError
+from colmap_affrect.errors import DAMAGE, WorkspaceError
 from colmap_affrect.project.atomic_files import replace_text
 
 Size = tuple[int, int]
@@ -30,12 +31,18 @@ def entries(path: Path, read: Callable[[], Entries]) -> Entries:
     stamp = [there.st_ino, there.st_size, there.st_mtime_ns, there.st_ctime_ns]
     kept = path.with_name(f".{path.name}.index")
     if path not in _known:
-        with suppress(OSError, ValueError, TypeError):
-            found = json.loads(kept.read_text(encoding="utf-8"))
+        with suppress(*DAMAGE):
+            checksum, _, text = kept.read_text(encoding="utf-8").partition(" ")
+            found = json.loads(text if checksum == _checksum(text) else "")
             _known[path] = found[0], {n: (c, k, (w, h)) for n, (c, k, (w, h)) in found[1].items()}
     if path not in _known or _known[path][0] != stamp:
         _known[path] = stamp, dict(sorted(read().items()))
         if len(_known[path][1]) >= MIN_NUM_KEPT and time.time_ns() > stamp[3] + MIN_AGE_NS:
             with suppress(WorkspaceError):
-                replace_text(kept, json.dumps(_known[path]))
+                text = json.dumps(_known[path])
+                replace_text(kept, f"{_checksum(text)} {text}")
     return _known[path][1]
+
+
+def _checksum(text: str) -> str:
+    return str(zlib.crc32(text.encode()))

@@ -1,14 +1,17 @@
 """A HDF5 file of groups that are complete or do not count, which changes as a whole."""
 
 import io
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
+from numpy.typing import NDArray
 
-from colmap_affrect.errors import StaleStoreError, StoreError
+from colmap_affrect.errors import StaleStoreError, StoreError, damage, made_again
 from colmap_affrect.project.atomic_files import (
     FileTransaction,
     apply_journal,
@@ -19,6 +22,7 @@ from colmap_affrect.project.atomic_files import (
 )
 
 FORMAT_VERSION = 2
+CHECKSUM = "crc32"  # of the values of a dataset, its attribute; files of before have none
 
 DATASETS = {
     "descriptors", "image_size", "keypoints", "lafs", "level_ends", "matches0",
@@ -31,6 +35,7 @@ class GroupStore:
     """A HDF5 file of complete groups that were all made with the same options."""
 
     kind = ""
+    stage = ""  # that makes it again
 
     def __init__(self, path: Path, options_digest: str = "") -> None:
         """Name the file, and the options that its content must have been made with (any if '')."""
@@ -61,17 +66,16 @@ class GroupStore:
 
     @contextmanager
     def _opened(self, changes: FileTransaction | None) -> Iterator[h5py.File]:
-        try:
+        with self._damage():
             if changes is None:
                 apply_journal(self.path)
             with h5py.File(changes or self.path, "r+" if changes else "r") as file:
                 self._check_format(file)
                 yield file
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            raise StoreError(
-                f"{self.path}: cannot be opened as HDF5 ({error}); if it is damaged or another "
-                "program has it open, close that program or run again with --overwrite"
-            ) from error
+
+    def _damage(self) -> AbstractContextManager[None]:
+        mend = f"unless another program has it open, {made_again(self.stage, self.path.parent)}"
+        return damage(self.path, mend)
 
     def _create(self) -> None:
         content = io.BytesIO()
@@ -109,15 +113,41 @@ class GroupStore:
         with self._open("a") as file:
             file.attrs[key] = text
 
+    def check_all(self) -> int:
+        """Read all that is there, and return how many groups; StoreError if it is damaged."""
+        if not self.path.exists():
+            return 0
+        with self._open("r") as file:
+            count = 0
+            for _, group in complete_groups(file):
+                for name in group:  # items() has None for what cannot be opened
+                    if isinstance(group[name], h5py.Dataset):
+                        checked(group, name)
+                count += 1
+            return count
+
     @staticmethod
     def _write(file: h5py.File, key: str, datasets: dict[str, Any], **attributes: Any) -> None:
         if key in file:
             del file[key]
         group = file.create_group(key)
         for name, values in datasets.items():
-            group.create_dataset(name, data=values)
+            group.create_dataset(name, data=values).attrs[CHECKSUM] = _checksum(values)
         group.attrs.update(attributes)
         group.attrs["complete"] = True
+
+
+def checked(group: h5py.Group, name: str) -> NDArray[Any]:
+    """Read a dataset; ValueError if it does not hold what was written."""
+    dataset = group[name]
+    values = np.asarray(dataset[()])
+    if dataset.attrs.get(CHECKSUM, known := _checksum(values)) != known:
+        raise ValueError(f"{dataset.name} is not as it was written")
+    return values
+
+
+def _checksum(values: Any) -> int:
+    return zlib.crc32(np.ascontiguousarray(values).data)
 
 
 def is_complete(file: h5py.File, key: str) -> bool:

@@ -22,7 +22,7 @@ from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
 from colmap_affrect.project.feature_index import Entries, entries, forget
-from colmap_affrect.project.group_store import GroupStore, complete_groups, is_complete
+from colmap_affrect.project.group_store import GroupStore, checked, complete_groups, is_complete
 
 MAX_INT16 = 32767
 STATIONARY = "stationary_cells"
@@ -44,7 +44,7 @@ class PairMatches:
 def _indexed(file: h5py.File) -> Entries:
     found: Entries = {}
     for name, group in complete_groups(file):
-        width, height = group["image_size"][()].tolist()
+        width, height = checked(group, "image_size").tolist()
         content = str(group.attrs.get("content", ""))
         found[name] = content, len(group["keypoints"]), (width, height)
     return found
@@ -63,7 +63,7 @@ def frame_datasets(lafs: Floats) -> dict[str, Singles]:
 class FeatureStore(GroupStore):
     """Local features by image name."""
 
-    kind = "features"
+    kind, stage = "features", "extract"
 
     def _entries(self) -> Entries:
         if not self.path.exists():
@@ -113,8 +113,8 @@ class FeatureStore(GroupStore):
         """Add the features of the next level; what is there keeps its indices."""
         with self._open("a") as file:
             group = self._group(file, name)
-            size = tuple(group["image_size"][()].tolist())
-            ends = group["level_ends"][()].tolist()
+            size = tuple(checked(group, "image_size").tolist())
+            ends = checked(group, "level_ends").tolist()
             there = self._features(group)
             first_id = int(there.rectification_ids.max(initial=0))
             ids = features.rectification_ids
@@ -160,18 +160,17 @@ class FeatureStore(GroupStore):
 
     @staticmethod
     def _features(group: h5py.Group) -> LocalFeatures:
-        end = group["level_ends"][-1]
         return LocalFeatures(
-            group["lafs"][:end].astype(np.float64),
-            group["scores"][:end],
-            np.ascontiguousarray(group["descriptors"][:, :end].T, dtype=np.float32),
-            group["rectification_ids"][:end],
+            checked(group, "lafs").astype(np.float64),
+            checked(group, "scores"),
+            np.ascontiguousarray(checked(group, "descriptors").T, dtype=np.float32),
+            checked(group, "rectification_ids"),
         )
 
     def level_ends(self, name: str) -> list[int]:
         """Return, for each level that an image has, the number of features up to it."""
         with self._open("r") as file:
-            ends: list[int] = self._group(file, name)["level_ends"][()].tolist()
+            ends: list[int] = checked(self._group(file, name), "level_ends").tolist()
             return ends
 
     def num_keypoints(self) -> dict[str, int]:
@@ -181,7 +180,7 @@ class FeatureStore(GroupStore):
     def image_size(self, name: str) -> tuple[int, int]:
         """Return the (width, height) of one image in px."""
         with self._open("r") as file:
-            width, height = self._group(file, name)["image_size"][()].tolist()
+            width, height = checked(self._group(file, name), "image_size").tolist()
             return width, height
 
     def image_sizes(self) -> dict[str, tuple[int, int]]:
@@ -191,12 +190,12 @@ class FeatureStore(GroupStore):
     def read_frames(self, name: str) -> Singles:
         """Read the (N, 2, 3) frames of one image."""
         with self._open("r") as file:
-            return np.asarray(file[name]["lafs"][()])
+            return checked(file[name], "lafs")
 
     def read_rectification_ids(self, name: str) -> NDArray[np.int32]:
         """Read the (N,) warps that the features of one image come from."""
         with self._open("r") as file:
-            return np.asarray(self._group(file, name)["rectification_ids"][()])
+            return checked(self._group(file, name), "rectification_ids")
 
 
 def pair_key(name1: str, name2: str) -> str:
@@ -220,7 +219,7 @@ def hloc_matches(pair: PairMatches) -> dict[str, NDArray[np.generic]]:
 class MatchStore(GroupStore):
     """Raw matches by pair of image names."""
 
-    kind = "matches"
+    kind, stage = "matches", "match"
 
     def write(
         self,
@@ -254,8 +253,9 @@ class MatchStore(GroupStore):
 
     def stationary_cells(self) -> dict[tuple[int, int], Indices]:
         """Return the (N, 2) cells that never move by size of photographs (stages/stationary)."""
-        known = json.loads(self._text(STATIONARY) or "[]")
-        return {tuple(size): np.array(cells, np.int64).reshape(-1, 2) for size, cells in known}
+        with self._damage():
+            known = json.loads(self._text(STATIONARY) or "[]")
+            return {tuple(size): np.array(cells, np.int64).reshape(-1, 2) for size, cells in known}
 
     def record_stationary_cells(self, cells: Mapping[tuple[int, int], Indices]) -> None:
         """Keep the cells that never move."""
@@ -287,8 +287,9 @@ class MatchStore(GroupStore):
 
     def step(self) -> tuple[int, list[tuple[str, str]]] | None:
         """Return the level and the pairs of the step of escalation that has begun and not ended."""
-        level, pairs = json.loads(self._text(STEP) or "[0, []]")
-        return (level, [(first, second) for first, second in pairs]) if level else None
+        with self._damage():
+            level, pairs = json.loads(self._text(STEP) or "[0, []]")
+            return (int(level), [(first, second) for first, second in pairs]) if level else None
 
     def record_step(self, level: int = 0, pairs: Sequence[tuple[str, str]] = ()) -> None:
         """Keep a step that begins; without one, that it has ended."""
@@ -313,12 +314,12 @@ class MatchStore(GroupStore):
                 key = pair_key(name1, name2)
                 if not is_complete(file, key):
                     raise StoreError(f"{self.path}: no matches of {name1}, {name2}; run match")
-                matches0 = file[key]["matches0"][()].astype(np.int64)
+                matches0 = checked(file[key], "matches0").astype(np.int64)
                 rows = np.flatnonzero(matches0 >= 0)
                 yield PairMatches(
                     (name1, name2),
                     np.stack([rows, matches0[rows]], axis=1),
-                    file[key]["matching_scores0"][()][rows].astype(np.float32),
+                    checked(file[key], "matching_scores0")[rows].astype(np.float32),
                     len(matches0),
                     int(file[key].attrs["level"]),
                 )
@@ -339,7 +340,7 @@ class GuidedPair:
 class GuidedStore(GroupStore):
     """Which pairs were matched again by their geometry."""
 
-    kind = "guided matches"
+    kind, stage = "guided matches", "verify"
 
     def write(self, pairs: Iterable[GuidedPair]) -> None:
         """Write a batch of pairs, in the place of what is there of them."""
@@ -358,8 +359,8 @@ class GuidedStore(GroupStore):
             return [
                 GuidedPair(
                     (str(first), str(second)),
-                    group["exact"][()],
-                    group["candidates"][()],
+                    checked(group, "exact"),
+                    checked(group, "candidates"),
                     int(group.attrs["num_inliers"]),
                 )
                 for _, group in sorted(complete_groups(file), key=lambda item: item[0])

@@ -15,8 +15,8 @@ import tomli_w
 from filelock import FileLock, Timeout
 
 from colmap_affrect import __version__
-from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
-from colmap_affrect.options import digest_of, flat
+from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError, damage
+from colmap_affrect.options import digest_of, flat, suggestion
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 from colmap_affrect.project.outputs import (
     LOCK,
@@ -194,21 +194,24 @@ class Workspace:
         """
         if not self.config.exists():
             return {}
-        try:
+        mend = f"restore it, or use another --output-path than {self.path}"
+        with damage(self.config, mend, WorkspaceError):
             record = deepcopy(_parsed(self.config.read_text(encoding="utf-8")))
-        except (ValueError, RecursionError) as error:
-            raise WorkspaceError(f"{self.config}: damaged ({error}); remove it") from error
         if record.pop("format_version", None) != FORMAT_VERSION:
             raise WorkspaceError(
                 f"{self.path}: was made by another version of colmap-affrect, which cannot be "
                 "gone on with; use another --output-path or remove it"
             )
+        for name in record.keys() - {"recipe", "begun", *STAGES}:
+            raise OptionError(f"{self.config}: unknown {name!r}{suggestion(name, STAGES)}; {mend}")
+        with damage(self.config, mend, WorkspaceError):
+            _require_complete(record)
         return record
 
     def recipe(self) -> str:
         """Return the name of the recipe that the features were made with."""
         self.require("extract")
-        return str(self.recorded()["recipe"])
+        return str(self.recorded().get("recipe", ""))
 
     def planned(self, stage: str) -> dict[str, Any] | None:
         """Return the options on record for a stage, begun or not; None if there are none."""
@@ -357,6 +360,17 @@ def _may_be_ours(path: Path) -> bool:
     is_temporary = name.startswith(TEMPORARY_PREFIX) or name.endswith(NEW_SUFFIX)
     is_empty_log = name == "run.log" and not path.stat().st_size
     return name in OF_SYSTEMS or name == LOCK or is_temporary or is_empty_log
+
+
+def _require_complete(record: Mapping[str, Any]) -> None:
+    """Refuse a record that lacks options of a stage that has begun; ValueError."""
+    begun = record.get("begun", [])
+    tables = [record.get(stage, None if stage in begun else {}) for stage in STAGES]
+    texts = [record.get("recipe", ""), *begun]
+    if not (set(begun) <= set(STAGES) and all(isinstance(each, dict) for each in tables)):
+        raise ValueError("options of stages that have begun are missing")
+    if not all(isinstance(each, str) for each in texts):
+        raise ValueError("names are no texts")
 
 
 def database_files(path: Path) -> list[Path]:

@@ -7,8 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import registered_names
+from colmap_affrect.colmap.model_files import read_model
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.geometry.arrays import Array, Bytes
 from colmap_affrect.report.pictures import base64_text
@@ -100,8 +99,7 @@ def read_models(paths: Mapping[str, Path | None]) -> tuple[dict[str, Model], dic
 
 
 def _read(path: Path, max_num_points: int) -> Model:
-    registered_names(path)
-    model = pycolmap.Reconstruction(path)
+    model = read_model(path)
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     cameras = [model.cameras[image.camera_id] for image in images]
     ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)

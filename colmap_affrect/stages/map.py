@@ -22,7 +22,7 @@ from colmap_affrect.mappers.doubts import loose_names
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
 from colmap_affrect.mappers.starts import holding
-from colmap_affrect.mappers.summaries import read_summary
+from colmap_affrect.mappers.summaries import made_from, model_folders, read_summary, refuse_edited
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.report import ModelSummary, StageReport
@@ -69,8 +69,7 @@ def map_images(
         existing = read_existing(extend, workspace.database)  # it may be discarded now
     inputs = _inputs(workspace, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
-    path = workspace.sparse / INPUTS
-    known = path.read_text() if path.exists() else ""
+    known = made_from(workspace.sparse)
     if known != inputs and " " in known and not extend:
         raise StaleStoreError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
@@ -80,6 +79,7 @@ def map_images(
     if known == inputs:
         models = read_models(workspace.sparse, task)
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
+    refuse_edited(workspace.sparse)
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models, num_rejected = _map(context, mapper, task, advance)
@@ -95,7 +95,7 @@ def map_images(
             f"{'contradicts the others and was' if is_one else 'contradict the others and were'} "
             "rejected"
         )
-    replace_text(path, inputs)
+    replace_text(workspace.sparse / INPUTS, inputs)
     if extend and existing and existing.num_other_keypoints:
         warnings[str(extend.model_path)] = (
             f"keypoints of {existing.num_other_keypoints} of its {len(existing.names)} images are "
@@ -361,8 +361,7 @@ def _missing_places(workspace: Workspace, missing: Collection[str]) -> str:
 def agreement(context: Context, sparse_path: Path) -> float:
     """Return how well the best of some models agrees with the verified pairs."""
     graph = PairGraph.read(context.workspace.database)
-    folders = [path for path in sparse_path.iterdir() if path.name.isdigit()]
-    return graph.best_score(pycolmap.Reconstruction(folder) for folder in folders)
+    return graph.best_score(map(pycolmap.Reconstruction, model_folders(sparse_path)))
 
 
 def contradicting_pairs(context: Context) -> dict[str, int]:

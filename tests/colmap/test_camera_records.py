@@ -32,7 +32,7 @@ def test_records_come_back(tmp_path: Path) -> None:
 def test_damaged_records_are_one_clear_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "cameras.json"
     path.write_text(text)
-    with pytest.raises(WorkspaceError, match=r"cameras\.json: damaged .*; remove it"):
+    with pytest.raises(WorkspaceError, match=r"cameras\.json: damaged .*; run .*verify"):
         read_camera_records(path)
 
 

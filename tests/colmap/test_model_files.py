@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import random
+import shutil
 from pathlib import Path
 
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import RECORDS, registered_names
+from colmap_affrect.colmap.model_files import read_given_model, registered_names
+from colmap_affrect.colmap.model_records import RECORDS
 from colmap_affrect.errors import StoreError
 
 
@@ -55,29 +57,65 @@ def test_missing_cut_and_lengthened_files_are_errors_that_name_them(
     rng = random.Random(1)
     for length in [0, 7, len(data) - 1, *(rng.randrange(len(data)) for _ in range(20))]:
         path.write_bytes(data[:length])
-        with pytest.raises(StoreError, match=rf"{name}: damaged, it ends within a record"):
+        with pytest.raises(StoreError, match=rf"{name}: damaged \(it ends within a record"):
             registered_names(model_path)
     path.write_bytes(data + b"x")
-    with pytest.raises(StoreError, match=rf"{name}: damaged, something follows"):
+    with pytest.raises(StoreError, match=rf"{name}: damaged \(something follows"):
         registered_names(model_path)
     path.unlink()
-    with pytest.raises(StoreError, match=rf"{name}: cannot be read"):
+    with pytest.raises(StoreError, match=rf"{name}: damaged \(.*No such file"):
         registered_names(model_path)
 
 
-def test_changed_bytes_are_an_error_or_pass_but_nothing_else(model_path: Path) -> None:
-    rng = random.Random(2)
-    num_errors = 0
-    for _ in range(100):
+def test_damaged_models_are_an_error_or_can_be_used(model_path: Path, tmp_path: Path) -> None:
+    rng, num_errors = random.Random(2), 0
+    for _ in range(200):
         path = model_path / rng.choice(sorted(RECORDS))
         data = path.read_bytes()
-        changed = bytearray(data)
-        for _ in range(20):
-            changed[rng.randrange(min(300, len(data)))] = rng.randrange(256)
+        changed, start = bytearray(data), rng.randrange(len(data))
+        for k in range(start, min(len(data), start + rng.choice([1, 8, 60]))):
+            changed[k] = rng.choice([0, rng.randrange(256)])
         path.write_bytes(changed)
         try:
-            registered_names(model_path)
+            read_given_model(model_path).write_text(tmp_path)
         except StoreError:
             num_errors += 1
         path.write_bytes(data)
-    assert num_errors > 50
+    assert 100 < num_errors < 200
+
+
+@pytest.mark.parametrize(
+    ("name", "offset", "what"),
+    [
+        ("cameras.bin", 16, "a camera is of no size"),
+        ("rigs.bin", 20, "a rig has a camera that is not there"),
+        ("frames.bin", 12, "a frame has a rig that is not there"),
+        ("images.bin", 8, "a frame has an image that is not there"),
+    ],
+)
+def test_what_files_say_of_each_other_must_be_so(
+    model_path: Path, name: str, offset: int, what: str
+) -> None:
+    path = model_path / name
+    data = bytearray(path.read_bytes())
+    data[offset : offset + 4] = bytes(4)
+    path.write_bytes(data)
+    with pytest.raises(StoreError, match=what):
+        read_given_model(model_path)
+
+
+def test_tracks_and_keypoints_see_each_other(
+    model: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    model.write(tmp_path)
+    changed = pycolmap.Reconstruction(tmp_path)
+    changed.delete_point3D(min(changed.points3D))
+    for name, of in ("images.bin", changed), ("points3D.bin", model):
+        (tmp_path / name).unlink()
+        (other := tmp_path / "other").mkdir(exist_ok=True)
+        of.write(other)
+        shutil.copy(other / name, tmp_path)
+    with pytest.raises(
+        StoreError, match=r"points3D\.bin: damaged \(a track has a keypoint that sees"
+    ):
+        read_given_model(tmp_path)

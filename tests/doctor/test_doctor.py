@@ -15,11 +15,13 @@ from pathlib import Path
 
 import cv2
 import h5py
+import numpy as np
 import pytest
 import tomli_w
 from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.cli import main
+from colmap_affrect.colmap import pycolmap
 from colmap_affrect.doctor import Diagnosis, Finding, diagnose
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.pipeline import RunOptions, run
@@ -108,6 +110,23 @@ def unmark(file: h5py.File) -> None:
 
 def unmatch(file: h5py.File) -> None:
     del file["a.png/b c.png"]
+
+
+def zero(file: h5py.File) -> None:
+    file["a.png/b c.png/matches0"][:9] = 0
+
+
+def flip(path: Path) -> None:
+    """Change a digit in the middle."""
+    text = path.read_text()
+    place = next(k for k in range(len(text) // 2, len(text)) if text[k].isdigit())
+    path.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :])
+
+
+def edit_model(path: Path) -> None:
+    model = pycolmap.Reconstruction(path)
+    model.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(), np.zeros(3)))
+    model.write(path)
 
 
 def lengthen(path: Path) -> None:
@@ -200,7 +219,40 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
     "model damaged": (
         lambda f: lengthen(f.out / "sparse" / "0" / "points3D.bin"),
         Finding("error", "{out}/sparse/0", "points3D.bin: damaged",
-                "run 'colmap-affrect map --output-path {out}' --overwrite"),
+                "run 'colmap-affrect map --output-path {out} --overwrite'"),
+    ),
+    "model edited": (
+        lambda f: edit_model(f.out / "sparse" / "0"),
+        Finding("error", "{out}/sparse/0", "is not as it was written",
+                "copy it to a folder of its own without summary.json"),
+    ),
+    "summary damaged": (
+        lambda f: flip(f.out / "sparse" / "0" / "summary.json"),
+        Finding("error", "{out}/sparse/0/summary.json", "is missing or damaged",
+                "map --output-path {out} --overwrite"),
+    ),
+    "inputs of the models": (
+        lambda f: (f.out / "sparse" / "inputs.sha256").write_bytes(b"\xfe" * 64),
+        Finding("error", "{out}/sparse/inputs.sha256", "damaged (",
+                "map --output-path {out} --overwrite"),
+    ),
+    "cameras": (
+        lambda f: flip(f.out / "cameras.json"),
+        Finding("error", "{out}/cameras.json", "not as it was written",
+                "verify --output-path {out} --overwrite"),
+    ),
+    "contents": (
+        lambda f: (f.out / "contents.json").write_text("[1]"),
+        Finding("note", "{out}/contents.json", "damaged", "nothing to do"),
+    ),
+    "a page of matches": (
+        lambda f: break_h5(f.out / "matches.h5", zero),
+        Finding("error", "{out}/matches.h5", "/a.png/b c.png/matches0 is not as it was written",
+                "match --output-path {out} --overwrite"),
+    ),
+    "list of pairs cut": (
+        lambda f: (f.out / "pairs.txt").write_text("a.png\tb c.png\n"),
+        Finding("error", "{out}/pairs.txt", "is not the list whose pairs were matched", "match"),
     ),
     "pairs verified anew": (
         lambda f: f.execute(
@@ -211,7 +263,7 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
     ),
     "config.toml damaged": (
         lambda f: (f.out / "config.toml").write_text("no [toml"),
-        Finding("error", "{out}/config.toml", "cannot be used (damaged", "restore it"),
+        Finding("error", "{out}/config.toml", "damaged (Expected", "restore it"),
     ),
     "config.toml lacks an entry": (
         lambda f: f.change_record(lambda r: r["extract"].pop("image_path")),
@@ -236,6 +288,25 @@ def test_what_is_broken_in_a_folder_is_the_one_finding(folders: Folders, case: s
     assert found.where == expected.where.format(**places)
     assert expected.what in found.what
     assert expected.advice.format(**places) in found.advice
+
+
+def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(
+    folders: Folders, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, out = folders.out / "sparse" / "0", str(folders.out)
+    edit_model(model)
+    before = (model / "points3D.bin").read_bytes()
+    target = ["--model-path", str(model), "--output-path", str(tmp_path / "new"), "--format=text"]
+    for inputs in (None, "0" * 64):  # and where mapping would begin anew
+        if inputs:
+            (folders.out / "sparse" / "inputs.sha256").write_text(inputs)
+        for arguments in (["map", "--output-path", out], ["export", *target]):
+            assert main([*arguments, "--quiet"]) == 1
+            (line,) = capsys.readouterr().err.splitlines()
+            assert "copy it to a folder of its own without summary.json" in line
+    assert (model / "points3D.bin").read_bytes() == before
+    assert main(["map", "--output-path", out, "--quiet", "--overwrite"]) == 0
+    assert main(["export", *target, "--quiet"]) == 0
 
 
 def test_photograph_that_was_deleted_is_found(folders: Folders) -> None:

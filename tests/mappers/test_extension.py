@@ -236,7 +236,7 @@ def broken(old: pycolmap.Reconstruction, kind: str, folder: Path) -> Path:
         ("size", r"is \d+ x \d+ px there and \d+ x \d+ px here"),
         ("camera", "have different cameras there and share one here"),
         ("empty", "has no images with poses"),
-        ("damaged", "damaged, it ends within a record"),
+        ("damaged", r"damaged \(it ends within a record"),
     ],
 )
 def test_model_that_does_not_fit_is_one_clear_line(

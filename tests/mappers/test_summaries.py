@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.mappers.summaries import FILE_NAME, read_summary, write_summary
+from colmap_affrect.colmap.model_files import SUMMARY, read_given_model
+from colmap_affrect.errors import StoreError
+from colmap_affrect.mappers.summaries import read_summary, refuse_edited, write_summary
 from colmap_affrect.project.report import Arrival, ModelSummary
 
-SUMMARY = ModelSummary(
+MODEL = ModelSummary(
     registered_names=("a.jpg", "č.jpg"),
     num_points3D=120,
     mean_track_length=2.25,
@@ -27,26 +30,41 @@ SUMMARY = ModelSummary(
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     pycolmap.set_random_seed(1)
-    pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_points3D=20)).write(tmp_path)
-    write_summary(SUMMARY, tmp_path)
-    return tmp_path
+    path = tmp_path / "sparse" / "0"
+    path.mkdir(parents=True)
+    pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_points3D=20)).write(path)
+    write_summary(MODEL, path)
+    return path
 
 
 def test_a_summary_reads_back(folder: Path) -> None:
-    assert read_summary(folder) == SUMMARY
+    assert read_summary(folder) == MODEL
 
 
-def test_a_model_that_has_changed_has_no_summary(folder: Path) -> None:
+def test_a_model_that_has_changed_is_refused_but_its_copy_is_not(
+    folder: Path, tmp_path: Path
+) -> None:
     model = pycolmap.Reconstruction(folder)
     model.cameras[1].focal_length += 1
     model.write(folder)
-    assert read_summary(folder) is None
+    for read in (read_summary, read_given_model):
+        with pytest.raises(
+            StoreError, match=r"copy it to a folder of its own without summary\.json"
+        ):
+            read(folder)
+    shutil.copytree(folder, copy := tmp_path / "copy", ignore=lambda *_: [SUMMARY])
+    assert read_given_model(copy).cameras[1].focal_length == model.cameras[1].focal_length
     (folder / "points3D.bin").unlink()
-    assert read_summary(folder) is None
+    with pytest.raises(StoreError, match=r"points3D\.bin: damaged"):
+        read_summary(folder)
 
 
-def test_a_damaged_summary_is_none(folder: Path) -> None:
-    (folder / FILE_NAME).write_text('{"model": [1]}')
+@pytest.mark.parametrize("content", ['{"model": [1]}', "", "[]", "damaged"])
+def test_a_damaged_summary_is_none(folder: Path, content: str) -> None:
+    path = folder / SUMMARY
+    text = path.read_text()
+    path.write_text(text.replace("120", "121") if content == "damaged" else content)
     assert read_summary(folder) is None
-    (folder / FILE_NAME).unlink()
-    assert read_summary(folder) is None
+    assert read_given_model(folder).num_points3D() == 20
+    with pytest.raises(StoreError, match="may have been edited"):
+        refuse_edited(folder.parent)

@@ -205,10 +205,39 @@ def test_foreign_or_newer_file_is_refused_and_left_as_it_is(
 def test_damaged_file_is_refused_with_one_line(store: FeatureStore, content: bytes) -> None:
     store.path.write_bytes(content)
     for access in (store.names, lambda: store.write("a.png", some_features(2), (4, 3))):
-        with pytest.raises(StoreError, match=r"cannot be opened as HDF5 .*--overwrite") as error:
+        with pytest.raises(StoreError, match=r"damaged .*--overwrite") as error:
             access()
         one_line(error)
     assert store.path.read_bytes() == content
+
+
+@pytest.mark.parametrize("has_checksums", [True, False])
+def test_values_that_were_not_written_are_damage(
+    store: FeatureStore, matches: MatchStore, has_checksums: bool
+) -> None:
+    """Files of before have no checksums, and are taken as they are."""
+    store.write("a.png", some_features(30), (4, 3))
+    matches.write([pair_matches(("a.png", "b.png"), [[0, 1]], 9)])
+    for path, name in (store.path, "a.png/descriptors"), (matches.path, "a.png/b.png/matches0"):
+        with h5py.File(path, "r+") as file:
+            file[name][0] = 7
+            if not has_checksums:
+                del file[name].attrs["crc32"]
+    readers = {
+        f"extract.*{store.path.name}": (lambda: store.read("a.png"), store.check_all),
+        "match --output-path": (
+            lambda: list(matches.read([("a.png", "b.png")])),
+            matches.check_all,
+        ),
+    }
+    for mend, reads in readers.items():
+        for read in reads:
+            if not has_checksums:
+                assert read()
+                continue
+            with pytest.raises(StoreError, match="is not as it was written") as error:
+                read()
+            assert mend.partition(".")[0] in one_line(error)
 
 
 @pytest.mark.parametrize(
