@@ -19,7 +19,6 @@ from colmap_affrect.colmap.model_files import camera_like
 from colmap_affrect.colmap.tables import (
     DAMAGED,
     SENSOR_CAMERA,
-    Camera,
     Tables,
     columns_of,
     open_read_only,
@@ -27,8 +26,8 @@ from colmap_affrect.colmap.tables import (
     read_tables,
     rows_of,
 )
+from colmap_affrect.colmap.useless_keypoints import MAX_SIDE_PX, useless
 from colmap_affrect.errors import DatabaseError
-from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.shown import such_as
 
 Severity = Literal["error", "warning", "note"]
@@ -75,7 +74,10 @@ CHECKS: dict[str, Check] = {
         "extract these images again into a new database"),
     "keypoints-not-finite": ("error",
         "images with keypoints that are not finite numbers, or are where no image reaches",
-        "extract these images again into a new database"),
+        "extract these images again; 'map --from-database' leaves these keypoints out"),
+    "keypoints-at-one-place": ("warning",
+        "images with most keypoints at one place, at which COLMAP may never end",
+        "extract these images again; 'map --from-database' leaves these keypoints out"),
     "keypoints-outside": ("warning", "images with keypoints outside of them",
         "see that they were found in the images as stored: not rotated, not resized"),
     "descriptor-count": ("error", "images with another number of descriptors than of keypoints",
@@ -116,13 +118,12 @@ FATAL_FOR_IMAGES = frozenset({
 """Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
 
 FATAL = FATAL_FOR_IMAGES | {
-    "keypoint-columns", "keypoint-data", "keypoints-not-finite", "self-pair", "unknown-pair",
-    "match-data", "match-range", "matrix-data",
+    "keypoint-columns", "keypoint-data", "self-pair", "unknown-pair", "match-data", "match-range",
+    "matrix-data",
 }  # fmt: skip
 """The same of keypoints and matches."""
 
 Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
-MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
 
 MATRICES = {
     ("two_view_geometries", "pair_id"): {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
@@ -137,7 +138,6 @@ CAMERA_OF_PAIR = struct.Struct("<IiQQBQ")
 length is a prior, and the number of parameters that follow, float64."""
 
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
-OUTSIDE_TOLERANCE_PX = 1.0  # keypoints of images shrunk for detection may lie outside
 UNDEFINED = 0  # configuration of a two-view geometry that COLMAP 4.2 passes over
 
 
@@ -313,10 +313,10 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
             found["keypoint-data"].append(name)
         elif not count:
             found["no-keypoints"].append(name)
-        elif not (np.abs(keypoints) <= MAX_SIDE_PX).all():
-            found["keypoints-not-finite"].append(name)
-        elif _are_outside(keypoints, tables.cameras.get(tables.camera_ids[image_id])):
-            found["keypoints-outside"].append(name)
+        else:
+            camera = tables.cameras.get(tables.camera_ids[image_id])
+            for kind in useless(keypoints, (camera.width, camera.height) if camera else None):
+                found[kind].append(name)
 
 
 def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[Any] | None:
@@ -325,14 +325,6 @@ def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[
     if not isinstance(blob, bytes) or len(blob) != rows * columns * dtype.itemsize:
         return None
     return np.frombuffer(blob, dtype).reshape(rows, columns)
-
-
-def _are_outside(keypoints: Singles, camera: Camera | None) -> bool:
-    """Tell whether any keypoints, whose origin is the corner of the image, are not in it."""
-    if camera is None:
-        return False
-    beyond = np.maximum(-keypoints[:, :2], keypoints[:, :2] - [camera.width, camera.height])
-    return bool((beyond > OUTSIDE_TOLERANCE_PX).any())
 
 
 def _check_descriptors(tables: Tables, found: Problems) -> None:

@@ -44,6 +44,7 @@ from colmap_affrect.stages.extract import (
 )
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import match
+from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import add_pairs
 
 CANCELLED = "Operation cancelled"  # what pycolmap says
@@ -395,4 +396,6 @@ def _context(
     threads = asked.get("num_threads", -1)
     executor = Threads(threads) if threads > 0 else None
     with Workspace.beside(Path(database_path)).locked() as workspace:
-        yield Context(workspace, Resources(weights, name), executor, progress)
+        context = Context(workspace, Resources(weights, name), executor, progress)
+        with watched(context):
+            yield context

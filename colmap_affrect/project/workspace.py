@@ -33,6 +33,7 @@ INPUTS = "inputs.sha256"  # in sparse/: digests of what it was made from
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
 COPY_STAGES = ("copy", "verify", "map")  # of a folder in which another program's database is mapped
 BYTES_OF_MARK = 200  # at the beginning of our files, in which they tell what they are
+SEAL_SUFFIXES = (".seal", ".seal-open", ".parts")  # of what tells whether others changed a database
 TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
 WEIGHTS = "weights"  # of a record: the digests of files, beside the options of a stage
 FORMAT_VERSION = 6  # of ``config.toml``: counts up when a stage records other options than before
@@ -64,6 +65,7 @@ class Workspace:
         self.matches = path / "matches.h5"  # raw ones by pair
         self.guided = path / "guided.h5"  # what guided matching found, by pair
         self.pairs = path / "pairs.txt"  # those to match
+        self.deleted_pairs = path / "pairs.deleted.txt"  # but for those deleted in the database
         self.sparse = path / "sparse"  # folder of the COLMAP models 0, 1, ...
         self.aside = path / "sparse.aside"  # models to be compared with those of guided matches
         self.snapshots = path / "sparse.snapshots"  # from which an interrupted mapping goes on
@@ -268,9 +270,13 @@ class Workspace:
         made = {
             "map": [self.sparse, self.aside, self.snapshots, self.report, self.page],
             "guide": [self.guided],
-            "verify": [self.cameras, *database_files(self.database)],
+            "verify": [
+                self.cameras,
+                *database_files(self.database),
+                *(self.path / f"database.db{suffix}" for suffix in SEAL_SUFFIXES),
+            ],
             "match": [self.matches],
-            "pairs": [self.pairs],
+            "pairs": [self.pairs, self.deleted_pairs],
             "extract": [self.features, self.contents],
         }
         later = STAGES[STAGES.index(stage) :]

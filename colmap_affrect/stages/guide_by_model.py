@@ -23,6 +23,7 @@ from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.guide import Guiding, current, recorded_guiding
 from colmap_affrect.stages.one_guided_pair import GuidedTask
+from colmap_affrect.stages.pairs import deleted_pairs
 from colmap_affrect.stages.verify import verified_inliers
 
 
@@ -80,10 +81,12 @@ def guide_by_model(context: Context, model: pycolmap.Reconstruction) -> StageRep
         if image.has_pose and image.name in guiding.ids
     }
     known = verified_inliers(context).keys() | {pair.names for pair in current(context)}
+    deleted = deleted_pairs(context.workspace)
     todo = [
         (first, second)
         for first, second in combinations(sorted(views, key=guiding.ids.__getitem__), 2)
         if (first, second) not in known
+        and frozenset((first, second)) not in deleted
         and min(
             views[first].num_visible(views[second].points),
             views[second].num_visible(views[first].points),
