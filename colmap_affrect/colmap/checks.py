@@ -47,7 +47,8 @@ CHECKS: dict[str, Check] = {
     "camera-size": ("error", "cameras of a size that no photograph has",
         "import their images again into a new database"),
     "camera-params": ("error",
-        "cameras whose parameters are more or fewer than their model has, or not finite numbers",
+        "cameras whose parameters are more or fewer than their model has, a focal length that is "
+        "not positive, or not finite numbers",
         "import their images again into a new database"),
     "no-prior-focal": ("note", "cameras whose focal length is a guess",
         "if you know the intrinsics, give them: --cameras-path or --focal-length-px here, "
@@ -229,7 +230,11 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
         if not len(like.focal_length_idxs()):
             found["camera-panorama"].append(f"{label}: {like.model.name}")
         params = _array(camera.params, 1, len(like.params), np.dtype("<f8"))
-        if params is None or not np.isfinite(params).all():
+        if (
+            params is None
+            or not np.isfinite(params).all()
+            or (params[0, like.focal_length_idxs()] <= 0.0).any()
+        ):
             found["camera-params"].append(label)
         if not all(0 < side <= MAX_SIDE_PX for side in (camera.width, camera.height)):
             found["camera-size"].append(f"{label}: {camera.width} x {camera.height} px")

@@ -105,6 +105,9 @@ def end_work(path: Path, *, reads: bool = True) -> None:
         parts: dict[str, Any] = read_parts(path)
         np.savez(content, **parts)
         replace_bytes(parts_of(path), content.getvalue())
+    if is_same and _read_stamp(working) == stamp:
+        working.replace(seal_of(path))
+        return
     replace_text(seal_of(path), json.dumps(stamp))
     working.unlink(missing_ok=True)
 
@@ -117,7 +120,10 @@ def changes(path: Path) -> dict[str, Change]:
     now, found = read_parts(path), dict[str, Change]()
     if not seal_of(path).exists():
         return found
-    with suppress(OSError, ValueError, KeyError, BadZipFile), np.load(parts_of(path)) as before:
+    with (
+        suppress(OSError, ValueError, KeyError, BadZipFile),
+        np.load(parts_of(path), allow_pickle=False) as before,
+    ):
         for part, rows in now.items():
             old = before[part]
             _, at, there = np.intersect1d(old["key"], rows["key"], True, return_indices=True)

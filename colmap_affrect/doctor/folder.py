@@ -11,6 +11,7 @@ from colmap_affrect.colmap.tables import Tables
 from colmap_affrect.doctor.database import examine_database, examined_copy
 from colmap_affrect.doctor.findings import OWN_ADVICE, SAME_RUN, Findings, without_path
 from colmap_affrect.errors import AffrectError, WorkspaceError
+from colmap_affrect.pairs.base import PairList
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.atomic_files import NEW_SUFFIX
 from colmap_affrect.project.contents import Contents
@@ -18,6 +19,8 @@ from colmap_affrect.project.workspace import COPY_STAGES, INPUTS, STAGES, Worksp
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
 from colmap_affrect.stages.match import recorded_matching
+from colmap_affrect.stages.mend import edits_of
+from colmap_affrect.stages.pairs import without_deleted
 from colmap_affrect.stages.verify import recorded_verification
 
 DAMAGED_HDF5 = (OSError, RuntimeError, KeyError, ValueError, TypeError)
@@ -74,11 +77,14 @@ class _FolderExamination:
             self._add("database-missing", database)
             return
         own_advice = {} if self.workspace.users_database else OWN_ADVICE
+        edits = None if self.workspace.users_database else edits_of(database)
         with examined_copy(self.found, database, image_path, own_advice) as examined:
             if examined is None:
                 return
             copy, tables = examined
-            if features is not None:
+            if edits and str(edits):
+                self._add("database-changed", database, edits=edits)
+            elif features is not None:
                 self._compare_keypoints(features, tables)
                 if "match" in done:
                     self._matches(tables, sorted(images.union(features)))
@@ -182,11 +188,12 @@ class _FolderExamination:
     def _matches(self, tables: Tables, names: Sequence[str]) -> None:
         path = self.workspace.matches
         try:
-            pairs = read_pairs(self.workspace.pairs, names) if len(names) > 1 else []
+            pairs = read_pairs(self.workspace.pairs, names) if len(names) > 1 else PairList.of(())
         except AffrectError as error:
             self._add_unusable("pairs-unusable", self.workspace.pairs, error)
             return
         try:
+            pairs = without_deleted(self.workspace, pairs)
             is_there = Context(self.workspace).matches.has(pairs)
         except (AffrectError, *DAMAGED_HDF5) as error:
             self._add_unusable("matches-unusable", path, error)

@@ -120,7 +120,9 @@ def test_panoramas_are_refused_before_anything_is_recorded(
         assert "look all around, which have no focal length (camera 2: EQUIREC" in ended.stderr[0]
         assert not (tmp_path / "out" / "config.toml").exists()
     assert num_errors(path) == 0  # COLMAP has a use for it
-    with pytest.raises(DatabaseError, match=r"no focal length \(camera 2: E.*; cut perspective views"):
+    with pytest.raises(
+        DatabaseError, match=r"no focal length \(camera 2: E.*; cut perspective views"
+    ):
         extract_features(path, healthy.parent / "photos")
     assert not (tmp_path / "any.affrect" / "config.toml").exists()
     assert call("extract", "-q", *given, "--from-database", healthy, *FAST[:2]).code == 0
