@@ -142,10 +142,11 @@ KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine
 UNDEFINED = 0  # configuration of a two-view geometry that COLMAP 4.2 passes over
 
 
-def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
+def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> Problems:
     """Refuse a damaged database, or one with problems that would end the process inside COLMAP.
 
     It is only read; ``kinds`` of problems are keys of ``CHECKS``, and DatabaseError has one line.
+    Returns all other problems.
     """
     with open_read_only(path) as connection:
         _, problems = _check(connection, path)
@@ -153,6 +154,7 @@ def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
         _, what, advice = CHECKS[kind]
         items = such_as(problems[kind])
         raise DatabaseError(f"{path}: {what} ({items}); {advice.format(path=path)}")
+    return problems
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:

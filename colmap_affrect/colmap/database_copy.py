@@ -18,7 +18,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database import open_database, write_frame
 from colmap_affrect.colmap.tables import DAMAGED, columns_of, open_read_only
-from colmap_affrect.colmap.useless_keypoints import leave_out_useless
+from colmap_affrect.colmap.useless_keypoints import KINDS, leave_out_useless
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.workspace import remove_database
 
@@ -88,13 +88,13 @@ def copy_database(
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
-    if refused:
-        refuse_unusable(source, refused)
+    problems = refuse_unusable(source, refused) if refused else {}
+    has_useless = "keypoint-data" in refused and not problems.keys().isdisjoint(KINDS)
     new = target.with_name(target.name + ".new")
     remove_database(new)
     try:
         copy_as_it_is(source, new)
-        left_out = leave_out_useless(new) if "keypoint-data" in refused else ""
+        left_out = leave_out_useless(new) if has_useless else ""
         if left_out:
             logger.warning("%s: %s", source, left_out)
         positions = _old_positions(new)

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_affrect.colmap.tables import open_read_only, pair_images, rows_of
+from colmap_affrect.colmap.tables import pair_images, rows_of
 from colmap_affrect.geometry.arrays import Bools, Singles
 from colmap_affrect.shown import such_as
 
+KINDS = {"keypoints-not-finite", "keypoints-outside", "keypoints-at-one-place"}  # of checks.CHECKS
 MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
 OUTSIDE_TOLERANCE_PX = 1.0  # keypoints of images shrunk for detection may lie outside
 MIN_AT_ONE_PLACE = 10  # one place has a few keypoints, of several orientations or shapes
@@ -25,8 +26,7 @@ PLACEHOLDER = np.array([0, 0, 1, 0, 0, 1], "<f4")  # x, y, scale or the shape of
 def useless(keypoints: Singles, size: tuple[int, int] | None) -> dict[str, Bools]:
     """Tell for each kind of problem which of (N, 2 or more) keypoints have it, if any.
 
-    ``size`` is the (width, height) of the image, None if not known; its corner is the origin. Kinds
-    are keys of ``checks.CHECKS``.
+    ``size`` is the (width, height) of the image, None if not known; its corner is the origin.
     """
     finite = _are_finite(keypoints)
     points = keypoints[:, :2]
@@ -51,12 +51,6 @@ def with_places(keypoints: Singles) -> Singles:
     """Return (N, columns) keypoints with a place in the image for those that are nowhere."""
     finite = _are_finite(keypoints)[:, None]
     return np.where(finite, keypoints, PLACEHOLDER[: keypoints.shape[1]]).astype(np.float32)
-
-
-def has_useless(path: Path) -> bool:
-    """Tell whether an intact database has keypoints to be left out; it is only read."""
-    with open_read_only(path) as connection:
-        return bool(_masks(connection))
 
 
 def leave_out_useless(path: Path) -> str:

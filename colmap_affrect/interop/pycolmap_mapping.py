@@ -8,7 +8,7 @@ from pathlib import Path
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL, refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.useless_keypoints import has_useless
+from colmap_affrect.colmap.useless_keypoints import KINDS
 from colmap_affrect.interop import pycolmap_options as translate
 from colmap_affrect.interop.pycolmap_api import CANCELLED, Native, PathLike, Token
 from colmap_affrect.mappers.attempts import map_database
@@ -45,10 +45,10 @@ def incremental_mapping(
     native = translate.native(options, pycolmap.IncrementalPipelineOptions, "options")
     mapper = MAPPERS.make(translate.mapper_options(native))
     database, output = Path(database_path), Path(output_path)
-    refuse_unusable(database)
+    has_useless = not refuse_unusable(database).keys().isdisjoint(KINDS)
     output.mkdir(parents=True, exist_ok=True)
     with temporary_folder(output) as folder:
-        if has_useless(database):  # it stays as it is
+        if has_useless:  # it stays as it is
             copy_database(database, folder / "database.db", FATAL)
             database = folder / "database.db"
         existing = None

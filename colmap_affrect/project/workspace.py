@@ -61,6 +61,7 @@ class Workspace:
         """Name the folder, and a database of the user in the place of one there; never removed."""
         self.path, self.users_database = path, users_database
         self.database = users_database or path / "database.db"
+        self.changed_database = path / "database.changed.db"  # by others, before it was made again
         self.features = path / "features.h5"  # by image
         self.matches = path / "matches.h5"  # raw ones by pair
         self.guided = path / "guided.h5"  # what guided matching found, by pair

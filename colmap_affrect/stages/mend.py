@@ -28,7 +28,7 @@ from colmap_affrect.colmap.tables import Tables, delete_rows, open_read_only, re
 from colmap_affrect.errors import AffrectError, DatabaseError
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.project.workspace import Workspace, database_files
 from colmap_affrect.shown import such_as
 from colmap_affrect.stages.cameras import choose_cameras
 from colmap_affrect.stages.context import Context
@@ -85,7 +85,7 @@ class Edits:
 
     def __str__(self) -> str:
         """Say what was changed."""
-        return "; ".join(filter(None, [*self.lost, self.written, self.kept]))
+        return "; ".join(self.lost or filter(None, [self.written, self.kept]))
 
 
 def edits_of(path: Path) -> Edits | None:
@@ -153,8 +153,7 @@ def watched(context: Context, *, follows: bool = True, discards: bool = False) -
     """Mend the database before a command works in a folder, and seal it in the end.
 
     ``follows``: bring it up to the last stage that was run; else the command does that. One that
-    ``discards`` all there is needs nothing mended. A database
-    of the user is never mended, but
+    ``discards`` all there is needs nothing mended. A database of the user is never mended, but
     refused where COLMAP could not use it.
     """
     workspace, path = context.workspace, context.workspace.database
@@ -172,7 +171,8 @@ def watched(context: Context, *, follows: bool = True, discards: bool = False) -
         with suppress(AffrectError):
             end_work(path, reads=False)
         raise
-    end_work(path)
+    with suppress(AffrectError):  # one that is not sealed is looked at next time
+        end_work(path)
 
 
 def mend(context: Context, *, follows: bool) -> None:
@@ -185,9 +185,12 @@ def mend(context: Context, *, follows: bool) -> None:
     if found is None or not str(found):
         return
     is_copied = is_copy(workspace)
+    if not is_copied:
+        delete_pairs(workspace, found.deleted.values())
+        found = _without_others(context, found)
     # After a vote pairs would be verified by other cameras than they were.
-    is_other = len(found.pairs) and _has_voted(workspace)
-    if found.lost or is_other or (is_copied and found.written):
+    is_all = is_copied or (len(found.pairs) and _has_voted(workspace))
+    if found.lost or (found.written and is_all):
         _make_again(context, found, begun, follows=follows)
         return
     if found.kept:
@@ -196,8 +199,6 @@ def mend(context: Context, *, follows: bool) -> None:
         logger.warning(
             "%s: was changed since the last run, and is written again: %s", path, found.written
         )
-    if not is_copied:
-        delete_pairs(workspace, found.deleted.values())
     remove_seal(path)  # what is deleted now was not by others
     pairs = np.concatenate([found.pairs, np.array(list(found.deleted), np.int64)])
     delete_rows(
@@ -209,6 +210,17 @@ def mend(context: Context, *, follows: bool) -> None:
         verify_new(context)
 
 
+def _without_others(context: Context, found: Edits) -> Edits:
+    """Leave pairs alone that the stores do not hold: another program has added them."""
+    if not len(found.pairs):
+        return found
+    with open_read_only(context.workspace.database) as connection:
+        tables = read_tables(connection)
+    ours = set(map(frozenset, listed_pairs(context)))
+    are_ours = [frozenset(tables.pair_names(int(key))) in ours for key in found.pairs]
+    return replace(found, pairs=found.pairs[np.array(are_ours)])
+
+
 def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows: bool) -> None:
     workspace, record = context.workspace, context.workspace.recorded()
     original = Path(record["copy"]["database"]) if is_copy(workspace) else None
@@ -218,11 +230,17 @@ def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows
             "gone, of which it is a copy; put that back, or give another by --from-database"
         )
     logger.warning(
-        "%s: was changed since the last run (%s); it is made again from %s",
+        "%s: was changed since the last run (%s); it is made again from %s, what was there is %s",
         workspace.database,
         found,
         original or f"{workspace.features.name} and {workspace.matches.name}",
+        workspace.changed_database.name,
     )
+    kept = database_files(workspace.changed_database)
+    for file, target in zip(database_files(workspace.database), kept, strict=True):
+        target.unlink(missing_ok=True)
+        if file.exists():
+            file.replace(target)
     has_voted = _has_voted(workspace)
     workspace.rewind()
     if not (follows and "verify" in begun):

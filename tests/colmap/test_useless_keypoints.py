@@ -13,7 +13,7 @@ from command import start
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.useless_keypoints import has_useless, leave_out_useless, useless
+from colmap_affrect.colmap.useless_keypoints import leave_out_useless, useless
 
 LIMIT_S = 60.0  # COLMAP does not end for minutes
 
@@ -50,7 +50,6 @@ def test_kinds_of_useless_keypoints(keypoints: object, kinds: dict[str, list[int
 
 def test_indices_stay_and_matches_of_useless_keypoints_go(database: Path, tmp_path: Path) -> None:
     path = Path(shutil.copy(database, tmp_path / "copy.db"))
-    assert has_useless(path)
     assert "are left out, with " in leave_out_useless(path)
     with open_database(database) as before, open_database(path) as after:
         for image_id in range(1, 7):

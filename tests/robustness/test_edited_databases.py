@@ -14,7 +14,7 @@ from command import Call, on_photographs
 from results import database_content, model_names, results
 from small_scene import write_photographs
 
-from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.seal import is_untouched
 from colmap_affrect.project.workspace import Workspace
 
@@ -111,6 +111,7 @@ def test_missing_and_exchanged_databases_are_made_again(
     with open_database(out / "database.db"):
         pass
     assert "images: 3 gone" in again(call, finished, out, "run")[0]
+    assert not image_ids(out / "database.changed.db")
     assert results(out) == results(finished / "out")
 
 
