@@ -143,12 +143,15 @@ def read_parts(path: Path) -> Parts:
     with open_read_only(path) as connection:
         connection.text_factory = bytes
         try:
-            return {
+            parts = {
                 part: np.fromiter(((row[0], _digest(row)) for row in connection.execute(sql)), ROW)
                 for part, sql in QUERIES.items()
             }
         except (TypeError, ValueError, OverflowError) as error:
             raise DatabaseError(f"{path}: damaged ({error})") from error
+    if any(len(np.unique(rows["key"])) < len(rows) for rows in parts.values()):
+        raise DatabaseError(f"{path}: damaged (rows have the same number)")
+    return parts
 
 
 def _digest(row: tuple[object, ...]) -> int:

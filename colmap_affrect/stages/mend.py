@@ -23,8 +23,10 @@ from colmap_affrect.colmap.seal import (
     end_work,
     is_untouched,
     remove_seal,
+    seal_of,
 )
 from colmap_affrect.colmap.tables import Tables, delete_rows, open_read_only, read_tables
+from colmap_affrect.colmap.useless_keypoints import KINDS
 from colmap_affrect.errors import AffrectError, DatabaseError
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
@@ -41,7 +43,7 @@ from colmap_affrect.stages.verify import recorded_verification, verify_matches, 
 
 logger = logging.getLogger(__name__)
 
-UNUSABLE = FATAL | {"no-frame", "keypoints-not-finite"}
+UNUSABLE = (FATAL | KINDS | {"no-frame"}) - {"keypoints-outside"}
 NOTHING = np.zeros(0, np.int64)
 RIGS = ("rigs", "rig_sensors", "frames", "frame_data")
 
@@ -99,7 +101,7 @@ def edits_of(path: Path) -> Edits | None:
         with open_read_only(path) as connection:
             edits = _edits(found, read_tables(connection))
         if not edits.lost:
-            refuse_unusable(path, UNUSABLE)
+            refuse_unusable(path, UNUSABLE - KINDS if len(edits.keypoints) else UNUSABLE)
         return edits
     except AffrectError as error:
         text = str(error).removeprefix(f"{path}: ").partition(";")[0]
@@ -181,10 +183,11 @@ def mend(context: Context, *, follows: bool) -> None:
     begun = workspace.recorded().get("begun", [])
     if not begun or not (path.exists() or "verify" in begun):
         return
-    found = edits_of(path)
-    if found is None or not str(found):
+    found, is_copied = edits_of(path), is_copy(workspace)
+    if found and not str(found) and not (is_copied or seal_of(path).exists()):
+        found = Edits(_unlike_features(context))
+    if not (found and str(found)):
         return
-    is_copied = is_copy(workspace)
     if not is_copied:
         delete_pairs(workspace, found.deleted.values())
         found = _without_others(context, found)
@@ -205,9 +208,27 @@ def mend(context: Context, *, follows: bool) -> None:
         path, {"keypoints": found.keypoints, "matches": pairs, "two_view_geometries": pairs}
     )
     _keep_cameras(workspace, found.cameras)
-    if follows and found.written and "verify" in begun:
-        write_matches(context, listed_pairs(context))
-        verify_new(context)
+    if found.written and "verify" in begun:
+        try:
+            write_matches(context, listed_pairs(context))
+            verify_new(context)
+        except AffrectError:
+            workspace.rewind()  # half of it must not count as verified
+            raise
+
+
+def _unlike_features(context: Context) -> tuple[str, ...]:
+    """Tell which images are not those of the features, where a killed run has left no seal."""
+    with open_read_only(context.workspace.database) as connection:
+        tables = read_tables(connection)
+    sizes, found = context.features.image_sizes(), list[str]()
+    for image_id, name in tables.names.items():
+        camera = tables.cameras[tables.camera_ids[image_id]]
+        if name not in sizes and not context.workspace.require("extract")["from_database"]:
+            found.append(f"images: {name} has no features")
+        elif sizes.get(name, (camera.width, camera.height)) != (camera.width, camera.height):
+            found.append(f"cameras: that of {name} has another size")
+    return tuple(found[:1])
 
 
 def _without_others(context: Context, found: Edits) -> Edits:
