@@ -106,6 +106,8 @@ def edits_of(path: Path) -> Edits | None:
     except AffrectError as error:
         text = str(error).removeprefix(f"{path}: ").partition(";")[0]
         return Edits((text,))
+    except (TypeError, ValueError, OverflowError) as error:
+        return Edits((f"damaged ({error})",))
 
 
 def _edits(found: dict[str, Change], tables: Tables) -> Edits:
@@ -114,10 +116,10 @@ def _edits(found: dict[str, Change], tables: Tables) -> Edits:
         if part in found:
             lost.append(_told(part, found[part], what))
     pairs = [found[part] for part in ("matches", "geometries") if part in found]
-    if any(len(change.gone) == change.num_before for change in pairs):
+    if any(0 < change.num_before == len(change.gone) for change in pairs):
         lost.append("all pairs are gone")
     rigs, others = any(part in found for part in RIGS), list[str]()
-    if rigs and tables.frame_images < tables.names.keys():
+    if rigs and not tables.names.keys() <= tables.frame_images:
         lost.append("images have no frames any more")
     gone = sorted({int(key) for change in pairs for key in change.gone})
     changed = np.unique(np.concatenate([NOTHING, *(change.changed for change in pairs)]))

@@ -8,6 +8,7 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 from benchmarks.damaged import BYTES, damage_bytes
 from command import Call, on_photographs
@@ -29,6 +30,7 @@ MENDED = {
     ),
     "keypoints gone": ("DELETE FROM keypoints WHERE image_id = 2", "keypoints that do not exist"),
     "camera of another size": ("UPDATE cameras SET width = 100", "cameras: 3 changed"),
+    "camera of no size": ("UPDATE cameras SET width = 'wide'", "(damaged (invalid"),
     "no focal length": ("UPDATE cameras SET params = zeroblob(32)", "focal length that is not"),
     "other matches": (
         f"UPDATE matches SET rows = 1, data = zeroblob(8) WHERE {FIRST_PAIR}",
@@ -144,6 +146,17 @@ def test_priors_and_cameras_of_others_are_kept(finished: Path, out: Path, call: 
     with open_database(path) as database:
         assert database.read_camera(camera.camera_id).params.tolist() == camera.params.tolist()
         assert len(database.read_all_pose_priors()) == 1
+
+
+def test_pairs_of_other_programs_are_kept(finished: Path, tmp_path: Path, call: Call) -> None:
+    arguments = on_photographs(finished / "photos", tmp_path / "out")
+    assert call("extract", "-q", *arguments).code == 0
+    with open_database(tmp_path / "out" / "database.db") as database:
+        database.write_matches(1, 2, np.array([[0, 1], [1, 0]], np.uint32))
+    ended = call("extract", *arguments)
+    assert "which is kept: 1 pair more" in ended.stderr[0]
+    with open_database(tmp_path / "out" / "database.db") as database:
+        assert database.read_matches(1, 2).tolist() == [[0, 1], [1, 0]]
 
 
 def test_nobody_reads_a_database_that_nobody_changed(
