@@ -64,6 +64,7 @@ from colmap_affrect.stages.map import (
     unregistered,
 )
 from colmap_affrect.stages.match import load_matchers, match
+from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed_pairs
 from colmap_affrect.stages.verify import recorded_verification, verify_matches
 
@@ -200,7 +201,7 @@ def run(
     resolve(options.recipe.weights, options.resources.weights_path, progress=progress)
     load_matchers(context, options.recipe.extraction.matchers(options.recipe.matching))
     later = {"pairs": options.pairs, "verify": options.verification, "map": mapper.options}
-    with context.workspace.locked():
+    with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         reports = [
             extract(context, inputs, options.recipe, later=later, overwrite=overwrite),
             choose_pairs(context, options.pairs),
@@ -257,7 +258,7 @@ def map_from_database(
             extend.refuse_discarding(output_path)
         read_given_model(extend.model_path, "--extend ", MappingError)
     context = Context(Workspace(output_path), progress=progress)
-    with context.workspace.locked():
+    with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         chosen = verification or VerificationOptions()
         report = copy_verified(context, database_path, image_path, chosen, overwrite=overwrite)
         reports = [report, choose_cameras(context)] if check_cameras else [report]

@@ -165,9 +165,14 @@ def executor(options: argparse.Namespace) -> Iterator[Executor | None]:
 def context(options: argparse.Namespace) -> Iterator[Context]:
     """Lock the output folder and return what the stages work with."""
     from colmap_affrect.stages.context import Context
+    from colmap_affrect.stages.mend import watched
 
     with Workspace(options.output_path).locked() as workspace, executor(options) as where:
-        yield Context(workspace, resources(options), where, progress(options))
+        found = Context(workspace, resources(options), where, progress(options))
+        is_first = options.command == "extract"
+        discards = is_first and options.overwrite
+        with watched(found, follows=not is_first, discards=discards):
+            yield found
 
 
 def cameras(options: argparse.Namespace) -> CameraOptions:

@@ -12,7 +12,7 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
-from colmap_affrect.colmap.database import cameras_of_images, open_database
+from colmap_affrect.colmap.database import cameras_of_images, open_database, working_seal
 from colmap_affrect.colmap.two_views import PLANAR
 from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES, ExtractedPx, of_pair
 from colmap_affrect.geometry.arrays import Array
@@ -380,3 +380,5 @@ def _delete_unused_cameras(path: Path) -> None:
             "SELECT sensor_id FROM rig_sensors WHERE sensor_type = :camera)",
             {"camera": int(pycolmap.SensorType.CAMERA)},
         )
+        if connection.total_changes:
+            working_seal(path).unlink(missing_ok=True)

@@ -9,7 +9,7 @@ import struct
 from collections import defaultdict
 from collections.abc import Collection, Mapping
 from contextlib import closing
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -19,7 +19,6 @@ from colmap_affrect.colmap.model_records import camera_like
 from colmap_affrect.colmap.tables import (
     DAMAGED,
     SENSOR_CAMERA,
-    Camera,
     Tables,
     columns_of,
     open_read_only,
@@ -27,8 +26,8 @@ from colmap_affrect.colmap.tables import (
     read_tables,
     rows_of,
 )
+from colmap_affrect.colmap.useless_keypoints import MAX_SIDE_PX, useless
 from colmap_affrect.errors import DatabaseError
-from colmap_affrect.geometry.arrays import Singles
 from colmap_affrect.shown import such_as
 
 Severity = Literal["error", "warning", "note"]
@@ -48,7 +47,8 @@ CHECKS: dict[str, Check] = {
     "camera-size": ("error", "cameras of a size that no photograph has",
         "import their images again into a new database"),
     "camera-params": ("error",
-        "cameras whose parameters are more or fewer than their model has, or not finite numbers",
+        "cameras whose parameters are more or fewer than their model has, a focal length that is "
+        "not positive, or not finite numbers",
         "import their images again into a new database"),
     "no-prior-focal": ("note", "cameras whose focal length is a guess",
         "if you know the intrinsics, give them: --cameras-path or --focal-length-px here, "
@@ -75,7 +75,10 @@ CHECKS: dict[str, Check] = {
         "extract these images again into a new database"),
     "keypoints-not-finite": ("error",
         "images with keypoints that are not finite numbers, or are where no image reaches",
-        "extract these images again into a new database"),
+        "extract these images again; 'map --from-database' leaves these keypoints out"),
+    "keypoints-at-one-place": ("warning",
+        "images with most keypoints at one place, at which COLMAP may never end",
+        "extract these images again; 'map --from-database' leaves these keypoints out"),
     "keypoints-outside": ("warning", "images with keypoints outside of them",
         "see that they were found in the images as stored: not rotated, not resized"),
     "descriptor-count": ("error", "images with another number of descriptors than of keypoints",
@@ -116,13 +119,12 @@ FATAL_FOR_IMAGES = frozenset({
 """Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
 
 FATAL = FATAL_FOR_IMAGES | {
-    "keypoint-columns", "keypoint-data", "keypoints-not-finite", "self-pair", "unknown-pair",
-    "match-data", "match-range", "matrix-data",
+    "keypoint-columns", "keypoint-data", "self-pair", "unknown-pair", "match-data", "match-range",
+    "matrix-data",
 }  # fmt: skip
 """The same of keypoints and matches."""
 
 Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
-MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it
 
 MATRICES = {
     ("two_view_geometries", "pair_id"): {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
@@ -137,14 +139,14 @@ CAMERA_OF_PAIR = struct.Struct("<IiQQBQ")
 length is a prior, and the number of parameters that follow, float64."""
 
 KEYPOINT_COLUMNS = (2, 4, 6)  # x, y; with scale and orientation; with an affine shape
-OUTSIDE_TOLERANCE_PX = 1.0  # keypoints of images shrunk for detection may lie outside
 UNDEFINED = 0  # configuration of a two-view geometry that COLMAP 4.2 passes over
 
 
-def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
+def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> Problems:
     """Refuse a damaged database, or one with problems that would end the process inside COLMAP.
 
     It is only read; ``kinds`` of problems are keys of ``CHECKS``, and DatabaseError has one line.
+    Returns all other problems.
     """
     with open_read_only(path) as connection:
         _, problems = _check(connection, path)
@@ -152,6 +154,7 @@ def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> None:
         _, what, advice = CHECKS[kind]
         items = such_as(problems[kind])
         raise DatabaseError(f"{path}: {what} ({items}); {advice.format(path=path)}")
+    return problems
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:
@@ -197,7 +200,7 @@ def check_image_files(
     """Compare a database with the (width, height) of its images' files, None if unreadable."""
     found: Problems = defaultdict(list)
     for image_id, name in tables.names.items():
-        if is_unsafe(name):
+        if leads_outside(name):
             continue
         camera = tables.cameras.get(tables.camera_ids[image_id])
         if not (image_path / name).is_file():
@@ -213,12 +216,6 @@ def check_image_files(
     return dict(found)
 
 
-def is_unsafe(name: str) -> bool:
-    """Return whether an image name leads out of the folder of the images."""
-    path = PurePosixPath(name.replace("\\", "/"))
-    return path.is_absolute() or ".." in path.parts
-
-
 def _check_cameras(tables: Tables, found: Problems) -> None:
     for camera_id, camera in tables.cameras.items():
         label = f"camera {camera_id}"
@@ -229,7 +226,11 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
         if not len(like.focal_length_idxs()):
             found["camera-panorama"].append(f"{label}: {like.model.name}")
         params = _array(camera.params, 1, len(like.params), np.dtype("<f8"))
-        if params is None or not np.isfinite(params).all():
+        if (
+            params is None
+            or not np.isfinite(params).all()
+            or (params[0, like.focal_length_idxs()] <= 0.0).any()
+        ):
             found["camera-params"].append(label)
         if not all(0 < side <= MAX_SIDE_PX for side in (camera.width, camera.height)):
             found["camera-size"].append(f"{label}: {camera.width} x {camera.height} px")
@@ -290,7 +291,7 @@ def _check_images(tables: Tables, found: Problems) -> None:
             found["no-camera"].append(name)
         if tables.num_frames and image_id not in tables.frame_images:
             found["no-frame"].append(name)
-        if is_unsafe(name):
+        if leads_outside(name):
             found["unsafe-name"].append(name)
     for camera_id, camera in tables.cameras.items():
         if not camera.has_prior_focal:
@@ -313,10 +314,10 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
             found["keypoint-data"].append(name)
         elif not count:
             found["no-keypoints"].append(name)
-        elif not (np.abs(keypoints) <= MAX_SIDE_PX).all():
-            found["keypoints-not-finite"].append(name)
-        elif _are_outside(keypoints, tables.cameras.get(tables.camera_ids[image_id])):
-            found["keypoints-outside"].append(name)
+        else:
+            camera = tables.cameras.get(tables.camera_ids[image_id])
+            for kind in useless(keypoints, (camera.width, camera.height) if camera else None):
+                found[kind].append(name)
 
 
 def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[Any] | None:
@@ -325,14 +326,6 @@ def _array(blob: Any, rows: int, columns: int, dtype: np.dtype[Any]) -> NDArray[
     if not isinstance(blob, bytes) or len(blob) != rows * columns * dtype.itemsize:
         return None
     return np.frombuffer(blob, dtype).reshape(rows, columns)
-
-
-def _are_outside(keypoints: Singles, camera: Camera | None) -> bool:
-    """Tell whether any keypoints, whose origin is the corner of the image, are not in it."""
-    if camera is None:
-        return False
-    beyond = np.maximum(-keypoints[:, :2], keypoints[:, :2] - [camera.width, camera.height])
-    return bool((beyond > OUTSIDE_TOLERANCE_PX).any())
 
 
 def _check_descriptors(tables: Tables, found: Problems) -> None:

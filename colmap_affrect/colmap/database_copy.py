@@ -4,6 +4,7 @@ COLMAP migrates a database in place as soon as it opens it, even for reading. So
 is read and copied by SQLite itself, and COLMAP opens only the copy.
 """
 
+import logging
 import sqlite3
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -17,8 +18,11 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import FATAL, FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database import open_database, write_frame
 from colmap_affrect.colmap.tables import DAMAGED, columns_of, open_read_only
+from colmap_affrect.colmap.useless_keypoints import KINDS, leave_out_useless
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.project.workspace import remove_database
+
+logger = logging.getLogger(__name__)
 
 FIRST_TYPED_SCHEMA = 4_000_000  # descriptors have a type since COLMAP 4.0
 
@@ -73,28 +77,33 @@ Change = Callable[[pycolmap.Database], None]
 
 def copy_database(
     source: Path, target: Path, refused: Collection[str] = (), change: Change | None = None
-) -> None:
+) -> str:
     """Copy a database as it is now, including its write-ahead log.
 
     The copy, which appears as a whole, has the schema of the installed pycolmap, which leaves
     positions (GPS) of COLMAP before 3.10 behind: they become pose priors. ``change`` is done to it
     first. Raises DatabaseError, beside :func:`copy_as_it_is`, when the target exists, and for
     ``refused`` kinds of problems: databases of anybody are checked before COLMAP sees the copy.
+    Returns which of their keypoints are left out, if any, which is also logged.
     """
     if target.exists():
         raise DatabaseError(f"{target}: exists already; it is not overwritten")
-    if refused:
-        refuse_unusable(source, refused)
+    problems = refuse_unusable(source, refused) if refused else {}
+    has_useless = "keypoint-data" in refused and not problems.keys().isdisjoint(KINDS)
     new = target.with_name(target.name + ".new")
     remove_database(new)
     try:
         copy_as_it_is(source, new)
+        left_out = leave_out_useless(new) if has_useless else ""
+        if left_out:
+            logger.warning("%s: %s", source, left_out)
         positions = _old_positions(new)
         with open_database(new) as database:  # COLMAP migrates it
             _add_positions(database, positions)
             if change:
                 change(database)
         new.replace(target)
+        return left_out
     finally:
         remove_database(new)
 
@@ -134,9 +143,9 @@ def _add_positions(
             database.write_pose_prior(prior)
 
 
-def copy_with_frames(source: Path, target: Path) -> None:
+def copy_with_frames(source: Path, target: Path) -> str:
     """Copy a database with all its content, as :func:`copy_database`; every image gets a frame."""
-    copy_database(source, target, FATAL, _add_frames)
+    return copy_database(source, target, FATAL, _add_frames)
 
 
 def copy_without_features(source: Path, target: Path) -> None:

@@ -16,7 +16,7 @@ from colmap_affrect.colmap.camera_vote import (
     log_evidence_for_sharing,
     voting_pairs,
 )
-from colmap_affrect.colmap.checks import CHECKS, check_database, check_image_files, is_unsafe
+from colmap_affrect.colmap.checks import CHECKS, check_database, check_image_files
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import (
     copy_as_it_is,
@@ -33,6 +33,7 @@ from colmap_affrect.images.exif import PLAUSIBLE_FOCALS
 from colmap_affrect.images.reading import readable_size
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
+from colmap_affrect.project.outputs import leads_outside
 from colmap_affrect.shown import such_as
 
 MAX_NUM_PAIRS = 48  # the strongest pairs that are asked, some seconds' worth
@@ -206,7 +207,7 @@ def _file_sizes(
     image_path: Path, names: Iterable[str], progress: Progress
 ) -> dict[str, tuple[int, int] | None]:
     """Read photographs for their (width, height), None for those that cannot be read."""
-    present = [n for n in names if not is_unsafe(n) and (image_path / n).is_file()]
+    present = [n for n in names if not leads_outside(n) and (image_path / n).is_file()]
     sizes = {}
     with progress.stage("read", len(present), "images") as advance:
         paths = (image_path / name for name in present)

@@ -94,6 +94,8 @@ TEXTS: dict[str, Check] = CHECKS | {
         "images that have changed since their features were extracted, or their masks or depth "
         "maps", SAME_RUN),
     "database-missing": ("error", "is missing", f"{SAME_RUN} to make it anew"),
+    "database-changed": ("warning", "was changed since the last run: {edits}",
+        f"{SAME_RUN}, or any stage: what features.h5 and matches.h5 hold is made again from these"),
     "features-not-in-database": ("warning", "images whose features are not in the database",
         SAME_RUN),
     "levels-not-in-database": ("warning",

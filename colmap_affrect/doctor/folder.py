@@ -38,6 +38,8 @@ from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, recorded_extraction
 from colmap_affrect.stages.guide import recorded_guiding
 from colmap_affrect.stages.match import recorded_matching
+from colmap_affrect.stages.mend import edits_of
+from colmap_affrect.stages.pairs import without_deleted
 from colmap_affrect.stages.verify import recorded_verification
 
 Read = TypeVar("Read")
@@ -92,11 +94,14 @@ class _FolderExamination:
             self._add("database-missing", database)
             return
         own_advice = {} if self.workspace.users_database else OWN_ADVICE
+        edits = None if self.workspace.users_database else edits_of(database)
         with examined_copy(self.found, database, image_path, own_advice) as examined:
             if examined is None:
                 return
             copy, tables = examined
-            if features is not None:
+            if edits and str(edits):
+                self._add("database-changed", database, edits=edits)
+            elif features is not None:
                 self._compare_keypoints(features, tables)
                 if "match" in done:
                     self._matches(tables, sorted(images.union(features)))
@@ -220,6 +225,7 @@ class _FolderExamination:
         )  # fmt: skip
         if pairs is None:
             return
+        pairs = without_deleted(self.workspace, pairs)
         is_there = self._read(path, lambda: store.has(pairs), MATCH_AGAIN)
         if is_there is None or self._read(path, store.check_all, MATCH_AGAIN) is None:
             return

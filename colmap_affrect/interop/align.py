@@ -9,8 +9,7 @@ from statistics import median
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.database_copy import schema_version
+from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.model_files import read_given_model, write_model
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
@@ -180,8 +179,7 @@ def _scale(
 
 def _gps(path: Path) -> tuple[dict[str, Array], bool]:
     """Return the positions of images on record in a database, and whether they are on earth."""
-    schema_version(path)  # refuses what is no database
-    with open_database(path) as database:
+    with open_copy(path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
         priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
     on_earth = pycolmap.PosePriorCoordinateSystem.WGS84
@@ -190,7 +188,11 @@ def _gps(path: Path) -> tuple[dict[str, Array], bool]:
         raise DatabaseError(f"{path}: no photograph has a position; give --positions FILE")
     if len(systems) > 1:
         raise DatabaseError(f"{path}: some positions are on earth, others are not")
-    found = {names[prior.corr_data_id.id]: np.array(prior.position).ravel() for prior in priors}
+    found = {
+        names[prior.corr_data_id.id]: np.array(prior.position).ravel()
+        for prior in priors
+        if prior.corr_data_id.id in names
+    }
     return found, on_earth in systems
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import MAX_SIDE_PX
 from colmap_affrect.colmap.database import (
     DESCRIPTOR_NORM,
     colmap_keypoints,
@@ -22,10 +21,11 @@ from colmap_affrect.colmap.database import (
 )
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images
+from colmap_affrect.colmap.useless_keypoints import left_out, useless, with_places
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import DatabaseError, ImageError, OptionError, StoreError
-from colmap_affrect.geometry.arrays import Singles
+from colmap_affrect.geometry.arrays import Bools, Singles
 from colmap_affrect.images.photographs import CameraOptions, list_images
 from colmap_affrect.interop.hdf5_layouts import (
     LAYOUTS,
@@ -126,11 +126,12 @@ def import_h5(
                 f"{image_path}: COLMAP does not take (damaged, or of another size than camera "
                 f"mode {cameras.mode} allows): {listed(lost)}"
             )
-        counts, num_matches = _fill_database(new, files, pixel_origin, progress)
+        counts, num_matches, unusable = _fill_database(new, files, pixel_origin, progress)
         without = sorted(set(names) - set(rejected) - counts.keys())
         notes = [
             *files.notes,
             *_rounded(files),
+            *([unusable] if unusable else []),
             *noted("images without features are there without keypoints", without),
             *noted("images that COLMAP does not take are left out", rejected),
         ]
@@ -152,16 +153,20 @@ def _rounded(files: ForeignFiles) -> list[str]:
     half = [key for key in keys if files.features.file[key].dtype == np.float16]
     if not half:
         return []
-    largest = max(files.features.read(key, (None, 2)).max(initial=0) for key in half)
+    values = (files.features.read(key, (None, 2)) for key in half)
+    largest = max(found[np.isfinite(found)].max(initial=0) for found in values)
     return [f"keypoints of {len(half)} images are float16, rounded to steps of "
             f"{np.spacing(np.float16(largest)):g} px"]  # fmt: skip
 
 
 def _fill_database(
     path: Path, files: ForeignFiles, pixel_origin: str, progress: Progress
-) -> tuple[dict[str, int], int]:
-    """Write keypoints and matches; return the keypoints of each image, and how many matches."""
-    counts, num_matches = {}, 0
+) -> tuple[dict[str, int], int, str]:
+    """Write keypoints and matches; return the keypoints of each image, and how many matches.
+
+    Keypoints that no model can use are left out; the last value says which.
+    """
+    counts, num_matches, num_lost, masks = {}, 0, 0, dict[str, Bools]()
     with open_database(path) as database, pycolmap.DatabaseTransaction(database):
         images = {image.name: image for image in database.read_all_images()}
         with progress.stage("keypoints", len(files.keys), "images") as advance:
@@ -169,7 +174,9 @@ def _fill_database(
                 camera = database.read_camera(images[name].camera_id)
                 files.check_size(name, (camera.width, camera.height))
                 keypoints = _read_keypoints(files.features, key, pixel_origin)
-                database.write_keypoints(images[name].image_id, keypoints)
+                if found := useless(keypoints, (camera.width, camera.height)):
+                    masks[name] = np.logical_or.reduce(list(found.values()))
+                database.write_keypoints(images[name].image_id, with_places(keypoints))
                 counts[name] = len(keypoints)
                 advance(1)
         with progress.stage("matches", len(files.pairs), "pairs") as advance:
@@ -177,10 +184,15 @@ def _fill_database(
                 indices = files.read_indices(pair, counts[pair[0]])
                 _check_range(files.matches.path, pair, indices, counts)
                 id1, id2 = (images[name].image_id for name in pair)
-                write_matches(database, id1, id2, indices)
-                num_matches += len(indices)
+                usable = np.ones(len(indices), np.bool_)
+                for name, column in zip(pair, indices.T, strict=True):
+                    if name in masks:
+                        usable &= ~masks[name][column]
+                write_matches(database, id1, id2, indices[usable])
+                num_matches += int(usable.sum())
+                num_lost += int((~usable).sum())
                 advance(1)
-    return counts, num_matches
+    return counts, num_matches, left_out(masks, num_lost)
 
 
 def export_h5(
@@ -266,7 +278,7 @@ def _read_keypoints(source: Source, key: str, pixel_origin: str) -> Singles:
     """Return the (N, 2), (N, 4) or (N, 6) keypoints of an image as COLMAP stores them."""
     path = keypoints_key(source, key)
     lafs, scales, oris = (f"{key}/{name}" for name in ("lafs", "scales", "oris"))
-    with np.errstate(over="ignore"):  # what float32 cannot hold is refused at the end
+    with np.errstate(over="ignore"):  # what float32 cannot hold is left out
         points = source.read(path, (None, 2)).astype(np.float32)
         centers = colmap_from_pixel(points) if pixel_origin == "center" else points
         count = len(points)
@@ -280,8 +292,6 @@ def _read_keypoints(source: Source, key: str, pixel_origin: str) -> Singles:
                 raise StoreError(f"{source.path}: {scales} holds negative values")
             angles = np.deg2rad(source.read(oris, (count,)).astype(np.float32))
             keypoints = np.column_stack([centers, sigmas, angles])
-    if not (np.abs(keypoints) <= MAX_SIDE_PX).all():
-        raise StoreError(f"{source.path}: {path} or its shapes hold values that are too large")
     return keypoints
 
 

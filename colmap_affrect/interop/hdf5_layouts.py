@@ -71,7 +71,7 @@ class Source:
     shapes: dict[str, tuple[int, ...]]
 
     def read(self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu") -> NDArray[Any]:
-        """Read finite numbers of some of numpy's kinds, of a shape in which None is any size."""
+        """Read numbers of some of numpy's kinds, of a shape in which None is any size."""
         found = self.shapes[key]
         same = [size in (expected, None) for size, expected in zip(shape, found, strict=False)]
         if len(found) != len(shape) or not all(same):
@@ -85,8 +85,6 @@ class Source:
         if values is None:
             what = "numbers" if "f" in kinds else "integers"
             raise StoreError(f"{self.path}: {key} does not hold {what}")
-        if not np.isfinite(values).all():
-            raise StoreError(f"{self.path}: {key} holds values that are not finite")
         return values
 
 

@@ -13,7 +13,7 @@ from typing import Any, TypedDict, Unpack
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
-from colmap_affrect.colmap.checks import refuse_unusable
+from colmap_affrect.colmap.checks import FATAL, refuse_unusable
 from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.initial_cameras import record_cameras
@@ -45,6 +45,7 @@ from colmap_affrect.stages.extract import (
 )
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import match
+from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import add_pairs
 
 CANCELLED = "Operation cancelled"  # what pycolmap says
@@ -252,7 +253,7 @@ def verify(
     """
     path = Path(database_path)
     verification = translate.verification_options(options, random_seed)
-    refuse_unusable(path)
+    refuse_unusable(path, FATAL | {"keypoints-not-finite"})
     advance = _advance_unless_cancelled(cancellation_token)
     advance(0)
     if pairs_path is None:
@@ -396,4 +397,6 @@ def _context(
     threads = asked.get("num_threads", -1)
     executor = Threads(threads) if threads > 0 else None
     with Workspace.beside(Path(database_path)).locked() as workspace:
-        yield Context(workspace, Resources(weights, name), executor, progress)
+        context = Context(workspace, Resources(weights, name), executor, progress)
+        with watched(context):
+            yield context

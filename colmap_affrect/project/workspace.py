@@ -48,7 +48,7 @@ OWN_STEMS = {
 
 OF_SYSTEMS = {".DS_Store", "Thumbs.db", "desktop.ini", "lost+found"}
 """What file managers and file systems put into folders that are empty for their user."""
-
+SEAL_SUFFIXES = (".seal", ".seal-open", ".parts")  # of what tells whether others changed a database
 WEIGHTS = "weights"  # of a record: the digests of files, beside the options of a stage
 FORMAT_VERSION = 6  # of ``config.toml``: counts up when a stage records other options than before
 
@@ -75,10 +75,12 @@ class Workspace:
         """Name the folder, and a database of the user in the place of one there; never removed."""
         self.path, self.users_database = path, users_database
         self.database = users_database or path / "database.db"
+        self.changed_database = path / "database.changed.db"  # by others, before it was made again
         self.features = path / "features.h5"  # by image
         self.matches = path / "matches.h5"  # raw ones by pair
         self.guided = path / "guided.h5"  # what guided matching found, by pair
         self.pairs = path / "pairs.txt"  # those to match
+        self.deleted_pairs = path / "pairs.deleted.txt"  # but for those deleted in the database
         self.sparse = path / "sparse"  # folder of the COLMAP models 0, 1, ...
         self.aside = path / "sparse.aside"  # models to be compared with those of guided matches
         self.snapshots = path / "sparse.snapshots"  # from which an interrupted mapping goes on
@@ -338,9 +340,13 @@ class Workspace:
         made = {
             "map": [self.sparse, self.aside, self.snapshots, self.report, self.page],
             "guide": [self.guided],
-            "verify": [self.cameras, *database_files(self.database)],
+            "verify": [
+                self.cameras,
+                *database_files(self.database),
+                *(self.path / f"database.db{suffix}" for suffix in SEAL_SUFFIXES),
+            ],
             "match": [self.matches],
-            "pairs": [self.pairs],
+            "pairs": [self.pairs, self.deleted_pairs],
             "extract": [self.features, self.contents],
         }
         later = STAGES[STAGES.index(stage) :]

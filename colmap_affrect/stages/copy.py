@@ -54,11 +54,14 @@ def copy_verified(
             warnings[str(source)] = "has changed; its copy and the models are made anew"
         workspace.rewind()
         contents.record("copy", digest)
+    left_out = ""
     if not workspace.database.exists():
-        copy_with_frames(source, workspace.database)
+        left_out = copy_with_frames(source, workspace.database)
     warnings |= _other_sizes(workspace.database, image_path) if image_path else {}
     for name, what in warnings.items():
         logger.warning("%s: %s", name, what)
+    if left_out:  # which is logged
+        warnings[workspace.database.name] = left_out
     record_cameras(workspace.database, workspace.cameras)
     workspace.record_options("verify", verification.to_mapping())
     num_pairs = colmap_database.num_matched_pairs(workspace.database)

@@ -10,7 +10,7 @@ from typing import Self
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.camera_records import read_camera_records
-from colmap_affrect.colmap.checks import CHECKS, FATAL_FOR_IMAGES, refuse_unusable
+from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_without_features, read_names
 from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
@@ -223,12 +223,7 @@ def _require_usable_cameras(workspace: Workspace, inputs: Inputs) -> None:
     path, camera_id = workspace.database, inputs.cameras.existing_camera_id
     if inputs.from_database and not path.exists():
         refuse_unusable(Path(inputs.from_database), FATAL_FOR_IMAGES)
-    is_asked = workspace.users_database or camera_id >= 0
-    cameras = colmap_database.all_cameras(path) if is_asked and path.exists() else []
-    for camera in cameras:
-        if not len(camera.focal_length_idxs()):
-            _, what, advice = CHECKS["camera-panorama"]
-            raise DatabaseError(f"{path}: {what} (camera {camera.camera_id}); {advice}")
+    cameras = colmap_database.all_cameras(path) if camera_id >= 0 and path.exists() else []
     if camera_id >= 0 and all(camera.camera_id != camera_id for camera in cameras):
         raise OptionError(f"existing_camera_id={camera_id}: {path} has no such camera")
 

@@ -2,10 +2,12 @@
 
 import logging
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from itertools import combinations
 from pathlib import Path
+
+import numpy as np
 
 from colmap_affrect.errors import PairListError
 from colmap_affrect.matchers.base import Matches
@@ -13,8 +15,10 @@ from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair, PairList, PairOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs, pairs_by_place, read_pairs, write_pairs
 from colmap_affrect.pairs.retrieval import NUM_STRONGEST, low_resolution_pairs, retrieved_pairs
+from colmap_affrect.project.atomic_files import replace_lines
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import Inputs, write_images_and_keypoints
 from colmap_affrect.stages.one_pair import CachedMatcher, Matching
@@ -160,4 +164,28 @@ def listed_pairs(context: Context) -> PairList:
             "'colmap-affrect pairs' and then match again"
         )
     names = context.features.names()
-    return read_pairs(context.workspace.pairs, names) if len(names) > 1 else PairList.of(())
+    pairs = read_pairs(context.workspace.pairs, names) if len(names) > 1 else PairList.of(())
+    return without_deleted(context.workspace, pairs)
+
+
+def without_deleted(workspace: Workspace, pairs: PairList) -> PairList:
+    """Leave out the pairs that somebody has deleted in the database."""
+    deleted = deleted_pairs(workspace)
+    if not deleted:
+        return pairs
+    return pairs.at(np.array([frozenset(pair) not in deleted for pair in pairs], np.bool_))
+
+
+def deleted_pairs(workspace: Workspace) -> set[frozenset[str]]:
+    """Return the pairs that somebody has deleted in the database."""
+    if not workspace.deleted_pairs.exists():
+        return set()
+    text = workspace.deleted_pairs.read_text(encoding="utf-8", errors="replace")
+    return {frozenset(line.split("\t")) for line in text.splitlines()}
+
+
+def delete_pairs(workspace: Workspace, pairs: Iterable[Pair]) -> None:
+    """Have pairs left out of the list from now on, until it is made anew with ``overwrite``."""
+    if new := set(map(frozenset, pairs)):
+        lines = sorted("\t".join(sorted(pair)) + "\n" for pair in deleted_pairs(workspace) | new)
+        replace_lines(workspace.deleted_pairs, lines)

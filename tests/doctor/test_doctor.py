@@ -171,10 +171,21 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
         lambda f: f.database.unlink(),
         Finding("error", "{out}/database.db", "is missing", "to make it anew"),
     ),
-    "keypoint added": (
+    "keypoint removed": (
         lambda f: f.execute(
-            "UPDATE keypoints SET rows = rows + 1, data = zeroblob(rows * 24 + 24) "
-            "WHERE image_id = 1"
+            "UPDATE keypoints SET rows = rows - 1, data = substr(data, 1, rows * 24 - 24) "
+            "WHERE image_id = 3"
+        ),
+        Finding("warning", "{out}/database.db",
+                "was changed since the last run: keypoints of 1 image", "is made again from these"),
+    ),
+    "keypoint removed by a killed run": (
+        lambda f: (
+            (f.out / "database.db.seal").unlink(),
+            f.execute(
+                "UPDATE keypoints SET rows = rows - 1, data = substr(data, 1, rows * 24 - 24) "
+                "WHERE image_id = 3"
+            ),
         ),
         Finding("error", "{out}/database.db", "images with other keypoints than in features.h5 (1)",
                 "--overwrite"),
@@ -185,8 +196,15 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
                 "listed pairs that are not matched (1): a.png - b c.png",
                 "run 'colmap-affrect match --output-path {out}'"),
     ),
-    "matches not in the database": (
+    "pair deleted": (
         lambda f: f.execute("DELETE FROM matches WHERE pair_id = 2147483649"),
+        Finding("warning", "{out}/database.db", "1 pair deleted (a.png - b c.png)", "any stage"),
+    ),
+    "matches not in the database": (
+        lambda f: (
+            (f.out / "database.db.seal").unlink(),
+            f.execute("DELETE FROM matches WHERE pair_id = 2147483649"),
+        ),
         Finding("warning", "{out}/database.db",
                 "pairs whose matches are not in the database (1): a.png - b c.png",
                 "run 'colmap-affrect match --output-path {out}'"),
@@ -255,10 +273,7 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
         Finding("error", "{out}/pairs.txt", "is not the list whose pairs were matched", "match"),
     ),
     "pairs verified anew": (
-        lambda f: f.execute(
-            "UPDATE two_view_geometries SET rows = rows - 1, data = substr(data, 9) "
-            "WHERE pair_id = 2147483649"
-        ),
+        lambda f: (f.out / "sparse" / "inputs.sha256").write_text("others"),
         Finding("warning", "{out}/sparse", "the models were made before", "map"),
     ),
     "config.toml damaged": (
@@ -331,6 +346,7 @@ def test_features_that_the_database_lacks_are_found(folders: Folders) -> None:
 
 def test_advice_for_a_database_of_ours_names_our_commands(folders: Folders) -> None:
     folders.execute("UPDATE two_view_geometries SET config = 0 WHERE pair_id = 2147483649")
+    (folders.out / "database.db.seal").unlink()
     (own,) = findings(folders.out)
     assert own.advice == (
         f"run 'colmap-affrect verify --output-path {folders.out} --overwrite' and map"
@@ -374,7 +390,7 @@ def test_schema_of_another_version_is_found_and_not_migrated(
     assert str(version) in found.what
     assert ("keep a copy: cp " in found.advice) == (change < 0)
     assert folders.database.read_bytes() == before
-    assert [path.name for path in folders.out.glob("database.db*")] == ["database.db"]
+    assert not list(folders.out.glob("database.db-*"))
 
 
 def damaged_files(data: bytes) -> Iterator[bytes]:

@@ -119,7 +119,7 @@ def test_exported_folder_has_real_descriptors_of_32_bits_and_scales(
 def test_indices_beyond_16_bits_are_written_in_32(
     tmp_path: Path, targets: tuple[Path, Path], count: int, dtype: type
 ) -> None:
-    many = np.column_stack([np.arange(count), np.zeros(count)])
+    many = np.column_stack([np.linspace(0.0, 60.0, count), np.zeros(count)])
     pairs = {("a.png", "b.png"): [[0, count - 1], [1, 5]]}
     make_database(tmp_path / "x.db", {"a.png": many[:2], "b.png": many}, pairs).close()
     export_h5(*targets, database_path=tmp_path / "x.db")

@@ -153,7 +153,7 @@ def test_record_of_options_that_does_not_fit_on_the_disk(disturbed: Disturbed) -
 
 
 def test_report_that_cannot_be_written(disturbed: Disturbed) -> None:
-    disturbed.begin_without()
+    disturbed.begin_without("database.db.seal")  # as after a kill
     (disturbed.out / "report.json").mkdir()
     assert_says_what_to_do(disturbed.run(), disturbed.workspace.report)
     (disturbed.out / "report.json").rmdir()
@@ -171,7 +171,7 @@ def test_new_database_that_does_not_fit_on_the_disk(disturbed: Disturbed) -> Non
 def test_database_that_grows_too_large_for_the_disk(
     disturbed: Disturbed, emptied: tuple[str, ...]
 ) -> None:
-    disturbed.begin_without()
+    disturbed.begin_without("database.db.seal")  # as after a kill
     path = disturbed.workspace.database
     with closing(sqlite3.connect(path, isolation_level=None)) as database:
         for table in ("two_view_geometries", *emptied):
@@ -194,7 +194,7 @@ def test_geometries_that_do_not_fit_on_the_disk(disturbed: Disturbed) -> None:
 
 def test_model_that_does_not_fit_on_the_disk_is_not_taken_for_whole(disturbed: Disturbed) -> None:
     # pycolmap writes what fits and says nothing.
-    disturbed.begin_without()
+    disturbed.begin_without("database.db.seal")  # as after a kill
     with file_size_limit(50_000):
         ended = disturbed.run()
     assert_says_what_to_do(ended, disturbed.out / "sparse.partial" / "0")

@@ -32,10 +32,6 @@ ROWS = [
     ("UPDATE keypoints SET rows = 100000 WHERE image_id = 1", "less data than rows and columns ("),
     ("UPDATE keypoints SET rows = -1 WHERE image_id = 1", "less data than rows and columns ("),
     ("UPDATE keypoints SET data = substr(data, 1, 100)", "less data than rows and columns ("),
-    (
-        "UPDATE keypoints SET rows = 1, cols = 2, data = x'CAF249F1CAF249F1'",  # -1e30
-        "or are where no image reaches (",
-    ),
     ("UPDATE matches SET rows = 100000", "less data than rows and 2 columns ("),
     ("UPDATE matches SET rows = -1", "less data than rows and 2 columns ("),
     ("UPDATE matches SET data = substr(data, 1, 9)", "less data than rows and 2 columns ("),
@@ -124,7 +120,9 @@ def test_panoramas_are_refused_before_anything_is_recorded(
         assert "look all around, which have no focal length (camera 2: EQUIREC" in ended.stderr[0]
         assert not (tmp_path / "out" / "config.toml").exists()
     assert num_errors(path) == 0  # COLMAP has a use for it
-    with pytest.raises(DatabaseError, match=r"no focal length \(camera 2\); cut perspective views"):
+    with pytest.raises(
+        DatabaseError, match=r"no focal length \(camera 2: E.*; cut perspective views"
+    ):
         extract_features(path, healthy.parent / "photos")
     assert not (tmp_path / "any.affrect" / "config.toml").exists()
     assert call("extract", "-q", *given, "--from-database", healthy, *FAST[:2]).code == 0

@@ -1,0 +1,200 @@
+"""The database of a finished run that others change: mended from the stores, or kept and said."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.damaged import BYTES, damage_bytes
+from command import Call, on_photographs
+from results import database_content, model_names, results
+from small_scene import write_photographs
+
+from colmap_affrect.colmap.database import image_ids, open_database
+from colmap_affrect.colmap.seal import is_untouched
+from colmap_affrect.project.workspace import Workspace
+
+FIRST_PAIR = "pair_id = (SELECT min(pair_id) FROM matches)"
+MENDED = {
+    "image renamed": ("UPDATE images SET name = 'x.png' WHERE image_id = 2", "1 changed (x.png)"),
+    "image deleted": ("DELETE FROM images WHERE image_id = 2", "images: 1 gone"),
+    "image added": ("INSERT INTO images (name, camera_id) VALUES ('x', 1)", "1 added (x)"),
+    "keypoints zero": (
+        "UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = 2",
+        "is written again: keypoints of 1 image",
+    ),
+    "keypoints gone": ("DELETE FROM keypoints WHERE image_id = 2", "keypoints that do not exist"),
+    "camera of another size": ("UPDATE cameras SET width = 100", "cameras: 3 changed"),
+    "camera of no size": ("UPDATE cameras SET width = 'wide'", "(damaged (invalid"),
+    "no focal length": ("UPDATE cameras SET params = zeroblob(32)", "focal length that is not"),
+    "other matches": (
+        f"UPDATE matches SET rows = 1, data = zeroblob(8) WHERE {FIRST_PAIR}",
+        "is written again: 1 pair",
+    ),
+    "other geometry": (
+        f"UPDATE two_view_geometries SET F = zeroblob(72) WHERE {FIRST_PAIR}",
+        "is written again: 1 pair",
+    ),
+    "no geometries": ("DELETE FROM two_view_geometries", "all pairs are gone"),
+    "table dropped": ("DROP TABLE frames", "no such table: frames"),
+    "trigger": (
+        "CREATE TRIGGER t AFTER INSERT ON matches BEGIN DELETE FROM images; END",
+        "its tables are others",
+    ),
+}
+"""What is done, and what is said of it."""
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three photographs and a run on them."""
+    from colmap_affrect.cli import main
+
+    folder = tmp_path_factory.mktemp("edited")
+    write_photographs(folder / "photos", 3)
+    assert main(["run", "-q", *on_photographs(folder / "photos", folder / "out")]) == 0
+    return folder
+
+
+@pytest.fixture
+def out(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the output folder, to be changed."""
+    return Path(shutil.copytree(finished / "out", tmp_path / "out"))
+
+
+def execute(path: Path, statement: str) -> None:
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA foreign_keys = OFF")
+        connection.execute(statement)
+        connection.commit()
+
+
+def again(call: Call, finished: Path, out: Path, command: str) -> list[str]:
+    """Run a command again that must end well; return its warnings."""
+    given = on_photographs(finished / "photos", out) if command == "run" else []
+    ended = call(command, *(given or ["--output-path", out]))
+    assert ended.code == 0, ended.stderr
+    return [line for line in ended.stderr if line.startswith("WARNING: ")]
+
+
+@pytest.mark.parametrize("case", MENDED)
+@pytest.mark.parametrize("command", ["run", pytest.param("map", marks=pytest.mark.long)])
+def test_what_the_stores_hold_is_made_again(
+    finished: Path, out: Path, call: Call, case: str, command: str
+) -> None:
+    statement, said = MENDED[case]
+    execute(out / "database.db", statement)
+    (warning,) = again(call, finished, out, command)
+    assert warning.startswith(f"WARNING: {out / 'database.db'}: was changed since the last run")
+    assert said in warning
+    assert results(out) == results(finished / "out")
+    assert again(call, finished, out, "map") == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_damaged_files_are_made_again(finished: Path, out: Path, call: Call, seed: int) -> None:
+    damage_bytes(out / "database.db", BYTES[1:][seed], random.Random(seed))
+    again(call, finished, out, "map")
+    assert results(out) == results(finished / "out")
+
+
+def test_missing_and_exchanged_databases_are_made_again(
+    finished: Path, out: Path, call: Call
+) -> None:
+    (out / "database.db").unlink()
+    assert "it is gone" in again(call, finished, out, "map")[0]
+    assert results(out) == results(finished / "out")
+    (out / "database.db").unlink()
+    with open_database(out / "database.db"):
+        pass
+    assert "images: 3 gone" in again(call, finished, out, "run")[0]
+    assert not image_ids(out / "database.changed.db")
+    assert results(out) == results(finished / "out")
+
+
+@pytest.mark.parametrize("table", ["matches", "two_view_geometries"])
+def test_deleted_pairs_stay_deleted(finished: Path, out: Path, call: Call, table: str) -> None:
+    path = out / "database.db"
+    execute(path, f"DELETE FROM {table} WHERE {FIRST_PAIR}")
+    (warning,) = again(call, finished, out, "run")
+    assert "which is kept: 1 pair deleted (a.png - b c.png)" in warning
+    execute(path, "UPDATE images SET name = 'x' WHERE image_id = 1")  # all is made again
+    for command in ("map", "escalate", "guide", "run"):
+        again(call, finished, out, command)
+        assert len(results(out)["raw matches"]) == len(results(out)["inliers"]) == 2
+    again(call, finished, out, "pairs")
+    (out / "pairs.deleted.txt").unlink()
+    again(call, finished, out, "run")
+    assert results(out) == results(finished / "out")
+
+
+def test_priors_and_cameras_of_others_are_kept(finished: Path, out: Path, call: Call) -> None:
+    path = out / "database.db"
+    execute(path, "INSERT INTO pose_priors SELECT 1, 1, 1, 0, zeroblob(24), zeroblob(72), NULL, 0")
+    with open_database(path) as database:
+        camera = database.read_all_cameras()[0]
+        camera.params = camera.params * 1.02
+        database.update_camera(camera)
+    (warning,) = again(call, finished, out, "map")
+    assert "which is kept: pose priors, intrinsics of cameras 1" in warning
+    assert again(call, finished, out, "run") == []
+    with open_database(path) as database:
+        assert database.read_camera(camera.camera_id).params.tolist() == camera.params.tolist()
+        assert len(database.read_all_pose_priors()) == 1
+
+
+def test_pairs_of_other_programs_are_kept(finished: Path, tmp_path: Path, call: Call) -> None:
+    arguments = on_photographs(finished / "photos", tmp_path / "out")
+    assert call("extract", "-q", *arguments).code == 0
+    with open_database(tmp_path / "out" / "database.db") as database:
+        database.write_matches(1, 2, np.array([[0, 1], [1, 0]], np.uint32))
+    ended = call("extract", *arguments)
+    assert "which is kept: 1 pair more" in ended.stderr[0]
+    with open_database(tmp_path / "out" / "database.db") as database:
+        assert database.read_matches(1, 2).tolist() == [[0, 1], [1, 0]]
+
+
+def test_nobody_reads_a_database_that_nobody_changed(
+    finished: Path, out: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again(call, finished, out, "map")
+    monkeypatch.setattr("colmap_affrect.colmap.seal.read_parts", None)
+    for command in ("run", "map"):
+        assert again(call, finished, out, command) == []
+    assert is_untouched(out / "database.db")
+    assert call("map", "--output-path", out, "--extend", out / "none").code == 2
+    assert is_untouched(out / "database.db")
+
+
+def test_copies_are_made_again_from_the_original(
+    finished: Path, tmp_path: Path, call: Call
+) -> None:
+    original = Path(shutil.copy(finished / "out" / "database.db", tmp_path / "any.db"))
+    workspace = Workspace(tmp_path / "copied")
+    paths = ["--output-path", workspace.path]
+    assert call("map", "-q", "--from-database", original, *paths).code == 0
+    before = results_of_copy(workspace)
+    changes: list[tuple[str, list[object]]] = [
+        ("UPDATE images SET name = 'x' WHERE image_id = 1", []),
+        ("UPDATE keypoints SET data = zeroblob(length(data))", ["--from-database", original]),
+    ]
+    for statement, given in changes:
+        execute(workspace.database, statement)
+        ended = call("map", *given, *paths)
+        assert ended.code == 0
+        assert f"is made again from {original}" in ended.stderr[0]
+        assert results_of_copy(workspace) == before
+    original.unlink()
+    execute(workspace.database, "UPDATE images SET name = 'x' WHERE image_id = 1")
+    ended = call("map", *paths)
+    assert (ended.code, len(ended.stderr)) == (1, 1)
+    assert f"and {original} is gone" in ended.errors[0]
+
+
+def results_of_copy(workspace: Workspace) -> object:
+    return database_content(workspace.database), model_names(workspace)
