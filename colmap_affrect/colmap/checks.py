@@ -28,6 +28,7 @@ from colmap_affrect.colmap.tables import (
 )
 from colmap_affrect.colmap.useless_keypoints import MAX_SIDE_PX, useless
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.project.outputs import leads_outside
 from colmap_affrect.shown import such_as
 
 Severity = Literal["error", "warning", "note"]

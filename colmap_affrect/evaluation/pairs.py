@@ -36,7 +36,6 @@ import cv2
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import is_unsafe
 from colmap_affrect.conventions import colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import EvaluationError
 from colmap_affrect.evaluation.homographies import (
@@ -71,6 +70,7 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.options import within
 from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.project.outputs import leads_outside
 
 LIST = "pairs.json"
 KINDS = ("homography", "correspondences", "relative_pose")
@@ -239,7 +239,7 @@ def _named(entry: Any, path: Path, number: int) -> str:
     if unknown:
         raise EvaluationError(f"{where}: unknown key '{unknown[0]}'; known are {', '.join(KEYS)}")
     for key in ("image1", "image2"):
-        if not isinstance(entry.get(key), str) or is_unsafe(entry[key]):
+        if not isinstance(entry.get(key), str) or leads_outside(entry[key]):
             raise EvaluationError(f"{where}: {key} must be the path of an image in the folder")
     kinds = [kind for kind in KINDS if kind in entry]
     if len(kinds) != 1:
@@ -274,7 +274,7 @@ class _Entry:
         given = self.values[key]
         if not isinstance(given, str):
             return given
-        if is_unsafe(given):
+        if leads_outside(given):
             raise EvaluationError(f"{given}: must be a file in the folder of the pairs")
         return read_numbers(self.folder / given)
 

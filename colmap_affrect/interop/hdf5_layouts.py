@@ -27,12 +27,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.colmap.checks import is_unsafe
 from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.images.photographs import refuse_colliding_keys
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import require_space
+from colmap_affrect.project.outputs import leads_outside
 from colmap_affrect.project.stores import PairMatches, hloc_matches, pair_key
 from colmap_affrect.shown import such_as
 
@@ -315,7 +315,7 @@ def check_names(names: Sequence[str], layout: str) -> None:
     unsafe = [
         name
         for name in names
-        if is_unsafe(name) or PurePosixPath(name).as_posix() != name or "\0" in name
+        if leads_outside(name) or PurePosixPath(name).as_posix() != name or "\0" in name
     ]
     if unsafe:
         raise StoreError(f"names that are no plain relative paths: {listed(unsafe)}")

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.checks import check_database, check_image_files, is_unsafe
+from colmap_affrect.colmap.checks import check_database, check_image_files
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.tables import pair_images
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.project.outputs import leads_outside
 
 NAMES = ["a.png", "b c.png", "side/č.png"]
 NUM_KEYPOINTS = [5, 7, 9]
@@ -297,7 +298,7 @@ def test_pair_ids_are_those_of_colmap(first: int, second: int) -> None:
     [("a/b.png", False), ("a..b/c.png", False), ("../a.png", True), ("a\\..\\b.png", True)],
 )
 def test_unsafe_names_lead_out_of_the_folder(name: str, unsafe: bool) -> None:
-    assert is_unsafe(name) == unsafe
+    assert leads_outside(name) == unsafe
 
 
 def test_damaged_file_is_a_database_error_or_problems(tmp_path: Path, database_path: Path) -> None:

@@ -273,7 +273,7 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
         Finding("error", "{out}/pairs.txt", "is not the list whose pairs were matched", "match"),
     ),
     "pairs verified anew": (
-        lambda f: (f.out / "sparse" / "inputs.sha256").write_text("others"),
+        lambda f: (f.out / "sparse" / "inputs.sha256").write_text("0" * 64),
         Finding("warning", "{out}/sparse", "the models were made before", "map"),
     ),
     "config.toml damaged": (

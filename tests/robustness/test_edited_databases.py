@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.damaged import BYTES, damage_bytes
 from command import Call, on_photographs
+from damaged import BYTES, damage_bytes
 from results import database_content, model_names, results
 from small_scene import write_photographs
 
