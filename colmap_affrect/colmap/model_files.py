@@ -6,6 +6,7 @@ Models of ours have a digest of their files beside them.
 import hashlib
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -46,43 +47,50 @@ def require_intact(folder: Path) -> None:
     Models of others are followed record by record, and what one says of another must be so. Text
     files are left to pycolmap.
     """
-    known = kept_digest(folder)
-    if known and known == model_digest(folder):
+    known, now = kept_digests(folder), file_digests(folder)
+    if isinstance(known, str):  # of an older version: one for all files
+        changed = [] if known == _digest_of(now) else [folder]
+    else:
+        changed = [folder / name for name in RECORDS if known.get(name) != now.get(name)]
+    if known and not changed:
         return
     if known or all((folder / name).exists() for name in OLD_RECORDS):
         require_consistent(folder)
     if known:
         raise StoreError(
-            f"{folder}: is not as it was written (see {SUMMARY} in it); if you have edited it, "
-            f"copy it to a folder of its own without {SUMMARY} and use that; else {mend(folder)}"
+            f"{changed[0]}: is not as it was written (see {SUMMARY} in its folder); if you have "
+            f"edited the model, copy it to a folder of its own without {SUMMARY} and use that; "
+            f"else {mend(folder)}"
         )
 
 
 class _Kept(BaseModel):
     """What of the summary of a model tells whether it has changed since."""
 
-    model: str
+    model: dict[str, str] | str
 
 
-def kept_digest(folder: Path) -> str:
-    """Return the digest of the files of a model of ours when it was written, else an empty text."""
+def kept_digests(folder: Path) -> dict[str, str] | str:
+    """Return the digests of the files of a model of ours when they were written, else nothing."""
     try:
         content = without_checksum((folder / SUMMARY).read_bytes())
         return _Kept.model_validate_json(content).model
     except (OSError, ValueError):
-        return ""
+        return {}
 
 
-def model_digest(folder: Path) -> str:
-    """Return a sha256 of the files of a model, empty if one is missing."""
-    digest = hashlib.sha256()
-    for name in sorted(RECORDS):
-        try:
-            with (folder / name).open("rb") as file:
-                digest.update(hashlib.file_digest(file, "sha256").digest())
-        except OSError:
-            return ""
-    return digest.hexdigest()
+def file_digests(folder: Path) -> dict[str, str]:
+    """Return the sha256 of each file of a model that can be read."""
+    found = {}
+    for name in RECORDS:
+        with suppress(OSError), (folder / name).open("rb") as file:
+            found[name] = hashlib.file_digest(file, "sha256").hexdigest()
+    return found
+
+
+def _digest_of(files: Mapping[str, str]) -> str:
+    parts = [bytes.fromhex(files[name]) for name in sorted(files)]
+    return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:

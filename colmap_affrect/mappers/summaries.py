@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from colmap_affrect.colmap.model_files import SUMMARY, model_digest, require_intact
+from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact
 from colmap_affrect.errors import DAMAGE, StoreError, damage, made_again
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.checked_json import with_checksum, without_checksum
@@ -22,8 +22,8 @@ GUIDED_BEFORE = "guided-before.json"  # beside models that wait: the pairs guide
 class _Kept:
     """The content of the file."""
 
-    model: str
-    """Digest of the files of the model."""
+    model: dict[str, str] | str
+    """Digests of the files of the model by name, or one of all of an older version."""
     summary: ModelSummary
 
 
@@ -33,7 +33,7 @@ _PAIRS = TypeAdapter(dict[str, list[tuple[str, str]]])
 
 def write_summary(summary: ModelSummary, folder: Path) -> None:
     """Keep the summary of the model in a folder."""
-    text = _KEPT.dump_json(_Kept(model_digest(folder), summary), indent=2).decode()
+    text = _KEPT.dump_json(_Kept(file_digests(folder), summary), indent=2).decode()
     replace_text(folder / SUMMARY, with_checksum(text))
 
 

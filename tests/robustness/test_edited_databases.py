@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import Call, on_photographs
-from damaged import BYTES, damage_bytes
+from damaged import bits, cut, damage, noise, zeros
 from results import database_content, model_names, results
 from small_scene import write_photographs
 
@@ -98,7 +98,8 @@ def test_what_the_stores_hold_is_made_again(
 
 @pytest.mark.parametrize("seed", range(4))
 def test_damaged_files_are_made_again(finished: Path, out: Path, call: Call, seed: int) -> None:
-    damage_bytes(out / "database.db", BYTES[1:][seed], random.Random(seed))
+    harms = [[noise], [zeros], [bits], [cut]]
+    damage(out / "database.db", random.Random(seed), harms[seed])
     again(call, finished, out, "map")
     assert results(out) == results(finished / "out")
 
