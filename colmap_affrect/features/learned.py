@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -89,14 +88,17 @@ class XFeatOptions(LearnedOptions):
 class LearnedFeatures(FeatureExtractor):
     """A network on one view after another; its class says how it is called."""
 
-    def __init__(self, options: LearnedOptions, context: NetworkContext) -> None:
+    def __init__(
+        self, options: AlikedOptions | DiskOptions | XFeatOptions, context: NetworkContext
+    ) -> None:
         """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
-        from colmap_affrect.features.networks import resolve_device
+        from colmap_affrect.features.networks import load_extractor, resolve_device
 
-        self.limit, self.device = options.max_num_features, resolve_device(context.device)
+        self.options, self.device = options, resolve_device(context.device)
         self.dtype = "float32" if self.device.type == "cpu" else options.dtype
         (key,) = options.weights
-        self.network: Any = self._load(options, context.weights[key], context.device)
+        path, threshold = context.weights[key], options.score_threshold
+        self.network: Any = load_extractor(key, threshold, path, context.device)
 
     def detect(self, view: View) -> LocalFeatures:
         """Detect and describe, by falling response; none for views under 8 px.
@@ -111,16 +113,12 @@ class LearnedFeatures(FeatureExtractor):
         from colmap_affrect.features.networks import arithmetic
 
         allowed = np.ones(image.shape[:2], dtype=bool) if mask is None else mask > 0
-        best = partial(_best, allowed, self.limit)
+        best = partial(_best, allowed, self.options.max_num_features)
         with torch.inference_mode(), arithmetic(self.dtype, self.device):
             found = self._run(_pixels(image).to(self.device), best)
         points, responses, descriptors = (_array(values) for values in found)
         lafs = lafs_from_keypoints(points, np.full(len(points), RADIUS_PX), np.zeros(len(points)))
         return LocalFeatures(lafs, responses, descriptors)
-
-    @abstractmethod
-    def _load(self, options: Any, path: Path, device: str) -> Any:
-        """Return the network with the weights in a file."""
 
     @abstractmethod
     def _run(self, pixels: Tensor, best: Best) -> Found:
@@ -135,11 +133,6 @@ class Aliked(LearnedFeatures):
 
     Options = AlikedOptions
     descriptor_size = 128
-
-    def _load(self, options: AlikedOptions, path: Path, device: str) -> Any:
-        from colmap_affrect.features.networks import load_aliked
-
-        return load_aliked(options.weights[0], options.score_threshold, path, device)
 
     def _run(self, pixels: Tensor, best: Best) -> Found:
         features, scores = self.network.extract_dense_map(pixels)
@@ -161,21 +154,14 @@ class Disk(LearnedFeatures):
     Options = DiskOptions
     descriptor_size = 128
 
-    def _load(self, options: DiskOptions, path: Path, device: str) -> Any:
-        from colmap_affrect.features.networks import load_disk
-
-        self.score_threshold = options.score_threshold
-        return load_disk(path, device)
-
     def _run(self, pixels: Tensor, best: Best) -> Found:
         from torch.nn.functional import pad
 
         height, width = pixels.shape[2:]
         missing = max(MIN_NETWORK_PX - width, 0), max(MIN_NETWORK_PX - height, 0)
         filled = pad(pixels, (0, missing[0], 0, missing[1]))
-        (found,) = self.network(
-            filled, score_threshold=self.score_threshold, pad_if_not_divisible=True
-        )
+        threshold = self.options.score_threshold
+        (found,) = self.network(filled, score_threshold=threshold, pad_if_not_divisible=True)
         points = found.keypoints - HALF_PIXEL
         chosen = best(points, found.detection_scores)
         return points[chosen], found.detection_scores[chosen], found.descriptors[chosen]
@@ -191,11 +177,6 @@ class XFeat(LearnedFeatures):
 
     Options = XFeatOptions
     descriptor_size = 64
-
-    def _load(self, options: XFeatOptions, path: Path, device: str) -> Any:
-        from colmap_affrect.features.networks import load_xfeat
-
-        return load_xfeat(options.score_threshold, path, device)
 
     def _run(self, pixels: Tensor, best: Best) -> Found:
         height, width = pixels.shape[2:]

@@ -21,7 +21,6 @@ from colmap_affrect.features.affnet_hardnet import (
     MAX_TILT,
     AffNetHardNet,
     AffNetHardNetOptions,
-    shapes_from_outputs,
 )
 from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.geometry.affine import lafs_from_keypoints, rotation
@@ -166,17 +165,6 @@ def test_orientation_points_along_the_gradient_of_a_turned_pattern(
     assert_allclose(first @ direction, 1.0, atol=1.0 - np.cos(np.deg2rad(ANGLE_DEG)))
     # A rotation: the second column is a quarter turn on, x towards y.
     assert_allclose(described.lafs[0, :, 1], rotation(np.pi / 2) @ described.lafs[0, :, 0])
-
-
-def test_shapes_from_outputs_have_area_one_and_keep_the_first_row_upright() -> None:
-    rng = np.random.default_rng(0)
-    outputs = rng.uniform(-0.9, 0.9, (40, 3))
-    shapes = shapes_from_outputs(outputs)
-    assert_allclose(np.linalg.det(shapes), 1.0)
-    assert (shapes[:, 0, 1] == 0.0).all()
-    assert_allclose(shapes[:, 1, 0] / shapes[:, 0, 0], outputs[:, 1] / (1.0 + outputs[:, 0]))
-    degenerate = np.array([[-1.0, 0.3, 0.0], [0.0, 0.0, -1.0]])
-    assert not np.isfinite(shapes_from_outputs(degenerate)).any()
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from torch import nn
 from colmap_affrect.data import GrayImage, LocalFeatures, ShapeGrid
 from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.features.shapes import affnet
-from colmap_affrect.features.shapes.affnet import AffNet, AffNetOptions, fully_convolutional
+from colmap_affrect.features.shapes.affnet import AffNet, AffNetOptions
 from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.shapes import log_metrics, metrics_from_log
@@ -154,27 +154,6 @@ def image() -> GrayImage:
     x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
     values = texture(ODD_SIZE, seed=3).astype(float)
     return np.rint((values - 128) * (0.3 + 0.6 * x) + 90 + 60 * y).clip(0, 255).astype(np.uint8)
-
-
-def test_fully_convolutional_layers_equal_the_network_on_patches() -> None:
-    network = random_network()
-    patches = torch.randn((5, 1, 32, 32), generator=torch.Generator().manual_seed(1))
-    expected = network.features(patches)
-    assert expected.shape == (5, 3, 1, 1)
-    assert expected.std() > 0.1
-    outputs = fully_convolutional(network)(patches)
-    torch.testing.assert_close(outputs, expected, atol=1e-5, rtol=1e-5)
-
-
-def test_fully_convolutional_layers_leave_the_network_as_it_was() -> None:
-    network = random_network().train()
-    before = {name: value.clone() for name, value in network.state_dict().items()}
-    layers = fully_convolutional(network)
-    assert network.training
-    assert not any(layer.training for layer in layers)
-    for name, value in network.state_dict().items():
-        assert torch.equal(value, before[name])
-        assert value.stride() == before[name].stride()
 
 
 @pytest.mark.parametrize("size", [ODD_SIZE, (84, 34), (32, 39), (34, 33)])
