@@ -168,9 +168,7 @@ class WeightStatus:
     key: str
     published: WeightFile
     path: Path | None  # where it was found; None if nowhere
-    # whether its sha256 is that of the published file; None if there is no file or no sha256 to
-    # compare with
-    verified: bool | None
+    verified: bool | None  # its sha256 is the published one; None if there is none to compare
 
 
 def describe_weights(
