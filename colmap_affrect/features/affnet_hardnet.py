@@ -9,8 +9,7 @@ Patches are sampled from a pyramid whose level has steps of 1 to 2 px.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -82,22 +81,22 @@ class AffNetHardNet:
 
     def __init__(self, options: AffNetHardNetOptions, network: NetworkContext) -> None:
         """Load the networks; WeightsError and DeviceError as :mod:`.networks` raises them."""
-        from colmap_affrect.features.networks import (
-            AffineShapes,
-            load_affnet,
-            load_descriptor,
-            load_orinet,
-            resolve_device,
-        )
+        from colmap_affrect.features import networks
 
         weights, device = network.weights, network.device
-        self.options, self.device = options, resolve_device(device)
+        self.options, self.device = options, networks.resolve_device(device)
         self.affine_shapes = None
         if options.affine_shape:
-            self.affine_shapes = AffineShapes(load_affnet(weights["affnet"], device))
-        self.orinet = load_orinet(weights["orinet"], device)
-        self.descriptor = load_descriptor(options.descriptor, weights[options.descriptor], device)
-        self.detector = _detector(options, weights, device)
+            affnet = networks.load_affnet(weights["affnet"], device)
+            self.affine_shapes = networks.OnPatches(affnet)
+        self.orinet = networks.load_orinet(weights["orinet"], device)
+        name = options.descriptor
+        self.descriptor = networks.load_descriptor(name, weights[name], device)
+        self.detector = None  # OpenCV's
+        if options.detector != "dog":
+            self.detector = networks.load_detector(
+                options.detector, options.max_num_features, weights, device
+            )
 
     def detect(self, view: View) -> LocalFeatures:
         """Detect keypoints, by falling response: upright circles of 6 sigma, descriptors (N, 0).
@@ -147,15 +146,14 @@ class AffNetHardNet:
             shapes, descriptors = self._describe(_sampler(images, counts, self.device), found)
         lengths = np.linalg.norm(descriptors, axis=1)
         valid = _is_sound(shapes) & np.isfinite(lengths) & (lengths > 0.0)
-        radii_px = found.scales
-        described = []
-        for part in np.split(np.arange(len(found)), np.cumsum(counts)[:-1]):
-            kept = part[valid[part]]
-            lafs = _frames(shapes[kept], radii_px[kept], found.keypoints[kept])
-            rows = descriptors[kept] / lengths[kept, None]
-            ids = found.rectification_ids[kept]
-            described.append(LocalFeatures(lafs, found.responses[kept], rows, ids))
-        return described
+        rows = np.flatnonzero(valid)
+        frames = _frames(shapes[rows], found.scales[rows], found.keypoints[rows])
+        unit_rows = descriptors[rows] / lengths[rows, None]
+        described = LocalFeatures(
+            frames, found.responses[rows], unit_rows, found.rectification_ids[rows]
+        )
+        numbers = np.repeat(np.arange(len(detected)), counts)[rows]  # of the images
+        return [described.select(numbers == number) for number in range(len(detected))]
 
     def _describe(
         self, sample: Callable[[Array], Tensor], found: LocalFeatures
@@ -236,22 +234,6 @@ def _frames(shapes: Array, radii_px: Array, centers: Array) -> Array:
 def _unit_range(image: GrayImage) -> Singles:
     """Return an (H, W) image as float32 in [0, 1]."""
     return image.astype(np.float32) / np.float32(255)
-
-
-def _detector(
-    options: AffNetHardNetOptions, weights: Mapping[str, Path], device: str
-) -> nn.Module | None:
-    """Build one of kornia's detectors; None stands for OpenCV's."""
-    if options.detector == "dog":
-        return None
-    from kornia.feature import MultiResolutionDetector, ScaleSpaceDetector
-
-    from colmap_affrect.features.networks import load_keynet, resolve_device
-
-    count = options.max_num_features
-    if options.detector == "keynet":
-        return MultiResolutionDetector(load_keynet(weights["keynet"], device), count)
-    return ScaleSpaceDetector(count, MEASUREMENT_SIGMAS).to(resolve_device(device))
 
 
 def _centers_from_keynet(centers: Array, radii_px: Array) -> Array:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -31,11 +29,8 @@ that a point that warps show again is known as the same."""
 
 MIN_NETWORK_PX = 32  # views are filled up to it: DISK normalises over a sixteenth of it
 
-Found = tuple["Tensor", "Tensor", "Tensor"]
-"""(N, 2) points in pixel-centre px, (N,) responses, (N, D) descriptors of unit length."""
-
-Best = Callable[["Tensor", "Tensor"], "Tensor"]
-"""Chooses the strongest of (N, 2) points with (N,) responses where they are allowed."""
+Found = tuple["Tensor", "Tensor", Callable[["Tensor"], "Tensor"]]
+"""(N, 2) points in pixel-centre px, (N,) responses, and what describes those of some indices."""
 
 
 class LearnedOptions(FeatureOptions):
@@ -89,14 +84,17 @@ class XFeatOptions(LearnedOptions):
 class LearnedFeatures(FeatureExtractor):
     """A network on one view after another; its class says how it is called."""
 
-    def __init__(self, options: LearnedOptions, context: NetworkContext) -> None:
+    def __init__(
+        self, options: AlikedOptions | DiskOptions | XFeatOptions, context: NetworkContext
+    ) -> None:
         """Load the network; WeightsError and DeviceError as :mod:`.networks` raises them."""
-        from colmap_affrect.features.networks import resolve_device
+        from colmap_affrect.features.networks import load_extractor, resolve_device
 
-        self.limit, self.device = options.max_num_features, resolve_device(context.device)
+        self.options, self.device = options, resolve_device(context.device)
         self.dtype = "float32" if self.device.type == "cpu" else options.dtype
         (key,) = options.weights
-        self.network: Any = self._load(options, context.weights[key], context.device)
+        path, threshold = context.weights[key], options.score_threshold
+        self.network: Any = load_extractor(key, threshold, path, context.device)
 
     def detect(self, view: View) -> LocalFeatures:
         """Detect and describe, by falling response; none for views under 8 px.
@@ -111,20 +109,17 @@ class LearnedFeatures(FeatureExtractor):
         from colmap_affrect.features.networks import arithmetic
 
         allowed = np.ones(image.shape[:2], dtype=bool) if mask is None else mask > 0
-        best = partial(_best, allowed, self.limit)
         with torch.inference_mode(), arithmetic(self.dtype, self.device):
-            found = self._run(_pixels(image).to(self.device), best)
+            places, scores, describe = self._run(_pixels(image).to(self.device))
+            best = _best(places, scores, allowed, self.options.max_num_features)
+            found = places[best], scores[best], describe(best)
         points, responses, descriptors = (_array(values) for values in found)
         lafs = lafs_from_keypoints(points, np.full(len(points), RADIUS_PX), np.zeros(len(points)))
         return LocalFeatures(lafs, responses, descriptors)
 
     @abstractmethod
-    def _load(self, options: Any, path: Path, device: str) -> Any:
-        """Return the network with the weights in a file."""
-
-    @abstractmethod
-    def _run(self, pixels: Tensor, best: Best) -> Found:
-        """Return the best features of a (1, 3, H, W) view in [0, 1]."""
+    def _run(self, pixels: Tensor) -> Found:
+        """Return the features of a (1, 3, H, W) view in [0, 1]; descriptors are of unit length."""
 
 
 class Aliked(LearnedFeatures):
@@ -136,19 +131,13 @@ class Aliked(LearnedFeatures):
     Options = AlikedOptions
     descriptor_size = 128
 
-    def _load(self, options: AlikedOptions, path: Path, device: str) -> Any:
-        from colmap_affrect.features.networks import load_aliked
-
-        return load_aliked(options.weights[0], options.score_threshold, path, device)
-
-    def _run(self, pixels: Tensor, best: Best) -> Found:
+    def _run(self, pixels: Tensor) -> Found:
         features, scores = self.network.extract_dense_map(pixels)
         (places,), (responses,), _ = self.network.dkd(scores)
         size = places.new_tensor([pixels.shape[3] - 1, pixels.shape[2] - 1])
         points = (places + 1) / 2 * size
-        chosen = best(points, responses)
-        (descriptors,), _ = self.network.desc_head(features, [places[chosen]])
-        return points[chosen], responses[chosen], descriptors
+        head = self.network.desc_head
+        return points, responses, lambda chosen: head(features, [places[chosen]])[0][0]
 
 
 class Disk(LearnedFeatures):
@@ -161,24 +150,16 @@ class Disk(LearnedFeatures):
     Options = DiskOptions
     descriptor_size = 128
 
-    def _load(self, options: DiskOptions, path: Path, device: str) -> Any:
-        from colmap_affrect.features.networks import load_disk
-
-        self.score_threshold = options.score_threshold
-        return load_disk(path, device)
-
-    def _run(self, pixels: Tensor, best: Best) -> Found:
+    def _run(self, pixels: Tensor) -> Found:
         from torch.nn.functional import pad
 
         height, width = pixels.shape[2:]
         missing = max(MIN_NETWORK_PX - width, 0), max(MIN_NETWORK_PX - height, 0)
         filled = pad(pixels, (0, missing[0], 0, missing[1]))
-        (found,) = self.network(
-            filled, score_threshold=self.score_threshold, pad_if_not_divisible=True
-        )
+        threshold = self.options.score_threshold
+        (found,) = self.network(filled, score_threshold=threshold, pad_if_not_divisible=True)
         points = found.keypoints - HALF_PIXEL
-        chosen = best(points, found.detection_scores)
-        return points[chosen], found.detection_scores[chosen], found.descriptors[chosen]
+        return points, found.detection_scores, found.descriptors.__getitem__
 
 
 class XFeat(LearnedFeatures):
@@ -192,23 +173,17 @@ class XFeat(LearnedFeatures):
     Options = XFeatOptions
     descriptor_size = 64
 
-    def _load(self, options: XFeatOptions, path: Path, device: str) -> Any:
-        from colmap_affrect.features.networks import load_xfeat
-
-        return load_xfeat(options.score_threshold, path, device)
-
-    def _run(self, pixels: Tensor, best: Best) -> Found:
+    def _run(self, pixels: Tensor) -> Found:
         height, width = pixels.shape[2:]
         (found,) = self.network.detectAndCompute(pixels, top_k=height * width)
         # kornia multiplies whole pixels of the shrunk view by these; of corner coordinates, which
         # that is right for, those of the middle are i + 1.
         factors = [side / max(side // 32 * 32, 32) for side in (width, height)]
         points = found["keypoints"] + pixels.new_tensor(factors) - HALF_PIXEL
-        chosen = best(points, found["scores"])
-        return points[chosen], found["scores"][chosen], found["descriptors"][chosen]
+        return points, found["scores"], found["descriptors"].__getitem__
 
 
-def _best(allowed: Mask, limit: int, points: Tensor, responses: Tensor) -> Tensor:
+def _best(points: Tensor, responses: Tensor, allowed: Mask, limit: int) -> Tensor:
     """Return the indices of the strongest features where they are allowed, by falling response."""
     import torch
 

@@ -6,6 +6,7 @@ of them and no others, in their shapes.
 """
 
 import re
+from collections import OrderedDict
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -17,6 +18,7 @@ from kornia.feature.mkd import Whitening
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.errors import DeviceError, OptionError
 from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict, unusable
@@ -37,11 +39,8 @@ def resolve_device(name: str) -> torch.device:
     if not re.fullmatch(r"cpu|cuda(:\d+)?|mps", name):
         raise OptionError(f"--device {name}: not one of auto, cpu, cuda, cuda:0, mps")
     device = torch.device(name)
-    count = 1
-    if device.type == "cuda":
-        count = torch.cuda.device_count()
-    elif device.type == "mps":
-        count = int(torch.backends.mps.is_available())
+    counts = {"cpu": lambda: 1, "cuda": torch.cuda.device_count}
+    count = counts.get(device.type, torch.backends.mps.is_available)()
     if not count:
         kind = device.type.upper()
         raise DeviceError(
@@ -59,23 +58,25 @@ def arithmetic(dtype: str, device: torch.device) -> AbstractContextManager[objec
     return torch.autocast(device.type, getattr(torch, dtype))
 
 
-def load_affnet(path: Path, device: str) -> feature.LAFAffNetShapeEstimator:
-    """Build AffNet as kornia has it; ``preserve_orientation`` is off, unlike its default."""
-    network = feature.LAFAffNetShapeEstimator(pretrained=False, preserve_orientation=False)
-    _load(network, path, "AffNet")
-    return _ready(network, device)
+def load_affnet(path: Path, device: str) -> nn.Sequential:
+    """Build AffNet (Mishkin, Radenovic, Matas 2018) without its final pooling.
+
+    Standardized patches (B, 1, 32, 32) give (B, 3, 1, 1); an image of H x W px gives (ceil(H / 4) -
+    7) x (ceil(W / 4) - 7) cells, where cell (i, j) has the patch whose first pixel is (4 j, 4 i).
+    """
+    network = _loaded(feature.LAFAffNetShapeEstimator(pretrained=False), path, "AffNet")
+    kept = (nn.Conv2d, nn.BatchNorm2d, nn.ReLU, nn.Tanh)
+    layers = nn.Sequential(*(layer for layer in network.features if isinstance(layer, kept)))
+    return _ready(folded(layers), device)
 
 
-class AffineShapes(nn.Module):
-    """AffNet on patches (Mishkin, Radenovic, Matas 2018)."""
-
-    def __init__(self, affnet: feature.LAFAffNetShapeEstimator) -> None:
-        super().__init__()
-        self.features = folded(affnet.features)
+class OnPatches(nn.Sequential):
+    """Layers that are given (B, 1, 32, 32) patches, standardized, and whose outputs are (B, D)."""
 
     def forward(self, patches: Tensor) -> Tensor:
-        """Return (B, 3) outputs of (B, 1, 32, 32) patches."""
-        return cast(Tensor, self.features(standardized(patches))).flatten(1)
+        """Return (B, D) outputs, not of unit length."""
+        outputs: Tensor = super().forward(standardized(patches))  # type: ignore[no-untyped-call]
+        return outputs.flatten(1)
 
 
 def load_orinet(path: Path, device: str) -> feature.OriNet:
@@ -84,73 +85,55 @@ def load_orinet(path: Path, device: str) -> feature.OriNet:
     kornia's convention: an orientation a is a frame turned by [[cos a, sin a], [-sin a, cos a]],
     which is R(-a) here.
     """
-    network = feature.OriNet(pretrained=False)
-    _load(network, path, "OriNet")
+    network = _loaded(feature.OriNet(pretrained=False), path, "OriNet")
     network.features = folded(network.features)
     return _ready(network, device)
 
 
-def load_keynet(path: Path, device: str) -> feature.KeyNet:
-    """Build Key.Net: (1, 1, H, W) images in [0, 1] to responses of that size."""
-    network = feature.KeyNet(pretrained=False)
-    _load(network, path, "Key.Net")
-    return _ready(network, device)
+def load_detector(name: str, count: int, weights: Mapping[str, Path], device: str) -> nn.Module:
+    """Build ``keynet`` or ``hessian``, which finds so many features of (1, 1, H, W) in [0, 1]."""
+    if name == "hessian":
+        return feature.ScaleSpaceDetector(count, MEASUREMENT_SIGMAS).to(resolve_device(device))
+    keynet = _loaded(feature.KeyNet(pretrained=False), weights["keynet"], "Key.Net")
+    return feature.MultiResolutionDetector(_ready(keynet, device), count)
 
 
 def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
     """Build what makes (B, 128) rows of any length of (B, 1, 32, 32) patches in [0, 1]."""
     if name == "mkd":
         return _ready(_load_mkd(path), device)
-    network: nn.Module = DESCRIPTOR_NETWORKS[name]()
-    _load(network, path, name)
+    network: nn.Module = _loaded(DESCRIPTOR_NETWORKS[name](), path, name)
     if isinstance(network, feature.HardNet | feature.HardNet8):
         network.features = folded(network.features)
     return _ready(network, device)
 
 
-def load_aliked(name: str, score_threshold: float, path: Path, device: str) -> feature.ALIKED:
-    """Build ALIKED by kornia's name of the model, which keeps all maxima above the threshold."""
-    network = feature.ALIKED(name, detection_threshold=score_threshold)
-    grid = {"dkd.hw_grid": network.dkd.hw_grid}  # derived, and in no file
-    _load_state(network, {**load_state_dict(path), **grid}, path, name)
-    return _ready(network, device)
+def load_extractor(key: str, score_threshold: float, path: Path, device: str) -> nn.Module:
+    """Build ALIKED, DISK or XFeat by the key of its file; maxima above the threshold are kept."""
+    state = load_state_dict(path)
+    if key == "disk":  # whose threshold is given with each image
+        if not isinstance(inner := state.get("extractor"), Mapping):
+            raise unusable(path, "not the weights of disk (no extractor)")
+        return _ready(_with_state(feature.DISK(), inner, path, key), device)
+    if key == "xfeat":
+        xfeat = feature.XFeat(detection_threshold=score_threshold)
+        _with_state(xfeat.net, state, path, key)
+        return _ready(xfeat, device)
+    aliked = feature.ALIKED(key, detection_threshold=score_threshold)
+    grid = {"dkd.hw_grid": aliked.dkd.hw_grid}  # derived, and in no file
+    return _ready(_with_state(aliked, {**state, **grid}, path, key), device)
 
 
-def load_disk(path: Path, device: str) -> feature.DISK:
-    """Build DISK from a checkpoint of its authors."""
-    network = feature.DISK()
-    state = load_state_dict(path).get("extractor")
-    if not isinstance(state, Mapping):
-        raise unusable(path, "not the weights of disk (no extractor)")
-    _load_state(network, state, path, "disk")
-    return _ready(network, device)
-
-
-def load_xfeat(score_threshold: float, path: Path, device: str) -> feature.XFeat:
-    """Build XFeat."""
-    network = feature.XFeat(detection_threshold=score_threshold)
-    _load(network.net, path, "xfeat")
-    return _ready(network, device)
-
-
-class HardTFeat(nn.Module):
-    """Two convolutions and a fully connected layer, with tanh, as in TFeat (Balntas et al. 2016).
+def hardtfeat() -> OnPatches:
+    """Build the layers of TFeat (Balntas et al. 2016): two convolutions, one fully connected.
 
     As it is published, tanh comes before the maximum; here after it, a quarter of the work.
     """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.features = nn.Sequential(
-            nn.Conv2d(1, 32, 7), nn.MaxPool2d(2), nn.Tanh(), nn.Conv2d(32, 64, 6), nn.Tanh()
-        )
-        self.classifier = nn.Sequential(
-            nn.Dropout(0.1), nn.Conv2d(64, DESCRIPTOR_SIZE, 8), nn.Tanh()
-        )
-
-    def forward(self, patches: Tensor) -> Tensor:
-        """Return (B, 128) descriptors, not yet of unit length, of (B, 1, 32, 32) patches."""
-        return cast(Tensor, self.classifier(self.features(standardized(patches)))).flatten(1)
+    features = nn.Sequential(
+        nn.Conv2d(1, 32, 7), nn.MaxPool2d(2), nn.Tanh(), nn.Conv2d(32, 64, 6), nn.Tanh()
+    )
+    classifier = nn.Sequential(nn.Dropout(0.1), nn.Conv2d(64, DESCRIPTOR_SIZE, 8), nn.Tanh())
+    return OnPatches(OrderedDict(features=features, classifier=classifier))
 
 
 DESCRIPTOR_NETWORKS: dict[str, Any] = {
@@ -159,7 +142,7 @@ DESCRIPTOR_NETWORKS: dict[str, Any] = {
     "hynet": lambda: feature.HyNet(pretrained=False),
     "sosnet": lambda: feature.SOSNet(pretrained=False),
     "tfeat": lambda: feature.TFeat(pretrained=False),
-    "hardtfeat": HardTFeat,
+    "hardtfeat": hardtfeat,
 }
 """Constructors of all descriptors but ``mkd``, which has no learned layers."""
 
@@ -199,18 +182,18 @@ def _load_mkd(path: Path) -> nn.Module:
     return nn.Sequential(kernels, Whitening("pcawt", {"pca": model}, width, DESCRIPTOR_SIZE))
 
 
-def _load(network: nn.Module, path: Path, name: str) -> None:
+def _loaded(network: Network, path: Path, name: str) -> Network:
     """Give a network the parameters in a file; WeightsError when they are not exactly its own."""
     state = load_state_dict(path)
-    if isinstance(network, HardTFeat):  # the file also holds a SIFT that helped in its training
+    if name == "hardtfeat":  # the file also holds a SIFT that helped in its training
         state = {key: value for key, value in state.items() if not key.startswith("SIFT.")}
-    _load_state(network, state, path, name)
+    return _with_state(network, state, path, name)
 
 
 COUNTER = "num_batches_tracked"  # of batch normalisations; older files have none
 
 
-def _load_state(network: nn.Module, state: Mapping[str, Any], path: Path, name: str) -> None:
+def _with_state(network: Network, state: Mapping[str, Any], path: Path, name: str) -> Network:
     given, wanted = (
         {key: _kind(value) for key, value in values.items() if not key.endswith(COUNTER)}
         for values in (state, network.state_dict())
@@ -225,6 +208,7 @@ def _load_state(network: nn.Module, state: Mapping[str, Any], path: Path, name: 
     if problems:
         raise unusable(path, f"not the weights of {name} ({such_as(problems, 1)})")
     network.load_state_dict(state, strict=False)
+    return network
 
 
 def _kind(value: Any) -> str:

@@ -21,13 +21,10 @@ from colmap_affrect.features.affnet_hardnet import (
     MAX_TILT,
     AffNetHardNet,
     AffNetHardNetOptions,
-    shapes_from_outputs,
 )
 from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.geometry.affine import lafs_from_keypoints, rotation
 from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
-
-SHARED = Path(__file__).resolve().parents[3] / "shared"
 
 FLOAT32_ROUNDING = 1e-6
 
@@ -166,17 +163,6 @@ def test_orientation_points_along_the_gradient_of_a_turned_pattern(
     assert_allclose(first @ direction, 1.0, atol=1.0 - np.cos(np.deg2rad(ANGLE_DEG)))
     # A rotation: the second column is a quarter turn on, x towards y.
     assert_allclose(described.lafs[0, :, 1], rotation(np.pi / 2) @ described.lafs[0, :, 0])
-
-
-def test_shapes_from_outputs_have_area_one_and_keep_the_first_row_upright() -> None:
-    rng = np.random.default_rng(0)
-    outputs = rng.uniform(-0.9, 0.9, (40, 3))
-    shapes = shapes_from_outputs(outputs)
-    assert_allclose(np.linalg.det(shapes), 1.0)
-    assert (shapes[:, 0, 1] == 0.0).all()
-    assert_allclose(shapes[:, 1, 0] / shapes[:, 0, 0], outputs[:, 1] / (1.0 + outputs[:, 0]))
-    degenerate = np.array([[-1.0, 0.3, 0.0], [0.0, 0.0, -1.0]])
-    assert not np.isfinite(shapes_from_outputs(degenerate)).any()
 
 
 @pytest.mark.parametrize(
@@ -321,53 +307,3 @@ def test_keynet_centres_are_unbiased_on_every_level(weights: dict[str, Path]) ->
         assert len(points) > 30
         # Whole pixels of the level, so each is off by 0.29 of them; half of one would be a bias.
         assert_allclose(offsets.mean(axis=0), 0.0, atol=0.2 * pixel)
-
-
-# Real weights and photographs.
-
-
-@pytest.fixture
-def published() -> dict[str, Path]:
-    names = {"affnet": "AffNet", "orinet": "OriNet", "hardtfeat": "HardTFeat"}
-    return {key: SHARED / "weights" / f"{name}.pth" for key, name in names.items()}
-
-
-needs_shared = [
-    pytest.mark.shared,
-    pytest.mark.skipif(not SHARED.is_dir(), reason="the files of ../shared are not here"),
-]
-
-
-def right_matches(
-    one: LocalFeatures, two: LocalFeatures, homography: np.ndarray, max_ratio: float = 0.85
-) -> tuple[int, int]:
-    """Number of mutual nearest neighbours within 3 px of the homography, and of all of them."""
-    distances = np.sqrt(np.maximum(2.0 - 2.0 * one.descriptors @ two.descriptors.T, 0.0))
-    rows, nearest = np.arange(len(one)), distances.argmin(axis=1)
-    first = distances[rows, nearest]
-    distances[rows, nearest] = np.inf
-    second = distances.min(axis=1)
-    distances[rows, nearest] = first
-    kept = (distances.argmin(axis=0)[nearest] == rows) & (first < max_ratio * second)
-    mapped = np.column_stack([one.keypoints, np.ones(len(one))]) @ homography.T
-    errors = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - two.keypoints[nearest], axis=1)
-    return np.count_nonzero(kept & (errors < 3.0)), np.count_nonzero(kept)
-
-
-class TestPublishedWeights:
-    pytestmark = needs_shared
-
-    def test_affine_shapes_bring_matches_on_graffiti(self, published: dict[str, Path]) -> None:
-        folder = SHARED / "pairs/oxford_graf"
-        images = [cv2.imread(str(folder / f"graf_{number}.png"), 0) for number in (1, 4)]
-        homography = np.loadtxt(folder / "H_graf_1_4.txt")
-        counts = {}
-        for affine_shape in (True, False):
-            profile = make(
-                published, descriptor="hardtfeat", max_num_features=2000, affine_shape=affine_shape
-            )
-            detected = [profile.detect((each, None)) for each in images]
-            counts[affine_shape] = right_matches(*profile.describe(images, detected), homography)
-        assert 60 < counts[True][0] < 400
-        assert counts[True][0] > 1.5 * counts[False][0]
-        assert counts[True][0] > 0.4 * counts[True][1]

@@ -11,7 +11,6 @@ import torch
 from kornia import feature
 from kornia.feature.mkd import Whitening
 from random_weights import randomized
-from torch import nn
 from torch.nn import functional
 
 from colmap_affrect.errors import DeviceError, OptionError, WeightsError
@@ -19,15 +18,12 @@ from colmap_affrect.features.affnet_hardnet import AffNetHardNetOptions
 from colmap_affrect.features.networks import (
     DESCRIPTOR_NETWORKS,
     DESCRIPTOR_SIZE,
-    AffineShapes,
-    HardTFeat,
-    folded,
+    OnPatches,
     load_affnet,
     load_descriptor,
-    load_keynet,
+    load_detector,
     load_orinet,
     resolve_device,
-    standardized,
 )
 
 ROUNDING = 1e-5
@@ -157,7 +153,7 @@ def test_loaders_refuse_the_file_of_another_network(folder: Path) -> None:
     with pytest.raises(WeightsError, match=r"affnet\.pth: not the weights of OriNet"):
         load_orinet(folder / "affnet.pth", "cpu")
     with pytest.raises(WeightsError, match=r"hardnet\.pth: not the weights of Key\.Net"):
-        load_keynet(folder / "hardnet.pth", "cpu")
+        load_detector("keynet", 10, {"keynet": folder / "hardnet.pth"}, "cpu")
     with pytest.raises(WeightsError, match=r"hardnet8\.pth: not the weights of hardnet \("):
         load_descriptor("hardnet", folder / "hardnet8.pth", "cpu")
 
@@ -199,42 +195,21 @@ def test_load_affnet_takes_files_with_and_without_batch_counters(
 # Architectures.
 
 
-def test_load_affnet_drops_the_orientation_it_is_given(folder: Path) -> None:
-    assert load_affnet(folder / "affnet.pth", "cpu").preserve_orientation is False
-
-
-def test_affine_shapes_and_orinet_compute_what_kornia_does(
-    folder: Path, patches: torch.Tensor
-) -> None:
-    affnet = load_affnet(folder / "affnet.pth", "cpu")
+def test_affnet_and_orinet_compute_what_kornia_does(folder: Path, patches: torch.Tensor) -> None:
+    affnet = feature.LAFAffNetShapeEstimator(pretrained=False).eval()
     orinet = feature.OriNet(pretrained=False).eval()
-    orinet.load_state_dict(torch.load(folder / "orinet.pth", weights_only=True)["state_dict"])
+    for name, network in (("affnet", affnet), ("orinet", orinet)):
+        path = folder / f"{name}.pth"
+        network.load_state_dict(torch.load(path, weights_only=True)["state_dict"])
+    deviations, means = torch.std_mean(patches, dim=(1, 2, 3), keepdim=True)
     with torch.inference_mode():
-        outputs = affnet.features(standardized(patches)).view(-1, 3)
-        torch.testing.assert_close(AffineShapes(affnet)(patches), outputs, rtol=0, atol=ROUNDING)
+        outputs = affnet.features((patches - means) / (deviations + 1e-6)).flatten(1)
+        found = OnPatches(load_affnet(folder / "affnet.pth", "cpu"))(patches)
+        torch.testing.assert_close(found, outputs, rtol=0, atol=ROUNDING)
         angles = load_orinet(folder / "orinet.pth", "cpu")(patches)
         torch.testing.assert_close(angles, orinet(patches), rtol=0, atol=ROUNDING)
     assert outputs.std() > 1e-3
     assert angles.std() > 1e-3
-
-
-def test_standardized_patches_have_mean_zero_and_deviation_one(patches: torch.Tensor) -> None:
-    flat = torch.full((1, 1, 32, 32), 0.7)
-    result = standardized(torch.cat([patches, flat]))
-    torch.testing.assert_close(result.mean((1, 2, 3)), torch.zeros(8), rtol=0, atol=ROUNDING)
-    torch.testing.assert_close(result[:7].std((1, 2, 3)), torch.ones(7), rtol=1e-3, atol=0)
-    assert result[7].abs().max() < 1.0
-
-
-def test_folded_layers_compute_the_same_with_fewer_of_them(patches: torch.Tensor) -> None:
-    torch.manual_seed(1)
-    layers = randomized(feature.HardNet(pretrained=False), 4).features
-    with torch.inference_mode():
-        expected = layers(patches)
-        fewer = folded(layers)
-        torch.testing.assert_close(fewer(patches), expected, rtol=0, atol=ROUNDING)
-    assert not any(isinstance(layer, nn.BatchNorm2d | nn.Dropout) for layer in fewer)
-    assert any(isinstance(layer, nn.BatchNorm2d) for layer in layers)
 
 
 def test_hardtfeat_is_the_published_chain(folder: Path, patches: torch.Tensor) -> None:
@@ -249,5 +224,4 @@ def test_hardtfeat_is_the_published_chain(folder: Path, patches: torch.Tensor) -
     weight = state["classifier.1.weight"].flatten(1)
     expected = torch.tanh(values @ weight.T + state["classifier.1.bias"])
     network = load_descriptor("hardtfeat", folder / "hardtfeat.pth", "cpu")
-    assert isinstance(network, HardTFeat)
     torch.testing.assert_close(network(patches), expected, rtol=0, atol=10 * ROUNDING)

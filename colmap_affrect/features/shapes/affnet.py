@@ -9,7 +9,6 @@ The three outputs o of the network make a frame L; shapes are the unit metrics o
 
 from __future__ import annotations
 
-from copy import deepcopy
 from functools import partial
 from math import ceil
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -36,8 +35,6 @@ from colmap_affrect.options import within
 
 if TYPE_CHECKING:
     import torch
-    from kornia.feature import LAFAffNetShapeEstimator
-    from torch import nn
 
 LEAD_PX = (PATCH_SIZE_PX - STEP_PX) // 2
 """Cell (0, 0) of the network has the patch of the rows and columns 0...31. With 14 px more in
@@ -98,8 +95,7 @@ class AffNet:
         dog = features if isinstance(features, DogOptions) else DogOptions()
         self.detect = partial(detect_dog, options=dog)
         self.device = resolve_device(network.device)
-        affnet = load_affnet(network.weights["affnet"], network.device)
-        self.layers = fully_convolutional(affnet).to(self.device)
+        self.layers = load_affnet(network.weights["affnet"], network.device)
 
     def grid(self, image: GrayImage) -> ShapeGrid:
         """Estimate one affine shape per 4 x 4 block of a (H, W) uint8 image.
@@ -182,30 +178,10 @@ class AffNet:
         wide = lafs.copy()
         wide[:, :, :2] *= PATCH_SIGMAS / MEASUREMENT_SIGMAS
         patches = PatchSampler(image.astype(np.float32), self.device).sample(wide)
-        outputs = torch.empty((len(patches), 3))
         with torch.inference_mode():
-            for begin in range(0, len(patches), BATCH_SIZE):
-                batch = standardized(patches[begin : begin + BATCH_SIZE])
-                outputs[begin : begin + BATCH_SIZE] = self.layers(batch)[:, :, 0, 0]
-        return outputs
-
-
-def fully_convolutional(network: LAFAffNetShapeEstimator) -> nn.Sequential:
-    """Return the layers of AffNet without the final pooling, batch normalisation folded in.
-
-    An image of H x W px gives (ceil(H / 4) - 7) x (ceil(W / 4) - 7) cells; cell (i, j) has the
-    patch whose first pixel is (4 j, 4 i).
-    """
-    import torch
-    from torch import nn
-    from torch.nn.utils import convert_conv2d_weight_memory_format
-
-    from colmap_affrect.features.networks import folded
-
-    kept = (nn.Conv2d, nn.BatchNorm2d, nn.ReLU, nn.Tanh)
-    layers = [layer for layer in deepcopy(network.features) if isinstance(layer, kept)]
-    sequence = folded(nn.Sequential(*layers)).eval()
-    return convert_conv2d_weight_memory_format(sequence, torch.channels_last)
+            batches = (batch for batch in torch.split(patches, BATCH_SIZE) if len(batch))
+            outputs = [self.layers(standardized(batch))[:, :, 0, 0] for batch in batches]
+            return torch.cat([patches.new_empty((0, 3)), *outputs])
 
 
 def _frames(outputs: torch.Tensor) -> Array:

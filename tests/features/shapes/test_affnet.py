@@ -20,9 +20,8 @@ from torch import nn
 from colmap_affrect.data import GrayImage, LocalFeatures, ShapeGrid
 from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.features.shapes import affnet
-from colmap_affrect.features.shapes.affnet import AffNet, AffNetOptions, fully_convolutional
+from colmap_affrect.features.shapes.affnet import AffNet, AffNetOptions
 from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
-from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.shapes import log_metrics, metrics_from_log
 from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 from colmap_affrect.images.reading import shrink_to
@@ -35,11 +34,6 @@ normalisation and other orders of summation."""
 
 ODD_SIZE = (117, 83)
 """(width, height): both leave another remainder when divided by 4."""
-
-TILT_BAND = 0.15
-"""Relative error of the mean tilt of a stretched isotropic texture."""
-
-ANGLE_BAND_DEG = 5.0
 
 
 def no_keypoints(image: GrayImage) -> LocalFeatures:
@@ -156,27 +150,6 @@ def image() -> GrayImage:
     return np.rint((values - 128) * (0.3 + 0.6 * x) + 90 + 60 * y).clip(0, 255).astype(np.uint8)
 
 
-def test_fully_convolutional_layers_equal_the_network_on_patches() -> None:
-    network = random_network()
-    patches = torch.randn((5, 1, 32, 32), generator=torch.Generator().manual_seed(1))
-    expected = network.features(patches)
-    assert expected.shape == (5, 3, 1, 1)
-    assert expected.std() > 0.1
-    outputs = fully_convolutional(network)(patches)
-    torch.testing.assert_close(outputs, expected, atol=1e-5, rtol=1e-5)
-
-
-def test_fully_convolutional_layers_leave_the_network_as_it_was() -> None:
-    network = random_network().train()
-    before = {name: value.clone() for name, value in network.state_dict().items()}
-    layers = fully_convolutional(network)
-    assert network.training
-    assert not any(layer.training for layer in layers)
-    for name, value in network.state_dict().items():
-        assert torch.equal(value, before[name])
-        assert value.stride() == before[name].stride()
-
-
 @pytest.mark.parametrize("size", [ODD_SIZE, (84, 34), (32, 39), (34, 33)])
 def test_grid_is_the_network_on_the_window_in_the_middle_of_which_a_block_lies(
     image: GrayImage, size: tuple[int, int]
@@ -285,14 +258,6 @@ def test_sizes_smaller_than_a_patch_are_left_out(image: GrayImage) -> None:
     assert np.isfinite(largest.metrics).all()
 
 
-def test_blank_and_faint_images_are_untextured_identities() -> None:
-    rng = np.random.default_rng(0)
-    for values in (np.full((61, 83), 200), 128 + rng.integers(-2, 3, (64, 97))):
-        grid = source(random_network()).grid(values.astype(np.uint8))
-        assert not grid.textured.any()
-        assert_allclose(grid.metrics, np.broadcast_to([1.0, 1.0, 0.0], grid.metrics.shape))
-
-
 def test_textured_blocks_are_those_whose_surroundings_deviate() -> None:
     image = np.full((161, 318), 128, np.uint8)
     image[:, :160] = texture((160, 161), seed=5)
@@ -372,38 +337,6 @@ def published() -> LAFAffNetShapeEstimator:
 def graffiti(number: int) -> GrayImage:
     path = SHARED / "pairs" / "oxford_graf" / f"graf_{number}.png"
     return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
-
-
-def stretched_texture(tilt: float, axis_deg: float) -> GrayImage:
-    """Isotropic texture shown ``tilt`` times longer along an axis (x towards y)."""
-    turn = rotation(np.deg2rad(axis_deg))
-    image_from_result = turn @ np.diag([1.0 / tilt, 1.0]) @ turn.T
-    matrix = np.zeros((2, 3))
-    matrix[:, :2] = image_from_result
-    matrix[:, 2] = np.array([319.5, 279.5]) - image_from_result @ np.array([249.5, 239.5])
-    return cv2.warpAffine(
-        texture((640, 560), seed=9, finest_sigma_px=2.5),
-        matrix,
-        (500, 480),
-        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REFLECT_101,
-    )
-
-
-@pytest.mark.shared
-@needs_shared
-@pytest.mark.parametrize("options", [{}, {"paper": True}], ids=["default", "paper"])
-@pytest.mark.parametrize("axis_deg", [0.0, 35.0, 90.0, 140.0])
-def test_shapes_of_a_texture_stretched_by_3_undo_the_stretch(
-    published: LAFAffNetShapeEstimator, axis_deg: float, options: dict[str, bool]
-) -> None:
-    grid = source(published, **options).grid(stretched_texture(3.0, axis_deg))
-    inside = log_metrics(grid.metrics[12:-12, 12:-12]).reshape(-1, 2)
-    tilt, angle = tilts_from_metrics(metrics_from_log(inside.mean(axis=0)))
-    # The rectifying map diag(t, 1) R(phi) stretches the direction -phi: across the axis.
-    expected_deg = (90.0 - axis_deg) % 180.0
-    assert_allclose(tilt, 3.0, rtol=TILT_BAND)
-    assert abs((np.rad2deg(angle) - expected_deg + 90.0) % 180.0 - 90.0) < ANGLE_BAND_DEG
 
 
 def residual_tilts(grid1: ShapeGrid, grid2: ShapeGrid, homography: Array) -> Array:
