@@ -90,6 +90,12 @@ def resolve(
             if path == _find_installed(key):
                 raise unusable(path, why)
             _warn_once(f"{path}: {why}; unless it is your own, {remedy(path)}")
+        elif path and path == _find_installed(key):
+            for unused in filter(Path.is_file, _cached(key)):
+                _warn_once(
+                    f"{unused}: not the published file of {key}, {path} is used instead; if it is "
+                    f"your own, give --weights {shlex.quote(str(unused.parent))}"
+                )
     try:
         return {k: path or _get(k, cache_folder(), progress) for k, path in found.items()}
     except WeightsError as error:
@@ -264,9 +270,17 @@ def _folder_of_variable() -> Path | None:
 
 
 def _find(key: str, weights_path: Path | None) -> Path | None:
-    folders = [weights_path, _folder_of_variable(), cache_folder()]
-    places = (folder / name for folder in folders if folder for name in WEIGHT_FILES[key].names)
-    return next((path for path in places if path.is_file()), None) or _find_installed(key)
+    """Return the file that the user gives, else the published one, else any in the cache."""
+    names, given = WEIGHT_FILES[key].names, (weights_path, _folder_of_variable())
+    own = [folder / name for folder in given if folder for name in names]
+    others = [*_cached(key), _find_installed(key)]
+    found = [path for path in (*own, *others) if path and path.is_file()]
+    good = (path for path in found if path in own or _is_published(key, path) is not False)
+    return next(good, found[0] if found else None)
+
+
+def _cached(key: str) -> list[Path]:
+    return [cache_folder() / name for name in WEIGHT_FILES[key].names]
 
 
 def _find_installed(key: str) -> Path | None:

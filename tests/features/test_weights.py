@@ -179,6 +179,11 @@ def test_resolve_looks_into_installed_distributions_last(
     (folders["cache"] / "xfeat.pt").write_bytes(b"published")
     assert resolve(["xfeat"]) == {"xfeat": folders["cache"] / "xfeat.pt"}
     assert caplog.messages == []
+    (folders["cache"] / "xfeat.pt").write_bytes(b"damaged")
+    assert resolve(["xfeat"]) == {"xfeat": installed}
+    (message,) = caplog.messages
+    assert message.startswith(f"{folders['cache'] / 'xfeat.pt'}: not the published file of xfeat")
+    assert message.endswith(f"give --weights {folders['cache']}")
 
 
 def test_installed_file_that_is_not_the_published_one_is_refused(installed: Path) -> None:
