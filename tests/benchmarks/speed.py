@@ -60,7 +60,8 @@ def run_commands(method: Method, paths: Sequence[Path], resources: Resources) ->
     """
     image_path, names = paths[0].parent, [path.name for path in paths]
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
+        folder = Path(scratch) / "out"
+        folder.mkdir()
         if method.recipe is None:
             row = run_sift(folder, image_path, names, affine=method.label == SIFT_AFFINE_DSP)
         else:
@@ -102,7 +103,7 @@ def run_recipe(
     folder: Path, image_path: Path, names: Sequence[str], recipe: Recipe, resources: Resources
 ) -> Row:
     """Run a recipe; return seconds, and the number of images registered."""
-    list_path = folder / "names.txt"
+    list_path = folder.with_name("names.txt")
     list_path.write_text("\n".join(names) + "\n", encoding="utf-8")
     options = RunOptions(
         recipe=recipe,

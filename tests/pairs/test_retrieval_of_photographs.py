@@ -30,7 +30,8 @@ pytestmark = [
 def test_photographs_of_one_side_of_a_temple_find_each_other(tmp_path: Path) -> None:
     for scene in (RING, "kermit"):
         shutil.copytree(SCENES / scene / "images", tmp_path / "images" / scene)
-    context = Context(Workspace(tmp_path))
+    context = Context(Workspace(tmp_path / "out"))
+    context.workspace.begin()
     inputs = Inputs.of(tmp_path / "images")
     extract(context, inputs, load_recipe("unrectified-rootsift"))
     choose_pairs(context, PairOptions(methods=("retrieval",), num_neighbors=4))

@@ -210,7 +210,7 @@ def test_model_that_was_damaged_later_is_named(disturbed: Disturbed) -> None:
     ended = disturbed.run()
     assert (ended.code, ended.stdout, len(ended.stderr)) == (1, "", 1)
     assert ended.stderr[0].startswith(f"error: {damaged}: damaged")
-    assert ended.stderr[0].endswith("run map again with --overwrite")
+    assert f"run 'colmap-affrect map --output-path {disturbed.out} --overwrite'" in ended.stderr[0]
     assert disturbed.call("map", "--output-path", disturbed.out, "--overwrite").code == 0
     assert results(disturbed.out) == disturbed.undisturbed.results
 
