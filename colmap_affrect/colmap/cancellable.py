@@ -23,7 +23,16 @@ def run_cancellable(
     pycolmap's call must be given; the caller may have one too, to cancel by.
     """
     return_freed_memory()
-    token = token or pycolmap.CancellationToken()
+    known = token or pycolmap.CancellationToken()
+    return _run(lambda: call(known), known.cancel)
+
+
+def run_leavable(call: Callable[[], Result]) -> Result:
+    """Run ``call``, which cannot be cancelled, in a thread that Ctrl-C leaves."""
+    return _run(call, lambda: None)
+
+
+def _run(call: Callable[[], Result], cancel: Callable[[], object]) -> Result:
     outcome: Future[Result] = Future()
     # Not Thread.join: interrupted in Python 3.11, it takes the running thread for ended, and
     # the interpreter then ends under pycolmap's feet (bpo-45274).
@@ -31,7 +40,7 @@ def run_cancellable(
 
     def work() -> None:
         try:
-            outcome.set_result(call(token))
+            outcome.set_result(call())
         except BaseException as error:  # noqa: BLE001  (raised again by the waiting thread)
             outcome.set_exception(error)
         finally:
@@ -42,7 +51,7 @@ def run_cancellable(
         while not ended.wait(POLL_S):
             pass
     except KeyboardInterrupt:
-        token.cancel()
+        cancel()
         ended.wait(LEAVE_AFTER_S)
         raise
     return outcome.result()

@@ -24,7 +24,7 @@ from colmap_affrect.colmap.camera_records import (
     read_camera_records,
     write_camera_records,
 )
-from colmap_affrect.colmap.cancellable import run_cancellable
+from colmap_affrect.colmap.cancellable import run_leavable
 from colmap_affrect.colmap.database import (
     camera_matrix,
     cameras_of_images,
@@ -249,7 +249,7 @@ def import_images(
         require_database_space(new, 2 * len(missing))
         image_ids(read)  # makes it
         mode = pycolmap.CameraMode.PER_IMAGE
-        run_cancellable(lambda _: pycolmap.import_images(read, image_path, mode, missing))
+        run_leavable(lambda: pycolmap.import_images(read, image_path, mode, missing))
         with open_database(read) as found, open_database(new) as database:
             _take_over(initial, found, database)
         remove_database(read)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cancellable import run_cancellable
+from colmap_affrect.colmap.cancellable import run_leavable
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.model_files import read_given_model
@@ -127,7 +127,7 @@ class ExistingModel:
         adjuster = pycolmap.create_default_bundle_adjuster(
             native.get_global_bundle_adjustment(), config, model
         )
-        run_cancellable(lambda _: adjuster.solve())
+        run_leavable(adjuster.solve)
 
     def is_part_of(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether a model that was made from this one has all its images, posed or not.

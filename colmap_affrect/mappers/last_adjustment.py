@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cancellable import run_cancellable
+from colmap_affrect.colmap.cancellable import run_leavable
 from colmap_affrect.colmap.model_files import seen_points
 from colmap_affrect.geometry.arrays import rows_in
 
@@ -222,6 +222,6 @@ def solve(
         config.set_constant_cam_intrinsics(int(camera_id))
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
-    solved = run_cancellable(lambda _: adjuster.solve())
+    solved = run_leavable(adjuster.solve)
     summary = cast("pycolmap.CeresBundleAdjustmentSummary", solved)
     return summary.ceres_summary.final_cost if summary.is_solution_usable() else np.inf
