@@ -1,7 +1,7 @@
 """Evaluate recipes on a dataset by a protocol: features, matches, scores, tables, plots.
 
 The output folder has ``features/`` (features and costs by recipe), ``pairs/`` (scores of single
-pairs by recipe and settings), ``evaluation.json``, ``evaluation.csv`` and plots. An evaluation that
+pairs by recipe and settings), ``evaluation.json`` and plots. An evaluation that
 was stopped goes on; scores of other settings are kept beside, so that only what changed is redone.
 """
 
@@ -14,7 +14,6 @@ import time
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from colmap_affrect.evaluation.pairs import Pairs
 from colmap_affrect.evaluation.plots import write_plots
 from colmap_affrect.evaluation.posed_scenes import Imc, Svp
 from colmap_affrect.evaluation.protocol import (
-    GROUP,
     Dataset,
     EvaluationPair,
     EvaluationProtocol,
@@ -46,13 +44,12 @@ from colmap_affrect.evaluation.results import (
     PAIR_RESULT,
     SECONDS,
     Evaluation,
-    Interval,
     RecipeResult,
     Solved,
     published,
 )
 from colmap_affrect.evaluation.statistics import bootstrap_intervals, paired_test
-from colmap_affrect.geometry.arrays import Array, Indices
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import require_png
 from colmap_affrect.options import digest_of
 from colmap_affrect.pipeline import installed_versions
@@ -123,7 +120,7 @@ def evaluate(
 
     An image or pair that cannot be used counts as failed, and the others go on; so does an
     evaluation that was stopped, unless ``overwrite`` discards features and scores of these recipes
-    first. What is returned is also written to ``evaluation.json``, ``evaluation.csv`` and plots in
+    first. What is returned is also written to ``evaluation.json`` and plots in
     the output folder, which is made if missing. Raises AffrectError for anything that the caller
     can mend, before any image is worked on.
     """
@@ -160,7 +157,6 @@ def evaluate(
             versions=installed_versions(),
         )
         replace_text(output_path / "evaluation.json", evaluation.to_json())
-        replace_text(output_path / "evaluation.csv", evaluation.to_csv())
         write_plots(evaluation, output_path)
     return evaluation
 
@@ -313,7 +309,6 @@ class _Run:
             name=self.label,
             description=self.recipe.summary,
             summary={**self.protocol.summarize(results), SECONDS: seconds},
-            intervals=_intervals(self.protocol, results, seed),
             solved=Solved(float(successes.mean()), interval),
             solved_by_category={name: float(successes[rows].mean()) for name, rows in by_category},
             p_value=p_value,
@@ -327,29 +322,6 @@ class _Run:
 
     def _successes(self, results: Sequence[PairResult]) -> Array:
         return np.array([self.protocol.success(result) for result in results])
-
-
-def _intervals(
-    protocol: EvaluationProtocol, results: Sequence[PairResult], seed: int
-) -> dict[str, Interval]:
-    """Return bootstrap intervals of the columns; those of a category over its pairs."""
-    by_category = _by_category(results)
-    columns = list(protocol.summarize(results))
-
-    def of_resampled(rows: Sequence[int], names: Sequence[str], picked: Indices) -> list[float]:
-        summary = protocol.summarize([results[rows[place]] for place in picked])
-        return [summary.get(name, 0.0) for name in names]
-
-    groups: dict[str, list[str]] = {}
-    for name in columns:
-        category = name.rpartition(GROUP)[2]
-        groups.setdefault(category if category in by_category else "", []).append(name)
-    found: dict[str, Interval] = {}
-    for category, names in groups.items():
-        rows = by_category.get(category, range(len(results)))
-        intervals = bootstrap_intervals(len(rows), partial(of_resampled, rows, names), seed)
-        found |= zip(names, intervals, strict=True)
-    return {name: found[name] for name in columns}
 
 
 def _by_category(results: Sequence[PairResult]) -> dict[str, list[int]]:

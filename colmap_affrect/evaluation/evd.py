@@ -6,13 +6,16 @@ px of image 1 to those of image 2.
 """
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.homographies import HomographyProtocol, checked_homography
+from colmap_affrect.evaluation.homographies import (
+    HomographyProtocol,
+    checked_homography,
+    true_homography,
+)
 from colmap_affrect.evaluation.protocol import (
     Dataset,
     EvaluationImage,
@@ -20,7 +23,6 @@ from colmap_affrect.evaluation.protocol import (
     read_numbers,
     with_truth,
 )
-from colmap_affrect.evaluation.truth_checks import true_homography
 from colmap_affrect.images.reading import IMAGE_SUFFIXES
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 
@@ -51,12 +53,10 @@ class Evd(HomographyProtocol):
         pair, homography_path = found
         paths = [image.path for image in pair.images]
 
-        def read(pair: EvaluationPair) -> tuple[EvaluationPair, Sequence[str]]:
+        def read(pair: EvaluationPair) -> EvaluationPair:
             values = read_numbers(homography_path)
             matrix = checked_homography(values, f"{homography_path}: homography")
-            truth, doubt = true_homography(matrix, paths, check=self.check_truth)
-            doubts = [f"the homography {homography_path} {doubt}"] if doubt else []
-            return replace(pair, truth=truth), doubts
+            return replace(pair, truth=true_homography(matrix, paths))
 
         return with_truth(pair, [*paths, homography_path], read)
 

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from statistics import median_low
 from typing import Annotated, Any, ClassVar
 
@@ -27,6 +28,7 @@ from colmap_affrect.evaluation.protocol import (
 from colmap_affrect.evaluation.two_views import Points
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.images.reading import read_gray
 from colmap_affrect.options import within
 
 Homography = Array
@@ -149,6 +151,19 @@ def visible_points(truth: Homography, size1: Size, size2: Size) -> Points:
 def oriented(matrix: Homography, size1: Size, size2: Size) -> Homography:
     """Give a homography of any scale a positive third coordinate in the part that is visible."""
     return max((matrix, -matrix), key=lambda signed: len(visible_points(signed, size1, size2)))
+
+
+def true_homography(matrix: Homography, paths: Sequence[Path]) -> TrueHomography:
+    """Return the truth of two images; ``matrix`` is (3, 3) image2_from_image1 of any scale.
+
+    Raises ImageError when an image cannot be read, EvaluationError when image 2 shows no part of
+    image 1.
+    """
+    size1, size2 = ((image.shape[1], image.shape[0]) for image in map(read_gray, paths))
+    truth = TrueHomography(oriented(matrix, size1, size2), size1, size2)
+    if not len(truth.visible):
+        raise EvaluationError("the homography shows no part of image 1 in image 2")
+    return truth
 
 
 def checked_homography(given: Any, what: str) -> Homography:

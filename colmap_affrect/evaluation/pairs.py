@@ -43,6 +43,7 @@ from colmap_affrect.evaluation.homographies import (
     HomographyProtocol,
     TrueHomography,
     checked_homography,
+    true_homography,
 )
 from colmap_affrect.evaluation.protocol import (
     GROUP,
@@ -55,17 +56,11 @@ from colmap_affrect.evaluation.protocol import (
     PairScore,
     finite_numbers,
     read_numbers,
+    rotation_fault,
     stem,
     with_truth,
 )
 from colmap_affrect.evaluation.relative_pose import RelativePoseProtocol, posed_image
-from colmap_affrect.evaluation.truth_checks import (
-    correspondence_doubts,
-    pose_contradictions,
-    rotation_fault,
-    size_of,
-    true_homography,
-)
 from colmap_affrect.evaluation.two_views import Points, symmetric_epipolar_distances
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import read_gray
@@ -79,7 +74,6 @@ INTRINSICS = dict.fromkeys(("intrinsics1", "intrinsics2"), (3, 3))
 POSE_SHAPES = {"rotation": (3, 3), "translation": (3,), **INTRINSICS}
 ORIGINS = ("center", "corner")
 
-MAX_OFF_CENTRE = 0.25  # principal points further from the middle, in image sizes, do not fit
 WXBS_THRESHOLDS_PX = tuple(range(20))
 """The score of WxBS is the mean over these of the share of correspondences that agree."""
 
@@ -154,11 +148,8 @@ class Pairs(HomographyProtocol, CorrespondenceProtocol, RelativePoseProtocol):
     def load(self, dataset_path: Path) -> Dataset:
         """See :class:`EvaluationProtocol`."""
         listed, offset_px = _read_list(dataset_path / LIST)
-        entries = [_Entry(each, dataset_path, offset_px, self.check_truth) for each in listed]
-        dataset = Dataset.united(map_ordered(_Entry.load, entries, available_cores()))
-        posed = [pair for pair in dataset.pairs if isinstance(pair.truth, tuple)]
-        notes = pose_contradictions(posed) if self.check_truth and posed else []
-        return Dataset(dataset.pairs, (*dataset.notes, *notes))
+        entries = [_Entry(each, dataset_path, offset_px) for each in listed]
+        return Dataset.united(map_ordered(_Entry.load, entries, available_cores()))
 
     def score(
         self, pair: EvaluationPair, points1: Points, points2: Points, random_seed: int
@@ -256,7 +247,6 @@ class _Entry:
     values: Mapping[str, Any]
     folder: Path
     offset_px: float
-    check: bool
 
     def load(self) -> Dataset:
         """Return the pair, and notes where there is something to say about it."""
@@ -278,43 +268,34 @@ class _Entry:
             raise EvaluationError(f"{given}: must be a file in the folder of the pairs")
         return read_numbers(self.folder / given)
 
-    def _homography(self, pair: EvaluationPair) -> tuple[EvaluationPair, list[str]]:
+    def _homography(self, pair: EvaluationPair) -> EvaluationPair:
         matrix = checked_homography(self._numbers("homography"), f"{pair.name}: homography")
         offset_px = self.offset_px
         center = np.array([[1.0, 0.0, offset_px], [0.0, 1.0, offset_px], [0.0, 0.0, 1.0]])
         matrix = center @ matrix @ np.linalg.inv(center)
         paths = [image.path for image in pair.images]
-        truth, doubt = true_homography(matrix, paths, check=self.check)
-        return replace(pair, truth=truth), [f"its homography {doubt}"] if doubt else []
+        return replace(pair, truth=true_homography(matrix, paths))
 
-    def _correspondences(self, pair: EvaluationPair) -> tuple[EvaluationPair, list[str]]:
+    def _correspondences(self, pair: EvaluationPair) -> EvaluationPair:
         values = finite_numbers(
             self._numbers("correspondences"), (-1, 4), f"{pair.name}: the array of correspondences"
         )
-        truth = values + self.offset_px
-        paths = [image.path for image in pair.images]
-        doubt = correspondence_doubts(truth, paths) if self.check else ""
-        return replace(pair, truth=truth), [f"its correspondences {doubt}"] if doubt else []
+        return replace(pair, truth=values + self.offset_px)
 
-    def _pose(self, pair: EvaluationPair) -> tuple[EvaluationPair, list[str]]:
+    def _pose(self, pair: EvaluationPair) -> EvaluationPair:
         """Return a pair with a relative pose: the first camera stands at the origin."""
         values = _pose_values(self.values["relative_pose"], pair.name)
         poses = (np.eye(3), np.zeros(3)), (values["rotation"], values["translation"])
-        doubts, posed = [], []
+        posed = []
         for number, (image, pose) in enumerate(zip(pair.images, poses, strict=True), 1):
             matrix = values[f"intrinsics{number}"]
             principal = matrix[:2, 2] + self.offset_px
-            width, height = size_of(read_gray(image.path))
-            if np.abs(principal / (width, height) - 1 / 2).max() > MAX_OFF_CENTRE:
-                doubts.append(
-                    f"the principal point of intrinsics{number} is far from the middle of the "
-                    f"{width} x {height} px of {image.name}"
-                )
+            height, width = read_gray(image.path).shape
             params = [matrix[0, 0], matrix[1, 1], *colmap_from_pixel(principal)]
             camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
             posed.append(posed_image(image.name, image.path, camera, pose))
         images = posed[0].image, posed[1].image
-        return replace(pair, images=images, truth=(posed[0], posed[1])), doubts
+        return replace(pair, images=images, truth=(posed[0], posed[1]))
 
 
 def _pose_values(given: Any, where: str) -> dict[str, Array]:

@@ -12,8 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from colmap_affrect.evaluation.recipe_features import IMAGE_STEPS, PAIR_STEPS
-from colmap_affrect.evaluation.results import Evaluation, PublishedRow, complexity_columns
+from colmap_affrect.evaluation.results import Evaluation, PublishedRow
 from colmap_affrect.project.atomic_files import replace_bytes
 
 SIZE_IN, DPI = (8.0, 5.0), 120
@@ -21,9 +20,6 @@ ERROR_LIMITS = (0.1, 100.0)
 GRID = "#DDDDDD"
 BARS = "#DDE3EA"
 PAPER_STYLE: dict[str, Any] = dict(marker=".", linestyle=":", linewidth=1.2, alpha=0.8)
-MIN_SECONDS = 0.01
-ROOM_FOR_NUMBERS = 1.12  # of an axis, in lengths of the longest bar
-ROW_IN = 0.42  # height of a row of bars
 PAPER_THRESHOLD = "< "
 
 
@@ -31,10 +27,9 @@ def write_plots(evaluation: Evaluation, folder: Path) -> None:
     """Draw all plots that the results allow, as PNG.
 
     ``errors.png``: pairs with an error below each threshold. ``categories.png``: success by
-    category, where there are some. ``times.png``: seconds by step. ``complexity.png``: area,
-    keypoints, regions and warps per image.
+    category, where there are some.
     """
-    drawings = {"errors": _errors, "times": _times, "complexity": _complexity}
+    drawings = {"errors": _errors}
     if evaluation.category_title and len(_categories(evaluation)) > 1:
         drawings["categories"] = _success_by_category
     for name, draw in drawings.items():
@@ -44,8 +39,8 @@ def write_plots(evaluation: Evaluation, folder: Path) -> None:
         replace_bytes(folder / f"{name}.png", stream.getvalue())
 
 
-def _figure(height_in: float = SIZE_IN[1]) -> Figure:
-    figure = Figure(figsize=(SIZE_IN[0], height_in), dpi=DPI, layout="constrained")
+def _figure() -> Figure:
+    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
@@ -120,52 +115,3 @@ def _finished(figure: Figure, axes: Axes, title: str) -> Figure:
     axes.set_axisbelow(True)
     figure.legend(fontsize=7, loc="outside lower center", ncols=2, frameon=False)
     return figure
-
-
-def _times(evaluation: Evaluation) -> Figure:
-    """Seconds by step, one bar for each recipe: per image, and per pair."""
-    recipes = evaluation.recipes
-    rows = range(len(recipes))
-    figure = _figure(1.6 + 2 * ROW_IN * len(recipes))
-    upper, lower = figure.subplots(2, 1)
-    plots = (upper, IMAGE_STEPS, "image", 0), (lower, PAIR_STEPS, "pair", len(IMAGE_STEPS))
-    for axes, steps, unit, first in plots:
-        left = np.zeros(len(recipes))
-        for number, step in enumerate(steps, first):
-            widths = np.array([recipe.seconds_per_step[step] for recipe in recipes])
-            axes.barh(rows, widths, left=left, color=f"C{number}", label=step)
-            left += widths
-        _label_bars(axes, left.tolist(), 8)
-        axes.set_yticks(rows, [recipe.name for recipe in recipes])
-        axes.invert_yaxis()
-        axes.set_xlim(0, ROOM_FOR_NUMBERS * max(left.max(), MIN_SECONDS))
-        axes.set_xlabel(f"seconds per {unit}")
-        axes.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, frameon=False)
-    return figure
-
-
-def _complexity(evaluation: Evaluation) -> Figure:
-    """The paper's complexity table as bars, its numbers below ours."""
-    recipes, paper = evaluation.recipes, evaluation.published_complexity
-    names = [*(recipe.name for recipe in recipes), *(f"paper: {row.method}" for row in paper)]
-    columns = [*map(complexity_columns, recipes), *(row.values for row in paper)]
-    colors = [*(f"C{number}" for number in range(len(recipes))), *["#BBBBBB"] * len(paper)]
-    figure = _figure(1.2 + ROW_IN * len(names))
-    panels = figure.subplots(1, len(columns[0]), sharey=True)
-    for axes, title in zip(panels, columns[0], strict=True):
-        values = [column.get(title, 0.0) for column in columns]
-        axes.barh(range(len(names)), values, color=colors)
-        _label_bars(axes, values, 7)
-        axes.set_xlim(0, 1.4 * max([*values, 0.1]))
-        axes.set_title(title, fontsize=9)
-    panels[0].set_yticks(range(len(names)), names)
-    panels[0].invert_yaxis()
-    figure.supxlabel("mean per image", fontsize=9)
-    return figure
-
-
-def _label_bars(axes: Axes, lengths: list[float], font_size: int) -> None:
-    for place, length in enumerate(lengths):
-        axes.text(length, place, f" {length:.2f}", va="center", fontsize=font_size)
-    axes.grid(axis="x", color=GRID)
-    axes.set_axisbelow(True)

@@ -17,12 +17,10 @@ Phototourism sets of the Image Matching Challenge, and the like: a folder ``set_
     new-vis-pairs/keys-th-0.<k>.npy      names "<image 1>-<image 2>" with covisibility >= 0.<k>
 
 Its lists are cumulative; the categories are their differences, from 0.1 on, as in the paper, or
-from 0.0 where there is such a list. K is COLMAP's: the origin is the corner of the image. Where it
-is plainly that of another size (its principal point, taken for the middle, is far from the middle
-of the image), it is scaled.
+from 0.0 where there is such a list, and
+K is COLMAP's: the origin is the corner of the image.
 """
 
-import itertools
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -34,7 +32,13 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, relative_pose
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.protocol import Dataset, EvaluationPair, counted, stem
+from colmap_affrect.evaluation.protocol import (
+    Dataset,
+    EvaluationPair,
+    counted,
+    rotation_fault,
+    stem,
+)
 from colmap_affrect.evaluation.relative_pose import (
     PosedImage,
     RelativePoseProtocol,
@@ -43,7 +47,6 @@ from colmap_affrect.evaluation.relative_pose import (
     posed_pair,
     rotation_angle_deg,
 )
-from colmap_affrect.evaluation.truth_checks import image_sizes, pose_contradictions, rotation_fault
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import IMAGE_SUFFIXES
 
@@ -55,7 +58,6 @@ SET_FOLDER = "set_100"
 LIST_FOLDER = "new-vis-pairs"
 CALIBRATION_PREFIX = "calibration_"
 BINS = tuple(range(10))  # lower limits of the categories, in tenths; the first may have no list
-MAX_OFF_CENTRE = 1.15  # factor by which twice the principal point and the size may differ
 
 
 class PosedScenes(RelativePoseProtocol):
@@ -163,9 +165,6 @@ class Svp(PosedScenes):
         notes = [
             *counted(bad_lines, f"lines that are no pair of {list_path.name}"),
             *missing_notes(listed_names, names, files, lacking, "pose or camera"),
-            *_difficulty_notes(listed, poses),
-            *_size_notes(pairs),
-            *(pose_contradictions(pairs) if self.check_truth else ()),
             *([f"no pairs are left from {empty}"] if empty else []),
         ]
         return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
@@ -254,30 +253,6 @@ def _pose(words: list[str]) -> Pose:
     return np.asarray(rotation), values[4:]
 
 
-def _difficulty_notes(listed: Sequence[ListedPair], poses: Mapping[str, Pose]) -> list[str]:
-    wrong = [
-        f"{' '.join(pair.names)} (listed {pair.difficulty}, by its poses {found})"
-        for pair in listed
-        if pair.difficulty is not None and poses.keys() >= set(pair.names)
-        if (found := difficulty(poses, *pair.names)) != pair.difficulty
-    ]
-    return counted(
-        wrong, f"of {len(listed)} listed difficulties contradict the poses, which are used"
-    )
-
-
-def _size_notes(pairs: Sequence[EvaluationPair]) -> list[str]:
-    images: dict[str, PosedImage] = {im.image.name: im for pair in pairs for im in pair.truth}
-    paths = [posed.image.path for posed in images.values()]
-    wrong = [
-        f"{name} ({size[0]} x {size[1]} px, intrinsics for "
-        f"{posed.camera.width} x {posed.camera.height} px)"
-        for (name, posed), size in zip(images.items(), image_sizes(paths), strict=True)
-        if size and size != (posed.camera.width, posed.camera.height)
-    ]
-    return counted(wrong, "images are of another size than their intrinsics")
-
-
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Return the numbered lines of a text file that are not empty or comments."""
     try:
@@ -310,7 +285,7 @@ class Imc(PosedScenes):
                 bins[names] = f"{limit / 10:.1f}"
             else:
                 unclear.append(key)
-        posed, size_notes = _posed(scene, files, calibrations)
+        posed = _posed(scene, files, calibrations)
         pairs = posed_pairs(bins, posed, lambda names: bins[names])
         wanted = sorted({name for names in bins for name in names})
         uncalibrated = [name for name in wanted if name in files and name not in calibrations]
@@ -321,8 +296,6 @@ class Imc(PosedScenes):
             *list_notes,
             *counted(unclear, "listed pairs are of images that are not there"),
             *missing_notes(list(bins), wanted, files, lacking, "calibration"),
-            *size_notes,
-            *(pose_contradictions(pairs[::-1]) if self.check_truth else ()),
             *([f"no pairs with a covisibility from {empty}"] if empty else []),
         ]
         return Dataset(tuple(pairs), tuple(f"{scene}: {note}" for note in notes))
@@ -378,9 +351,6 @@ def _read_lists(folder: Path) -> tuple[dict[int, list[str]], list[str]]:
             fault = f"cannot be read ({error})"
         if fault:
             notes.append(f"{path.name} {fault}: its pairs count as of less covisibility")
-    for lower, upper in itertools.pairwise(sorted(lists)):
-        extra = sorted(set(lists[upper]) - set(lists[lower]))
-        notes += counted(extra, f"pairs of list 0.{upper} are not in list 0.{lower}")
     return lists, notes
 
 
@@ -405,37 +375,13 @@ def _split(key: str, known: set[str]) -> Names | None:
 
 def _posed(
     scene: str, files: Mapping[str, Path], calibrations: Mapping[str, Calibration]
-) -> tuple[dict[str, PosedImage], list[str]]:
-    """Give images their cameras; also say whose intrinsics are of another size."""
-    names = sorted(files.keys() & calibrations.keys())
-    sizes = image_sizes(files[name] for name in names)
+) -> dict[str, PosedImage]:
+    """Give images their cameras."""
     found: dict[str, PosedImage] = {}
-    scaled, unfitting = [], []
-    for name, size in zip(names, sizes, strict=True):
+    for name in sorted(files.keys() & calibrations.keys()):
         path, (matrix, pose) = files[name], calibrations[name]
-        guess = tuple(np.rint(2 * matrix[:2, 2]).astype(int).tolist())
-        width, height = size or guess
-        example = f"{path.name} ({width} x {height} px, K about {guess[0]} x {guess[1]} px)"
-        scale = _scale(matrix, width, height)
-        if scale is None:
-            unfitting.append(example)
-        elif scale != 1.0:
-            matrix = np.diag([scale, scale, 1.0]) @ matrix
-            scaled.append(example)
+        width, height = np.rint(2 * matrix[:2, 2]).astype(int).tolist()
         params = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
         found[name] = posed_image(f"{scene}/{path.name}", path, camera, pose)
-    return found, [
-        *counted(scaled, "images are of another size than their K, which is scaled"),
-        *counted(unfitting, "images are of another shape than their K"),
-    ]
-
-
-def _scale(matrix: Array, width: int, height: int) -> float | None:
-    """Return what K is to be multiplied by to fit an image; None if nothing makes it fit."""
-    ratios = np.array([width, height]) / (2.0 * matrix[:2, 2])
-    if np.all(np.maximum(ratios, 1 / ratios) < MAX_OFF_CENTRE):
-        return 1.0
-    if ratios.max() > MAX_OFF_CENTRE * ratios.min():
-        return None
-    return float(ratios[0])
+    return found

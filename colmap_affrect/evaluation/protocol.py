@@ -16,6 +16,8 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import Options, within
 from colmap_affrect.shown import such_as
 
+MAX_NOT_ORTHONORMAL = 1e-3  # largest element of R Rᵀ - I of what passes for a rotation
+
 Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value is None else value)]
 """Infinite where JSON has null."""
 
@@ -126,8 +128,6 @@ class EvaluationProtocol(Options, ABC):
     max_num_iterations: Annotated[int, within(1, 1_000_000_000)] = 100_000
     """Of estimators, as the paper says; 1000 gave its numbers of relative poses, for the function
     of OpenCV that its code called takes no number."""
-    check_truth: bool = True
-    """See whether the images confirm the truth."""
 
     def ransac(self, method: int, threshold: float, random_seed: int) -> Ransac:
         """Return how to look for a model."""
@@ -161,26 +161,25 @@ class EvaluationProtocol(Options, ABC):
 
     def settings(self) -> dict[str, Any]:
         """Return everything that decides scores, for the record."""
-        return self.model_dump(mode="json", exclude={"check_truth"})
+        return self.to_mapping()
 
 
 def with_truth(
     pair: EvaluationPair,
     paths: Sequence[Path],
-    read: Callable[[EvaluationPair], tuple[EvaluationPair, Sequence[str]]],
+    read: Callable[[EvaluationPair], EvaluationPair],
 ) -> Dataset:
     """Return a pair with its truth; one that cannot be used with its problem, which is a note too.
 
-    ``paths`` must be there; ``read`` returns the pair with its truth, and what is odd about it.
+    ``paths`` must be there; ``read`` returns the pair with its truth.
     """
     try:
         if missing := [path for path in paths if not path.is_file()]:
             raise EvaluationError(f"{missing[0]}: missing")
-        pair, doubts = read(pair)
+        return Dataset((read(pair),))
     except AffrectError as error:
         note = f"{pair.name}: cannot be evaluated and counts as failed: {error}"
         return Dataset((replace(pair, problem=str(error)),), (note,))
-    return Dataset((pair,), tuple(f"{pair.name}: {doubt}" for doubt in doubts if doubt))
 
 
 def counted(names: Sequence[str], what: str) -> list[str]:
@@ -223,3 +222,22 @@ def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> Array:
     if not np.isfinite(values).all():
         raise EvaluationError(f"{what} has values that are not finite")
     return values
+
+
+def rotation_fault(rotation: Array) -> str:
+    """Tell why a (3, 3) matrix is not a rotation; empty if it is one.
+
+    >>> rotation_fault(2.0 * np.eye(3))
+    'the rotation is scaled by 2'
+    """
+    if not np.isfinite(rotation).all():
+        return "the rotation has values that are not finite"
+    determinant = float(np.linalg.det(rotation))
+    scale = float(np.cbrt(determinant))
+    if scale and np.abs(rotation @ rotation.T / scale**2 - np.eye(3)).max() < MAX_NOT_ORTHONORMAL:
+        if scale < 0:
+            return "the rotation is a reflection"
+        if abs(scale - 1) > MAX_NOT_ORTHONORMAL:
+            return f"the rotation is scaled by {scale:.3g}"
+        return ""
+    return "the rotation is not orthogonal"

@@ -1,4 +1,4 @@
-"""What an evaluation found: as JSON and CSV for programs, as tables for people."""
+"""What an evaluation found: as JSON for programs, as tables for people."""
 
 import json
 import math
@@ -15,7 +15,6 @@ from pydantic import Field, TypeAdapter
 from colmap_affrect.comparison.tables import aligned
 from colmap_affrect.evaluation.protocol import GROUP, Number, PairResult
 from colmap_affrect.evaluation.recipe_features import STEPS
-from colmap_affrect.project.report import csv_text
 
 DATA = Path(__file__).with_name("published.toml")
 COMPLEXITY = "complexity"
@@ -68,7 +67,6 @@ class RecipeResult:
     Attributes:
         name: label of the recipe.
         summary: columns of the protocol's table by name, and ``seconds`` of all steps together.
-        intervals: bootstrap intervals (95 %) over pairs of the columns, where there are any.
         solved_by_category: mean success by category, of pairs that have one.
         p_value: of the paired test of success against the baseline; None without.
         num_images: that have features.
@@ -82,7 +80,6 @@ class RecipeResult:
     name: str
     description: str
     summary: Mapping[str, Number]
-    intervals: Mapping[str, Interval]
     solved: Solved
     solved_by_category: Mapping[str, float]
     p_value: float | None
@@ -132,19 +129,6 @@ class Evaluation:
             recipe["pairs"] = [{"name": pair["name"], **pair} for pair in recipe["pairs"]]
         values["recipes"] = {recipe.pop("name"): recipe for recipe in values["recipes"]}
         return json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False)
-
-    def to_csv(self) -> str:
-        """Return a row for each recipe and pair."""
-        rows: list[dict[str, Any]] = []
-        before = ("category", "error", "num_inliers", "num_correct", "num_matches")
-        for recipe in self.recipes:
-            for pair in recipe.pairs:
-                row: dict[str, Any] = {"recipe": recipe.name, "pair": pair.name}
-                row |= {key: getattr(pair, key) for key in before}
-                row |= {f"num_keypoints{k}": count for k, count in enumerate(pair.num_keypoints, 1)}
-                row |= {key: getattr(pair, key) for key in ("seconds", "level", "failure")}
-                rows.append({**row, **pair.details})
-        return csv_text(rows)
 
     def summary(self) -> str:
         """Return the protocol's tables with the paper's numbers, costs, and notes."""

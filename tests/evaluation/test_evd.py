@@ -13,7 +13,7 @@ from colmap_affrect.evaluation.evaluate import PROTOCOLS, make_protocol
 from colmap_affrect.evaluation.evd import Evd
 from colmap_affrect.evaluation.protocol import PairScore
 
-UNCHECKED = Evd(check_truth=False)
+UNCHECKED = Evd()
 
 
 def test_layout_of_the_extreme_view_dataset(tmp_path: Path) -> None:
@@ -58,15 +58,6 @@ def test_files_that_are_missing_or_damaged_are_named_and_fail_their_pair(tmp_pat
     assert notes.count("counts as failed") == 5
 
 
-def test_wrong_homography_is_in_the_notes(tmp_path: Path) -> None:
-    write_extreme_views(tmp_path, ["cafe", "shop"])
-    np.savetxt(tmp_path / "h" / "shop.txt", np.linalg.inv(TRUTH))
-    notes = [note for note in Evd().load(tmp_path).notes if "homography" in note]
-    assert len(notes) == 1
-    assert notes[0].startswith("shop: ")
-    assert "inverted" in notes[0]
-
-
 def test_other_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match=r"holds neither 1/NAME\.png"):
         UNCHECKED.load(tmp_path)
@@ -87,14 +78,13 @@ def test_every_protocol_has_what_the_frame_needs(name: str) -> None:
 
 
 def test_settings_of_a_protocol_are_read_by_their_type() -> None:
-    protocol = make_protocol("evd", ["magsac_threshold_px=1", "check_truth=false"])
-    assert protocol == Evd(magsac_threshold_px=1.0, check_truth=False)
+    protocol = make_protocol("evd", ["magsac_threshold_px=1"])
+    assert protocol == Evd(magsac_threshold_px=1.0)
     for setting, message in (
         ("magsac_treshold_px=1", "did you mean 'magsac_threshold_px'"),
         ("threshold_px", "expected KEY=VALUE"),
         ("threshold_px=wide", "expected float"),
         ("threshold_px=-1", "is outside"),
-        ("check_truth=perhaps", "expected bool"),
         ("threshold_px=" + 20_000 * "[", "expected float"),
     ):
         with pytest.raises(OptionError, match=message):

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from posed_photographs import NAMES, pose, write_calibration, write_imc, write_lists
@@ -18,7 +17,7 @@ from colmap_affrect.evaluation.posed_scenes import Imc
 from colmap_affrect.evaluation.relative_pose import true_pose
 
 SCRIPT = Path(__file__).parents[2] / "recipes" / "own-evaluation-set" / "imc_from_model.py"
-UNCHECKED = Imc(check_truth=False)
+UNCHECKED = Imc()
 EMPTY = ", ".join(f"0.{limit}" for limit in range(3, 10))
 
 
@@ -77,7 +76,7 @@ def test_missing_or_contradictory_lists_are_named(scene: Path) -> None:
         "keys-th-0.8.npy is missing: its pairs count as of less covisibility"
     )
     assert notes(scene)[1].startswith("keys-th-0.9.npy cannot be read (Object arrays cannot be")
-    assert notes(scene)[2:] == ["1 pairs of list 0.2 are not in list 0.1: b-c"]
+    assert len(notes(scene)) == 2
 
 
 def test_names_with_dashes_and_pairs_of_unknown_images(scene: Path) -> None:
@@ -123,29 +122,6 @@ def test_damaged_and_missing_files_are_named(scene: Path) -> None:
     assert left_out == "2 of 3 listed pairs are left out"
     assert without_file == "1 of 4 listed images are not in images/: b"
     assert "1 of 4 listed images have no usable calibration: a (cannot be read (" in uncalibrated
-
-
-def test_transposed_rotations_are_named_by_the_matches(scene: Path) -> None:
-    for index in range(4):
-        write_calibration(scene, index, R=pose(index)[0].T)
-    note, _ = Imc().load(scene).notes
-    assert "contradict their true poses; they fit with rotation transposed" in note
-
-
-def test_intrinsics_of_another_size_are_scaled_or_named(scene: Path) -> None:
-    half = np.array([[FOCAL_PX / 2, 0, 80], [0, FOCAL_PX / 2, 60], [0, 0, 1]])
-    write_calibration(scene, 0, K=half)
-    path = scene / "set_100" / "images" / "b.png"
-    cv2.imwrite(str(path), cv2.imread(str(path))[:150])
-    pairs = {pair.category: pair for pair in UNCHECKED.load(scene).pairs}
-    np.testing.assert_allclose(
-        pairs["0.1"].images[0].intrinsics, [[FOCAL_PX, 0, 159.5], [0, FOCAL_PX, 119.5], [0, 0, 1]]
-    )
-    assert notes(scene) == [
-        "1 images are of another size than their K, which is scaled: "
-        "a.png (320 x 240 px, K about 160 x 120 px)",
-        "1 images are of another shape than their K: b.png (320 x 150 px, K about 320 x 240 px)",
-    ]
 
 
 def test_folder_without_a_scene_is_an_error(tmp_path: Path) -> None:

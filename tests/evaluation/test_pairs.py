@@ -16,11 +16,10 @@ from synthetic import write_image
 from colmap_affrect.errors import EvaluationError
 from colmap_affrect.evaluation.pairs import Pairs, recalls
 from colmap_affrect.evaluation.protocol import Dataset, EvaluationPair, PairResult
-from colmap_affrect.evaluation.truth_checks import correspondence_doubts
 from colmap_affrect.evaluation.two_views import symmetric_epipolar_distances
 
 SHARED_PAIRS = Path(__file__).resolve().parents[3] / "shared" / "pairs"
-UNCHECKED = Pairs(check_truth=False)
+UNCHECKED = Pairs()
 
 SHIFT_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Fundamental matrix of a camera that moved along x: y stays the same."""
@@ -139,18 +138,11 @@ def test_relative_pose_is_that_of_the_photographs(tmp_path: Path, posed: dict[st
     assert list(columns) == [group + name for group in groups for name in names]
 
 
-def test_wrong_poses_are_noticed(tmp_path: Path, posed: dict[str, Any]) -> None:
+def test_pose_that_is_no_rotation_is_refused(tmp_path: Path, posed: dict[str, Any]) -> None:
     pose = posed["relative_pose"]
-    off = [[FOCAL_PX, 0, 30], [0, FOCAL_PX, 110], [0, 0, 1]]
-    dataset = load(tmp_path, {**posed, "relative_pose": {**pose, "intrinsics2": off}})
-    assert "principal point of intrinsics2" in dataset.notes[0]
     scaled = (2 * np.array(pose["rotation"])).tolist()
     (pair,) = load(tmp_path, {**posed, "relative_pose": {**pose, "rotation": scaled}}).pairs
     assert "scaled by 2" in pair.problem
-    transposed = np.array(pose["rotation"]).T.tolist()
-    changed = {**posed, "relative_pose": {**pose, "rotation": transposed}}
-    assert "contradict their true poses" in load(tmp_path, changed, protocol=Pairs()).notes[0]
-    assert load(tmp_path, posed, protocol=Pairs()).notes == ()
 
 
 def test_pixels_from_the_corner_are_moved(
@@ -184,29 +176,6 @@ def test_tables_are_by_kind_of_truth(tmp_path: Path, planar: dict[str, Any]) -> 
 
 
 @pytest.mark.parametrize(
-    ("change", "note"),
-    [
-        (np.eye(4), ""),
-        (np.eye(4)[[1, 0, 3, 2]], "x and y are exchanged"),
-        (np.eye(4)[[2, 3, 0, 1]], "the images are exchanged"),
-        (0.5 * np.eye(4), "of images 0.5 times as large"),
-        (8.0 * np.eye(4), "outside of image"),
-    ],
-)
-def test_wrong_correspondences_are_noticed(change: np.ndarray, note: str, tmp_path: Path) -> None:
-    paths = tmp_path / "a.png", tmp_path / "b.png"
-    views = ((0.0, 0.0, 0.0), 0.0), ((0.0, -0.6, 0.2), 8.0)
-    for path, where in zip(paths, views, strict=True):
-        write_image(path, photograph(*where))
-    x, y = np.meshgrid([-1.1, -0.2, 0.7, 1.3], [-1.2, -0.6, 0.1])
-    wall = np.stack([x.ravel(), y.ravel(), np.full(x.size, 7.0)], axis=1)
-    marked = np.hstack([seen(wall, *where) for where in views])
-    found = correspondence_doubts(marked @ change.T, paths)
-    assert note in found
-    assert bool(note) == bool(found)
-
-
-@pytest.mark.parametrize(
     ("content", "message"),
     [
         ("[]", "has no list 'pairs'"),
@@ -231,10 +200,3 @@ def test_two_pairs_of_one_name_are_refused(tmp_path: Path, planar: dict[str, Any
     entry = {**planar, "homography": TRUTH.tolist()}
     with pytest.raises(EvaluationError, match="two pairs are called 'a b'"):
         load(tmp_path, entry, entry)
-
-
-@pytest.mark.shared
-def test_marked_correspondences_of_wxbs_are_plausible() -> None:
-    dataset = Pairs().load(SHARED_PAIRS / "wxbs_sample")
-    assert len(dataset.pairs) == 8
-    assert dataset.notes == ()
