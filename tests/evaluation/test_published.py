@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from pathlib import Path
 
 import pytest
 
-from colmap_affrect.evaluation.results import COMPLEXITY, DATA, published
+from colmap_affrect.evaluation.results import published
 
 PAPER = Path(__file__).parents[3] / "shared" / "paper" / "matching_with_affnet_rectifications.tex"
 
@@ -65,14 +64,3 @@ def test_results_are_those_of_the_paper(protocol: str, number: int, first_column
     }
     rows = [row for row in published(protocol) if re.match(rf"Table {number}\b", row.table)]
     assert {row.method: row.values for row in rows} == expected
-
-
-@pytest.mark.shared
-@needs_the_paper
-def test_complexity_is_that_of_the_paper_and_no_table_is_missing() -> None:
-    _, *lines = latex_table(1)
-    expected = {method_of(name): [float(value) for value in values] for name, *values in lines}
-    assert {row.method: list(row.values.values()) for row in published(COMPLEXITY)} == expected
-    protocols = {table["protocol"] for table in tomllib.loads(DATA.read_text("utf-8"))["tables"]}
-    tables = {row.table for protocol in protocols for row in published(protocol)}
-    assert PAPER.read_text(encoding="utf-8").count(r"\begin{tabular}") == len(tables)
