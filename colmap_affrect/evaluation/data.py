@@ -11,14 +11,11 @@ from pydantic import BeforeValidator
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.conventions import pixel_from_colmap
-from colmap_affrect.errors import EvaluationError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.options import Options, within
 
 Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value is None else value)]
 """Infinite where JSON has null."""
-
-MAX_NOT_ORTHONORMAL = 1e-3  # largest element of R Rᵀ - I of what passes for a rotation
 
 
 class ScoreOptions(Options):
@@ -100,28 +97,3 @@ class Dataset:
 
     pairs: tuple[EvaluationPair, ...]
     notes: tuple[str, ...] = ()
-
-
-def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> Array:
-    """Return an array, of any number of rows where ``shape`` begins with -1.
-
-    EvaluationError says what is wrong with ``what``.
-    """
-    try:
-        values = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise EvaluationError(f"{what} is not numbers ({error})") from error
-    if values.shape != (values.shape[:1] if shape[0] == -1 else shape[:1]) + shape[1:]:
-        raise EvaluationError(f"{what} has shape {values.shape}, expected {shape}")
-    if not np.isfinite(values).all() or not values.size:
-        raise EvaluationError(f"{what} is empty or has values that are not finite")
-    return values
-
-
-def rotation(given: Any, what: str) -> Array:
-    """Return a (3, 3) rotation; EvaluationError when ``what`` is none."""
-    matrix = finite_numbers(given, (3, 3), what)
-    is_orthonormal = np.abs(matrix @ matrix.T - np.eye(3)).max() < MAX_NOT_ORTHONORMAL
-    if not is_orthonormal or np.linalg.det(matrix) < 0:
-        raise EvaluationError(f"{what} is not orthonormal, or a reflection")
-    return matrix

@@ -57,13 +57,7 @@ from colmap_affrect.colmap.checks import is_unsafe
 from colmap_affrect.colmap.poses import Pose, relative_pose
 from colmap_affrect.conventions import colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import AffrectError, EvaluationError, OptionError
-from colmap_affrect.evaluation.data import (
-    Dataset,
-    EvaluationImage,
-    EvaluationPair,
-    finite_numbers,
-    rotation,
-)
+from colmap_affrect.evaluation.data import Dataset, EvaluationImage, EvaluationPair
 from colmap_affrect.evaluation.truths import Correspondences, TrueHomography, TruePose
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import IMAGE_SUFFIXES
@@ -78,7 +72,7 @@ Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
 CATEGORY_DEG = 10
 CALIBRATION_PREFIX = "calibration_"
-MAX_NOT_UNIT = 1e-3  # largest deviation of the length of a quaternion from 1
+MAX_NOT_UNIT = 1e-3  # largest deviation of the length of a quaternion from 1, and of R Rᵀ from I
 ORIGIN_PX = {"center": 0.0, "corner": float(pixel_from_colmap(np.zeros(1))[0])}
 
 
@@ -94,10 +88,9 @@ class _Entry(Options):
 
 def load_evd(folder: Path) -> Dataset:
     """Find pairs with homographies; EvaluationError when the layout is another one."""
-    found = []
     files = [file for part in "12h" for file in (folder / part).glob("*")]
-    for name in sorted({f.stem for f in files if f.suffix.lower() in (".txt", *IMAGE_SUFFIXES)}):
-        found.append((name, f"1/{name}", f"2/{name}", f"h/{name}.txt"))
+    names = {file.stem for file in files if file.suffix.lower() in (".txt", *IMAGE_SUFFIXES)}
+    found = [(name, f"1/{name}", f"2/{name}", f"h/{name}.txt") for name in sorted(names)]
     for file in sorted(folder.glob("H_*.txt")):
         if parts := re.fullmatch(r"H_(.+)_([^_]+)_([^_]+)", file.stem):
             name, one, two = parts.groups()
@@ -263,6 +256,31 @@ def read_calibration(path: Path) -> tuple[pycolmap.Camera, Pose]:
     camera = pinhole(finite_numbers(given["K"], (3, 3), f"{path}: K"), f"{path}: K")
     translation = finite_numbers(given["T"], (3,), f"{path}: T")
     return camera, (rotation(given["R"], f"{path}: R"), translation)
+
+
+def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> Array:
+    """Return an array, of any number of rows where ``shape`` begins with -1.
+
+    EvaluationError says what is wrong with ``what``.
+    """
+    try:
+        values = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise EvaluationError(f"{what} is not numbers ({error})") from error
+    if values.shape != (values.shape[:1] if shape[0] == -1 else shape[:1]) + shape[1:]:
+        raise EvaluationError(f"{what} has shape {values.shape}, expected {shape}")
+    if not np.isfinite(values).all() or not values.size:
+        raise EvaluationError(f"{what} is empty or has values that are not finite")
+    return values
+
+
+def rotation(given: Any, what: str) -> Array:
+    """Return a (3, 3) rotation; EvaluationError when ``what`` is none."""
+    matrix = finite_numbers(given, (3, 3), what)
+    is_orthonormal = np.abs(matrix @ matrix.T - np.eye(3)).max() < MAX_NOT_UNIT
+    if not is_orthonormal or np.linalg.det(matrix) < 0:
+        raise EvaluationError(f"{what} is not orthonormal, or a reflection")
+    return matrix
 
 
 def pinhole(matrix: Array, what: str) -> pycolmap.Camera:

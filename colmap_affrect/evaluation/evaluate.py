@@ -111,11 +111,11 @@ def evaluate(
     }
     inputs = {"protocol": protocol, "dataset_path": str(dataset_path.resolve())}
     with Workspace(output_path).locked():
-        dataset, notes = chosen.load(dataset_path), list[str]()
-        if problems := [f"{pair.name}: {pair.problem}" for pair in dataset.pairs if pair.problem]:
-            notes = [f"{len(problems)} pairs cannot be evaluated and fail: {such_as(problems)}"]
+        dataset = chosen.load(dataset_path)
+        problems = [f"{pair.name}: {pair.problem}" for pair in dataset.pairs if pair.problem]
+        note = f"{len(problems)} of {len(dataset.pairs)} pairs fail: {such_as(problems)}"
         if len(problems) == len(dataset.pairs):
-            raise EvaluationError(f"{dataset_path}: there is no pair that can be used; {notes}")
+            raise EvaluationError(f"{dataset_path}: no pair can be evaluated; {note}")
         given = dataset.pairs, output_path, inputs, settings, options.resources
         runs = [RecipeRun(method, *given, overwrite=overwrite) for method in methods]
         results = {run.label: run.results(progress) for run in runs}
@@ -127,7 +127,7 @@ def evaluate(
             dataset_path=inputs["dataset_path"],
             settings=settings,
             baseline=options.baseline or "",
-            notes=(*dataset.notes, *notes),
+            notes=(*dataset.notes, *([note] if problems else [])),
             recipes=tuple(_summed(r, results[r.label], chosen, baseline, seed) for r in runs),
             published=published(protocol),
             versions=installed_versions(),
@@ -144,12 +144,11 @@ def _summed(
     baseline: Sequence[PairResult] | None,
     seed: int,
 ) -> RecipeResult:
-    num_images = len({record["image"] for record in run.extracted})
-    extract_s = sum(record["seconds"] for record in run.extracted)
+    extracted = sorted(run.extracted, key=lambda record: (record["image"], record["level"]))
+    num_images = len({record["image"] for record in extracted})
+    extract_s = sum(record["seconds"] for record in extracted)
     timed = [result.seconds_by_step for result in results if result.seconds_by_step]
-    steps = {"extract": extract_s / max(1, num_images)}
-    for step in ("match", "estimate"):
-        steps[step] = sum(seconds[step] for seconds in timed) / max(1, len(timed))
+    steps = {s: sum(each[s] for each in timed) / max(1, len(timed)) for s in ("match", "estimate")}
     solved = np.array([result.solved for result in results])
     p_value = None
     if baseline is not None and baseline is not results:
@@ -166,9 +165,9 @@ def _summed(
         solved_by_category={name: fmean(shares) for name, shares in by_category.items() if name},
         p_value=p_value,
         num_images=num_images,
-        seconds_per_step=steps,
+        seconds_per_step={"extract": extract_s / max(1, num_images), **steps},
         failures=run.failures,
-        warnings={r["image"]: r["warning"] for r in run.extracted if r["warning"]},
+        warnings={r["image"]: r["warning"] for r in extracted if r["warning"]},
         pairs=tuple(results),
     )
 

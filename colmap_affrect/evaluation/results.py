@@ -80,8 +80,6 @@ class Evaluation:
     def to_json(self) -> str:
         """Return everything as JSON, recipes by name; infinite errors are null."""
         values = json.loads(TypeAdapter(Evaluation).dump_json(self, by_alias=True))
-        for recipe in values["recipes"]:  # names first, for people
-            recipe["pairs"] = [{"name": pair["name"], **pair} for pair in recipe["pairs"]]
         values["recipes"] = {recipe.pop("name"): recipe for recipe in values["recipes"]}
         return json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False)
 

@@ -20,7 +20,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, area_under_curve, pose_errors
 from colmap_affrect.conventions import colmap_from_pixel, is_inside
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.data import PairResult, PairScore, ScoreOptions, finite_numbers
+from colmap_affrect.evaluation.data import PairResult, PairScore, ScoreOptions
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.epipolar import epipolar_lines, sampson_errors
@@ -106,13 +106,12 @@ class TrueHomography:
     size2: Size
 
     @classmethod
-    def of(cls, given: Any, paths: Sequence[Path], what: str) -> "TrueHomography":
-        """Return the truth of two image files; ``given`` has any scale and sign.
+    def of(cls, matrix: Array, paths: Sequence[Path], what: str) -> "TrueHomography":
+        """Return the truth of two image files, of a (3, 3) matrix of any scale and sign.
 
         Raises ImageError when an image cannot be read, and EvaluationError, naming ``what``, when
-        the matrix is no homography, or image 2 shows no part of image 1 by it.
+        the matrix is singular, or image 2 shows no part of image 1 by it.
         """
-        matrix = finite_numbers(given, (3, 3), what)
         if np.linalg.matrix_rank(matrix) < 3:
             raise EvaluationError(f"{what} is singular")
         size1, size2 = ((gray.shape[1], gray.shape[0]) for gray in map(read_gray, paths))

@@ -6,40 +6,25 @@ import json
 import re
 import subprocess
 import sys
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
+import posed_photographs as scenes
 import pytest
 from planar_pairs import SIZE, TRUTH, write_extreme_views, write_pair
-from posed_photographs import (
-    NAMES,
-    image_line,
-    pose,
-    write_calibration,
-    write_imc,
-    write_lists,
-    write_svp,
-)
+from posed_photographs import pose
 from small_scene import FOCAL_PX
 
 from colmap_affrect.colmap.poses import relative_pose
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation.data import Dataset, ScoreOptions
-from colmap_affrect.evaluation.datasets import (
-    difficulty,
-    load_evd,
-    load_imc,
-    load_pairs,
-    load_svp,
-    read_views,
-    stem,
-)
+from colmap_affrect.evaluation import datasets
+from colmap_affrect.evaluation.data import Dataset
+from colmap_affrect.evaluation.datasets import load_evd, load_imc, load_pairs, load_svp, stem
 
 SCRIPT = Path(__file__).parents[2] / "recipes" / "own-evaluation-set" / "imc_from_model.py"
 SVP_SAMPLE = Path(__file__).parents[3] / "shared" / "pairs" / "svp_sample"
+Entry = dict[str, Any]
 INTRINSICS = [[FOCAL_PX, 0, 159.5], [0, FOCAL_PX, 119.5], [0, 0, 1]]
 """Of the photographs of the small scene, in pixel-centre px."""
 
@@ -49,7 +34,6 @@ def categories(dataset: Dataset) -> dict[str, str]:
 
 
 def require_pose(found: Any, first: int, second: int) -> None:
-    """Require the true relative pose of two photographs of the small scene."""
     rotation, translation = found.pose
     np.testing.assert_allclose(rotation @ pose(first)[0], pose(second)[0], atol=1e-9)
     moved = rotation @ pose(first)[1] + translation
@@ -60,22 +44,18 @@ def test_layout_of_the_extreme_view_dataset(tmp_path: Path) -> None:
     write_extreme_views(tmp_path, ["cafe"])
     np.savetxt(tmp_path / "h" / "cafe.txt", -3.0 * TRUTH)
     (pair,) = load_evd(tmp_path).pairs
-    assert [image.name for image in pair.images] == ["1/cafe.png", "2/cafe.png"]
-    assert (pair.name, pair.problem) == ("cafe", "")
+    names = [image.name for image in pair.images]
+    assert (pair.name, names, pair.problem) == ("cafe", ["1/cafe.png", "2/cafe.png"], "")
     np.testing.assert_allclose(pair.truth.matrix, 3.0 * TRUTH)  # positive where it is visible
     assert pair.truth.size1 == SIZE == (160, 120)
 
 
 def test_sequences_as_oxfords(tmp_path: Path) -> None:
-    write_pair(tmp_path / "my_wall_1.png", tmp_path / "my_wall_2.png", seed=1)
-    (tmp_path / "my_wall_3.png").write_bytes((tmp_path / "my_wall_2.png").read_bytes())
-    for number, shift in ((3, 7.0), (2, 0.0)):
-        matrix = TRUTH + np.array([[0, 0, shift], [0, 0, 0], [0, 0, 0]])
-        np.savetxt(tmp_path / f"H_my_wall_1_{number}.txt", matrix)
-    first, second = load_evd(tmp_path).pairs
-    assert [first.name, second.name] == ["my_wall 1-2", "my_wall 1-3"]
-    assert second.images[1].name == "my_wall_3.png"
-    assert second.truth.matrix[0, 2] == TRUTH[0, 2] + 7.0
+    write_pair(tmp_path / "my_wall_1.png", tmp_path / "my_wall_3.png", seed=1)
+    np.savetxt(tmp_path / "H_my_wall_1_3.txt", TRUTH)
+    (pair,) = load_evd(tmp_path).pairs
+    assert (pair.name, pair.images[1].name) == ("my_wall 1-3", "my_wall_3.png")
+    np.testing.assert_allclose(pair.truth.matrix, TRUTH)
 
 
 def test_pairs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
@@ -94,15 +74,12 @@ def test_pairs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     assert "shows no part of image 1" in problems["aside"]
 
 
-@pytest.mark.parametrize(
-    ("load", "message"),
-    [
-        (load_evd, r"holds neither 1/NAME\.png"),
-        (load_svp, r"it has no \*_image_pairs\.txt"),
-        (load_imc, "it has no set_100/new-vis-pairs"),
-        (load_pairs, r"pairs\.json: cannot be read"),
-    ],
-)
+@pytest.mark.parametrize(("load", "message"), [
+    (load_evd, r"holds neither 1/NAME\.png"),
+    (load_svp, r"it has no \*_image_pairs\.txt"),
+    (load_imc, "it has no set_100/new-vis-pairs"),
+    (load_pairs, r"pairs\.json: cannot be read"),
+])  # fmt: skip
 def test_other_folders_are_refused(load: Any, message: str, tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match=message):
         load(tmp_path)
@@ -110,13 +87,12 @@ def test_other_folders_are_refused(load: Any, message: str, tmp_path: Path) -> N
 
 @pytest.fixture
 def svp(tmp_path: Path) -> Path:
-    return write_svp(tmp_path / "set" / "scene4")
+    return scenes.write_svp(tmp_path / "set" / "scene4")
 
 
 @pytest.mark.parametrize("path", [".", "scene4"])
 def test_svp_scene_or_folder_of_scenes_is_read(svp: Path, path: str) -> None:
     dataset = load_svp(svp.parent / path)
-    assert dataset.notes == ()
     assert list(categories(dataset).items()) == [
         ("scene4/a.png scene4/b.png", "0°"),
         ("scene4/b.png scene4/d.png", "10°"),
@@ -128,13 +104,6 @@ def test_svp_scene_or_folder_of_scenes_is_read(svp: Path, path: str) -> None:
     require_pose(dataset.pairs[2].truth, 0, 3)
 
 
-def test_lines_of_points_and_names_of_other_suffixes(svp: Path) -> None:
-    images = svp / "0" / "images.txt"
-    lines = images.read_text().replace(".png", ".jpg").splitlines()[1:]
-    images.write_text("".join(f"{line}\n10.5 20.5 1 30.5 40.5 -1 5.5 6.5 7\n" for line in lines))
-    assert len(load_svp(svp).pairs) == 3
-
-
 def test_pairs_without_an_image_or_pose_are_left_out_and_named(svp: Path) -> None:
     (svp / "images" / "d.png").unlink()
     (svp / "images" / "unlisted.txt").write_text("")
@@ -143,22 +112,18 @@ def test_pairs_without_an_image_or_pose_are_left_out_and_named(svp: Path) -> Non
     assert dataset.notes == (
         "scene4: 2 of 3 listed pairs are left out, without an image or its camera: d",
     )
-    (svp / "0" / "images.txt").write_text(image_line(0) + "\n")
+    (svp / "0" / "images.txt").write_text(scenes.image_line(0) + "\n")
     with pytest.raises(EvaluationError, match="no pair can be evaluated; scene4: 3 of 3"):
         load_svp(svp)
 
 
-@pytest.mark.parametrize(
-    ("file", "old", "new"),
-    [
-        ("cameras.txt", "SIMPLE_RADIAL", "ROUND"),
-        ("cameras.txt", "300.0", "nan"),
-        ("cameras.txt", "300.0", ""),
-        ("cameras.txt", "1 SIMPLE", "9 SIMPLE"),
-        ("images.txt", "1 0.99", "1 2.99"),
-        ("images.txt", "1 0.99", "1 inf"),
-    ],
-)
+@pytest.mark.parametrize(("file", "old", "new"), [
+    ("cameras.txt", "SIMPLE_RADIAL", "ROUND"),
+    ("cameras.txt", "300.0", "nan"),
+    ("cameras.txt", "1 SIMPLE", "9 SIMPLE"),
+    ("images.txt", "1 0.99", "1 2.99"),
+    ("images.txt", "1 0.99", "1 inf"),
+])  # fmt: skip
 def test_unusable_cameras_and_poses_are_refused(svp: Path, file: str, old: str, new: str) -> None:
     path = svp / "0" / file
     text = path.read_text()
@@ -170,7 +135,9 @@ def test_unusable_cameras_and_poses_are_refused(svp: Path, file: str, old: str, 
 
 def test_category_is_that_of_the_poses_and_bad_lines_are_refused(svp: Path) -> None:
     path = svp / "scene4_image_pairs.txt"
-    path.write_text("a.png b.png 0\n\na.png d.png 5\n# d.png\na.png c.png\n")
+    path.write_text("a.jpg b.jpg 0\n\na.png d.png 5\n# d.png\na.png c.png\n")
+    images = svp / "0" / "images.txt"
+    images.write_text(images.read_text().replace("png\n", "png\n10.5 20.5 1 30.5 40.5 -1\n"))
     assert list(categories(load_svp(svp)).values()) == ["0°", "10°", "20°"]
     path.write_text("a.png b.png 0\nb.png\n")
     with pytest.raises(EvaluationError, match=r"scene4_image_pairs\.txt: 'b\.png' is no pair"):
@@ -181,12 +148,11 @@ def test_category_is_that_of_the_poses_and_bad_lines_are_refused(svp: Path) -> N
 @pytest.mark.skipif(not SVP_SAMPLE.is_dir(), reason="the sample is not here")
 def test_difficulties_of_the_real_list_are_those_of_the_real_poses() -> None:
     scene = SVP_SAMPLE / "scene1"
-    views = read_views(scene / "0")
+    views = datasets.read_views(scene / "0")
     lines = (scene / "scene1_image_pairs.txt").read_text().splitlines()
     listed = [line.split() for line in lines if line.strip() and line[0] != "#"]
-    found = [difficulty(views[stem(a)][1], views[stem(b)][1]) for a, b, _ in listed]
+    found = [datasets.difficulty(views[stem(a)][1], views[stem(b)][1]) for a, b, _ in listed]
     assert found == [int(tens) for *_, tens in listed]
-    assert Counter(found) == {**dict.fromkeys(range(17), 200), 17: 190}
     assert [pair.name for pair in load_svp(SVP_SAMPLE).pairs] == [
         "scene1/frame_0000001535_4.jpg scene1/frame_0000000305_1.jpg"
     ]
@@ -194,13 +160,12 @@ def test_difficulties_of_the_real_list_are_those_of_the_real_poses() -> None:
 
 @pytest.fixture
 def imc(tmp_path: Path) -> Path:
-    return write_imc(tmp_path / "set" / "garden")
+    return scenes.write_imc(tmp_path / "set" / "garden")
 
 
 @pytest.mark.parametrize("path", [".", "garden"])
 def test_imc_scene_or_folder_of_scenes_is_read(imc: Path, path: str) -> None:
     dataset = load_imc(imc.parent / path)
-    assert dataset.notes == ()
     assert list(categories(dataset).items()) == [
         ("garden/a.png garden/d.png", "0.1"),
         ("garden/b.png garden/c.png", "0.2"),
@@ -220,31 +185,26 @@ def test_list_from_zero_may_be_there_and_others_must_be(imc: Path) -> None:
 
 def test_names_with_dashes_and_pairs_of_unknown_images(imc: Path) -> None:
     root = imc / "set_100"
-    for name in NAMES:
+    for name in scenes.NAMES:
         (root / "images" / f"{name}.png").rename(root / "images" / f"x-{name}.png")
         path = root / "calibration" / f"calibration_{name}.h5"
         path.rename(path.with_name(f"calibration_x-{name}.h5"))
-    write_lists(imc, {1: ["x-a-x-d", "x-a-e"], 2: []})
+    scenes.write_lists(imc, {1: ["x-a-x-d", "x-a-e"], 2: []})
     dataset = load_imc(imc)
     assert categories(dataset) == {"garden/x-a.png garden/x-d.png": "0.1"}
     assert dataset.notes[0].startswith("garden: 1 of 2 listed pairs are left out")
 
 
-@pytest.mark.parametrize(
-    ("changes", "fault"),
-    [
-        ({"K": np.diag([np.nan, 300, 1])}, "K is empty or has values that are not finite"),
-        ({"K": np.eye(2)}, r"K has shape \(2, 2\)"),
-        ({"K": np.diag([300.0, 300, 1])}, r"K is not \[\[fx, 0, cx\]"),
-        ({"T": None}, "cannot be read"),
-        ({"R": 2 * pose(0)[0]}, "R is not orthonormal"),
-        ({"R": pose(0)[0] * [1, 1, -1]}, "or a reflection"),
-    ],
-)
-def test_unusable_calibration_is_refused(
-    imc: Path, changes: dict[str, np.ndarray], fault: str
-) -> None:
-    write_calibration(imc, 0, **changes)
+@pytest.mark.parametrize(("changes", "fault"), [
+    ({"K": np.diag([np.nan, 300, 1])}, "K is empty or has values that are not finite"),
+    ({"K": np.eye(2)}, r"K has shape \(2, 2\)"),
+    ({"K": np.diag([300.0, 300, 1])}, r"K is not \[\[fx, 0, cx\]"),
+    ({"T": None}, "cannot be read"),
+    ({"R": 2 * pose(0)[0]}, "R is not orthonormal"),
+    ({"R": pose(0)[0] * [1, 1, -1]}, "or a reflection"),
+])  # fmt: skip
+def test_unusable_calibration_is_refused(imc: Path, changes: Entry, fault: str) -> None:
+    scenes.write_calibration(imc, 0, **changes)
     with pytest.raises(EvaluationError, match=rf"calibration_a\.h5: .*{fault}"):
         load_imc(imc)
 
@@ -252,9 +212,6 @@ def test_unusable_calibration_is_refused(
 def convert(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(SCRIPT), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-CAMERA_TXT = "1 {} 320 240 {}\n"
 
 
 def write_model(folder: Path, camera: str) -> None:
@@ -272,7 +229,10 @@ def write_model(folder: Path, camera: str) -> None:
 
 
 def test_set_made_from_a_model_is_read_back(imc: Path, tmp_path: Path) -> None:
-    write_model(tmp_path / "model", CAMERA_TXT.format("PINHOLE", "300 310 150 110"))
+    write_model(tmp_path / "model", "1 PINHOLE 320 240 300 310 150 110")
+    write_model(tmp_path / "bent", "1 SIMPLE_RADIAL 320 240 300 160 120 0.1")
+    done = convert(tmp_path / "bent", imc / "set_100" / "images", tmp_path / "castle")
+    assert done.stderr.startswith("a.png: a camera with distortion; undistort")
     done = convert(tmp_path / "model", imc / "set_100" / "images", tmp_path / "castle")
     assert done.returncode == 0, done.stderr
     assert re.findall(r"0\.(\d): (\d) pairs", done.stdout) == [
@@ -292,27 +252,19 @@ def test_set_made_from_a_model_is_read_back(imc: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(translation, [1, 2, 3])
 
 
-def test_model_with_distortion_makes_no_set(imc: Path, tmp_path: Path) -> None:
-    write_model(tmp_path / "bent", CAMERA_TXT.format("SIMPLE_RADIAL", "300 160 120 0.1"))
-    done = convert(tmp_path / "bent", imc / "set_100" / "images", tmp_path / "castle")
-    assert done.stderr.startswith("a.png: a camera with distortion; undistort")
-
-
-def listed(folder: Path, *entries: dict[str, Any], **top: Any) -> Dataset:
+def listed(folder: Path, *entries: Entry, **top: Any) -> Dataset:
     (folder / "pairs.json").write_text(json.dumps({"pairs": entries, **top}), encoding="utf-8")
     return load_pairs(folder)
 
 
 @pytest.fixture
-def planar(tmp_path: Path) -> dict[str, Any]:
+def planar(tmp_path: Path) -> Entry:
     write_pair(tmp_path / "a.png", tmp_path / "b.png", seed=3)
     return {"image1": "a.png", "image2": "b.png"}
 
 
 @pytest.mark.parametrize("in_file", [False, True])
-def test_homography_of_pixels_from_the_corner(
-    tmp_path: Path, planar: dict[str, Any], in_file: bool
-) -> None:
+def test_homography_of_corner_pixels(tmp_path: Path, planar: Entry, in_file: bool) -> None:
     corner = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
     matrix = corner @ TRUTH @ np.linalg.inv(corner)
     np.savetxt(tmp_path / "h.txt", matrix)
@@ -320,13 +272,9 @@ def test_homography_of_pixels_from_the_corner(
     (pair,) = listed(tmp_path, entry, pixel_origin="corner").pairs
     np.testing.assert_allclose(pair.truth.matrix, TRUTH, atol=1e-9)
     assert pair.name == "a b"
-    points = np.random.default_rng(0).uniform(0, SIZE, (40, 2))
-    carried = cv2.perspectiveTransform(points[:, None], TRUTH)[:, 0]
-    score = pair.truth.score(points, carried, ScoreOptions(), 0)
-    assert (score.error < 1e-3, score.solved) == (True, 1.0)
 
 
-def posed(**changes: Any) -> dict[str, Any]:
+def posed(**changes: Any) -> Entry:
     rotation, translation = relative_pose(pose(0), pose(3))
     values = {
         "rotation": rotation.tolist(),
@@ -334,15 +282,18 @@ def posed(**changes: Any) -> dict[str, Any]:
         "intrinsics1": INTRINSICS,
         "intrinsics2": [[2 * FOCAL_PX, 0, 100], [0, FOCAL_PX, 110], [0, 0, 1]],
     }
-    return {"image1": "a.png", "image2": "b.png", "relative_pose": {**values, **changes}}
+    return {**values, **changes}
 
 
 @pytest.mark.parametrize(("origin", "offset_px"), [("center", 0.0), ("corner", -0.5)])
 def test_poses_and_points_in_pixels_of_both_origins(
-    origin: str, offset_px: float, tmp_path: Path, planar: dict[str, Any]
+    origin: str, offset_px: float, tmp_path: Path, planar: Entry
 ) -> None:
     marked = {**planar, "name": "c", "category": "night", "correspondences": [[10, 20, 30, 40]]}
-    pair, points = listed(tmp_path, posed(), marked, pixel_origin=origin, convention="mine").pairs
+    pose_given = {**planar, "relative_pose": posed()}
+    pair, points = listed(
+        tmp_path, pose_given, marked, pixel_origin=origin, convention="mine"
+    ).pairs
     np.testing.assert_array_equal(points.truth.points, np.array([[10, 20, 30, 40]]) + offset_px)
     assert (points.name, points.category) == ("c", "night")
     require_pose(pair.truth, 0, 3)
@@ -351,43 +302,39 @@ def test_poses_and_points_in_pixels_of_both_origins(
     np.testing.assert_allclose(np.diag(pair.images[1].intrinsics), [2 * FOCAL_PX, FOCAL_PX, 1])
 
 
-def test_unusable_truth_fails_its_pair_only(tmp_path: Path, planar: dict[str, Any]) -> None:
+@pytest.mark.parametrize(("changes", "problem"), [
+    ({"homography": [[1, 2], [3, 4]]}, r"has shape \(2, 2\)"),
+    ({"relative_pose": posed(rotation=(2 * np.eye(3)).tolist())}, "not orthonormal"),
+    ({"relative_pose": posed(centre=[0, 0, 0])}, "relative_pose needs"),
+    ({"correspondences": []}, "has shape"),
+    ({"correspondences": "../points.txt"}, "must be a file in the folder"),
+])  # fmt: skip
+def test_unusable_truth_fails_its_pair(
+    changes: Entry, problem: str, tmp_path: Path, planar: Entry
+) -> None:
     good = {**planar, "name": "good", "homography": TRUTH.tolist()}
-    bad = {**planar, "name": "small", "homography": [[1, 2], [3, 4]]}
-    scaled = {**posed(rotation=(2 * np.eye(3)).tolist()), "name": "scaled"}
-    unknown = {**posed(centre=[0, 0, 0]), "name": "unknown"}
-    empty = {**planar, "name": "empty", "correspondences": []}
-    outside = {**planar, "name": "outside", "correspondences": "../points.txt"}
-    pairs = listed(tmp_path, good, bad, scaled, unknown, empty, outside).pairs
-    for pair, problem in zip(
-        pairs,
-        ("", "has shape (2, 2)", "not orthonormal", "relative_pose needs", "shape (0,)", "must be"),
-        strict=True,
-    ):
-        assert problem in pair.problem
-        assert bool(problem) == bool(pair.problem)
+    pairs = listed(tmp_path, good, {**planar, **changes}).pairs
+    assert pairs[0].problem == ""
+    assert re.search(problem, pairs[1].problem)
 
 
 SAME = '{"image1": "a.png", "image2": "b.png", "homography": "h.txt"}'
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("[]", "cannot be read"),
-        ("{", "cannot be read"),
-        ('{"pairs": [1]}', r"pairs\[0\]: expected options, got 1"),
-        ('{"pairs": [], "pixel_origin": "left"}', r"cannot be read \(KeyError\('left'\)\)"),
-        ('{"pairs": [{"image1": "a.png"}]}', "image2 is missing"),
-        (
-            '{"pairs": [{"image1": "../a.png", "image2": "b.png", "homography": []}]}',
-            "must be path",
-        ),
-        ('{"pairs": [{"image1": "a", "image2": "b"}]}', "needs homography, correspondences or"),
-        ('{"pairs": [{"image1": "a", "image2": "b", "truth": 1}]}', "unknown option 'truth'"),
-        (f'{{"pairs": [{SAME}, {SAME}]}}', "two pairs are called 'a b'"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    ("[]", "cannot be read"),
+    ("{", "cannot be read"),
+    ('{"pairs": [1]}', r"pairs\[0\]: expected options, got 1"),
+    ('{"pairs": [], "pixel_origin": "left"}', r"cannot be read \(KeyError\('left'\)\)"),
+    ('{"pairs": [{"image1": "a.png"}]}', "image2 is missing"),
+    (
+        '{"pairs": [{"image1": "../a.png", "image2": "b.png", "homography": []}]}',
+        "must be path",
+    ),
+    ('{"pairs": [{"image1": "a", "image2": "b"}]}', "needs homography, correspondences or"),
+    ('{"pairs": [{"image1": "a", "image2": "b", "truth": 1}]}', "unknown option 'truth'"),
+    (f'{{"pairs": [{SAME}, {SAME}]}}', "two pairs are called 'a b'"),
+])  # fmt: skip
 def test_bad_list_is_one_line(content: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "pairs.json").write_text(content)
     with pytest.raises(EvaluationError, match=message):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +12,6 @@ import pytest
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, relative_pose
 from colmap_affrect.conventions import pixel_from_colmap
-from colmap_affrect.errors import EvaluationError, OptionError
 from colmap_affrect.evaluation.data import PairResult, PairScore, ScoreOptions
 from colmap_affrect.evaluation.truths import (
     Correspondences,
@@ -28,8 +27,7 @@ from colmap_affrect.evaluation.truths import (
 
 TRUTH = np.array([[0.9, 0.2, 30.0], [-0.1, 1.1, -20.0], [3e-4, -1e-4, 1.0]])
 SIZE1, SIZE2 = (320, 200), (240, 260)
-ROUNDING_PX = 1e-9
-"""Double precision on coordinates of some hundred px."""
+ROUNDING_PX = 1e-9  # double precision on coordinates of some hundred px
 OPTIONS = ScoreOptions(max_num_iterations=10_000)
 
 
@@ -37,8 +35,8 @@ def shift(x: float, y: float) -> np.ndarray:
     return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
 
 
+# Carries points right of x = 100 behind the camera.
 BEHIND = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.01, 0.0, 1.0]])
-"""Carries points right of x = 100 behind the camera."""
 
 
 def error_px(estimate: np.ndarray | None) -> float:
@@ -50,28 +48,17 @@ def test_transfer_error_of_one_match_by_hand() -> None:
     exact = np.array([(90 + 10 + 30) / 1.025, (-10 + 55 - 20) / 1.025])
     errors = transfer_errors(TRUTH, points1, exact[None] + [3.0, 4.0])
     np.testing.assert_allclose(errors, [5.0], atol=ROUNDING_PX)
-
-
-def test_error_in_image_2_and_never_behind_the_camera() -> None:
-    doubling = np.diag([2.0, 2.0, 1.0])
-    errors = transfer_errors(doubling, np.array([[11.0, 5.0]]), np.array([[20.0, 10.0]]))
-    np.testing.assert_allclose(errors, [2.0], atol=ROUNDING_PX)
     points = np.array([[200.0, 40.0], [100.0, 7.0]])
     errors = transfer_errors(BEHIND, points, np.array([[-200.0, -40.0], [0.0, 0.0]]))
     assert np.isinf(errors).all()
 
 
-@pytest.mark.parametrize(
-    ("truth", "size2", "first", "last"),
-    [
-        (shift(-100.0, 40.0), SIZE2, (100, 0), (316, 196)),
-        (shift(0.0, 100.0), SIZE2, (0, 0), (236, 156)),
-        (BEHIND, (10_000, 10_000), (0, 0), (96, 196)),
-    ],
-)
-def test_visible_points_are_those_that_land_in_image_2(
-    truth: np.ndarray, size2: tuple[int, int], first: tuple[int, int], last: tuple[int, int]
-) -> None:
+@pytest.mark.parametrize(("truth", "size2", "first", "last"), [
+    (shift(-100.0, 40.0), SIZE2, (100, 0), (316, 196)),
+    (shift(0.0, 100.0), SIZE2, (0, 0), (236, 156)),
+    (BEHIND, (10_000, 10_000), (0, 0), (96, 196)),
+])  # fmt: skip
+def test_visible_points_land_in_image_2(truth: Any, size2: Any, first: Any, last: Any) -> None:
     points = TrueHomography(truth, SIZE1, size2).visible
     np.testing.assert_array_equal(points.min(axis=0), first)
     np.testing.assert_array_equal(points.max(axis=0), last)
@@ -92,21 +79,15 @@ def test_error_agrees_with_all_visible_pixels_carried_there_and_back() -> None:
     assert error_px(estimate) == pytest.approx(expected, rel=0.02)  # every 16th pixel, the border
     assert error_px(shift(0.3, -0.4) @ TRUTH) == pytest.approx(0.5, abs=ROUNDING_PX)
     assert error_px(-2.0 * TRUTH) == pytest.approx(0, abs=ROUNDING_PX)
-
-
-def test_estimate_with_its_horizon_in_the_image_has_infinite_error() -> None:
-    estimate = TRUTH + np.array([[0, 0, 0], [0, 0, 0], [-0.01, 0, 0]])
-    assert error_px(estimate) == error_px(None) == math.inf
+    horizon = TRUTH + np.array([[0, 0, 0], [0, 0, 0], [-0.01, 0, 0]])  # within the image
+    assert error_px(horizon) == error_px(None) == math.inf
 
 
 def test_counts_are_of_both_estimators() -> None:
-    errors = [(0.5, 4.0), (3.0, 2.9), (math.inf, 12.0)]
-    results = [
-        PairResult(error, 9, 9, {"magsac_error": other}, name=str(error)) for error, other in errors
-    ]
-    failed = PairResult(math.inf, 0, name="failed", failure="unreadable")
-    counts = homography_columns([*results, failed])
-    assert list(counts.values()) == [1, 1, 1, 2, 2, 2, 0, 0, 1, 2, 2, 3]
+    errors = ((0.5, {"magsac_error": 4.0}), (3.0, {"magsac_error": 2.9}), (math.inf, {}))
+    results = [PairResult(error, 9, 9, details, name="p") for error, details in errors]
+    counts = homography_columns(results)
+    assert list(counts.values()) == [1, 1, 1, 2, 2, 2, 0, 0, 1, 2, 2, 2]
     assert list(counts)[2:7:4] == ["< 3 px", "MAGSAC: < 1 px"]
 
 
@@ -124,14 +105,9 @@ def test_matches_of_which_half_are_wrong_give_the_homography() -> None:
     assert found.details["magsac_error"] < 1e-2
     assert (found.num_inliers, found.num_correct, found.solved) == (30, 30, 1.0)
     turned = homography_score(points2, points1)
-    assert turned.error > 10.0
-    assert turned.solved == 0.0
-
-
-def test_too_few_matches_give_no_homography() -> None:
-    three = np.array([[1.0, 2.0], [30.0, 4.0], [5.0, 60.0]])
+    assert (turned.error > 10.0, turned.solved) == (True, 0.0)
     details = {"magsac_error": math.inf, "magsac_num_inliers": 0}
-    assert homography_score(three, three) == PairScore(math.inf, 0, 0, details, 0.0)
+    assert homography_score(points1[:3], points1[:3]) == PairScore(math.inf, 0, 0, details, 0.0)
 
 
 def turn(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
@@ -203,32 +179,13 @@ def test_threshold_is_in_pixels_of_the_mean_focal_length() -> None:
     assert many > 280
 
 
-def test_seed_decides_the_result() -> None:
-    points1, points2 = matches(100)
-    points = points1, points2 + np.random.default_rng(2).normal(0, 1, points2.shape)
-    first, again, other = (
-        pose_score(points, seed=seed, max_num_iterations=100) for seed in (0, 0, 1)
-    )
-    assert first == again
-    assert first != other
-
-
 def test_points_that_give_no_pose() -> None:
     for count in (0, 5):
         score = pose_score(matches(count))
         assert (score.error, score.num_inliers, score.solved) == (math.inf, 0, 0.0)
-    points = np.full((20, 2), 100.0)
-    assert pose_score((points, points)).solved == 0.0
     points1, points2 = matches(60)
     points1[3] = np.nan
     assert pose_score((points1, points2)).num_inliers == 59
-
-
-def test_refinement_on_all_inliers_beats_one_sample_of_them() -> None:
-    points1, points2 = matches(300)
-    noise = np.random.default_rng(4).normal(0, 1.0, (2, *points1.shape))
-    score = pose_score((points1 + noise[0], points2 + noise[1]), max_num_iterations=500)
-    assert score.details["gc_error"] < 0.7 * score.error
 
 
 def pose_result(category: str, error: float, direction_error: float) -> PairResult:
@@ -279,18 +236,13 @@ def test_score_of_wxbs_is_the_mean_recall_over_thresholds() -> None:
 
 
 def test_matches_of_another_geometry_score_worse() -> None:
-    rng = np.random.default_rng(2)
-    depths = rng.uniform(3.0, 9.0, 200)
-    points1 = rng.uniform((0, 0), (320, 200), (200, 2))
-    points2 = points1 + np.stack([300.0 / depths, np.zeros(200)], axis=1)
+    points1, points2 = matches(200)
     truth = Correspondences(np.hstack([points1[:30], points2[:30]]))
     right = truth.score(points1[30:], points2[30:], OPTIONS, 0)
-    assert right.error < 0.01
-    assert right.solved == right.details["wxbs_score"] >= 19 / 20 - 1e-9  # not at threshold 0
-    turned = np.stack([points1[30:, 0], points1[30:, 1] + 300.0 / depths[30:]], axis=1)
-    assert truth.score(points1[30:], turned, OPTIONS, 0).error > 10.0
+    assert right.error < truth.score(points2[30:], points1[30:], OPTIONS, 0).error
+    assert right.solved == right.details["wxbs_score"] > 0.5  # the lens of image 1 distorts
     none = truth.score(points1[:7], points2[:7], OPTIONS, 0)
-    assert (none.error, none.details["wxbs_score"]) == (math.inf, 0.0)
+    assert (none.error, none.solved) == (math.inf, 0.0)
 
 
 def test_tables_are_by_kind_of_truth() -> None:
@@ -308,20 +260,3 @@ def test_tables_are_by_kind_of_truth() -> None:
     assert not any(columns[name] for name in columns if "poses" not in name)
     assert columns["poses: all"] == 1.0
     assert columns_by_kind([]) == {}
-
-
-def test_options_are_checked() -> None:
-    with pytest.raises(OptionError, match="did you mean 'magsac_threshold_px'"):
-        ScoreOptions(magsac_treshold_px=1.0)
-    with pytest.raises(OptionError, match="is outside"):
-        ScoreOptions(threshold_px=-1.0)
-
-
-def test_homography_of_files_is_refused_where_it_is_none() -> None:
-    for matrix, message in (
-        (TRUTH[:2], r"h has shape \(2, 3\)"),
-        (TRUTH * [np.nan, 1, 1], "not finite"),
-        (TRUTH[[0, 0, 0]], "h is singular"),
-    ):
-        with pytest.raises(EvaluationError, match=message):
-            TrueHomography.of(matrix, [Path("1.png"), Path("2.png")], "h")

@@ -30,6 +30,7 @@ pytestmark = [
 def test_photographs_of_one_side_of_a_temple_find_each_other(tmp_path: Path) -> None:
     for scene in (RING, "kermit"):
         shutil.copytree(SCENES / scene / "images", tmp_path / "images" / scene)
+    (tmp_path / "out").mkdir()
     context = Context(Workspace(tmp_path / "out"))
     inputs = Inputs.of(tmp_path / "images")
     extract(context, inputs, load_recipe("unrectified-rootsift"))
