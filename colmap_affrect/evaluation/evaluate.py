@@ -144,7 +144,9 @@ def _summed(
     baseline: Sequence[PairResult] | None,
     seed: int,
 ) -> RecipeResult:
-    extracted = sorted(run.extracted, key=lambda record: (record["image"], record["level"]))
+    extracted = sorted(
+        run.extracted.values(), key=lambda record: (record["image"], record["level"])
+    )
     num_images = len({record["image"] for record in extracted})
     extract_s = sum(record["seconds"] for record in extracted)
     timed = [result.seconds_by_step for result in results if result.seconds_by_step]

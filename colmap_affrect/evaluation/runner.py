@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -41,7 +42,7 @@ from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 
 logger = logging.getLogger(__name__)
 
-PAIR_RESULT = TypeAdapter(PairResult)  # from and to JSON; infinite errors are null
+RESULT = TypeAdapter(PairResult)  # from and to JSON; infinite errors are null
 NO_SCORE = PairScore(math.inf, 0)
 NOTHING = np.zeros((0, 2)), np.zeros((0, 2))  # points of a pair that could not be matched
 
@@ -50,7 +51,7 @@ class RecipeRun:
     """One recipe on the pairs of a dataset.
 
     Attributes:
-        extracted: a record of each image and level: ``image``, ``level``, ``seconds``, ``warning``.
+        extracted: records by image and level: ``image``, ``level``, ``seconds``, ``warning``.
         failures: images that could not be used in this run, with the reason.
     """
 
@@ -87,13 +88,14 @@ class RecipeRun:
         self._scores = output_path / "pairs" / f"{method.folder_name}-{scored[:8]}"
         for folder in (self._features, self._scores):
             folder.mkdir(parents=True, exist_ok=True)
-        self.extracted = [json.loads(path.read_bytes()) for path in self._features.glob("*.json")]
+        paths = self._features.glob("*.json")
+        self.extracted = {path.name: json.loads(path.read_bytes()) for path in paths}
         budget = settings["max_num_keypoints"]
-        self._matchers = []
+        self._matchings = []
         for level, chosen in enumerate(extraction.levels):
             of, kind = chosen.matching or matching, chosen.features.kind
             task = Matching(self._store, of, level, chosen.base, kind, resources, budget)
-            self._matchers.append(CachedMatcher(task))
+            self._matchings.append(task)
         self.failures: dict[str, str] = {}
         self._lock = Lock()  # of extraction and of the store
 
@@ -102,23 +104,20 @@ class RecipeRun:
         with np.printoptions(floatmode="unique", threshold=sys.maxsize):  # all numbers, in words
             keys = {p.name: digest_of([p.name, repr(p.truth)]) for p in self._pairs}
         paths = {name: self._scores / f"{key}.json" for name, key in keys.items()}
-        done = {
-            name: PAIR_RESULT.validate_json(path.read_bytes())
-            for name, path in paths.items()
-            if path.exists()
-        }
+        done = {n: RESULT.validate_json(p.read_bytes()) for n, p in paths.items() if p.exists()}
         todo = [pair for pair in self._pairs if not pair.problem and pair.name not in done]
         with progress.stage(self.label, len(todo), "pairs") as advance:
-            for result in map_ordered(self._result, todo, available_cores()):
+            work = partial(self._result, [CachedMatcher(task) for task in self._matchings])
+            for result in map_ordered(work, todo, available_cores()):
                 if not result.failure:
-                    replace_bytes(paths[result.name], PAIR_RESULT.dump_json(result))
+                    replace_bytes(paths[result.name], RESULT.dump_json(result))
                 done[result.name] = result
                 advance(1)
         return [done.get(pair.name) or self._failed(pair, pair.problem) for pair in self._pairs]
 
-    def _result(self, pair: EvaluationPair) -> PairResult:
+    def _result(self, matchers: Sequence[CachedMatcher], pair: EvaluationPair) -> PairResult:
         """Match a pair, and score it; an unforeseen error of the score fails this pair only."""
-        result, points = self._matched(pair)
+        result, points = self._matched(matchers, pair)
         if not result.num_levels:
             failures = (self.failures.get(image.name, "") for image in pair.images)
             return self._failed(pair, "; ".join(filter(None, failures)))
@@ -129,22 +128,23 @@ class RecipeRun:
             logger.exception("%s: %s cannot be scored", self.label, pair.name)
             return self._failed(pair, f"{type(error).__name__}: {error}")
         steps = {"match": result.seconds, "estimate": time.perf_counter() - start}
-        total_s = sum(steps.values())
-        return replace(result, **vars(score), seconds=total_s, seconds_by_step=steps)
+        return replace(result, **vars(score), seconds=sum(steps.values()), seconds_by_step=steps)
 
     def _failed(self, pair: EvaluationPair, failure: str) -> PairResult:
         """Return the result of a pair that has no matches."""
         score = pair.truth.score(*NOTHING, *self._options) if pair.truth else NO_SCORE
         return PairResult(**vars(score), name=pair.name, category=pair.category, failure=failure)
 
-    def _matched(self, pair: EvaluationPair) -> tuple[PairResult, tuple[Array, Array]]:
+    def _matched(
+        self, matchers: Sequence[CachedMatcher], pair: EvaluationPair
+    ) -> tuple[PairResult, tuple[Array, Array]]:
         """Return the (M, 2) and (M, 2) points of the best level, and a result without score.
 
         It has no levels where an image cannot be used.
         """
         best = PairResult(**vars(NO_SCORE), name=pair.name, category=pair.category)
         points, most, seconds, num_levels = NOTHING, 0, 0.0, 0
-        for level, matcher in enumerate(self._matchers):
+        for level, matcher in enumerate(matchers):
             with self._lock:
                 usable = [self._extract(image, level) for image in pair.images]
                 if not all(usable):
@@ -154,7 +154,7 @@ class RecipeRun:
             rows1, rows2 = matcher.match(first, second).indices.T
             frames = first.frames[rows1], second.frames[rows2]
             count, decided = 0, ""
-            if len(self._matchers) > 1:
+            if len(matchers) > 1:
                 count = self._verified_inliers(pair, frames, level)
                 decided = self.recipe.extraction.levels[level].name if count else "none"
             seconds, num_levels = seconds + time.perf_counter() - start, level + 1
@@ -184,16 +184,14 @@ class RecipeRun:
             record = {"image": name, "level": missing, "seconds": seconds, "warning": warning}
             path = self._features / f"{digest_of([name, missing])}.json"
             replace_text(path, json.dumps(record))  # first, so that features never lack it
-            self.extracted.append(record)
+            self.extracted[path.name] = record
             if missing:
                 store.extend(name, found.features)
             else:
                 store.write(name, found.features, found.image_size)
         return True
 
-    def _verified_inliers(
-        self, pair: EvaluationPair, frames: tuple[Floats, Floats], level: int
-    ) -> int:
+    def _verified_inliers(self, pair: EvaluationPair, frames: Sequence[Floats], level: int) -> int:
         """Return the inliers of COLMAP's two-view geometry; 0 if a run would not take it."""
         with self._lock:
             sizes = [self._store.image_size(image.name) for image in pair.images]
