@@ -24,7 +24,7 @@ class ScoreOptions(Options):
     threshold_px: Annotated[float, within(1e-6, 1e9)] = 0.5
     """Of an inlier of plain RANSAC, for homographies and poses (the paper: 0.5)."""
     magsac_threshold_px: Annotated[float, within(1e-6, 1e9)] = 5.0
-    """Largest noise that OpenCV's USAC_MAGSAC reckons with for homographies."""
+    """Largest noise that OpenCV's USAC_MAGSAC assumes for homographies."""
     max_num_iterations: Annotated[int, within(1, 1_000_000_000)] = 100_000
     """Of estimators, as the paper says; its numbers of relative poses are those of 1000."""
 

@@ -113,7 +113,7 @@ def evaluate(
     with Workspace(output_path).locked():
         dataset = chosen.load(dataset_path)
         problems = [f"{pair.name}: {pair.problem}" for pair in dataset.pairs if pair.problem]
-        note = f"{len(problems)} of {len(dataset.pairs)} pairs fail: {such_as(problems)}"
+        note = f"{len(problems)} of {len(dataset.pairs)} pairs count as failed: {such_as(problems)}"
         if len(problems) == len(dataset.pairs):
             raise EvaluationError(f"{dataset_path}: no pair can be evaluated; {note}")
         given = dataset.pairs, output_path, inputs, settings, options.resources

@@ -37,7 +37,7 @@ CONFIDENCE = 0.9999  # at which estimators may end before all iterations
 NUM_ESTIMATES = 5  # orders of the matches, of which the one of median error counts
 MIN_HOMOGRAPHY_MATCHES, MIN_FUNDAMENTAL_MATCHES, MIN_POSE_MATCHES = 4, 8, 6
 """Of poses six: five leave several essential matrices, none of which another match supports."""
-MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC reckons with for fundamental matrices
+MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC assumes for fundamental matrices
 GC_THRESHOLD_PX = 3.0  # of an inlier of GC-RANSAC, as in verification by default
 CORRECT_PX = 3.0
 """Matches are correct up to this transfer error in image 2, or Sampson distance from a pose."""
