@@ -204,10 +204,16 @@ def compare(options: argparse.Namespace) -> int:
 
 def evaluate(options: argparse.Namespace) -> int:
     from colmap_affrect.comparison.methods import parse_methods
-    from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate, make_protocol
+    from colmap_affrect.evaluation.data import ScoreOptions
+    from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate
+    from colmap_affrect.recipes import with_settings
 
+    for setting in options.protocol_options:
+        if "=" not in setting:
+            raise OptionError(f"--protocol-options {setting}: expected KEY=VALUE")
+    changed = with_settings({}, options.protocol_options)
     evaluation = evaluate(
-        make_protocol(options.protocol, options.protocol_options),
+        options.protocol,
         options.dataset_path,
         options.output_path,
         EvaluateOptions(
@@ -215,6 +221,7 @@ def evaluate(options: argparse.Namespace) -> int:
             baseline=options.baseline,
             max_num_keypoints=options.max_num_keypoints,
             random_seed=options.random_seed,
+            scores=ScoreOptions.from_mapping(changed, "--protocol-options"),
             resources=given.resources(options),
         ),
         overwrite=options.overwrite,

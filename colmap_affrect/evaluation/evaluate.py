@@ -1,117 +1,86 @@
 """Evaluate recipes on a dataset by a protocol: features, matches, scores, tables, plots.
 
-The output folder has ``features/`` (features and costs by recipe), ``pairs/`` (scores of single
-pairs by recipe and settings), ``evaluation.json``, ``evaluation.csv`` and plots. An evaluation that
-was stopped goes on; scores of other settings are kept beside, so that only what changed is redone.
+The output folder has ``features/`` and ``pairs/`` (scores of single pairs), both by recipe and a
+digest of all that decides them, ``evaluation.json`` and plots. An evaluation that was stopped goes
+on, and after a change only what depends on it is made again.
 """
 
-import hashlib
-import json
-import logging
-import math
-import sys
-import time
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import Any
+from statistics import fmean
 
 import numpy as np
 
 from colmap_affrect.comparison.methods import Method, parse_methods
-from colmap_affrect.errors import AffrectError, EvaluationError, OptionError
-from colmap_affrect.evaluation.evd import Evd
-from colmap_affrect.evaluation.pair_matches import MatchedPair, PairMatcher
-from colmap_affrect.evaluation.pairs import Pairs
+from colmap_affrect.errors import EvaluationError, OptionError
+from colmap_affrect.evaluation import datasets, truths
+from colmap_affrect.evaluation.data import Dataset, PairResult, ScoreOptions
 from colmap_affrect.evaluation.plots import write_plots
-from colmap_affrect.evaluation.posed_scenes import Imc, Svp
-from colmap_affrect.evaluation.protocol import (
-    GROUP,
-    Dataset,
-    EvaluationPair,
-    EvaluationProtocol,
-    PairResult,
-    PairScore,
-)
-from colmap_affrect.evaluation.recipe_features import (
-    PAIR_STEPS,
-    ImageCost,
-    RecipeFeatures,
-    RecordFile,
-)
-from colmap_affrect.evaluation.results import (
-    COMPLEXITY,
-    PAIR_RESULT,
-    SECONDS,
-    Evaluation,
-    Interval,
-    RecipeResult,
-    Solved,
-    published,
-)
-from colmap_affrect.evaluation.statistics import bootstrap_intervals, paired_test
-from colmap_affrect.geometry.arrays import Array, Indices
+from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult, Solved, published
+from colmap_affrect.evaluation.runner import RecipeRun
+from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import require_png
-from colmap_affrect.options import digest_of
 from colmap_affrect.pipeline import installed_versions
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import Recipe
+from colmap_affrect.shown import such_as
 from colmap_affrect.stages.context import Resources
 
-logger = logging.getLogger(__name__)
+NUM_RESAMPLES = 2000  # of the bootstrap
+MAX_ENUMERATED = 14  # up to so many differences all signs are tried, above that random ones
+NUM_RANDOM_SIGNS = 9999
 
-PROTOCOLS: Mapping[str, type[EvaluationProtocol]] = {
-    protocol.name: protocol for protocol in (Evd, Svp, Imc, Pairs)
+
+@dataclass(frozen=True)
+class Protocol:
+    """How a dataset is read and summed up."""
+
+    load: Callable[[Path], Dataset]
+    columns: Callable[[Sequence[PairResult]], dict[str, float]]  # of the table, in order
+    error_title: str  # what the error of a score is, with its unit
+    category_title: str = ""  # what the categories are; empty without
+
+
+ERROR_PX, ERROR_DEG = "mean reprojection error of the visible part (px)", "rotation error [deg]"
+ANGLE, COVISIBILITY = "relative rotation, from [deg]", "covisibility, from"
+PROTOCOLS = {
+    "evd": Protocol(datasets.load_evd, truths.homography_columns, ERROR_PX),
+    "svp": Protocol(datasets.load_svp, truths.pose_columns, ERROR_DEG, ANGLE),
+    "imc": Protocol(datasets.load_imc, truths.pose_columns, ERROR_DEG, COVISIBILITY),
+    "pairs": Protocol(
+        datasets.load_pairs, truths.columns_by_kind, "error (px; poses: degrees)", "category"
+    ),
 }
-DEFAULT_RECIPES = ("unrectified-rootsift", "default")
-
-NOTHING: Array = np.zeros((0, 2))  # matches of a pair that could not be matched
-
-
-def make_protocol(name: str, settings: Sequence[str] = ()) -> EvaluationProtocol:
-    """Return a protocol, some of its options changed by ``KEY=VALUE``.
-
-    Raises OptionError for an unknown protocol or option, or a value that it cannot have.
-    """
-    if name not in PROTOCOLS:
-        raise OptionError(f"unknown protocol '{name}': known are {', '.join(PROTOCOLS)}")
-    values = {}
-    for setting in settings:
-        key, separator, text = (part.strip() for part in setting.partition("="))
-        if not separator:
-            raise OptionError(f"{setting}: expected KEY=VALUE")
-        try:
-            values[key] = tomllib.loads(f"value = {text}")["value"]
-        except (ValueError, RecursionError):
-            values[key] = text
-    return PROTOCOLS[name].from_mapping(values, name)
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """Everything an evaluation depends on beside protocol, dataset and output folder.
+    """Everything an evaluation depends on beside protocol, dataset and output folder."""
 
-    Attributes:
-        recipes: by name as the command line takes them, or as methods.
-        baseline: label of the recipe that the others are tested against; None for none.
-        max_num_keypoints: of each image so many of its strongest features are matched; None: all.
-        random_seed: of the estimators and the statistics.
-    """
-
-    recipes: Sequence[str | Method] = DEFAULT_RECIPES
-    baseline: str | None = None
-    max_num_keypoints: int | None = None
-    random_seed: int = 0
+    recipes: Sequence[str | Method] = ("unrectified-rootsift", "default")  # also by name
+    baseline: str | None = None  # label of the recipe that the others are tested against
+    max_num_keypoints: int | None = None  # of each image the strongest are matched; None: all
+    random_seed: int = 0  # of the estimators and the statistics
+    scores: ScoreOptions = field(default_factory=ScoreOptions)
     resources: Resources = field(default_factory=Resources)
+
+    def methods(self) -> tuple[Method, ...]:
+        """Return the recipes as methods; OptionError for options that nothing can be made of."""
+        methods = parse_methods(self.recipes)
+        labels = [method.label for method in methods]
+        if self.baseline is not None and self.baseline not in labels:
+            raise OptionError(f"--baseline {self.baseline}: is not among {', '.join(labels)}")
+        if self.max_num_keypoints is not None and self.max_num_keypoints < 1:
+            raise OptionError(f"--max-num-keypoints {self.max_num_keypoints}: must be at least 1")
+        if self.random_seed < 0:
+            raise OptionError(f"--random-seed {self.random_seed}: must be at least 0")
+        return methods
 
 
 def evaluate(
-    protocol: str | EvaluationProtocol,
+    protocol: str,
     dataset_path: Path,
     output_path: Path,
     options: EvaluateOptions | None = None,
@@ -119,246 +88,111 @@ def evaluate(
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> Evaluation:
-    """Score recipes on a dataset by a protocol (its name, or one with changed settings).
+    """Score recipes on a dataset by one of ``PROTOCOLS``.
 
     An image or pair that cannot be used counts as failed, and the others go on; so does an
     evaluation that was stopped, unless ``overwrite`` discards features and scores of these recipes
-    first. What is returned is also written to ``evaluation.json``, ``evaluation.csv`` and plots in
-    the output folder, which is made if missing. Raises AffrectError for anything that the caller
-    can mend, before any image is worked on.
+    first. What is returned is also written to ``evaluation.json`` and plots in the output folder,
+    which is made if missing. Raises AffrectError for anything that the caller can mend, before any
+    image is worked on.
     """
     require_png()
-    options = options or EvaluateOptions()
-    chosen = make_protocol(protocol) if isinstance(protocol, str) else protocol
-    methods = _methods(options)
+    if protocol not in PROTOCOLS:
+        raise OptionError(f"unknown protocol '{protocol}': known are {', '.join(PROTOCOLS)}")
+    chosen, options = PROTOCOLS[protocol], options or EvaluateOptions()
+    methods, seed = options.methods(), options.random_seed
     if not dataset_path.is_dir():
         raise OptionError(f"{dataset_path}: no such folder; give the folder of the dataset")
     Workspace(output_path).require_own(dataset_path)
+    settings = {
+        "scores": options.scores.to_mapping(),
+        "random_seed": seed,
+        "max_num_keypoints": options.max_num_keypoints,
+    }
+    inputs = {"protocol": protocol, "dataset_path": str(dataset_path.resolve())}
     with Workspace(output_path).locked():
-        dataset = _loaded(chosen, dataset_path, progress)
-        settings = {
-            "scores": chosen.settings(),
-            "random_seed": options.random_seed,
-            "max_num_keypoints": options.max_num_keypoints,
-        }
-        inputs = {"protocol": chosen.name, "dataset_path": str(dataset_path.resolve())}
-        rest = (dataset.pairs, output_path, inputs, settings, options)
-        runs = [_Run(method, chosen, *rest, overwrite=overwrite) for method in methods]
+        dataset = chosen.load(dataset_path)
+        problems = [f"{pair.name}: {pair.problem}" for pair in dataset.pairs if pair.problem]
+        note = f"{len(problems)} of {len(dataset.pairs)} pairs count as failed: {such_as(problems)}"
+        if len(problems) == len(dataset.pairs):
+            raise EvaluationError(f"{dataset_path}: no pair can be evaluated; {note}")
+        given = dataset.pairs, output_path, inputs, settings, options.resources
+        runs = [RecipeRun(method, *given, overwrite=overwrite) for method in methods]
         results = {run.label: run.results(progress) for run in runs}
         baseline = results.get(options.baseline or "")
         evaluation = Evaluation(
-            protocol=chosen.name,
+            protocol=protocol,
             error_title=chosen.error_title,
             category_title=chosen.category_title,
             dataset_path=inputs["dataset_path"],
             settings=settings,
             baseline=options.baseline or "",
-            notes=dataset.notes,
-            recipes=tuple(run.summarized(results[run.label], baseline) for run in runs),
-            published=tuple(published(chosen.name)),
-            published_complexity=tuple(published(COMPLEXITY)),
+            notes=(*dataset.notes, *([note] if problems else [])),
+            recipes=tuple(_summed(r, results[r.label], chosen, baseline, seed) for r in runs),
+            published=published(protocol),
             versions=installed_versions(),
         )
         replace_text(output_path / "evaluation.json", evaluation.to_json())
-        replace_text(output_path / "evaluation.csv", evaluation.to_csv())
         write_plots(evaluation, output_path)
     return evaluation
 
 
-def _methods(options: EvaluateOptions) -> tuple[Method, ...]:
-    methods = parse_methods(options.recipes)
-    labels = [method.label for method in methods]
-    for method in methods:
-        _recipe(method)
-    if options.baseline is not None and options.baseline not in labels:
-        raise OptionError(
-            f"--baseline {options.baseline}: is not among the recipes {', '.join(labels)}"
-        )
-    if options.max_num_keypoints is not None and options.max_num_keypoints < 1:
-        raise OptionError(f"--max-num-keypoints {options.max_num_keypoints}: must be at least 1")
-    if options.random_seed < 0:
-        raise OptionError(f"--random-seed {options.random_seed}: must be at least 0")
-    return methods
+def _summed(
+    run: RecipeRun,
+    results: Sequence[PairResult],
+    protocol: Protocol,
+    baseline: Sequence[PairResult] | None,
+    seed: int,
+) -> RecipeResult:
+    extracted = sorted(
+        run.extracted.values(), key=lambda record: (record["image"], record["level"])
+    )
+    num_images = len({record["image"] for record in extracted})
+    extract_s = sum(record["seconds"] for record in extracted)
+    timed = [result.seconds_by_step for result in results if result.seconds_by_step]
+    steps = {s: sum(each[s] for each in timed) / max(1, len(timed)) for s in ("match", "estimate")}
+    solved = np.array([result.solved for result in results])
+    p_value = None
+    if baseline is not None and baseline is not results:
+        p_value = paired_test(solved, np.array([result.solved for result in baseline]), seed)
+    by_category: dict[str, list[float]] = {}
+    for result in results:
+        by_category.setdefault(result.category, []).append(result.solved)
+    total_s = extract_s + sum(result.seconds for result in results)
+    return RecipeResult(
+        name=run.label,
+        description=run.recipe.summary,
+        summary={**protocol.columns(results), SECONDS: total_s},
+        solved=Solved(float(solved.mean()), bootstrap_interval(solved, seed)),
+        solved_by_category={name: fmean(shares) for name, shares in by_category.items() if name},
+        p_value=p_value,
+        num_images=num_images,
+        seconds_per_step={"extract": extract_s / max(1, num_images), **steps},
+        failures=run.failures,
+        warnings={r["image"]: r["warning"] for r in extracted if r["warning"]},
+        pairs=tuple(results),
+    )
 
 
-def _loaded(protocol: EvaluationProtocol, path: Path, progress: Progress) -> Dataset:
-    with progress.stage("check dataset", 1, "datasets") as advance:
-        dataset = protocol.load(path)
-        advance(1)
-    if all(pair.problem for pair in dataset.pairs):
-        why = dataset.pairs[0].problem if dataset.pairs else "it has none"
-        raise EvaluationError(f"{path}: no pair can be evaluated; the first: {why}")
-    return dataset
+def bootstrap_interval(values: Array, seed: int) -> tuple[float, float]:
+    """Return the percentile bootstrap interval (95 %) of the mean of (N,) values."""
+    picks = np.random.default_rng(seed).integers(len(values), size=(NUM_RESAMPLES, len(values)))
+    means, tail = np.sort(values[picks].mean(axis=1)), NUM_RESAMPLES // 40
+    return float(means[tail]), float(means[-1 - tail])
 
 
-def _recipe(method: Method) -> Recipe:
-    if method.recipe is None:
-        raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
-    return method.recipe
+def paired_test(first: Array, second: Array, seed: int) -> float:
+    """Return the two-sided p-value of a difference of two methods, by (N,) values pair by pair.
 
-
-class _Run:
-    """One recipe on the pairs of a dataset."""
-
-    def __init__(
-        self,
-        method: Method,
-        protocol: EvaluationProtocol,
-        pairs: Sequence[EvaluationPair],
-        output_path: Path,
-        inputs: Mapping[str, Any],
-        settings: Mapping[str, Any],
-        options: EvaluateOptions,
-        *,
-        overwrite: bool,
-    ) -> None:
-        """Find everything that the recipe needs before any image is worked on.
-
-        Features depend on ``inputs``, and scores on ``settings`` beside them; both are recorded.
-        """
-        self.label, self.recipe = method.label, _recipe(method)
-        self.protocol, self.pairs, self.options = protocol, pairs, options
-        images = {image.name: image for p in pairs if not p.problem for image in p.images}
-        self.features = RecipeFeatures(
-            output_path / "features" / method.folder_name,
-            self.recipe.extraction,
-            images,
-            inputs,
-            options.resources,
-            overwrite=overwrite,
-        )
-        decisive = {
-            "features": self.features.settings,
-            "matching": self.recipe.matching.to_mapping(),
-            **settings,
-        }
-        path = output_path / "pairs" / f"{method.folder_name}-{digest_of(decisive)[:8]}.jsonl"
-        if overwrite:
-            remove_own(path.parent.glob(f"{method.folder_name}-????????.jsonl"))
-        self.records = RecordFile(path, decisive)
-
-    def results(self, progress: Progress) -> list[PairResult]:
-        """Match and score all pairs that have not been; what fails is tried again next time."""
-        truths = {pair.name: _fingerprint(pair.truth) for pair in self.pairs}
-        done = {
-            record["name"]: PAIR_RESULT.validate_python(record["result"])
-            for record in self.records.records
-            if truths.get(record["name"]) == record["truth"]
-        }
-        todo = [pair for pair in self.pairs if not pair.problem and pair.name not in done]
-        budget = self.options.max_num_keypoints
-        matcher = PairMatcher(self.recipe, self.features, budget, self.label, progress)
-        for result in matcher.run(todo, self._scored):
-            if not result.failure:
-                values = json.loads(PAIR_RESULT.dump_json(result))
-                record = {"name": result.name, "truth": truths[result.name], "result": values}
-                self.records.append(record)
-            done[result.name] = result
-        return [done.get(pair.name) or self._failed(pair) for pair in self.pairs]
-
-    def _scored(self, matched: MatchedPair) -> PairResult:
-        """Score matches; an unforeseen error fails this pair only."""
-        pair, start = matched.pair, time.perf_counter()
-        try:
-            score = self.protocol.score(pair, *matched.points, self.options.random_seed)
-        except AffrectError as error:
-            return self._failed(pair, str(error))
-        except Exception as error:
-            logger.exception("%s: %s cannot be scored", self.label, pair.name)
-            return self._failed(pair, f"{type(error).__name__}: {error}")
-        estimate_s = time.perf_counter() - start
-        return PairResult(
-            **vars(score),
-            name=pair.name,
-            category=pair.category,
-            num_matches=len(matched.points[0]),
-            num_keypoints=matched.num_keypoints,
-            seconds=matched.seconds + estimate_s,
-            seconds_by_step={"match": matched.seconds, "estimate": estimate_s},
-            level=matched.level,
-            num_levels=matched.num_levels,
-        )
-
-    def _failed(self, pair: EvaluationPair, failure: str = "") -> PairResult:
-        """Return the result of a pair that has no matches."""
-        score, why = PairScore(math.inf, 0), failure or pair.problem
-        if not why:
-            failures = self.features.failures
-            why = "; ".join(failures[im.name] for im in pair.images if im.name in failures)
-            score = self.protocol.score(pair, NOTHING, NOTHING, self.options.random_seed)
-        return PairResult(**vars(score), name=pair.name, category=pair.category, failure=why)
-
-    def summarized(
-        self, results: Sequence[PairResult], baseline: Sequence[PairResult] | None
-    ) -> RecipeResult:
-        num_levels: dict[str, int] = {}
-        for pair, result in zip(self.pairs, results, strict=True):
-            for image in pair.images:
-                num_levels[image.name] = max(num_levels.get(image.name, 0), result.num_levels)
-        costs = self.features.costs(num_levels)
-        cost, seed = ImageCost.mean(costs), self.options.random_seed
-        seconds = sum(cost.total_s for cost in costs) + sum(result.seconds for result in results)
-        timed = [result.seconds_by_step for result in results if result.seconds_by_step]
-        per_pair = {
-            step: math.fsum(seconds[step] for seconds in timed) / max(1, len(timed))
-            for step in PAIR_STEPS
-        }
-        successes = self._successes(results)
-        p_value = None
-        if baseline is not None and baseline is not results:
-            p_value = paired_test(successes, self._successes(baseline), seed)
-        (interval,) = bootstrap_intervals(len(results), lambda rows: [successes[rows].mean()], seed)
-        by_category = _by_category(results).items()
-        return RecipeResult(
-            name=self.label,
-            description=self.recipe.summary,
-            summary={**self.protocol.summarize(results), SECONDS: seconds},
-            intervals=_intervals(self.protocol, results, seed),
-            solved=Solved(float(successes.mean()), interval),
-            solved_by_category={name: float(successes[rows].mean()) for name, rows in by_category},
-            p_value=p_value,
-            num_images=len(costs),
-            complexity=cost.complexity(),
-            seconds_per_step={**cost.seconds(), **per_pair},
-            failures=self.features.failures,
-            warnings=self.features.warnings,
-            pairs=tuple(results),
-        )
-
-    def _successes(self, results: Sequence[PairResult]) -> Array:
-        return np.array([self.protocol.success(result) for result in results])
-
-
-def _intervals(
-    protocol: EvaluationProtocol, results: Sequence[PairResult], seed: int
-) -> dict[str, Interval]:
-    """Return bootstrap intervals of the columns; those of a category over its pairs."""
-    by_category = _by_category(results)
-    columns = list(protocol.summarize(results))
-
-    def of_resampled(rows: Sequence[int], names: Sequence[str], picked: Indices) -> list[float]:
-        summary = protocol.summarize([results[rows[place]] for place in picked])
-        return [summary.get(name, 0.0) for name in names]
-
-    groups: dict[str, list[str]] = {}
-    for name in columns:
-        category = name.rpartition(GROUP)[2]
-        groups.setdefault(category if category in by_category else "", []).append(name)
-    found: dict[str, Interval] = {}
-    for category, names in groups.items():
-        rows = by_category.get(category, range(len(results)))
-        intervals = bootstrap_intervals(len(rows), partial(of_resampled, rows, names), seed)
-        found |= zip(names, intervals, strict=True)
-    return {name: found[name] for name in columns}
-
-
-def _by_category(results: Sequence[PairResult]) -> dict[str, list[int]]:
-    """Return the rows of the pairs of each category, of those that have one."""
-    names = dict.fromkeys(result.category for result in results if result.category)
-    return {name: [row for row, r in enumerate(results) if r.category == name] for name in names}
-
-
-def _fingerprint(truth: Any) -> str:
-    """Return what a truth of any type can be recognised by: all of its numbers, in words."""
-    with np.printoptions(floatmode="unique", threshold=sys.maxsize):
-        return hashlib.sha256(repr(truth).encode()).hexdigest()
+    Sign-flip permutation test of the mean: if the methods did not differ, each difference would
+    have either sign with equal chance. Of zeros and ones it is the exact sign test. The seed is
+    that of the random signs, where there are too many differences to try all.
+    """
+    differences = (first - second)[first != second]
+    count = len(differences)
+    if count <= MAX_ENUMERATED:
+        signs = 1.0 - 2.0 * (np.arange(2**count)[:, None] >> np.arange(count) & 1)
+    else:
+        signs = np.random.default_rng(seed).choice((-1.0, 1.0), (NUM_RANDOM_SIGNS + 1, count))
+        signs[0] = 1.0  # those that were observed count too
+    return float((np.abs(signs @ differences) >= abs(differences.sum()) - 1e-9).mean())

@@ -2,170 +2,60 @@
 
 import io
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import matplotlib.style
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from colmap_affrect.evaluation.recipe_features import IMAGE_STEPS, PAIR_STEPS
-from colmap_affrect.evaluation.results import Evaluation, PublishedRow, complexity_columns
+from colmap_affrect.evaluation.results import Evaluation
 from colmap_affrect.project.atomic_files import replace_bytes
 
-SIZE_IN, DPI = (8.0, 5.0), 120
 ERROR_LIMITS = (0.1, 100.0)
-GRID = "#DDDDDD"
-BARS = "#DDE3EA"
-PAPER_STYLE: dict[str, Any] = dict(marker=".", linestyle=":", linewidth=1.2, alpha=0.8)
-MIN_SECONDS = 0.01
-ROOM_FOR_NUMBERS = 1.12  # of an axis, in lengths of the longest bar
-ROW_IN = 0.42  # height of a row of bars
-PAPER_THRESHOLD = "< "
 
 
 def write_plots(evaluation: Evaluation, folder: Path) -> None:
-    """Draw all plots that the results allow, as PNG.
-
-    ``errors.png``: pairs with an error below each threshold. ``categories.png``: success by
-    category, where there are some. ``times.png``: seconds by step. ``complexity.png``: area,
-    keypoints, regions and warps per image.
-    """
-    drawings = {"errors": _errors, "times": _times, "complexity": _complexity}
-    if evaluation.category_title and len(_categories(evaluation)) > 1:
-        drawings["categories"] = _success_by_category
+    """Draw ``errors.png``, and ``categories.png`` where there are several categories."""
+    drawings = {"errors": _errors}
+    if evaluation.category_title and len(evaluation.recipes[0].solved_by_category) > 1:
+        drawings["categories"] = _categories
     for name, draw in drawings.items():
+        figure = Figure(figsize=(8.0, 5.0), dpi=120, layout="constrained")
+        FigureCanvasAgg(figure)
+        draw(evaluation, figure.add_subplot())
+        figure.legend(fontsize=7, loc="outside lower center", ncols=2, frameon=False)
         stream = io.BytesIO()
-        with matplotlib.style.context("default"):
-            draw(evaluation).savefig(stream, format="png")
+        figure.savefig(stream, format="png")
         replace_bytes(folder / f"{name}.png", stream.getvalue())
 
 
-def _figure(height_in: float = SIZE_IN[1]) -> Figure:
-    figure = Figure(figsize=(SIZE_IN[0], height_in), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _published(evaluation: Evaluation) -> Iterator[tuple[PublishedRow, dict[str, Any]]]:
-    for number, row in enumerate(evaluation.published, len(evaluation.recipes)):
-        label = f"paper: {row.method} ({row.table})"
-        yield row, dict(color=f"C{number}", label=label, **PAPER_STYLE)
-
-
-def _errors(evaluation: Evaluation) -> Figure:
-    """Number of pairs over the threshold of the error, as the paper's table on EVD."""
-    figure = _figure()
-    axes = figure.add_subplot()
+def _errors(evaluation: Evaluation, axes: Any) -> None:
+    """Number of pairs over the threshold of the error."""
     low, high = ERROR_LIMITS
-    for number, recipe in enumerate(evaluation.recipes):
-        errors = sorted(pair.error for pair in recipe.pairs if pair.error < high)
-        steps = [low, *(max(error, low) for error in errors), high]
+    for recipe in evaluation.recipes:
+        errors = sorted(max(pair.error, low) for pair in recipe.pairs if pair.error < high)
         counts = [0, *range(1, len(errors) + 1), len(errors)]
-        style: dict[str, Any] = dict(color=f"C{number}", linewidth=2, clip_on=False, zorder=3)
-        axes.step(steps, counts, where="post", label=recipe.name, **style)
-    for row, style in _published(evaluation):
-        points = sorted(
-            (float(name.removeprefix(PAPER_THRESHOLD).split()[0]), value)
-            for name, value in row.values.items()
-            if name.startswith(PAPER_THRESHOLD)
-        )
-        if points:
-            axes.plot(*zip(*points, strict=True), **style)
-    axes.set_xscale("log")
-    axes.set_xlim(low, high)
-    axes.set_ylim(0, None)
-    axes.set_xlabel(f"threshold of the {evaluation.error_title}")
-    axes.set_ylabel(f"pairs with a smaller error, of {evaluation.num_pairs}")
-    return _finished(figure, axes, f"{evaluation.protocol}: pairs below an error")
+        axes.step([low, *errors, high], counts, where="post", label=recipe.name, linewidth=2)
+    axes.set(xscale="log", xlim=ERROR_LIMITS, ylim=(0, None))
+    axes.set(xlabel=f"threshold of the {evaluation.error_title}")
+    axes.set(ylabel=f"pairs with a smaller error, of {len(evaluation.recipes[0].pairs)}")
 
 
-def _categories(evaluation: Evaluation) -> list[str]:
-    """Return the categories in the order of the columns of the table, or as they come."""
-    recipe = evaluation.recipes[0]
-    there = dict.fromkeys(pair.category for pair in recipe.pairs if pair.category)
-    return list(dict.fromkeys([*(name for name in recipe.summary if name in there), *there]))
-
-
-def _success_by_category(evaluation: Evaluation) -> Figure:
-    """Accuracy over categories, their sizes as bars, the paper's numbers dotted."""
-    figure = _figure()
-    axes = figure.add_subplot()
-    categories = _categories(evaluation)
-    places = np.arange(len(categories))
-    pairs = evaluation.recipes[0].pairs
-    sizes = [sum(pair.category == name for pair in pairs) for name in categories]
-    axes.bar(places, np.divide(sizes, max(sizes)), width=0.5, color=BARS, zorder=0)
-    for place, size in enumerate(sizes):
-        axes.text(place, 0.01, f"{size}", ha="center", va="bottom", fontsize=7, color="#667788")
-    for number, recipe in enumerate(evaluation.recipes):
-        shares = [recipe.solved_by_category[name] for name in categories]
-        axes.plot(places, shares, marker="o", markersize=4, color=f"C{number}", label=recipe.name)
-    for row, style in _published(evaluation):
-        if any(name in row.values for name in categories):
-            axes.plot(places, [row.values.get(name, math.nan) for name in categories], **style)
-    axes.set_xticks(places, categories, rotation=30 if max(map(len, categories)) > 5 else 0)
-    axes.set_ylim(0, 1.05)
-    axes.set_xlabel(evaluation.category_title)
-    axes.set_ylabel("solved share of pairs (bars: size of categories)")
-    return _finished(figure, axes, f"{evaluation.protocol}: success by category")
-
-
-def _finished(figure: Figure, axes: Axes, title: str) -> Figure:
-    axes.set_title(title, fontsize=11)
-    axes.grid(color=GRID)
-    axes.set_axisbelow(True)
-    figure.legend(fontsize=7, loc="outside lower center", ncols=2, frameon=False)
-    return figure
-
-
-def _times(evaluation: Evaluation) -> Figure:
-    """Seconds by step, one bar for each recipe: per image, and per pair."""
-    recipes = evaluation.recipes
-    rows = range(len(recipes))
-    figure = _figure(1.6 + 2 * ROW_IN * len(recipes))
-    upper, lower = figure.subplots(2, 1)
-    plots = (upper, IMAGE_STEPS, "image", 0), (lower, PAIR_STEPS, "pair", len(IMAGE_STEPS))
-    for axes, steps, unit, first in plots:
-        left = np.zeros(len(recipes))
-        for number, step in enumerate(steps, first):
-            widths = np.array([recipe.seconds_per_step[step] for recipe in recipes])
-            axes.barh(rows, widths, left=left, color=f"C{number}", label=step)
-            left += widths
-        _label_bars(axes, left.tolist(), 8)
-        axes.set_yticks(rows, [recipe.name for recipe in recipes])
-        axes.invert_yaxis()
-        axes.set_xlim(0, ROOM_FOR_NUMBERS * max(left.max(), MIN_SECONDS))
-        axes.set_xlabel(f"seconds per {unit}")
-        axes.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, frameon=False)
-    return figure
-
-
-def _complexity(evaluation: Evaluation) -> Figure:
-    """The paper's complexity table as bars, its numbers below ours."""
-    recipes, paper = evaluation.recipes, evaluation.published_complexity
-    names = [*(recipe.name for recipe in recipes), *(f"paper: {row.method}" for row in paper)]
-    columns = [*map(complexity_columns, recipes), *(row.values for row in paper)]
-    colors = [*(f"C{number}" for number in range(len(recipes))), *["#BBBBBB"] * len(paper)]
-    figure = _figure(1.2 + ROW_IN * len(names))
-    panels = figure.subplots(1, len(columns[0]), sharey=True)
-    for axes, title in zip(panels, columns[0], strict=True):
-        values = [column.get(title, 0.0) for column in columns]
-        axes.barh(range(len(names)), values, color=colors)
-        _label_bars(axes, values, 7)
-        axes.set_xlim(0, 1.4 * max([*values, 0.1]))
-        axes.set_title(title, fontsize=9)
-    panels[0].set_yticks(range(len(names)), names)
-    panels[0].invert_yaxis()
-    figure.supxlabel("mean per image", fontsize=9)
-    return figure
-
-
-def _label_bars(axes: Axes, lengths: list[float], font_size: int) -> None:
-    for place, length in enumerate(lengths):
-        axes.text(length, place, f" {length:.2f}", va="center", fontsize=font_size)
-    axes.grid(axis="x", color=GRID)
-    axes.set_axisbelow(True)
+def _categories(evaluation: Evaluation, axes: Any) -> None:
+    """Share of solved pairs over categories, their sizes as bars, the paper's numbers dotted."""
+    first = evaluation.recipes[0]
+    there = first.solved_by_category
+    names = list(dict.fromkeys([*(name for name in first.summary if name in there), *there]))
+    sizes = [sum(pair.category == name for pair in first.pairs) for name in names]
+    bars = axes.bar(names, np.divide(sizes, max(sizes)), width=0.5, color="#DDE3EA")
+    axes.bar_label(bars, sizes, fontsize=7, label_type="center")
+    for recipe in evaluation.recipes:
+        shares = [recipe.solved_by_category[name] for name in names]
+        axes.plot(names, shares, marker="o", markersize=4, label=recipe.name)
+    for row in evaluation.published:
+        values = [row.values.get(name, math.nan) for name in names]
+        label = f"paper: {row.method} ({row.table})"
+        axes.plot(names, values, marker=".", linestyle=":", label=label)
+    axes.tick_params(axis="x", rotation=30 if max(map(len, names)) > 5 else 0)
+    axes.set(xlabel=evaluation.category_title, ylabel="solved share of pairs (bars: their number)")

@@ -14,19 +14,19 @@ Of recipes with escalation only the first level counts: the others depend on pai
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
+import numpy as np
 from machine import describe_machine, table
 
 from colmap_affrect.comparison.methods import parse_method
-from colmap_affrect.evaluation.recipe_features import ImageCost, extract_measured
 from colmap_affrect.images.photographs import list_images
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.whole_image import IdentityOptions
+from colmap_affrect.report.levels import PIXELS_PER_MEGAPIXEL, inspect_level
 from colmap_affrect.stages.context import Resources
-from colmap_affrect.stages.one_image import prepare
+from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
 HEADER = (
     "recipe", "warped area (Mpx)", "keypoints (K)", "regions", "warps per region", "seconds",
@@ -38,22 +38,31 @@ def without_warps(options: ExtractionOptions) -> ExtractionOptions:
     """Return the options for the same features without rectification."""
     return ExtractionOptions(
         rectifier=IdentityOptions(),
-        features=replace(options.features, max_num_rectified_features=1),
+        features=options.features.changed(max_num_rectified_features=1),
         max_image_size_px=options.max_image_size_px,
     )
 
 
-def table_row(label: str, costs: list[ImageCost], baseline: list[ImageCost]) -> list[str]:
-    """Format the costs of a method, and its ratio to the baseline by round."""
-    ratios = [mine.total_s / base.total_s for mine, base in zip(costs, baseline, strict=True)]
-    first = costs[0]
+def cost(extractor: ImageExtractor, path: Path) -> np.ndarray:
+    """Return megapixels of warps, keypoints, regions, warps, and seconds without reading."""
+    photograph, _ = extractor.photograph(path)
+    level = inspect_level(extractor, photograph, 0)
+    area_mpx = level.plan.rectified_area_px / PIXELS_PER_MEGAPIXEL
+    counts = len(level.features), level.plan.num_regions, len(level.plan.items)
+    return np.array([area_mpx, *counts, sum(level.seconds.values())])
+
+
+def table_row(label: str, costs: list[np.ndarray], baseline: list[np.ndarray]) -> list[str]:
+    """Format the mean costs of a method by round, and their ratios to the baseline."""
+    ratios = [mine[4] / base[4] for mine, base in zip(costs, baseline, strict=True)]
+    area_mpx, keypoints, regions, warps, _ = costs[0]
     return [
         label,
-        f"{first.area_mpx:.1f}",
-        f"{first.num_keypoints / 1000:.1f}",
-        f"{first.num_regions:.1f}",
-        f"{first.warps_per_region:.1f}" if first.num_regions else "-",
-        f"{median(cost.total_s for cost in costs):.1f}",
+        f"{area_mpx:.1f}",
+        f"{keypoints / 1000:.1f}",
+        f"{regions:.1f}",
+        f"{warps / regions:.1f}" if regions else "-",
+        f"{median(each[4] for each in costs):.1f}",
         f"{median(ratios):.1f} [{min(ratios):.1f}-{max(ratios):.1f}]",
     ]
 
@@ -81,11 +90,10 @@ def main() -> None:
             prepare(options, Resources(arguments.weights))
             for options in (extraction, without_warps(extraction))
         ]
-    costs: dict[str, list[list[ImageCost]]] = {text: [] for text in extractors}
+    costs: dict[str, list[list[np.ndarray]]] = {text: [] for text in extractors}
     for _ in range(arguments.num_rounds):
         for text, both in extractors.items():
-            found = [[extract_measured(way, path)[1] for path in paths] for way in both]
-            costs[text].append([ImageCost.mean(of_images) for of_images in found])
+            costs[text].append([np.mean([cost(way, p) for p in paths], axis=0) for way in both])
     rows = [table_row(text, *map(list, zip(*of, strict=True))) for text, of in costs.items()]
     print(f"{describe_machine()}\n\n{table(HEADER, rows)}")
 

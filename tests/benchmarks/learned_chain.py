@@ -25,12 +25,12 @@ from machine import describe_machine
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import GrayImage, LocalFeatures, View
-from colmap_affrect.evaluation.recipe_features import ImageCost, extract_measured
 from colmap_affrect.features.affnet_hardnet import AffNetHardNet
 from colmap_affrect.features.networks import DESCRIPTOR_NETWORKS
 from colmap_affrect.features.weights import load_state_dict
 from colmap_affrect.images.photographs import list_images
 from colmap_affrect.recipes import load_recipe
+from colmap_affrect.report.levels import InspectedLevel, inspect_level
 from colmap_affrect.stages.context import Resources
 from colmap_affrect.stages.one_image import ImageExtractor, prepare
 
@@ -103,24 +103,25 @@ def main() -> None:
     names = list_images(arguments.image_path)[: arguments.max_num_images]
     print(describe_machine())
     for name in names:
-        rounds: list[list[ImageCost]] = []
+        rounds: list[list[InspectedLevel]] = []
+        photograph, _ = extractor.photograph(arguments.image_path / name)
         for _ in range(arguments.rounds):
-            found = [extract_measured(way, arguments.image_path / name) for way in ways]
-            rounds.append([cost for _, cost in found])
-        expected = exact.extract_file(arguments.image_path / name).features.descriptors
+            rounds.append([inspect_level(way, photograph, 0) for way in ways])
+        expected = inspect_level(exact, photograph, 0).features.descriptors
         print(f"{name}: {len(expected)} features; from kornia's in 64 bits")
-        for whose, (image, _) in zip(("ours", "kornia's in 32"), found, strict=True):
-            differences = np.abs(image.features.descriptors - expected).max(axis=1)
+        for whose, level in zip(("ours", "kornia's in 32"), rounds[-1], strict=True):
+            differences = np.abs(level.features.descriptors - expected).max(axis=1)
             print(
                 f"{whose} differ by {np.median(differences):.1e}, at most {differences.max():.1e}, "
                 f"{np.count_nonzero(differences > TOLERANCE)} by over {TOLERANCE}"
             )
-        for what in ("describe_s", "total_s"):
-            pairs = [[getattr(cost, what) for cost in costs] for costs in rounds]
+        for what in ("describe", "all steps"):
+            steps = [[level.seconds for level in levels] for levels in rounds]
+            pairs = [[s.get(what, sum(s.values())) for s in both] for both in steps]
             first, second = (median(column) for column in zip(*pairs, strict=True))
             ratios = sorted(kornia_s / ours_s for ours_s, kornia_s in pairs)
             print(
-                f"{what[:-2]}: ours {first:.1f} s, kornia {second:.1f} s, kornia takes "
+                f"{what}: ours {first:.1f} s, kornia {second:.1f} s, kornia takes "
                 f"{median(ratios):.2f} [{ratios[0]:.2f}-{ratios[-1]:.2f}] times as long"
             )
 

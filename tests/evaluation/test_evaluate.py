@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +14,22 @@ import numpy as np
 import pytest
 from command import run_in_process_of_its_own
 from planar_pairs import TRUTH, write_extreme_views
+from posed_photographs import write_imc
 
-from colmap_affrect.errors import EvaluationError, OptionError, StaleStoreError
+from colmap_affrect.errors import EvaluationError, OptionError
 from colmap_affrect.evaluation import evaluate as module
-from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate
-from colmap_affrect.evaluation.evd import Evd
-from colmap_affrect.evaluation.pair_matches import MatchedPair
-from colmap_affrect.evaluation.posed_scenes import Imc
-from colmap_affrect.evaluation.protocol import PairResult
-from colmap_affrect.evaluation.recipe_features import IMAGE_STEPS, RecipeFeatures, RecordFile
+from colmap_affrect.evaluation.data import ScoreOptions
+from colmap_affrect.evaluation.datasets import load_evd
+from colmap_affrect.evaluation.evaluate import PROTOCOLS, EvaluateOptions, evaluate
 from colmap_affrect.evaluation.results import Evaluation, RecipeResult, Solved
-from colmap_affrect.matchers import nearest
-from colmap_affrect.stages.context import Resources
-from colmap_affrect.stages.one_image import ExtractedImage, ImageExtractor
+from colmap_affrect.evaluation.runner import RecipeRun
+from colmap_affrect.evaluation.truths import TrueHomography
+from colmap_affrect.stages.one_image import ImageExtractor
 
-FAST = "default=default:max_image_size_px=120"
-RECIPES = ("unrectified-rootsift", FAST)
-PROTOCOL = Evd(check_truth=False, max_num_iterations=2000, num_magsac_estimates=1)
+Done = tuple[Path, Evaluation]
+Patch, Calls = pytest.MonkeyPatch, Counter[str]
+PLAIN = "unrectified-rootsift"
+RECIPES = (PLAIN, "default=default:max_image_size_px=120")
 NAMES = ["cafe", "dance", "shop"]
 
 
@@ -40,159 +39,100 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def done(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Evaluation]:
+def done(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Done:
     out = tmp_path_factory.mktemp("out")
-    return out, run(dataset, out, baseline="unrectified-rootsift")
-
-
-@pytest.fixture(autouse=True)
-def _no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plots take most of the time; those of ``done`` are drawn."""
-    monkeypatch.setattr(module, "write_plots", lambda *_: [])
+    return out, run(dataset, out, baseline=PLAIN)
 
 
 @pytest.fixture
-def copied(done: tuple[Path, Evaluation], tmp_path: Path) -> Path:
+def copied(done: Done, tmp_path: Path) -> Path:
     return shutil.copytree(done[0], tmp_path / "out")
 
 
 @pytest.fixture
 def changed(dataset: Path, tmp_path: Path) -> Path:
-    """Return a copy of the dataset, to be changed."""
     return shutil.copytree(dataset, tmp_path / "changed")
 
 
 @pytest.fixture
-def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+def calls(monkeypatch: Patch) -> Calls:
     """Count images extracted and pairs scored."""
-    counts = {"images": 0, "pairs": 0}
+    counts: Calls = Counter()
+    extract, score = ImageExtractor.extract_file, TrueHomography.score
+    for owner, function in ((ImageExtractor, extract), (TrueHomography, score)):
 
-    def count(key: str, owner: type, method: str) -> None:
-        function = getattr(owner, method)
+        def counted(*given: Any, function: Any = function) -> Any:
+            counts[function.__name__] += 1
+            return function(*given)
 
-        def counted(*arguments):
-            counts[key] += 1
-            return function(*arguments)
-
-        monkeypatch.setattr(owner, method, counted)
-
-    count("images", RecipeFeatures, "_extract")
-    count("pairs", Evd, "score")
+        monkeypatch.setattr(owner, function.__name__, counted)
     return counts
 
 
 def run(path: Path, out: Path, recipes: Sequence[str] = RECIPES, **options: Any) -> Evaluation:
-    return evaluate(PROTOCOL, path, out, EvaluateOptions(recipes=recipes, **options))
-
-
-def test_device_reaches_extraction_and_matching(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    matched: list[str] = []
-    extracted: list[str] = []
-    extract = ImageExtractor.extract
-
-    def watched(extractor: ImageExtractor, *arguments: Any) -> ExtractedImage:
-        extracted.append(extractor.resources.device)
-        return extract(extractor, *arguments)
-
-    monkeypatch.setattr(nearest, "coarse_descriptors", lambda _, device: matched.append(device))
-    monkeypatch.setattr(ImageExtractor, "extract", watched)
-    run(dataset, tmp_path / "out", RECIPES[:1], resources=Resources(device="cpu"))
-    assert matched == ["cpu"]
-    assert set(extracted) == {"cpu"}
+    scores = ScoreOptions(max_num_iterations=2000)
+    return evaluate("evd", path, out, EvaluateOptions(recipes=recipes, scores=scores, **options))
 
 
 def errors(recipe: RecipeResult) -> list[float]:
     return [pair.error for pair in recipe.pairs]
 
 
-def test_every_recipe_solves_easy_pairs(done: tuple[Path, Evaluation]) -> None:
+def test_every_recipe_solves_easy_pairs(done: Done) -> None:
     _, evaluation = done
-    assert [recipe.name for recipe in evaluation.recipes] == ["unrectified-rootsift", "default"]
+    assert [recipe.name for recipe in evaluation.recipes] == [PLAIN, "default"]
     for recipe in evaluation.recipes:
         assert [pair.name for pair in recipe.pairs] == NAMES
         assert max(errors(recipe)) < 1.0
         assert recipe.summary["< 1 px"] == 3
-        assert recipe.intervals["< 1 px"] == (3, 3)
         assert recipe.solved == Solved(1.0, (1.0, 1.0))
-        assert not any(pair.failure for pair in recipe.pairs)
+        steps = recipe.seconds_per_step
+        total_s = 6 * steps["extract"] + 3 * (steps["match"] + steps["estimate"])
+        assert recipe.summary["seconds"] == pytest.approx(total_s)
         for pair in recipe.pairs:
             assert 4 <= pair.num_inliers <= pair.num_matches <= min(pair.num_keypoints)
-            assert pair.seconds == pytest.approx(sum(pair.seconds_by_step.values()))
+            assert (pair.level, pair.num_levels, pair.failure) == ("", 1, "")
     assert [recipe.p_value for recipe in evaluation.recipes] == [None, 1.0]
 
 
-def test_costs_are_those_of_the_warps(done: tuple[Path, Evaluation]) -> None:
-    plain, warped = done[1].recipes
-    assert plain.complexity["area_mpx"] == plain.complexity["warps_per_region"] == 0
-    assert warped.complexity["num_warps"] >= warped.complexity["num_regions"] > 0
-    assert 0 < warped.complexity["area_mpx"] < 10 * 160 * 120 / 1e6
-    steps = warped.seconds_per_step
-    assert min(steps[step] for step in ("plan", "warp", "detect", "match", "estimate")) > 0
-    expected = 6 * sum(steps[step] for step in IMAGE_STEPS) + sum(p.seconds for p in warped.pairs)
-    assert warped.summary["seconds"] == pytest.approx(expected)
-
-
-def test_files_say_the_same(done: tuple[Path, Evaluation]) -> None:
+def test_files_and_tables_say_the_same(done: Done) -> None:
     out, evaluation = done
     text = (out / "evaluation.json").read_text(encoding="utf-8")
     assert text == evaluation.to_json()
     values = json.loads(text)
-    assert values["protocol"] == "evd"
-    assert values["settings"]["scores"]["threshold_px"] == 0.5
+    assert (values["protocol"], values["settings"]["scores"]["threshold_px"]) == ("evd", 0.5)
     pair = values["recipes"]["default"]["pairs"][0]
     assert {"name", "error", "num_inliers", "seconds"} <= pair.keys()
-    lines = (out / "evaluation.csv").read_text().splitlines()
-    assert len(lines) == 1 + 2 * 3
-    assert lines[0].startswith("recipe,pair,category,error,num_inliers")
-    for name in ("errors", "times", "complexity"):
-        assert (out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
-    summary = evaluation.summary()
-    assert "paper: AffNetShapes (Table 2" in summary
-    assert "paper: depth-map-based (Table 1" in summary
-    assert "3 pairs; the dataset of the paper has 15" in summary
+    assert (out / "errors.png").read_bytes()[:4] == b"\x89PNG"
+    row = evaluation.published[2]
+    assert (row.method, row.table) == ("AffNetShapes", "Table 2: EVD, 15 pairs")
+    assert list(row.values.items())[4:] == [("< 10 px", 9), ("< 20 px", 10), ("seconds", 185.47)]
+    (line,) = (s for s in evaluation.summary().splitlines() if s.startswith("paper: AffNetS"))
+    assert line.split()[-7:] == ["0", "2", "5", "8", "9", "10", "185.5"]
 
 
-def test_finished_work_is_not_done_again(
-    dataset: Path, copied: Path, done: tuple[Path, Evaluation], calls: dict[str, int]
-) -> None:
-    again = run(dataset, copied, baseline="unrectified-rootsift")
-    assert calls == {"images": 0, "pairs": 0}
-    assert again.to_json() == done[1].to_json()
-
-
-def test_stopped_evaluation_goes_on(
-    dataset: Path, copied: Path, done: tuple[Path, Evaluation], calls: dict[str, int]
-) -> None:
-    (records,) = (copied / "pairs").glob("unrectified-rootsift-*.jsonl")
-    lines = records.read_bytes().splitlines(keepends=True)
-    records.write_bytes(b"".join(lines[:2]) + lines[2][:40])  # killed while writing a line
-    costs = copied / "features" / "default.jsonl"
-    costs.write_bytes(costs.read_bytes() + b'{"image": "1/ca')
+def test_stopped_work_goes_on(dataset: Path, copied: Path, done: Done, calls: Calls) -> None:
+    assert run(dataset, copied, baseline=PLAIN).to_json() == done[1].to_json()
+    assert (calls["extract_file"], calls["score"]) == (0, 0)
+    next(copied.glob(f"pairs/{PLAIN}-*/*.json")).unlink()
     again = run(dataset, copied)
-    assert calls == {"images": 0, "pairs": 2}
+    assert (calls["extract_file"], calls["score"]) == (0, 1)
     assert [errors(recipe) for recipe in again.recipes] == [errors(r) for r in done[1].recipes]
     assert again.recipes[1].num_images == 6
 
 
-def test_a_changed_truth_is_scored_again(
-    changed: Path, tmp_path: Path, calls: dict[str, int]
-) -> None:
-    run(changed, tmp_path / "out", RECIPES[:1])
-    assert calls == {"images": 6, "pairs": 3}
-    np.savetxt(changed / "h" / "dance.txt", np.diag([1, 1, 0.5]) @ TRUTH)
-    again = run(changed, tmp_path / "out", RECIPES[:1])
-    assert calls == {"images": 6, "pairs": 4}
-    cafe, dance, _ = errors(again.recipes[0])
+def test_a_changed_truth_is_scored_again(changed: Path, tmp_path: Path, calls: Calls) -> None:
+    for truth in (TRUTH, TRUTH * (1 + 1e-15), np.diag([1, 1, 0.5]) @ TRUTH):
+        np.savetxt(changed / "h" / "dance.txt", truth)
+        (recipe,) = run(changed, tmp_path / "out", RECIPES[:1]).recipes
+    assert (calls["extract_file"], calls["score"]) == (6, 5)
+    cafe, dance, _ = errors(recipe)
     assert dance > 20.0 > cafe
 
 
-def test_budget_takes_the_strongest_of_the_same_features(
-    dataset: Path, copied: Path, calls: dict[str, int]
-) -> None:
+def test_budget_takes_the_strongest(dataset: Path, copied: Path, calls: Calls) -> None:
     budgeted = run(dataset, copied, max_num_keypoints=60)
-    assert calls == {"images": 0, "pairs": 6}
+    assert (calls["extract_file"], calls["score"]) == (0, 6)
     for recipe in budgeted.recipes:
         assert {pair.num_keypoints for pair in recipe.pairs} == {(60, 60)}
     # Of features that were cut at random hardly any would match.
@@ -201,158 +141,111 @@ def test_budget_takes_the_strongest_of_the_same_features(
 
 @pytest.mark.parametrize(("when", "failed"), [("before", ["dance", "shop"]), ("later", ["dance"])])
 def test_damaged_image_fails_its_pair_and_the_others_go_on(
-    when: str, failed: list[str], changed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    when: str, failed: list[str], changed: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
-    loaded = PROTOCOL.load(changed)
+    loaded = load_evd(changed)
     (changed / "2" / "dance.png").write_bytes(b"no image")
     (changed / "h" / "shop.txt").write_text("1 2 nan")
     if when == "later":
-        monkeypatch.setattr(Evd, "load", lambda *_: loaded)
+        protocol = module.Protocol(lambda _: loaded, PROTOCOLS["evd"].columns, "error")
+        monkeypatch.setitem(PROTOCOLS, "evd", protocol)
     evaluation = run(changed, tmp_path / "out", RECIPES[:1])
     (recipe,) = evaluation.recipes
     assert [pair.name for pair in recipe.pairs if pair.failure] == failed
-    assert errors(recipe)[0] < 1.0
-    assert errors(recipe)[1] == math.inf
+    assert errors(recipe)[:2] == [pytest.approx(0.0, abs=1.0), math.inf]
     assert recipe.summary["< 20 px"] == 3 - len(failed)
     assert ("2/dance.png" in recipe.failures) == (when == "later")
-    assert "dance" in evaluation.summary()
+    assert any("dance.png: not a readable" in note for note in evaluation.notes) == (
+        when == "before"
+    )
     values = json.loads(evaluation.to_json())
     assert values["recipes"][recipe.name]["pairs"][1]["error"] is None
 
 
-def test_intervals_of_a_category_are_over_its_pairs() -> None:
-    errors = {"20°": [1.0], "100°": [90.0] * 9}
-    results = [
-        PairResult(error, 0, name="", category=category)
-        for category, members in errors.items()
-        for error in members
-    ]
-    intervals = module._intervals(Imc(), results, 0)
-    assert (intervals["20°"], intervals["100°"]) == ((1.0, 1.0), (0.0, 0.0))
-    assert intervals["all"] == (0.0, pytest.approx(0.3))
-
-
-def test_unforeseen_error_of_a_score_fails_its_pair_only(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    score = Evd.score
-
-    def fragile(self, pair, *arguments):
-        if pair.name == "dance":
-            raise ZeroDivisionError("an accident")
-        return score(self, pair, *arguments)
-
-    monkeypatch.setattr(Evd, "score", fragile)
+def test_error_of_a_score_fails_its_pair(dataset: Path, tmp_path: Path, monkeypatch: Patch) -> None:
+    score, fine = TrueHomography.score, [True, True, False, True]
+    monkeypatch.setattr(
+        TrueHomography, "score", lambda *given: score(*given) if fine.pop() else 1 / 0
+    )
     (recipe,) = run(dataset, tmp_path, RECIPES[:1]).recipes
-    assert [pair.failure for pair in recipe.pairs] == ["", "ZeroDivisionError: an accident", ""]
+    failures = sorted(pair.failure for pair in recipe.pairs)
+    assert failures == ["", "", "ZeroDivisionError: division by zero"]
 
 
 @pytest.fixture
 def climbing(tmp_path: Path) -> str:
     path = tmp_path / "climbing.toml"
-    path.write_text(
-        '[rectifier]\nname = "identity"\n[[escalation]]\nrectifier.name = "dense-shapes"\n'
-    )
-    return f"{path}:escalate.strong_num_inliers="
+    levels = '[[escalation]]\nrectifier.name = "dense-shapes"\n' * 2
+    path.write_text(f'[rectifier]\nname = "identity"\n{levels}')
+    return f"climbing={path}:escalate.strong_num_inliers="
 
 
-def test_escalation_stops_at_the_level_that_suffices(
-    changed: Path, tmp_path: Path, climbing: str
-) -> None:
-    for folder in ("1", "2", "h"):
-        for path in (changed / folder).glob("[ds]*"):
-            path.unlink()
-    recipes = [f"easy={climbing}0", f"hard={climbing}100000"]
-    easy, hard = run(changed, tmp_path / "out", recipes).recipes
-    assert easy.pairs[0].level == "identity"
-    assert easy.complexity["num_warps"] == 0 < hard.complexity["num_warps"]
-    assert [recipe.pairs[0].num_levels for recipe in (easy, hard)] == [1, 2]
-    assert hard.pairs[0].num_correct >= 0.9 * easy.pairs[0].num_correct
+@pytest.mark.parametrize(("inliers", "strong", "level", "num_levels"), [
+    ((20, 16, 10), 20, "identity", 1),
+    ((20, 16, 10), 30, "identity", 3),
+    ((20, 30, 99), 30, "dense-shapes", 2),
+    ((0, 0, 0), 30, "none", 3),
+])  # fmt: skip
+def test_escalation_stops_where_it_suffices_and_most_verified_inliers_count(
+    inliers: tuple[int, ...], strong: int, level: str, num_levels: int,
+    changed: Path, tmp_path: Path, climbing: str, monkeypatch: Patch,
+) -> None:  # fmt: skip
+    for path in changed.glob("*/[ds]*"):
+        path.unlink()
+    monkeypatch.setattr(RecipeRun, "_verified_inliers", lambda *given: inliers[given[-1]])
+    (recipe,) = run(changed, tmp_path / "out", [f"{climbing}{strong}"]).recipes
+    assert (recipe.pairs[0].level, recipe.pairs[0].num_levels) == (level, num_levels)
+    assert recipe.summary["< 1 px"] == 1
 
 
-def test_the_level_with_most_verified_inliers_counts() -> None:
-    first, weaker, stronger, lost = (
-        MatchedPair(None, (), (0, 0), level, number, inliers, 1.0)
-        for number, (level, inliers) in enumerate((("a", 20), ("b", 16), ("c", 30), ("none", 0)), 1)
-    )
-    assert first.better(weaker) == replace(first, num_levels=2, seconds=2.0)
-    assert first.better(weaker).better(stronger) == replace(stronger, seconds=3.0)
-    assert lost.better(lost) == replace(lost, seconds=2.0)
-
-
-def test_cost_is_that_of_the_levels_that_these_settings_need(
-    dataset: Path, tmp_path: Path, climbing: str
-) -> None:
-    recipes = [f"climbing={climbing}0"]
-    (climbed,) = run(dataset, tmp_path / "out", recipes, max_num_keypoints=15).recipes
-    assert climbed.complexity["num_warps"] > 0
-    (recipe,) = run(dataset, tmp_path / "out", recipes).recipes
-    assert {pair.level for pair in recipe.pairs} == {"identity"}
-    assert (recipe.complexity["num_warps"], recipe.num_images) == (0, 6)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (EvaluateOptions(recipes=["sift"]), "sift is COLMAP's and no recipe"),
-        (EvaluateOptions(baseline="asift"), "--baseline asift: is not among the recipes"),
-        (EvaluateOptions(max_num_keypoints=0), "--max-num-keypoints 0: must be at least 1"),
-        (EvaluateOptions(random_seed=-4), "--random-seed -4: must be at least 0"),
-        (EvaluateOptions(recipes=["default", "default"]), "two methods are called 'default'"),
-    ],
-)
-def test_bad_options_are_refused(
-    options: EvaluateOptions, message: str, dataset: Path, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("options", "message"), [
+    (EvaluateOptions(recipes=["sift"]), "sift is COLMAP's and no recipe"),
+    (EvaluateOptions(baseline="asift"), "--baseline asift: is not among unrectified"),
+    (EvaluateOptions(max_num_keypoints=0), "--max-num-keypoints 0: must be at least 1"),
+    (EvaluateOptions(random_seed=-4), "--random-seed -4: must be at least 0"),
+    (EvaluateOptions(recipes=["default", "default"]), "two methods are called 'default'"),
+])  # fmt: skip
+def test_bad_options(options: Any, message: str, dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=message):
-        evaluate(PROTOCOL, dataset, tmp_path, options)
+        evaluate("evd", dataset, tmp_path, options)
 
 
 def test_features_of_other_options_are_not_mixed(dataset: Path, copied: Path) -> None:
-    options = EvaluateOptions(recipes=["default=default:max_image_size_px=90"])
-    with pytest.raises(StaleStoreError, match="max_image_size_px=120, and it is 90 now"):
-        evaluate(PROTOCOL, dataset, copied, options)
-    evaluate(PROTOCOL, dataset, copied, options, overwrite=True)
-    assert len(list((copied / "pairs").glob("default-*"))) == 1
+    changed = "default=default:max_image_size_px=90"
+    run(dataset, copied, [changed, "default-of-mine=default:max_image_size_px=80"])
+    assert len(list(copied.glob("features/default-????????.h5"))) == 2
+    evaluate("evd", dataset, copied, EvaluateOptions(recipes=[changed]), overwrite=True)
+    assert len(list(copied.glob("*/default-????????"))) == 2
+    assert len(list(copied.glob("*/default-of-mine-*"))) == 3
 
 
 def test_dataset_without_a_usable_pair_is_refused(changed: Path, tmp_path: Path) -> None:
     for path in (changed / "2").iterdir():
         path.unlink()
-    with pytest.raises(EvaluationError, match=r"no pair can be evaluated; the first: .*cafe\.png"):
-        evaluate(PROTOCOL, changed, tmp_path / "out")
+    with pytest.raises(
+        EvaluationError,
+        match=r"no pair can be evaluated; 3 of 3 pairs count as failed: .*cafe\.png",
+    ):
+        run(changed, tmp_path / "out")
+    with pytest.raises(OptionError, match="unknown protocol 'megadepth': known are evd, svp"):
+        evaluate("megadepth", changed, tmp_path / "out")
 
 
-def test_record_file_refuses_other_settings_and_drops_half_a_line(tmp_path: Path) -> None:
-    path = tmp_path / "records.jsonl"
-    RecordFile(path, {"size": [1, 2]}).append({"name": "a\u2028b"})
-    path.write_bytes(path.read_bytes() + b'{"name": "c')
-    reopened = RecordFile(path, {"size": (1, 2)})
-    assert reopened.records == [{"name": "a\u2028b"}]
-    reopened.append({"name": "d"})
-    assert [record["name"] for record in RecordFile(path, {"size": [1, 2]}).records] == [
-        "a\u2028b",
-        "d",
-    ]
-    with pytest.raises(StaleStoreError, match=r"size=\[1, 2\], and it is \[1, 3\] now"):
-        RecordFile(path, {"size": [1, 3]})
-
-
-def test_fingerprint_sees_numbers_in_any_place() -> None:
-    first, again = ((Evd(), [np.ones((2, 999))], "a") for _ in range(2))
-    assert module._fingerprint(first) == module._fingerprint(again)
-    again[1][0][1, 500] += 1e-15
-    for other in ((Evd(threshold_px=1), *first[1:]), again):
-        assert module._fingerprint(other) != module._fingerprint(first)
+def test_poses_are_evaluated_and_drawn_by_category(tmp_path: Path) -> None:
+    scene = write_imc(tmp_path / "set" / "garden")
+    options = EvaluateOptions(recipes=[PLAIN], scores=ScoreOptions(max_num_iterations=1000))
+    (recipe,) = evaluate("imc", scene, tmp_path / "out", options).recipes
+    assert recipe.solved_by_category == {"0.1": 1.0, "0.2": 1.0}
+    assert recipe.summary["0.1"] == recipe.summary["GC-RANSAC: all"] == 1.0
+    assert (tmp_path / "out" / "categories.png").is_file()
 
 
 @pytest.mark.long
 def test_command_prints_tables_and_errors_are_one_line(dataset: Path, tmp_path: Path) -> None:
     common = ["evaluate", "evd", "--output-path", tmp_path / "out", "-q"]
-    settings = ["max_num_iterations=2000", "check_truth=false", "num_magsac_estimates=1"]
     ended = run_in_process_of_its_own(
-        *common, "--dataset-path", dataset, "--recipes", "unrectified-rootsift",
-        "--protocol-options", *settings,
+        *common, "--dataset-path", dataset, "--recipes", PLAIN,
+        "--protocol-options", "max_num_iterations=2000", "magsac_threshold_px=1",
     )  # fmt: skip
     assert (ended.code, ended.errors) == (0, [])
     assert "< 1 px  < 2 px  < 3 px  < 5 px  < 10 px  < 20 px  seconds" in ended.stdout

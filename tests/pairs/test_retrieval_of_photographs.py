@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from colmap_affrect.colmap.poses import read_poses
-from colmap_affrect.evaluation.relative_pose import rotation_angle_deg
+from colmap_affrect.evaluation.datasets import difficulty
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.workspace import Workspace
@@ -42,7 +42,7 @@ def test_photographs_of_one_side_of_a_temple_find_each_other(tmp_path: Path) -> 
     near = {
         (f"{RING}/{first}", f"{RING}/{second}")
         for first, second in itertools.combinations(sorted(poses), 2)
-        if rotation_angle_deg(poses[first][0] @ poses[second][0].T) < 40.0
+        if difficulty(poses[first], poses[second]) < 4
     }
     assert len(near) >= 12
     assert near <= set(pairs)

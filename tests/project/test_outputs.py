@@ -134,12 +134,13 @@ IN_TEMPORARY_FOLDERS = {
     ("export.py", "_nerfstudio"), ("export.py", "_text"), ("hdf5_layouts.py", "created"),
     ("inspection.py", "inspect_image"), ("sheet.py", "figure_page"), ("conversion.py", "_convert"),
     ("compare.py", "_make_shared"), ("worker.py", "_run_seed"), ("worker.py", "_seed_result"),
+    ("datasets.py", "read_views"),
 }  # fmt: skip
 """Functions that write where the door lets them."""
 
 IN_WORK_FOLDERS = {
-    ("compare.py", "_run"), ("recipe_features.py", "__init__"), ("recipe_features.py", "append"),
-    ("__init__.py", "_logging"), ("plots.py", "write_plots"),
+    ("compare.py", "_run"), ("runner.py", "__init__"), ("__init__.py", "_logging"),
+    ("plots.py", "write_plots"),
 }  # fmt: skip
 """Functions that write where the door has refused folders of others, and links."""
 

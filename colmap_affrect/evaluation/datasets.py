@@ -1,0 +1,378 @@
+"""Layouts of datasets: EVD, SVP and IMC as the paper has them, and any pairs.
+
+``evd``: ``1/NAME.png``, ``2/NAME.png``, ``h/NAME.txt`` (any image suffix), or Oxford's sequences,
+``NAME_1.png``, ``NAME_2.png``, ``H_NAME_1_2.txt``, ... with homographies of pixel-centre px.
+
+``svp`` (Strong ViewPoint Changes, Toft et al., 2020), a scene or a folder of scenes::
+
+    images/                   photographs
+    <scene>_image_pairs.txt   lines "IMAGE1 IMAGE2 DIFFICULTY", the last from the poses, not read
+    0/images.txt              poses, COLMAP's text, with or without the lines of points
+    0/cameras.txt             cameras, COLMAP's text
+
+``imc`` (Image Matching Challenge), a folder ``set_100/`` in a scene or in a folder of scenes::
+
+    images/<image>.jpg
+    calibration/calibration_<image>.h5   K (3 x 3), R (3 x 3), T (3): x_camera = R x + T
+    new-vis-pairs/keys-th-0.<k>.npy      names "<image 1>-<image 2>" with covisibility >= 0.<k>
+
+Its lists are cumulative; the categories are their differences, from 0.1 on, as in the paper, or
+from 0.0 where there is such a list. K is COLMAP's: the origin is the corner of the image. Images of
+scenes, and their depth maps, are known by ``<scene>/<name as its file>``.
+
+``pairs``, ``pairs.json`` beside the images::
+
+    {"pixel_origin": "center",
+     "pairs": [
+       {"image1": "a.png", "image2": "b.png", "homography": [[1, 0, 5], [0, 1, 0], [0, 0, 1]]},
+       {"image1": "c.png", "image2": "d.png", "correspondences": [[490.7, 39.2, 462.2, 18.7]],
+        "name": "cafe", "category": "indoors"},
+       {"image1": "e.png", "image2": "f.png",
+        "relative_pose": {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "translation": [1, 0, 0],
+                          "intrinsics1": [[500, 0, 320], [0, 500, 240], [0, 0, 1]],
+                          "intrinsics2": [[500, 0, 320], [0, 500, 240], [0, 0, 1]]}}]}
+
+Each pair has one of the three: a homography, image2_from_image1; correspondences, rows x1, y1, x2,
+y2 (both may also be the name of a text file of numbers); or a relative pose of undistorted images,
+x_camera2 = R x_camera1 + t. ``name`` (by default that of the images), ``category`` and
+``pixel_origin`` may be left out: ``center`` when (0, 0) is the centre of the first pixel (default),
+``corner`` when it is its corner.
+"""
+
+import json
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import copy
+from dataclasses import replace
+from functools import partial
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import h5py
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.poses import Pose, relative_pose
+from colmap_affrect.conventions import colmap_from_pixel, pixel_from_colmap
+from colmap_affrect.errors import AffrectError, EvaluationError, OptionError
+from colmap_affrect.evaluation.data import Dataset, EvaluationImage, EvaluationPair
+from colmap_affrect.evaluation.truths import Correspondences, TrueHomography, TruePose
+from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.images.reading import IMAGE_SUFFIXES
+from colmap_affrect.options import Options
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.project.outputs import leads_outside
+from colmap_affrect.shown import such_as
+
+Names = tuple[str, str]  # of the images of a pair, without suffix
+Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
+"""Cameras and cam_from_world poses by the name of the image without suffix."""
+
+PAIR_LIST_SUFFIX = "_image_pairs.txt"
+CATEGORY_DEG = 10
+CALIBRATION_PREFIX = "calibration_"
+MAX_NOT_UNIT = 1e-3  # largest deviation of the length of a quaternion from 1, and of R Rᵀ from I
+ORIGIN_PX = {"center": 0.0, "corner": float(pixel_from_colmap(np.zeros(1))[0])}
+
+
+class _Entry(Options):
+    image1: str
+    image2: str
+    name: str = ""
+    category: str = ""
+    homography: Any = None
+    correspondences: Any = None
+    relative_pose: Any = None
+
+
+def load_evd(folder: Path) -> Dataset:
+    """Find pairs with homographies; EvaluationError when the layout is another one."""
+    files = [file for part in "12h" for file in (folder / part).glob("*")]
+    names = {file.stem for file in files if file.suffix.lower() in (".txt", *IMAGE_SUFFIXES)}
+    found = [(name, f"1/{name}", f"2/{name}", f"h/{name}.txt") for name in sorted(names)]
+    for file in sorted(folder.glob("H_*.txt")):
+        if parts := re.fullmatch(r"H_(.+)_([^_]+)_([^_]+)", file.stem):
+            name, one, two = parts.groups()
+            found.append((f"{name} {one}-{two}", f"{name}_{one}", f"{name}_{two}", file.name))
+    if not found:
+        raise EvaluationError(
+            f"{folder}: holds neither 1/NAME.png, 2/NAME.png, h/NAME.txt nor "
+            "NAME_1.png, NAME_2.png, H_NAME_1_2.txt"
+        )
+
+    def image(name: str) -> str:  # PNG where there is none
+        names = (name + suffix for suffix in IMAGE_SUFFIXES)
+        return next((name for name in names if (folder / name).is_file()), f"{name}.png")
+
+    entries = [
+        _Entry(name=name, image1=image(one), image2=image(two), homography=matrix)
+        for name, one, two, matrix in found
+    ]
+    return _loaded(entries, folder, 0.0)
+
+
+def _scenes(pattern: str, load: Callable[[Path], Dataset], path: Path) -> Dataset:
+    """Read one or all scenes, by the file or folder that makes a folder one.
+
+    Raises EvaluationError when there is none, or its files are unusable.
+    """
+    folders = [path, *sorted(path.glob("*/"))]
+    scenes = [load(each) for folder in folders for each in sorted(folder.glob(pattern))]
+    notes = tuple(note for scene in scenes for note in scene.notes)
+    pairs = tuple(pair for scene in scenes for pair in scene.pairs)
+    if not pairs:
+        why = "; ".join(notes) or f"it has no {pattern}, nor has a folder in it"
+        raise EvaluationError(f"{path}: no pair can be evaluated; {why}")
+    return Dataset(pairs, notes)
+
+
+def _posed_pairs(
+    scene: str, folder: Path, views: Views, listed: Collection[Names], category: Callable[..., str]
+) -> Dataset:
+    """Return the listed pairs of images that are there and posed, ordered by their category."""
+    images, pairs, lacking = {}, {}, []
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.suffix.lower() in IMAGE_SUFFIXES and stem(name) in views:
+            images[stem(name)] = EvaluationImage(f"{scene}/{name}", path, views[stem(name)][0])
+    for names in listed:
+        if gone := [name for name in names if name not in images]:
+            lacking.append(gone[0])
+            continue
+        (camera1, pose1), (camera2, pose2) = (views[name] for name in names)
+        truth = TruePose((camera1, camera2), relative_pose(pose1, pose2))
+        both = images[names[0]], images[names[1]]
+        title = f"{both[0].name} {both[1].name}"
+        pairs[title] = EvaluationPair(title, both, category(*names), truth)
+    note = (
+        f"{scene}: {len(lacking)} of {len(listed)} listed pairs are left out, without an image or "
+        f"its camera: {such_as(dict.fromkeys(lacking))}"
+    )
+    ordered = sorted(pairs.values(), key=lambda pair: (float(pair.category.rstrip("°")), pair.name))
+    return Dataset(tuple(ordered), (note,) if lacking else ())
+
+
+def _svp_scene(list_path: Path) -> Dataset:
+    folder, scene = list_path.parent, list_path.name.removesuffix(PAIR_LIST_SUFFIX)
+    views, listed = read_views(folder / "0"), []
+    for words in map(str.split, _lines(list_path)):
+        if len(words) not in (2, 3):
+            raise EvaluationError(f"{list_path}: '{' '.join(words)}' is no pair of images")
+        listed.append((stem(words[0]), stem(words[1])))
+
+    def category(name1: str, name2: str) -> str:
+        return f"{CATEGORY_DEG * difficulty(views[name1][1], views[name2][1])}°"
+
+    return _posed_pairs(scene, folder / "images", views, listed, category)
+
+
+def difficulty(pose1: Pose, pose2: Pose) -> int:
+    """Return the category of two cam_from_world poses: tens of degrees of rotation."""
+    angle = pycolmap.Rotation3d(relative_pose(pose1, pose2)[0]).angle()
+    return int(np.rad2deg(angle) // CATEGORY_DEG)
+
+
+load_svp = partial(_scenes, f"*{PAIR_LIST_SUFFIX}", _svp_scene)
+
+
+def read_views(folder: Path) -> Views:
+    """Read ``images.txt`` and ``cameras.txt``; EvaluationError when that cannot be done."""
+    posed = [line for line in _lines(folder / "images.txt") if stem(line) != line]
+    with TemporaryDirectory() as name:
+        for file, lines in (
+            ("cameras.txt", _lines(folder / "cameras.txt")),
+            ("images.txt", [f"{line}\n" for line in posed]),  # each without points
+            ("points3D.txt", []),
+        ):
+            (Path(name) / file).write_text("\n".join([*lines, ""]), encoding="utf-8")
+        try:
+            model = pycolmap.Reconstruction(name)
+        except (RuntimeError, ValueError, IndexError) as error:
+            reason = " ".join(str(error).split())
+            raise EvaluationError(f"{folder}: COLMAP cannot read it ({reason})") from error
+    views = {}
+    for image in model.images.values():
+        pose = image.cam_from_world()
+        length = float(np.linalg.norm(pose.rotation.quat))
+        if not abs(length - 1.0) <= MAX_NOT_UNIT:
+            raise EvaluationError(f"{folder}: {image.name}: quaternion of length {length:.3g}")
+        pose.rotation.normalize()
+        views[stem(image.name)] = copy(image.camera), (pose.rotation.matrix(), pose.translation)
+    return views
+
+
+def stem(name: str) -> str:
+    """Return the name of an image without its suffix; other text as it is."""
+    path = PurePosixPath(name)
+    is_image = path.suffix.lower() in IMAGE_SUFFIXES
+    return path.with_suffix("").as_posix() if is_image else name
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a text file that are not empty or comments."""
+    try:
+        lines = map(str.strip, path.read_text(encoding="utf-8-sig").splitlines())
+        return [line for line in lines if line and not line.startswith("#")]
+    except (OSError, UnicodeDecodeError) as error:
+        raise EvaluationError(f"{path}: cannot be read ({error})") from error
+
+
+def _imc_scene(lists_path: Path) -> Dataset:
+    root, scene = lists_path.parent, lists_path.absolute().parents[1].name
+    views = {
+        path.stem.removeprefix(CALIBRATION_PREFIX): read_calibration(path)
+        for path in sorted((root / "calibration").glob(f"{CALIBRATION_PREFIX}*.h5"))
+    }
+    bins: dict[Names, str] = {}
+    for limit in range(10):
+        path = lists_path / f"keys-th-0.{limit}.npy"
+        if limit or path.exists():
+            try:
+                keys = np.load(path, allow_pickle=False).ravel().tolist()
+            except (OSError, ValueError, EOFError) as error:
+                raise EvaluationError(f"{path}: cannot be read ({error})") from error
+            bins |= {_split(str(key), views): f"0.{limit}" for key in keys}
+    return _posed_pairs(scene, root / "images", views, bins, lambda *names: bins[names])
+
+
+load_imc = partial(_scenes, "set_100/new-vis-pairs", _imc_scene)
+
+
+def _split(key: str, known: Views) -> Names:
+    """Split "a-b" where both names are known: names may have dashes in them."""
+    words = key.split("-")
+    splits = [("-".join(words[:k]), "-".join(words[k:])) for k in range(1, len(words))]
+    return next((names for names in splits if known.keys() >= set(names)), (key, key))
+
+
+def read_calibration(path: Path) -> tuple[pycolmap.Camera, Pose]:
+    """Read the camera and cam_from_world of an image; EvaluationError says what is wrong."""
+    try:
+        with h5py.File(path) as file:
+            given = {key: np.squeeze(file[key][()]) for key in ("K", "R", "T")}
+    except (OSError, TypeError, ValueError, RuntimeError, KeyError, AttributeError) as error:
+        raise EvaluationError(f"{path}: cannot be read ({error})") from error
+    camera = pinhole(finite_numbers(given["K"], (3, 3), f"{path}: K"), f"{path}: K")
+    translation = finite_numbers(given["T"], (3,), f"{path}: T")
+    return camera, (rotation(given["R"], f"{path}: R"), translation)
+
+
+def finite_numbers(given: Any, shape: tuple[int, ...], what: str) -> Array:
+    """Return an array, of any number of rows where ``shape`` begins with -1.
+
+    EvaluationError says what is wrong with ``what``.
+    """
+    try:
+        values = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise EvaluationError(f"{what} is not numbers ({error})") from error
+    if values.shape != (values.shape[:1] if shape[0] == -1 else shape[:1]) + shape[1:]:
+        raise EvaluationError(f"{what} has shape {values.shape}, expected {shape}")
+    if not np.isfinite(values).all() or not values.size:
+        raise EvaluationError(f"{what} is empty or has values that are not finite")
+    return values
+
+
+def rotation(given: Any, what: str) -> Array:
+    """Return a (3, 3) rotation; EvaluationError when ``what`` is none."""
+    matrix = finite_numbers(given, (3, 3), what)
+    is_orthonormal = np.abs(matrix @ matrix.T - np.eye(3)).max() < MAX_NOT_UNIT
+    if not is_orthonormal or np.linalg.det(matrix) < 0:
+        raise EvaluationError(f"{what} is not orthonormal, or a reflection")
+    return matrix
+
+
+def pinhole(matrix: Array, what: str) -> pycolmap.Camera:
+    """Return the camera of a (3, 3) matrix of COLMAP's px; EvaluationError when it is none."""
+    (fx, skew, cx), (zero, fy, cy), last = matrix.tolist()
+    if min(fx, fy, cx, cy) <= 0 or (skew, zero, *last) != (0, 0, 0, 0, 1):
+        raise EvaluationError(f"{what} is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    width, height = round(2 * cx), round(2 * cy)
+    return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, cx, cy])
+
+
+def load_pairs(folder: Path) -> Dataset:
+    """Read ``pairs.json``; EvaluationError when that cannot be used.
+
+    A pair whose images or truth cannot be used is returned with its problem.
+    """
+    path = folder / "pairs.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+        entries = [_entry(each, f"{path}: pairs[{k}]") for k, each in enumerate(content["pairs"])]
+        offset_px = ORIGIN_PX[content.get("pixel_origin", "center")]
+    except OptionError as error:
+        raise EvaluationError(str(error)) from error
+    except (OSError, ValueError, RecursionError, LookupError, TypeError) as error:
+        raise EvaluationError(
+            f"{path}: cannot be read ({error!r}); its format is that of the module {__name__}"
+        ) from error
+    names = [entry.name for entry in entries]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise EvaluationError(f"{path}: two pairs are called '{twice[0]}'; give them names")
+    return _loaded(entries, folder, offset_px)
+
+
+def _entry(values: Any, where: str) -> _Entry:
+    entry = _Entry.from_mapping(values, where)
+    if leads_outside(entry.image1) or leads_outside(entry.image2):
+        raise OptionError(f"{where}: images must be paths of images in the folder")
+    if (entry.homography, entry.correspondences, entry.relative_pose).count(None) != 2:
+        raise OptionError(f"{where}: needs homography, correspondences or relative_pose, and one")
+    return entry.changed(name=entry.name or f"{stem(entry.image1)} {stem(entry.image2)}")
+
+
+def _loaded(entries: Sequence[_Entry], folder: Path, offset_px: float) -> Dataset:
+    load = partial(_pair, folder=folder, offset_px=offset_px)
+    return Dataset(tuple(map_ordered(load, entries, available_cores())))
+
+
+def _pair(entry: _Entry, folder: Path, offset_px: float) -> EvaluationPair:
+    """Return the pair of an entry, with its truth, or with the problem why there is none."""
+    first, second = (EvaluationImage(name, folder / name) for name in (entry.image1, entry.image2))
+    pair = EvaluationPair(entry.name, (first, second), entry.category)
+    try:
+        for image in pair.images:
+            if not image.path.is_file():
+                raise EvaluationError(f"{image.path}: missing")
+        truth = _truth(entry, folder, offset_px)
+    except AffrectError as error:
+        return replace(pair, problem=str(error))
+    if isinstance(truth, TruePose):
+        both = zip(pair.images, truth.cameras, strict=True)
+        first, second = (replace(image, camera=camera) for image, camera in both)
+    return replace(pair, images=(first, second), truth=truth)
+
+
+def _truth(
+    entry: _Entry, folder: Path, offset_px: float
+) -> TrueHomography | TruePose | Correspondences:
+    """Return the truth of an entry; ``offset_px`` is added to coordinates for pixel centres."""
+    name, numbers = entry.name, entry.homography or entry.correspondences
+    if isinstance(numbers, str):
+        if leads_outside(numbers):
+            raise EvaluationError(f"{numbers}: must be a file in the folder of the pairs")
+        try:
+            numbers = np.loadtxt(folder / numbers, ndmin=2)
+        except (OSError, ValueError) as error:
+            raise EvaluationError(f"{folder / numbers}: cannot be read ({error})") from error
+    if entry.homography is not None:
+        center = np.array([[1.0, 0.0, offset_px], [0.0, 1.0, offset_px], [0.0, 0.0, 1.0]])
+        matrix = center @ finite_numbers(numbers, (3, 3), f"{name}: homography")
+        paths = [folder / entry.image1, folder / entry.image2]
+        return TrueHomography.of(matrix @ np.linalg.inv(center), paths, f"{name}: homography")
+    if entry.correspondences is not None:
+        points = finite_numbers(numbers, (-1, 4), f"{name}: correspondences")
+        return Correspondences(points + offset_px)
+    shapes = {"rotation": (3, 3), "translation": (3,), "intrinsics1": (3, 3), "intrinsics2": (3, 3)}
+    given = entry.relative_pose
+    if not isinstance(given, Mapping) or given.keys() != shapes.keys():
+        raise EvaluationError(f"{name}: relative_pose needs {', '.join(shapes)}")
+    values = {k: finite_numbers(given[k], shape, f"{name}: {k}") for k, shape in shapes.items()}
+    cameras = []
+    for key in ("intrinsics1", "intrinsics2"):
+        values[key][:2, 2] = colmap_from_pixel(values[key][:2, 2] + offset_px)
+        cameras.append(pinhole(values[key], f"{name}: {key}"))
+    pose = rotation(values["rotation"], f"{name}: rotation"), values["translation"]
+    return TruePose((cameras[0], cameras[1]), pose)

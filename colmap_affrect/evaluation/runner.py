@@ -1,0 +1,209 @@
+"""One recipe on the pairs of a dataset: features, matches and scores, kept for the next run.
+
+A pair is matched as a run of its two images alone would match it: a recipe with escalation tries
+its levels until COLMAP's geometric verification finds enough inliers. The level with most of them
+counts. Cameras are taken as unknown for that.
+"""
+
+import json
+import logging
+import math
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import colmap_keypoints
+from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
+from colmap_affrect.comparison.methods import Method
+from colmap_affrect.conventions import DEFAULT_FOCAL_RATIO
+from colmap_affrect.errors import AffrectError, OptionError
+from colmap_affrect.evaluation import data
+from colmap_affrect.evaluation.data import EvaluationPair, PairResult, PairScore
+from colmap_affrect.features.weights import digests
+from colmap_affrect.geometry.arrays import Array, Floats
+from colmap_affrect.options import digest_of
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.progress import Progress
+from colmap_affrect.project.atomic_files import replace_bytes, replace_text
+from colmap_affrect.project.outputs import remove_own
+from colmap_affrect.project.stores import FeatureStore
+from colmap_affrect.stages.context import Resources
+from colmap_affrect.stages.one_image import prepare
+from colmap_affrect.stages.one_pair import CachedMatcher, Matching
+
+logger = logging.getLogger(__name__)
+
+RESULT = TypeAdapter(PairResult)  # from and to JSON; infinite errors are null
+NO_SCORE = PairScore(math.inf, 0)
+NOTHING = np.zeros((0, 2)), np.zeros((0, 2))  # points of a pair that could not be matched
+
+
+class RecipeRun:
+    """One recipe on the pairs of a dataset.
+
+    Attributes:
+        extracted: records by image and level: ``image``, ``level``, ``seconds``, ``warning``.
+        failures: images that could not be used in this run, with the reason.
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        pairs: Sequence[EvaluationPair],
+        output_path: Path,
+        inputs: Mapping[str, Any],
+        settings: Mapping[str, Any],
+        resources: Resources,
+        *,
+        overwrite: bool,
+    ) -> None:
+        """Find everything that the recipe needs before any image is worked on.
+
+        Features depend on the recipe and ``inputs``, and scores on ``settings`` too. Others are
+        kept beside; ``overwrite`` removes all that this method has.
+        """
+        if method.recipe is None:
+            raise OptionError(f"{method.label} is COLMAP's and no recipe; compare can run it")
+        self.label, self.recipe, self._pairs = method.label, method.recipe, pairs
+        self._options = data.ScoreOptions(**settings["scores"]), settings["random_seed"]
+        extraction, matching = self.recipe.extraction, self.recipe.matching
+        images = {image.name for pair in pairs if not pair.problem for image in pair.images}
+        self._extractor = prepare(extraction, resources, sorted(images))
+        if overwrite:
+            names = [f"*/{method.folder_name}-????????{end}" for end in ("", ".h5")]
+            remove_own(path for name in names for path in output_path.glob(name))
+        made = digest_of([inputs, extraction.to_mapping(), digests(self._extractor.weights)])
+        self._features = output_path / "features" / f"{method.folder_name}-{made[:8]}"
+        self._store = FeatureStore(self._features.with_suffix(".h5"), made)
+        scored = digest_of([made, matching.to_mapping(), settings])
+        self._scores = output_path / "pairs" / f"{method.folder_name}-{scored[:8]}"
+        for folder in (self._features, self._scores):
+            folder.mkdir(parents=True, exist_ok=True)
+        paths = self._features.glob("*.json")
+        self.extracted = {path.name: json.loads(path.read_bytes()) for path in paths}
+        budget = settings["max_num_keypoints"]
+        self._matchings = []
+        for level, chosen in enumerate(extraction.levels):
+            of, kind = chosen.matching or matching, chosen.features.kind
+            task = Matching(self._store, of, level, chosen.base, kind, resources, budget)
+            self._matchings.append(task)
+        self.failures: dict[str, str] = {}
+        self._lock = Lock()  # of extraction and of the store
+
+    def results(self, progress: Progress) -> list[PairResult]:
+        """Match and score all pairs that have not been; what fails is tried again next time."""
+        with np.printoptions(floatmode="unique", threshold=sys.maxsize):  # all numbers, in words
+            keys = {p.name: digest_of([p.name, repr(p.truth)]) for p in self._pairs}
+        paths = {name: self._scores / f"{key}.json" for name, key in keys.items()}
+        done = {n: RESULT.validate_json(p.read_bytes()) for n, p in paths.items() if p.exists()}
+        todo = [pair for pair in self._pairs if not pair.problem and pair.name not in done]
+        with progress.stage(self.label, len(todo), "pairs") as advance:
+            work = partial(self._result, [CachedMatcher(task) for task in self._matchings])
+            for result in map_ordered(work, todo, available_cores()):
+                if not result.failure:
+                    replace_bytes(paths[result.name], RESULT.dump_json(result))
+                done[result.name] = result
+                advance(1)
+        return [done.get(pair.name) or self._failed(pair, pair.problem) for pair in self._pairs]
+
+    def _result(self, matchers: Sequence[CachedMatcher], pair: EvaluationPair) -> PairResult:
+        """Match a pair, and score it; an unforeseen error of the score fails this pair only."""
+        result, points = self._matched(matchers, pair)
+        if not result.num_levels:
+            failures = (self.failures.get(image.name, "") for image in pair.images)
+            return self._failed(pair, "; ".join(filter(None, failures)))
+        start = time.perf_counter()
+        try:
+            score = pair.truth.score(*points, *self._options)
+        except Exception as error:
+            logger.exception("%s: %s cannot be scored", self.label, pair.name)
+            return self._failed(pair, f"{type(error).__name__}: {error}")
+        steps = {"match": result.seconds, "estimate": time.perf_counter() - start}
+        return replace(result, **vars(score), seconds=sum(steps.values()), seconds_by_step=steps)
+
+    def _failed(self, pair: EvaluationPair, failure: str) -> PairResult:
+        """Return the result of a pair that has no matches."""
+        score = pair.truth.score(*NOTHING, *self._options) if pair.truth else NO_SCORE
+        return PairResult(**vars(score), name=pair.name, category=pair.category, failure=failure)
+
+    def _matched(
+        self, matchers: Sequence[CachedMatcher], pair: EvaluationPair
+    ) -> tuple[PairResult, tuple[Array, Array]]:
+        """Return the (M, 2) and (M, 2) points of the best level, and a result without score.
+
+        It has no levels where an image cannot be used.
+        """
+        best = PairResult(**vars(NO_SCORE), name=pair.name, category=pair.category)
+        points, most, seconds, num_levels = NOTHING, 0, 0.0, 0
+        for level, matcher in enumerate(matchers):
+            with self._lock:
+                usable = [self._extract(image, level) for image in pair.images]
+                if not all(usable):
+                    break
+                first, second = (matcher.prepared(image.name) for image in pair.images)
+            start = time.perf_counter()
+            rows1, rows2 = matcher.match(first, second).indices.T
+            frames = first.frames[rows1], second.frames[rows2]
+            count, decided = 0, ""
+            if len(matchers) > 1:
+                count = self._verified_inliers(pair, frames, level)
+                decided = self.recipe.extraction.levels[level].name if count else "none"
+            seconds, num_levels = seconds + time.perf_counter() - start, level + 1
+            if count > most or not most:
+                most, points = count, (frames[0][:, :, 2], frames[1][:, :, 2])
+                counts = len(first.frames), len(second.frames)
+                best = replace(best, num_matches=len(rows1), num_keypoints=counts, level=decided)
+            if most >= max(1, self.recipe.escalate.strong_num_inliers):
+                break
+        return replace(best, seconds=seconds, num_levels=num_levels), points
+
+    def _extract(self, image: data.EvaluationImage, level: int) -> bool:
+        """Extract what an image lacks up to a level; tell whether it can be used."""
+        name, store = image.name, self._store
+        num_levels = len(store.level_ends(name)) if store.complete([name]) else 0
+        for missing in range(num_levels, level + 1):
+            start = time.perf_counter()
+            try:
+                if name in self.failures:
+                    return False
+                found = self._extractor.extract_file(image.path, name, image.intrinsics, missing)
+            except AffrectError as error:
+                logger.warning("%s", error)
+                self.failures[name] = str(error)
+                return False
+            seconds, warning = time.perf_counter() - start, found.warning
+            record = {"image": name, "level": missing, "seconds": seconds, "warning": warning}
+            path = self._features / f"{digest_of([name, missing])}.json"
+            replace_text(path, json.dumps(record))  # first, so that features never lack it
+            self.extracted[path.name] = record
+            if missing:
+                store.extend(name, found.features)
+            else:
+                store.write(name, found.features, found.image_size)
+        return True
+
+    def _verified_inliers(self, pair: EvaluationPair, frames: Sequence[Floats], level: int) -> int:
+        """Return the inliers of COLMAP's two-view geometry; 0 if a run would not take it."""
+        with self._lock:
+            sizes = [self._store.image_size(image.name) for image in pair.images]
+        # What COLMAP assumes of an image without EXIF: a camera of its own, of unknown focus.
+        # The id matters: two images of one camera are verified in another way.
+        model, make = "SIMPLE_RADIAL", pycolmap.Camera.create_from_model_name
+        focal_px = [DEFAULT_FOCAL_RATIO * max(size) for size in sizes]
+        first, second = (
+            Side(make(k + 1, model, focal_px[k], *sizes[k]), colmap_keypoints(frames[k]))
+            for k in (0, 1)
+        )
+        rows = np.stack([np.arange(len(frames[0]))] * 2, axis=1)
+        options = VerificationOptions(random_seed=0)
+        extracted_px = self.recipe.extraction.levels[level].max_image_size_px
+        return len(estimate_geometry((first, second), rows, options, extracted_px).inlier_matches)

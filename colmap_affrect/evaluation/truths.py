@@ -1,0 +1,317 @@
+"""The three kinds of truth: scores of matches by them, and the columns of their tables.
+
+A truth scores (M, 2) and (M, 2) matched points, pixel-centre px of the stored images; its repr has
+all that it knows. Columns are named as the paper's rows where they have the same numbers. Results
+of failed pairs may have no details; their errors are infinite.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from statistics import fmean, median_low
+from typing import Any
+
+import cv2
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.poses import Pose, area_under_curve, pose_errors
+from colmap_affrect.conventions import colmap_from_pixel, is_inside
+from colmap_affrect.errors import EvaluationError
+from colmap_affrect.evaluation.data import PairResult, PairScore, ScoreOptions
+from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.arrays import Array, Floats
+from colmap_affrect.geometry.epipolar import epipolar_lines, sampson_errors
+from colmap_affrect.geometry.two_views import essential_matrix, homogeneous
+from colmap_affrect.images.reading import read_gray
+
+Points = Floats
+Sides = tuple[Floats, Floats]  # points or rays of both images
+Results = Sequence[PairResult]
+Size = tuple[int, int]  # (width, height) in px
+
+GROUP = ": "  # separates the name of a table from that of its column in the names of columns
+CONFIDENCE = 0.9999  # at which estimators may end before all iterations
+NUM_ESTIMATES = 5  # orders of the matches, of which the one of median error counts
+MIN_HOMOGRAPHY_MATCHES, MIN_FUNDAMENTAL_MATCHES, MIN_POSE_MATCHES = 4, 8, 6
+"""Of poses six: five leave several essential matrices, none of which another match supports."""
+MAX_EPIPOLAR_NOISE_PX = 1.0  # that USAC_MAGSAC assumes for fundamental matrices
+GC_THRESHOLD_PX = 3.0  # of an inlier of GC-RANSAC, as in verification by default
+CORRECT_PX = 3.0
+"""Matches are correct up to this transfer error in image 2, or Sampson distance from a pose."""
+GRID_STEP_PX = 4
+MAX_ERROR_PX, MAX_ERROR_DEG = 5.0, 5.0  # homographies and rotations of solved pairs are better
+HOMOGRAPHY_LIMITS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)  # the paper's table on EVD
+POSE_LIMITS_DEG = {"all": MAX_ERROR_DEG, "all < 10°": 10.0, "all < 20°": 20.0}
+MAX_AUC_ERROR_DEG = 10.0
+NUM_WXBS_LIMITS = 20  # the score of WxBS is the mean share within 0, 1, ... 19 px
+SHOWN_LIMITS_PX = (1, 2, 3, 5, 10, 20)
+
+
+def estimate_matrix(
+    find: Any, points: Sides, method: int, threshold_px: float, options: ScoreOptions, seed: int
+) -> tuple[Array | None, int]:
+    """Estimate a (3, 3) homography or fundamental matrix, x2 ~ H x1, x2' F x1 = 0, and its inliers.
+
+    ``find`` and ``method`` are OpenCV's; the seed is of the order of the matches, as OpenCV draws
+    the same samples every time.
+    """
+    count, least = len(points[0]), MIN_FUNDAMENTAL_MATCHES
+    if count < (MIN_HOMOGRAPHY_MATCHES if find is cv2.findHomography else least):
+        return None, 0
+    order = np.random.default_rng(seed).permutation(count)
+    first, second = (np.asarray(side, dtype=np.float64)[order] for side in points)
+    limits = dict(confidence=CONFIDENCE, maxIters=options.max_num_iterations)
+    matrix, inliers = find(first, second, method, threshold_px, **limits)
+    if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return None, 0
+    return np.asarray(matrix, dtype=np.float64), int(np.count_nonzero(inliers))
+
+
+def estimate_pose(
+    rays: Sides, method: int, threshold: float, options: ScoreOptions, seed: int
+) -> tuple[Pose | None, int]:
+    """Estimate camera2_from_camera1, |t| = 1, from five-point samples, and count its inliers.
+
+    ``rays`` are (M, 2) x/z, y/z in front of each camera, the threshold in focal lengths; rays that
+    are not finite are never inliers. For method and seed see :func:`estimate_matrix`.
+    """
+    usable = np.flatnonzero(np.isfinite(np.hstack(rays)).all(axis=1))
+    if len(usable) < MIN_POSE_MATCHES:
+        return None, 0
+    order = np.random.default_rng(seed).permutation(usable)
+    first, second = (np.ascontiguousarray(side[order]) for side in rays)
+    limits = CONFIDENCE, threshold, options.max_num_iterations
+    essential, mask = cv2.findEssentialMat(first, second, np.eye(3), method, *limits)
+    if essential is None or essential.shape != (3, 3):
+        return None, 0
+    inliers = mask.ravel() != 0
+    if inliers.sum() < MIN_POSE_MATCHES:
+        return None, int(inliers.sum())
+    _, turn, move, _ = cv2.recoverPose(essential, first[inliers], second[inliers], np.eye(3))
+    return (np.asarray(turn, np.float64), np.ravel(move).astype(np.float64)), int(inliers.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class TrueHomography:
+    """The (3, 3) image2_from_image1 of pixel-centre px, and the sizes of the images.
+
+    Its third coordinate is positive in the part of image 1 that image 2 shows.
+    """
+
+    matrix: Array
+    size1: Size
+    size2: Size
+
+    @classmethod
+    def of(cls, matrix: Array, paths: Sequence[Path], what: str) -> "TrueHomography":
+        """Return the truth of two image files, of a (3, 3) matrix of any scale and sign.
+
+        Raises ImageError when an image cannot be read, and EvaluationError, naming ``what``, when
+        the matrix is singular, or image 2 shows no part of image 1 by it.
+        """
+        if np.linalg.matrix_rank(matrix) < 3:
+            raise EvaluationError(f"{what} is singular")
+        size1, size2 = ((gray.shape[1], gray.shape[0]) for gray in map(read_gray, paths))
+        both = [cls(sign * matrix, size1, size2) for sign in (1.0, -1.0)]
+        found = max(both, key=lambda truth: len(truth.visible))
+        if not len(found.visible):
+            raise EvaluationError(f"{what} shows no part of image 1 in image 2")
+        return found
+
+    @cached_property
+    def visible(self) -> Points:
+        """(N, 2) pixel centres of image 1 that image 2 shows, each ``GRID_STEP_PX`` in x and y."""
+        columns, rows = (np.arange(0, extent, GRID_STEP_PX) for extent in self.size1)
+        points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
+        points = points[third_coordinates(self.matrix, points) > 0]
+        return points[is_inside(project(self.matrix, points), self.size2)]
+
+    def error_px(self, estimate: Array | None) -> float:
+        """Return the mean distance in image 2 between truth and estimate, over the visible part.
+
+        It is infinite without an estimate, or when its horizon runs through that part.
+        """
+        if estimate is None:
+            return math.inf
+        signed = estimate * np.sign(third_coordinates(estimate, self.visible).sum())
+        target = project(self.matrix, self.visible)
+        return float(transfer_errors(signed, self.visible, target).mean())
+
+    def score(
+        self, points1: Points, points2: Points, options: ScoreOptions, seed: int
+    ) -> PairScore:
+        """Score by the paper's RANSAC, in px; the details are those of USAC_MAGSAC."""
+        estimate = partial(estimate_matrix, cv2.findHomography, (points1, points2))
+        matrix, num_inliers = estimate(cv2.RANSAC, options.threshold_px, options, seed)
+        error = self.error_px(matrix)
+        num_correct = int((transfer_errors(self.matrix, points1, points2) < CORRECT_PX).sum())
+        threshold_px, seeds = options.magsac_threshold_px, range(seed, seed + NUM_ESTIMATES)
+        others = [estimate(cv2.USAC_MAGSAC, threshold_px, options, other) for other in seeds]
+        details = {
+            "magsac_error": median_low(self.error_px(other) for other, _ in others),
+            "magsac_num_inliers": median_low(count for _, count in others),
+        }
+        return PairScore(error, num_inliers, num_correct, details, float(error < MAX_ERROR_PX))
+
+
+def transfer_errors(matrix: Array, points1: Points, points2: Points) -> Array:
+    """Return the (N,) distances in image 2, in px, of (N, 2) points 1 carried over to points 2."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distances = np.linalg.norm(project(matrix, points1) - points2, axis=1)
+    return np.where(third_coordinates(matrix, points1) > 0, distances, np.inf)
+
+
+def third_coordinates(homography: Array, points: Points) -> Array:
+    """Return the (N,) third coordinates of (N, 2) points carried over, before the division."""
+    return np.asarray(points @ homography[2, :2] + homography[2, 2])
+
+
+def homography_columns(results: Results) -> dict[str, float]:
+    """Count the pairs whose error is below each limit, by plain RANSAC and by MAGSAC."""
+    errors = {
+        "": [result.error for result in results],
+        "MAGSAC: ": [result.details.get("magsac_error", math.inf) for result in results],
+    }
+    return {
+        f"{name}< {limit:g} px": float(sum(error < limit for error in values))
+        for name, values in errors.items()
+        for limit in HOMOGRAPHY_LIMITS_PX
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class TruePose:
+    """The cameras of a pair, which are COLMAP's, and its true camera2_from_camera1."""
+
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera]
+    pose: Pose
+
+    def score(
+        self, points1: Points, points2: Points, options: ScoreOptions, seed: int
+    ) -> PairScore:
+        """Score by the paper's RANSAC: the error is that of the rotation, in degrees.
+
+        Its result is one sample of five matches; the details ``gc_...`` are of OpenCV's GC-RANSAC
+        (``USAC_ACCURATE``), which refines on all inliers. ``direction_error_deg`` is the angle
+        between the directions of the translations. Matches within ``CORRECT_PX`` of the true
+        epipolar lines are correct, wrong ones by chance among them. Distances are in px by the mean
+        focal length of the two cameras.
+        """
+        both = rays(self.cameras[0], points1), rays(self.cameras[1], points2)
+        focal_px = float(np.mean([camera.mean_focal_length() for camera in self.cameras]))
+
+        def estimate(method: int, threshold_px: float, seed: int) -> tuple[float, float, int]:
+            pose, count = estimate_pose(both, method, threshold_px / focal_px, options, seed)
+            errors = (math.inf, math.inf) if pose is None else pose_errors(pose, self.pose)
+            return *errors, count
+
+        error, direction_error, num_inliers = estimate(cv2.RANSAC, options.threshold_px, seed)
+        seeds = range(seed, seed + NUM_ESTIMATES)
+        gc = median_low(estimate(cv2.USAC_ACCURATE, GC_THRESHOLD_PX, other) for other in seeds)
+        distances_px = focal_px * sampson_errors(essential_matrix(*self.pose), *both)
+        has_baseline = self.pose[1].any()  # without, distances are not defined
+        num_correct = int((distances_px < CORRECT_PX).sum()) if has_baseline else 0
+        details = {"direction_error_deg": direction_error}
+        details |= zip(("gc_error", "gc_direction_error_deg", "gc_num_inliers"), gc, strict=True)
+        return PairScore(error, num_inliers, num_correct, details, float(error < MAX_ERROR_DEG))
+
+
+def rays(camera: pycolmap.Camera, points: Points) -> Points:
+    """Turn (N, 2) pixel-centre points into (N, 2) x/z, y/z; NaN for what a lens cannot produce."""
+    pixels = colmap_from_pixel(np.asarray(points, dtype=np.float64).reshape(-1, 2))
+    return np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
+
+
+def pose_columns(results: Results, *, by_category: bool = True) -> dict[str, float]:
+    """Return shares of pairs with a rotation error below 5 degrees, by category and of all.
+
+    Also below 10 and 20 degrees, and the area under the curve of the larger of rotation and
+    direction error up to 10 degrees; then the same by GC-RANSAC. Categories are in the order of the
+    results.
+    """
+    columns = {}
+    categories = dict.fromkeys(result.category for result in results if by_category)
+    for group, prefix in {"": "", "GC-RANSAC: ": "gc_"}.items():
+        found = [{"error": result.error, **result.details} for result in results]
+        errors = [each.get(f"{prefix}error", math.inf) for each in found]
+        for title in (*categories, *POSE_LIMITS_DEG):
+            limit, every = POSE_LIMITS_DEG.get(title, MAX_ERROR_DEG), title in POSE_LIMITS_DEG
+            pairs = zip(errors, results, strict=True)
+            below = [error < limit for error, r in pairs if every or r.category == title]
+            columns[group + title] = sum(below) / max(1, len(below))
+        directions = [each.get(f"{prefix}direction_error_deg", math.inf) for each in found]
+        area = area_under_curve(map(max, errors, directions), len(errors), MAX_AUC_ERROR_DEG)
+        columns[f"{group}pose AUC {MAX_AUC_ERROR_DEG:g}°"] = area
+    return columns
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """(N, 4) points that correspond, x1, y1, x2, y2 in pixel-centre px."""
+
+    points: Points
+
+    def score(
+        self, points1: Points, points2: Points, options: ScoreOptions, seed: int
+    ) -> PairScore:
+        """Score by the fundamental matrix of OpenCV's USAC_MAGSAC, as WxBS does.
+
+        ``error`` is the median of the symmetric epipolar distances of the correspondences, in px.
+        The pair is solved as far as the score of WxBS says. Details: :func:`recalls`.
+        """
+        estimate = partial(estimate_matrix, cv2.findFundamentalMat, (points1, points2))
+        found = []
+        for other in range(seed, seed + NUM_ESTIMATES):
+            matrix, count = estimate(cv2.USAC_MAGSAC, MAX_EPIPOLAR_NOISE_PX, options, other)
+            distances = symmetric_epipolar_distances(matrix, *np.hsplit(self.points, 2))
+            found.append((float(np.median(distances)), count, other, distances))
+        error, num_inliers, _, distances = median_low(found)
+        details = recalls(distances)
+        return PairScore(error, num_inliers, None, details, details["wxbs_score"])
+
+
+def symmetric_epipolar_distances(matrix: Array | None, points1: Points, points2: Points) -> Array:
+    """Return (N,) sqrt(d1^2 + d2^2) of points from their epipolar lines, px, as WxBS has it.
+
+    Infinite without a matrix, and where a line is not defined.
+    """
+    if matrix is None:
+        return np.full(len(points1), np.inf)
+    lines1, lines2 = epipolar_lines(matrix, points1, points2)
+    residuals = (homogeneous(points2) * lines2).sum(axis=1)
+    slopes1, slopes2 = (np.square(lines[:, :2]).sum(axis=1) for lines in (lines1, lines2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distances = np.abs(residuals) * np.sqrt(1.0 / slopes1 + 1.0 / slopes2)
+    return np.asarray(np.nan_to_num(distances, nan=np.inf))
+
+
+def recalls(distances_px: Array) -> dict[str, float]:
+    """Return the score of WxBS, and shares of (N,) distances up to single limits."""
+    shares = [float((distances_px <= limit).mean()) for limit in range(21)]
+    score = float(np.mean(shares[:NUM_WXBS_LIMITS]))
+    return {"wxbs_score": score, **{f"recall_{px}px": shares[px] for px in SHOWN_LIMITS_PX}}
+
+
+def correspondence_columns(results: Results) -> dict[str, float]:
+    """Return the means of :func:`recalls` over results, at least one, under names for people."""
+    keys = {f"within {px} px": f"recall_{px}px" for px in SHOWN_LIMITS_PX}
+    keys = {"WxBS score": "wxbs_score", **keys}
+    return {name: fmean(result.details[key] for result in results) for name, key in keys.items()}
+
+
+def columns_by_kind(results: Results) -> dict[str, float]:
+    """Return the columns of each kind of truth; results without a truth are in none."""
+    columns: dict[str, float] = {}
+    for detail, kind, make in (
+        ("magsac_error", "homographies", homography_columns),
+        ("wxbs_score", "correspondences", correspondence_columns),
+        ("gc_error", "poses", partial(pose_columns, by_category=False)),
+    ):
+        if members := [result for result in results if detail in result.details]:
+            for name, value in make(members).items():
+                comma = kind == "poses" and GROUP in name
+                columns[f"{kind}{', ' if comma else GROUP}{name}"] = value
+    return columns

@@ -1,0 +1,341 @@
+"""Layouts of datasets, whole and damaged: EVD, SVP, IMC, a set made from a model, pairs.json."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import posed_photographs as scenes
+import pytest
+from planar_pairs import SIZE, TRUTH, write_extreme_views, write_pair
+from posed_photographs import pose
+from small_scene import FOCAL_PX
+
+from colmap_affrect.colmap.poses import relative_pose
+from colmap_affrect.errors import EvaluationError
+from colmap_affrect.evaluation import datasets
+from colmap_affrect.evaluation.data import Dataset
+from colmap_affrect.evaluation.datasets import load_evd, load_imc, load_pairs, load_svp, stem
+
+SCRIPT = Path(__file__).parents[2] / "recipes" / "own-evaluation-set" / "imc_from_model.py"
+SVP_SAMPLE = Path(__file__).parents[3] / "shared" / "pairs" / "svp_sample"
+Entry = dict[str, Any]
+INTRINSICS = [[FOCAL_PX, 0, 159.5], [0, FOCAL_PX, 119.5], [0, 0, 1]]
+"""Of the photographs of the small scene, in pixel-centre px."""
+
+
+def categories(dataset: Dataset) -> dict[str, str]:
+    return {pair.name: pair.category for pair in dataset.pairs}
+
+
+def require_pose(found: Any, first: int, second: int) -> None:
+    rotation, translation = found.pose
+    np.testing.assert_allclose(rotation @ pose(first)[0], pose(second)[0], atol=1e-9)
+    moved = rotation @ pose(first)[1] + translation
+    np.testing.assert_allclose(moved, pose(second)[1], atol=1e-9)
+
+
+def test_layout_of_the_extreme_view_dataset(tmp_path: Path) -> None:
+    write_extreme_views(tmp_path, ["cafe"])
+    np.savetxt(tmp_path / "h" / "cafe.txt", -3.0 * TRUTH)
+    (pair,) = load_evd(tmp_path).pairs
+    names = [image.name for image in pair.images]
+    assert (pair.name, names, pair.problem) == ("cafe", ["1/cafe.png", "2/cafe.png"], "")
+    np.testing.assert_allclose(pair.truth.matrix, 3.0 * TRUTH)  # positive where it is visible
+    assert pair.truth.size1 == SIZE == (160, 120)
+
+
+def test_sequences_as_oxfords(tmp_path: Path) -> None:
+    write_pair(tmp_path / "my_wall_1.png", tmp_path / "my_wall_3.png", seed=1)
+    np.savetxt(tmp_path / "H_my_wall_1_3.txt", TRUTH)
+    (pair,) = load_evd(tmp_path).pairs
+    assert (pair.name, pair.images[1].name) == ("my_wall 1-3", "my_wall_3.png")
+    np.testing.assert_allclose(pair.truth.matrix, TRUTH)
+
+
+def test_pairs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
+    write_extreme_views(tmp_path, ["good", "imageless", "truthless", "flat", "broken", "aside"])
+    (tmp_path / "2" / "imageless.png").unlink()
+    (tmp_path / "h" / "truthless.txt").unlink()
+    np.savetxt(tmp_path / "h" / "flat.txt", TRUTH[[0, 0, 0]])
+    (tmp_path / "1" / "broken.png").write_bytes(b"no image")
+    np.savetxt(tmp_path / "h" / "aside.txt", np.array([[1, 0, 900], [0, 1, 0], [0, 0, 1]]))
+    problems = {pair.name: pair.problem for pair in load_evd(tmp_path).pairs}
+    assert problems["good"] == ""
+    assert "imageless.png: missing" in problems["imageless"]
+    assert "truthless.txt: cannot be read" in problems["truthless"]
+    assert "singular" in problems["flat"]
+    assert "not a readable image" in problems["broken"]
+    assert "shows no part of image 1" in problems["aside"]
+
+
+@pytest.mark.parametrize(("load", "message"), [
+    (load_evd, r"holds neither 1/NAME\.png"),
+    (load_svp, r"it has no \*_image_pairs\.txt"),
+    (load_imc, "it has no set_100/new-vis-pairs"),
+    (load_pairs, r"pairs\.json: cannot be read"),
+])  # fmt: skip
+def test_other_folders_are_refused(load: Any, message: str, tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match=message):
+        load(tmp_path)
+
+
+@pytest.fixture
+def svp(tmp_path: Path) -> Path:
+    return scenes.write_svp(tmp_path / "set" / "scene4")
+
+
+@pytest.mark.parametrize("path", [".", "scene4"])
+def test_svp_scene_or_folder_of_scenes_is_read(svp: Path, path: str) -> None:
+    dataset = load_svp(svp.parent / path)
+    assert list(categories(dataset).items()) == [
+        ("scene4/a.png scene4/b.png", "0°"),
+        ("scene4/b.png scene4/d.png", "10°"),
+        ("scene4/a.png scene4/d.png", "20°"),
+    ]
+    image = dataset.pairs[0].images[1]
+    assert image.path == svp / "images" / "b.png"
+    np.testing.assert_allclose(image.intrinsics, INTRINSICS)
+    require_pose(dataset.pairs[2].truth, 0, 3)
+
+
+def test_pairs_without_an_image_or_pose_are_left_out_and_named(svp: Path) -> None:
+    (svp / "images" / "d.png").unlink()
+    (svp / "images" / "unlisted.txt").write_text("")
+    dataset = load_svp(svp)
+    assert list(categories(dataset).values()) == ["0°"]
+    assert dataset.notes == (
+        "scene4: 2 of 3 listed pairs are left out, without an image or its camera: d",
+    )
+    (svp / "0" / "images.txt").write_text(scenes.image_line(0) + "\n")
+    with pytest.raises(EvaluationError, match="no pair can be evaluated; scene4: 3 of 3"):
+        load_svp(svp)
+
+
+@pytest.mark.parametrize(("file", "old", "new"), [
+    ("cameras.txt", "SIMPLE_RADIAL", "ROUND"),
+    ("cameras.txt", "300.0", "nan"),
+    ("cameras.txt", "1 SIMPLE", "9 SIMPLE"),
+    ("images.txt", "1 0.99", "1 2.99"),
+    ("images.txt", "1 0.99", "1 inf"),
+])  # fmt: skip
+def test_unusable_cameras_and_poses_are_refused(svp: Path, file: str, old: str, new: str) -> None:
+    path = svp / "0" / file
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(EvaluationError, match=r"COLMAP cannot read it|quaternion of length 3"):
+        load_svp(svp)
+
+
+def test_category_is_that_of_the_poses_and_bad_lines_are_refused(svp: Path) -> None:
+    path = svp / "scene4_image_pairs.txt"
+    path.write_text("a.jpg b.jpg 0\n\na.png d.png 5\n# d.png\na.png c.png\n")
+    images = svp / "0" / "images.txt"
+    images.write_text(images.read_text().replace("png\n", "png\n10.5 20.5 1 30.5 40.5 -1\n"))
+    assert list(categories(load_svp(svp)).values()) == ["0°", "10°", "20°"]
+    path.write_text("a.png b.png 0\nb.png\n")
+    with pytest.raises(EvaluationError, match=r"scene4_image_pairs\.txt: 'b\.png' is no pair"):
+        load_svp(svp)
+
+
+@pytest.mark.shared
+@pytest.mark.skipif(not SVP_SAMPLE.is_dir(), reason="the sample is not here")
+def test_difficulties_of_the_real_list_are_those_of_the_real_poses() -> None:
+    scene = SVP_SAMPLE / "scene1"
+    views = datasets.read_views(scene / "0")
+    lines = (scene / "scene1_image_pairs.txt").read_text().splitlines()
+    listed = [line.split() for line in lines if line.strip() and line[0] != "#"]
+    found = [datasets.difficulty(views[stem(a)][1], views[stem(b)][1]) for a, b, _ in listed]
+    assert found == [int(tens) for *_, tens in listed]
+    assert [pair.name for pair in load_svp(SVP_SAMPLE).pairs] == [
+        "scene1/frame_0000001535_4.jpg scene1/frame_0000000305_1.jpg"
+    ]
+
+
+@pytest.fixture
+def imc(tmp_path: Path) -> Path:
+    return scenes.write_imc(tmp_path / "set" / "garden")
+
+
+@pytest.mark.parametrize("path", [".", "garden"])
+def test_imc_scene_or_folder_of_scenes_is_read(imc: Path, path: str) -> None:
+    dataset = load_imc(imc.parent / path)
+    assert list(categories(dataset).items()) == [
+        ("garden/a.png garden/d.png", "0.1"),
+        ("garden/b.png garden/c.png", "0.2"),
+    ]
+    np.testing.assert_allclose(dataset.pairs[0].images[0].intrinsics, INTRINSICS)
+    require_pose(dataset.pairs[0].truth, 0, 3)
+
+
+def test_list_from_zero_may_be_there_and_others_must_be(imc: Path) -> None:
+    folder = imc / "set_100" / "new-vis-pairs"
+    np.save(folder / "keys-th-0.0.npy", np.array(["a-b", "a-d", "b-c"]))
+    assert list(categories(load_imc(imc)).values()) == ["0.0", "0.1", "0.2"]
+    np.save(folder / "keys-th-0.9.npy", np.array(["a-d", None], dtype=object))
+    with pytest.raises(EvaluationError, match=r"keys-th-0\.9\.npy: cannot be read \(Object arrays"):
+        load_imc(imc)
+
+
+def test_names_with_dashes_and_pairs_of_unknown_images(imc: Path) -> None:
+    root = imc / "set_100"
+    for name in scenes.NAMES:
+        (root / "images" / f"{name}.png").rename(root / "images" / f"x-{name}.png")
+        path = root / "calibration" / f"calibration_{name}.h5"
+        path.rename(path.with_name(f"calibration_x-{name}.h5"))
+    scenes.write_lists(imc, {1: ["x-a-x-d", "x-a-e"], 2: []})
+    dataset = load_imc(imc)
+    assert categories(dataset) == {"garden/x-a.png garden/x-d.png": "0.1"}
+    assert dataset.notes[0].startswith("garden: 1 of 2 listed pairs are left out")
+
+
+@pytest.mark.parametrize(("changes", "fault"), [
+    ({"K": np.diag([np.nan, 300, 1])}, "K is empty or has values that are not finite"),
+    ({"K": np.eye(2)}, r"K has shape \(2, 2\)"),
+    ({"K": np.diag([300.0, 300, 1])}, r"K is not \[\[fx, 0, cx\]"),
+    ({"T": None}, "cannot be read"),
+    ({"R": 2 * pose(0)[0]}, "R is not orthonormal"),
+    ({"R": pose(0)[0] * [1, 1, -1]}, "or a reflection"),
+])  # fmt: skip
+def test_unusable_calibration_is_refused(imc: Path, changes: Entry, fault: str) -> None:
+    scenes.write_calibration(imc, 0, **changes)
+    with pytest.raises(EvaluationError, match=rf"calibration_a\.h5: .*{fault}"):
+        load_imc(imc)
+
+
+def convert(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(SCRIPT), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def write_model(folder: Path, camera: str) -> None:
+    """Write a model of a.png, b.png, c.png; a and b have a box of half by a quarter in common."""
+    folder.mkdir()
+    (folder / "cameras.txt").write_text(camera)
+    box = "10 10 1 170 10 2 170 70 3 10 70 4"  # 160 x 60 of 320 x 240
+    whole = "0 0 1 320 0 2 320 240 3 0 240 4"
+    (folder / "images.txt").write_text(
+        f"1 1 0 0 0 0 0 0 1 a.png\n{box}\n2 0.8 0.6 0 0 1 2 3 1 b.png\n{whole}\n"
+        "3 1 0 0 0 4 0 0 1 c.png\n\n"
+    )
+    tracks = (f"{k + 1} 0 0 {k} 9 9 9 1 1 {k} 2 {k}\n" for k in range(4))
+    (folder / "points3D.txt").write_text("".join(tracks))
+
+
+def test_set_made_from_a_model_is_read_back(imc: Path, tmp_path: Path) -> None:
+    write_model(tmp_path / "model", "1 PINHOLE 320 240 300 310 150 110")
+    write_model(tmp_path / "bent", "1 SIMPLE_RADIAL 320 240 300 160 120 0.1")
+    done = convert(tmp_path / "bent", imc / "set_100" / "images", tmp_path / "castle")
+    assert done.stderr.startswith("a.png: a camera with distortion; undistort")
+    done = convert(tmp_path / "model", imc / "set_100" / "images", tmp_path / "castle")
+    assert done.returncode == 0, done.stderr
+    assert re.findall(r"0\.(\d): (\d) pairs", done.stdout) == [
+        (str(limit), {0: "2", 1: "1"}.get(limit, "0")) for limit in range(10)
+    ]
+    dataset = load_imc(tmp_path / "castle")
+    assert categories(dataset) == {
+        "castle/a.png castle/b.png": "0.1",  # 160 * 60 / (320 * 240) = 0.125
+        "castle/a.png castle/c.png": "0.0",
+        "castle/b.png castle/c.png": "0.0",
+    }
+    pair = next(pair for pair in dataset.pairs if pair.category == "0.1")
+    expected = [[300, 0, 149.5], [0, 310, 109.5], [0, 0, 1]]
+    np.testing.assert_allclose(pair.images[0].intrinsics, expected)
+    rotation, translation = pair.truth.pose
+    np.testing.assert_allclose(rotation, [[1, 0, 0], [0, 0.28, -0.96], [0, 0.96, 0.28]])
+    np.testing.assert_allclose(translation, [1, 2, 3])
+
+
+def listed(folder: Path, *entries: Entry, **top: Any) -> Dataset:
+    (folder / "pairs.json").write_text(json.dumps({"pairs": entries, **top}), encoding="utf-8")
+    return load_pairs(folder)
+
+
+@pytest.fixture
+def planar(tmp_path: Path) -> Entry:
+    write_pair(tmp_path / "a.png", tmp_path / "b.png", seed=3)
+    return {"image1": "a.png", "image2": "b.png"}
+
+
+@pytest.mark.parametrize("in_file", [False, True])
+def test_homography_of_corner_pixels(tmp_path: Path, planar: Entry, in_file: bool) -> None:
+    corner = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    matrix = corner @ TRUTH @ np.linalg.inv(corner)
+    np.savetxt(tmp_path / "h.txt", matrix)
+    entry = {**planar, "homography": "h.txt" if in_file else matrix.tolist()}
+    (pair,) = listed(tmp_path, entry, pixel_origin="corner").pairs
+    np.testing.assert_allclose(pair.truth.matrix, TRUTH, atol=1e-9)
+    assert pair.name == "a b"
+
+
+def posed(**changes: Any) -> Entry:
+    rotation, translation = relative_pose(pose(0), pose(3))
+    values = {
+        "rotation": rotation.tolist(),
+        "translation": translation.tolist(),
+        "intrinsics1": INTRINSICS,
+        "intrinsics2": [[2 * FOCAL_PX, 0, 100], [0, FOCAL_PX, 110], [0, 0, 1]],
+    }
+    return {**values, **changes}
+
+
+@pytest.mark.parametrize(("origin", "offset_px"), [("center", 0.0), ("corner", -0.5)])
+def test_poses_and_points_in_pixels_of_both_origins(
+    origin: str, offset_px: float, tmp_path: Path, planar: Entry
+) -> None:
+    marked = {**planar, "name": "c", "category": "night", "correspondences": [[10, 20, 30, 40]]}
+    pose_given = {**planar, "relative_pose": posed()}
+    pair, points = listed(
+        tmp_path, pose_given, marked, pixel_origin=origin, convention="mine"
+    ).pairs
+    np.testing.assert_array_equal(points.truth.points, np.array([[10, 20, 30, 40]]) + offset_px)
+    assert (points.name, points.category) == ("c", "night")
+    require_pose(pair.truth, 0, 3)
+    for image, (x, y) in zip(pair.images, ((159.5, 119.5), (100, 110)), strict=True):
+        np.testing.assert_allclose(image.intrinsics[:2, 2], np.array([x, y]) + offset_px)
+    np.testing.assert_allclose(np.diag(pair.images[1].intrinsics), [2 * FOCAL_PX, FOCAL_PX, 1])
+
+
+@pytest.mark.parametrize(("changes", "problem"), [
+    ({"homography": [[1, 2], [3, 4]]}, r"has shape \(2, 2\)"),
+    ({"relative_pose": posed(rotation=(2 * np.eye(3)).tolist())}, "not orthonormal"),
+    ({"relative_pose": posed(centre=[0, 0, 0])}, "relative_pose needs"),
+    ({"correspondences": []}, "has shape"),
+    ({"correspondences": "../points.txt"}, "must be a file in the folder"),
+])  # fmt: skip
+def test_unusable_truth_fails_its_pair(
+    changes: Entry, problem: str, tmp_path: Path, planar: Entry
+) -> None:
+    good = {**planar, "name": "good", "homography": TRUTH.tolist()}
+    pairs = listed(tmp_path, good, {**planar, **changes}).pairs
+    assert pairs[0].problem == ""
+    assert re.search(problem, pairs[1].problem)
+
+
+SAME = '{"image1": "a.png", "image2": "b.png", "homography": "h.txt"}'
+
+
+@pytest.mark.parametrize(("content", "message"), [
+    ("[]", "cannot be read"),
+    ("{", "cannot be read"),
+    ('{"pairs": [1]}', r"pairs\[0\]: expected options, got 1"),
+    ('{"pairs": [], "pixel_origin": "left"}', r"cannot be read \(KeyError\('left'\)\)"),
+    ('{"pairs": [{"image1": "a.png"}]}', "image2 is missing"),
+    (
+        '{"pairs": [{"image1": "../a.png", "image2": "b.png", "homography": []}]}',
+        "must be path",
+    ),
+    ('{"pairs": [{"image1": "a", "image2": "b"}]}', "needs homography, correspondences or"),
+    ('{"pairs": [{"image1": "a", "image2": "b", "truth": 1}]}', "unknown option 'truth'"),
+    (f'{{"pairs": [{SAME}, {SAME}]}}', "two pairs are called 'a b'"),
+])  # fmt: skip
+def test_bad_list_is_one_line(content: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "pairs.json").write_text(content)
+    with pytest.raises(EvaluationError, match=message):
+        load_pairs(tmp_path)
