@@ -18,13 +18,7 @@ from colmap_affrect import __version__
 from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError, damage
 from colmap_affrect.options import digest_of, flat, suggestion
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
-from colmap_affrect.project.outputs import (
-    LOCK,
-    TEMPORARY_PREFIX,
-    is_output_folder,
-    refuse_link,
-    remove_own,
-)
+from colmap_affrect.project.outputs import LOCK, is_output_folder, refuse_link, remove_own
 
 logger = logging.getLogger(__name__)
 
@@ -46,8 +40,9 @@ OWN_STEMS = {
 }  # fmt: skip
 """How names of files and folders begin that are written here; the empty one is of hidden ones."""
 
-OF_SYSTEMS = {".DS_Store", "Thumbs.db", "desktop.ini", "lost+found"}
-"""What file managers and file systems put into folders that are empty for their user."""
+OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}
+"""What file managers and file systems put into folders that are empty for their user, beside hidden
+files."""
 SEAL_SUFFIXES = (".seal", ".seal-open", ".parts")  # of what tells whether others changed a database
 WEIGHTS = "weights"  # of a record: the digests of files, beside the options of a stage
 FORMAT_VERSION = 6  # of ``config.toml``: counts up when a stage records other options than before
@@ -363,9 +358,8 @@ class Workspace:
 def _may_be_ours(path: Path) -> bool:
     """Tell whether a file may be in an empty folder, or in that of a run that was killed early."""
     name = path.name
-    is_temporary = name.startswith(TEMPORARY_PREFIX) or name.endswith(NEW_SUFFIX)
     is_empty_log = name == "run.log" and not path.stat().st_size
-    return name in OF_SYSTEMS or name == LOCK or is_temporary or is_empty_log
+    return name.startswith(".") or name in OF_SYSTEMS or name.endswith(NEW_SUFFIX) or is_empty_log
 
 
 def _require_complete(record: Mapping[str, Any]) -> None:

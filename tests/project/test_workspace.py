@@ -161,6 +161,36 @@ def test_results_of_somebody_else_are_refused_and_left_as_they_are(
     assert not workspace.config.exists()
 
 
+def test_only_empty_folders_and_our_own_are_taken(tmp_path: Path) -> None:
+    out = Workspace(tmp_path / "out")
+    out.require_own()
+    out.path.mkdir()
+    for name in (".gitkeep", "desktop.ini", "config.toml.1234abcd.affrect-new", "run.log"):
+        (out.path / name).touch()
+    out.require_own()
+    (out.path / "report.html").write_text("mine")
+    with pytest.raises(OptionError, match=r"is not empty \(report\.html\) and was not made by"):
+        out.begin()
+    assert (out.path / "run.log").read_text() == ""
+    (out.path / "report.html").unlink()
+    out.begin()
+    (out.path / "report.html").write_text("ours, now")
+    out.require_own()
+    with pytest.raises(OptionError, match="is the folder of the photographs"):
+        out.require_own(tmp_path / "out" / ".." / "out")
+    out.require_own(tmp_path)
+
+
+@pytest.mark.parametrize("name", [".lock", "run.log", "database.db-wal", "sparse", "methods"])
+def test_links_in_the_place_of_our_files_are_refused(tmp_path: Path, name: str) -> None:
+    out = Workspace(tmp_path / "out")
+    out.path.mkdir()
+    (out.path / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OptionError, match=f"{name}: is a symbolic link"), out.locked():
+        pytest.fail("nothing may be made")
+    assert not (tmp_path / "elsewhere").exists()
+
+
 def test_require_of_a_stage_not_run_says_what_to_run(workspace: Workspace) -> None:
     with pytest.raises(OptionError, match=r"run 'colmap-affrect match' .* first"):
         workspace.require("match")
