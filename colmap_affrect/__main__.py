@@ -21,18 +21,23 @@ SIGNALS = {signal.SIGINT, signal.SIGTERM}
 
 def main() -> NoReturn:
     """Run the command line in a process of its own, where the system can do that, and end."""
-    if not hasattr(os, "fork"):
+    if sys.platform != "linux":  # elsewhere libraries of the system do not survive a fork
         _work()
     told: list[int] = []
 
     def stop(number: int, _: object) -> None:
+        if not told:
+            signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
         told.append(number)
         _kill(worker, signal.SIGTERM)
-        signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
 
     parent = os.getpid()
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # else nobody could wait for the worker
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    worker = os.fork()
+    try:
+        worker = os.fork()
+    except OSError:  # too many processes
+        _work()
     if not worker:
         _end_with(parent)
         _work()
@@ -60,37 +65,29 @@ def _kill(worker: int, number: int) -> None:
 
 def _exit_code(code: int, told: list[int]) -> int:
     """Return the exit code of the command, and say why it ended where it could not do that."""
-    if told and (code < 0 or code == 128 + signal.SIGINT):
-        if code < 0:
-            print(INTERRUPTED, file=sys.stderr)
+    if code >= 0:
+        return 128 + told[0] if told and code else code
+    if told:
+        _say(INTERRUPTED)
         return 128 + told[0]
-    if code < 0:
-        cause = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
-        print(
-            f"error: ended by {signal.Signals(-code).name}{cause}; run.log may say why, and what "
-            "was done before is kept: run the same command again, or 'colmap-affrect doctor'",
-            file=sys.stderr,
-        )
-        return 1
-    return code
+    cause = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
+    _say(
+        f"error: ended by {signal.Signals(-code).name}{cause}; run.log may say why, and what was "
+        "done before is kept: run the same command again, or 'colmap-affrect doctor'"
+    )
+    return 1
+
+
+def _say(line: str) -> None:
+    with suppress(OSError):  # nobody reads it any more
+        print(line, file=sys.stderr, flush=True)
 
 
 def _end_with(parent: int) -> None:
     """Let the system kill this process when its parent is killed."""
-    if sys.platform == "linux":
-        import ctypes
+    import ctypes
 
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    else:
-        import threading
-        import time
-
-        def watch() -> None:
-            while os.getppid() == parent:
-                time.sleep(0.2)
-            os.kill(os.getpid(), signal.SIGKILL)
-
-        threading.Thread(target=watch, daemon=True).start()
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
 
@@ -111,7 +108,7 @@ def _work() -> NoReturn:
 
         main_of_process()
     except KeyboardInterrupt:
-        print(INTERRUPTED, file=sys.stderr, flush=True)
+        _say(INTERRUPTED)
         os._exit(128 + signal.SIGINT)
 
 

@@ -98,6 +98,8 @@ def damage(path: Path, mend: str, error_class: type[AffrectError] = StoreError) 
     except AffrectError:
         raise
     except DAMAGE as error:
+        if lacks_memory(error):
+            raise
         raise error_class(f"{path}: damaged ({reason(error)}); {mend}") from error
 
 

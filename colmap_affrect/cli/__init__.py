@@ -53,7 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         return _fail(f"{MEMORY_HINT}: what was done before is kept")
     except KeyboardInterrupt:
-        print(INTERRUPTED, file=sys.stderr)
+        with suppress(OSError):  # nobody reads it any more
+            print(INTERRUPTED, file=sys.stderr)
         return EXIT_INTERRUPTED
 
 
@@ -70,7 +71,8 @@ def main_of_process() -> NoReturn:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     try:
-        sys.stdout.flush()
+        if sys.stdout:  # it may have been closed
+            sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     if code == EXIT_INTERRUPTED:  # threads may be in the middle of something long

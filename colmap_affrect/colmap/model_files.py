@@ -26,6 +26,7 @@ from colmap_affrect.errors import (
     OptionError,
     StoreError,
     damage,
+    lacks_memory,
     reason,
 )
 from colmap_affrect.geometry.arrays import Bools, Indices
@@ -124,6 +125,8 @@ def read_given_model(
     try:
         return pycolmap.Reconstruction(folder)
     except DAMAGE as error:
+        if lacks_memory(error):
+            raise
         why = f"not a COLMAP model; {wanted} ({reason(error)})"
         raise error_class(f"{option}{folder}: {why}") from error
 

@@ -30,8 +30,8 @@ QUERIES = {
     "'images', 'pose_priors', 'keypoints', 'descriptors', 'matches', 'two_view_geometries') "
     "ORDER BY name)) FROM pragma_user_version",
     "images": "SELECT image_id, name, camera_id FROM images",
-    "cameras": "SELECT camera_id, model, width, height FROM cameras",
-    "intrinsics": "SELECT camera_id, params, prior_focal_length FROM cameras",
+    "cameras": "SELECT camera_id, width, height FROM cameras",
+    "intrinsics": "SELECT camera_id, model, params, prior_focal_length FROM cameras",
     "rigs": "SELECT rowid, * FROM rigs",
     "rig_sensors": "SELECT rowid, * FROM rig_sensors",
     "frames": "SELECT rowid, * FROM frames",
@@ -83,6 +83,11 @@ def begin_work(path: Path) -> None:
         remove_seal(path)
     elif seal_of(path).exists():
         seal_of(path).replace(working_seal(path))
+
+
+def keep_seal(path: Path) -> None:
+    """Take a database that was read, and holds what was sealed, for one that nobody has touched."""
+    replace_text(working_seal(path), json.dumps(_stamp(path)))
 
 
 def remove_seal(path: Path) -> None:

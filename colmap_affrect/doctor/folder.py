@@ -19,7 +19,7 @@ from colmap_affrect.doctor.findings import (
     Findings,
     without_path,
 )
-from colmap_affrect.errors import AffrectError, WorkspaceError
+from colmap_affrect.errors import AffrectError, OptionError, WorkspaceError
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.summaries import (
     GUIDED_BEFORE,
@@ -62,7 +62,7 @@ def examine_folder(findings: Findings, path: Path, image_path: Path | None) -> N
     with ExitStack() as stack:
         try:
             stack.enter_context(workspace.locked())
-        except WorkspaceError as error:
+        except (WorkspaceError, OptionError) as error:
             in_use = isinstance(error.__cause__, TimeoutError)
             kind = "in-use" if in_use else "read-only"
             findings.add(kind, path, error=without_path(path, error))

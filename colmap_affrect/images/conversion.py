@@ -14,7 +14,7 @@ from colmap_affrect.images.headers import pages
 from colmap_affrect.images.photographs import TIFF_SUFFIXES, photograph_files, require_folder
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, foreign_format
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.outputs import new_results
+from colmap_affrect.project.outputs import OF_SYSTEMS, publish, temporary_folder
 
 AS_STORED = ("1", "L", "I;16", "RGB")  # Pillow's modes that PNG holds and COLMAP reads
 
@@ -61,10 +61,13 @@ def convert_images(
     if not names:
         raise ImageError(f"{image_path}: holds no photographs")
     _refuse_other_content(output_path, names)
-    with progress.stage("convert", len(names), "images") as advance:
+    with (
+        temporary_folder(output_path) as temporary,
+        progress.stage("convert", len(names), "images") as advance,
+    ):
         for name in names:
             try:
-                _convert(image_path / name, output_path, name, report)
+                _convert(image_path / name, output_path, name, report, temporary)
             except (ImageError, OptionError) as error:
                 report.failures[name] = str(error)
             advance(1)
@@ -72,18 +75,20 @@ def convert_images(
 
 
 def _refuse_other_content(folder: Path, names: Sequence[str]) -> None:
-    """Refuse a folder with other things than what an earlier call has made; OptionError."""
-    known = {PurePosixPath(name).parts[0] for name in names}
+    """Refuse a folder with other things than photographs and what is made of these; OptionError."""
+    known = {PurePosixPath(name).parts[0] for name in names} | OF_SYSTEMS
     for path in folder.iterdir() if folder.is_dir() else ():
-        original = path.name.partition("-page")[0].removesuffix(".png")
-        if not {path.name, original} & known and not path.name.startswith("."):
+        is_picture = path.suffix.lower() in IMAGE_SUFFIXES and not path.is_dir()
+        if not (is_picture or path.name in known or path.name.startswith(".")):
             raise OptionError(
-                f"{folder}: is not empty ({path.name}), and that is not made of these photographs; "
-                "give a new or an empty folder"
+                f"{folder}: is not empty ({path.name}), and not only photographs are there; give a "
+                "new or an empty folder"
             )
 
 
-def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> None:
+def _convert(
+    path: Path, folder: Path, name: str, report: ConversionReport, temporary: Path
+) -> None:
     suffix = PurePosixPath(name).suffix.lower()
     numbers = pages(path) if suffix in TIFF_SUFFIXES else [0]
     as_it_is = suffix in IMAGE_SUFFIXES and not foreign_format(path) and numbers == [0]
@@ -93,12 +98,13 @@ def _convert(path: Path, folder: Path, name: str, report: ConversionReport) -> N
     if not missing:
         report.kept.append(name)
         return
-    with new_results(*missing.values(), folder=folder) as made:
-        if as_it_is:
-            shutil.copy2(path, made[0])
-        else:
-            for new, content in zip(made, _as_png(path, list(missing)), strict=True):
-                new.write_bytes(content)
+    made = [(temporary / f"{number}.new", place) for number, place in missing.items()]
+    if as_it_is:
+        shutil.copy2(path, made[0][0])
+    else:
+        for (new, _), content in zip(made, _as_png(path, list(missing)), strict=True):
+            new.write_bytes(content)
+    publish(made, folder)
     if as_it_is:
         report.copied.append(name)
     else:

@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 
 from filelock import FileLock, Timeout
 
@@ -19,9 +19,18 @@ from colmap_affrect.project.atomic_files import cannot_write, require_space, uni
 
 TEMPORARY_PREFIX = ".affrect-"  # of folders for what is not complete yet
 LOCK = ".lock"  # in such a folder, and in a work folder, while somebody works there
-MARKS = (("config.toml", b"format_version"), ("run.log", b"colmap-affrect"))
+MARKS = (
+    ("config.toml", b"format_version"), ("run.log", b"colmap-affrect"),
+    ("request.json", b'"method"'), ("comparison.json", b'"verdict"'),
+)  # fmt: skip
+"""Files of ours, also of older versions, and what each has at its beginning."""
 SPARE_BYTES = 1 << 16  # a disk with less room may have cut off what was written last
 BYTES_OF_MARK = 200  # at the beginning of these files, in which they tell whose they are
+
+
+OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}
+"""What file managers and file systems put into folders that are empty for their user, beside hidden
+files."""
 
 
 def is_output_folder(path: Path) -> bool:
@@ -53,9 +62,9 @@ def refuse_link(path: Path) -> None:
 
 
 def folder_of(names: Collection[str], target: Path) -> Path | None:
-    """Return the folder above a file to be written in which photographs of these names lie."""
+    """Return the folder of a file to be written, or that above, if photographs lie there."""
     inner = [name for name in names if not leads_outside(name)]
-    for folder in _resolved(target).parents:
+    for folder in _resolved(target).parents[:2]:
         for name in inner:
             with suppress(OSError):  # a name that is too long, for one
                 if (folder / name).is_file():
@@ -87,7 +96,6 @@ def _resolved(target: Path) -> Path:
 @contextmanager
 def new_results(
     *targets: Path,
-    folder: Path | None = None,
     photographs: Path | None = None,
     names: Collection[str] = (),
     replaces: bool = False,
@@ -98,21 +106,23 @@ def new_results(
 
     Args:
         *targets: what is to be made; missing folders above are made.
-        folder: what they have to lie in, where some have folders of their own.
         photographs: folder in which nothing may be made.
-        names: of the photographs; nothing may be made where files of these names lie, either.
+        names: of the photographs, where their folder is not known: nothing is made where they lie.
         replaces: files that are there give way; else nothing is overwritten.
 
     Raises:
         OptionError: before anything is made, where a target is there already, is a symbolic link,
-            lies among the photographs, or leaves its folder by a link.
+            or lies among the photographs.
         WorkspaceError: when something cannot be written.
     """
     for target in targets:
         refuse_link(target)
-        if folder and folder.resolve() not in _resolved(target).parents:
-            raise OptionError(f"{target}: a link leads out of {folder}; remove it")
-        for place in filter(None, (photographs, folder_of(names, target))):
+        if any(p.name == "sparse" and is_output_folder(p.parent) for p in target.parents):
+            raise OptionError(
+                f"{target}: lies beside the models of a run, which mapping removes; give another "
+                "name or folder"
+            )
+        if place := photographs or folder_of(names, target):
             refuse_photographs(target, place)
         if not replaces:
             _refuse_existing(target)
@@ -148,6 +158,17 @@ def _folder_made(folder: Path) -> Iterator[None]:
         for path in new:
             with suppress(OSError):
                 path.rmdir()
+
+
+def publish(made: list[tuple[Path, Path]], folder: Path) -> None:
+    """Give what was made in a temporary folder its names in a folder, as :func:`new_results`."""
+    for _, target in made:
+        refuse_link(target)
+        if folder.resolve() not in _resolved(target).parents:
+            raise OptionError(f"{target}: a link leads out of {folder}; remove it")
+        target.parent.mkdir(parents=True, exist_ok=True)
+    with uninterrupted():
+        _publish(made, replaces=False)
 
 
 def _publish(made: list[tuple[Path, Path]], *, replaces: bool) -> None:
@@ -192,10 +213,14 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
         if (left / LOCK).is_file() and not left.is_symlink():
             with suppress(Timeout, OSError), FileLock(left / LOCK, timeout=0):
                 shutil.rmtree(left)  # its process has ended
-    with (
-        TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=parent, ignore_cleanup_errors=True) as name,
-        FileLock(Path(name) / LOCK),
-    ):
+    try:
+        name = mkdtemp(prefix=TEMPORARY_PREFIX, dir=parent)
+    except OSError as error:
+        raise cannot_write(parent, error) from error
+    with ExitStack() as stack:
+        stack.callback(shutil.rmtree, name, ignore_errors=True)
+        with suppress(OSError):  # of file systems without locks leftovers are not tidied up
+            stack.enter_context(FileLock(Path(name) / LOCK))
         yield Path(name)
 
 

@@ -18,7 +18,13 @@ from colmap_affrect import __version__
 from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError, damage
 from colmap_affrect.options import digest_of, flat, suggestion
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
-from colmap_affrect.project.outputs import LOCK, is_output_folder, refuse_link, remove_own
+from colmap_affrect.project.outputs import (
+    LOCK,
+    OF_SYSTEMS,
+    is_output_folder,
+    refuse_link,
+    remove_own,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -31,18 +37,19 @@ PLACES = {
 (:mod:`colmap_affrect.project.contents`). But none at all is another option."""
 GIVEN = "given"  # what stands in the place of such an option when options are compared
 INPUTS = "inputs.sha256"  # in sparse/: digests of what it was made from
+FILES_OF_SPARSE = {INPUTS, "guided-before.json"}
+FILES_OF_MODEL = {
+    "cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin", "summary.json",
+}  # fmt: skip
 STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
 COPY_STAGES = ("copy", "verify", "map")  # of a folder in which another program's database is mapped
 LOCK_WAIT_S = 1.0  # for one that a killed process still has while it ends
 OWN_STEMS = {
-    "", "cameras", "config", "contents", "database", "depth", "features", "guided", "matches",
+    "cameras", "config", "contents", "database", "depth", "features", "guided", "matches",
     "methods", "pairs", "report", "run", "shared", "sparse",
 }  # fmt: skip
-"""How names of files and folders begin that are written here; the empty one is of hidden ones."""
+"""How names of files and folders begin that are written here."""
 
-OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}
-"""What file managers and file systems put into folders that are empty for their user, beside hidden
-files."""
 SEAL_SUFFIXES = (".seal", ".seal-open", ".parts")  # of what tells whether others changed a database
 WEIGHTS = "weights"  # of a record: the digests of files, beside the options of a stage
 FORMAT_VERSION = 6  # of ``config.toml``: counts up when a stage records other options than before
@@ -70,7 +77,6 @@ class Workspace:
         """Name the folder, and a database of the user in the place of one there; never removed."""
         self.path, self.users_database = path, users_database
         self.database = users_database or path / "database.db"
-        self.changed_database = path / "database.changed.db"  # by others, before it was made again
         self.features = path / "features.h5"  # by image
         self.matches = path / "matches.h5"  # raw ones by pair
         self.guided = path / "guided.h5"  # what guided matching found, by pair
@@ -126,7 +132,7 @@ class Workspace:
         with suppress(OSError):  # not there, or refused when it is to be used
             names = {path.name: path for path in self.path.iterdir()}
             for name, path in names.items():
-                if name.partition(".")[0] in OWN_STEMS:
+                if name.partition(".")[0] in OWN_STEMS or name == LOCK:
                     refuse_link(path)
             foreign = [name for name, path in names.items() if not _may_be_ours(path)]
             if foreign and not is_output_folder(self.path):
@@ -179,7 +185,7 @@ class Workspace:
         with ExitStack() as stack:
             try:
                 stack.enter_context(self.locked())
-            except WorkspaceError as error:
+            except (WorkspaceError, OptionError) as error:  # the latter where links are
                 if not self.config.exists() or isinstance(error.__cause__, Timeout):
                     raise
             yield self
@@ -245,6 +251,7 @@ class Workspace:
         self._remove(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
         begun = record.get("begun", [])
         if overwrite:
+            self.refuse_foreign_models()
             self._remove(self._results(stage))
             begun = [name for name in begun if STAGES.index(name) < STAGES.index(stage)]
             record = record if begun else {}
@@ -329,6 +336,18 @@ class Workspace:
                     f"{path}: exists and was not made here; it is left as it is, use "
                     "another --output-path"
                 )
+
+    def refuse_foreign_models(self) -> None:
+        """Refuse to remove models beside which others have put something; StaleStoreError."""
+        files = [path for path in self.sparse.glob("*") if path.name not in FILES_OF_SPARSE]
+        for folder in [path for path in files if path.is_dir() and path.name.isdecimal()]:
+            files.remove(folder)
+            files += [path for path in folder.iterdir() if path.name not in FILES_OF_MODEL]
+        if foreign := [path for path in files if not path.name.startswith(".")]:
+            raise StaleStoreError(
+                f"{foreign[0]}: was not made by this run and would be removed with its models; "
+                "move it elsewhere, and run the same command again"
+            )
 
     def _results(self, stage: str) -> list[Path]:
         """Return what a stage and those after it make."""

@@ -79,6 +79,7 @@ def map_images(
     if known == inputs:
         models = read_models(workspace.sparse, task)
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
+    workspace.refuse_foreign_models()
     refuse_edited(workspace.sparse)
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from colmap_affrect.colmap.seal import (
     changes,
     end_work,
     is_untouched,
+    keep_seal,
     remove_seal,
     seal_of,
 )
@@ -93,7 +95,7 @@ class Edits:
 def edits_of(path: Path) -> Edits | None:
     """Return what others have changed in a database of ours; None if nobody touched it."""
     if not path.exists():
-        return Edits(("it is gone",))
+        return Edits(("it is missing",))
     if is_untouched(path):
         return None
     try:
@@ -189,6 +191,8 @@ def mend(context: Context, *, follows: bool) -> None:
     if found and not str(found) and not (is_copied or seal_of(path).exists()):
         found = Edits(_unlike_features(context))
     if not (found and str(found)):
+        if found and seal_of(path).exists():
+            keep_seal(path)
         return
     if not is_copied:
         delete_pairs(workspace, found.deleted.values())
@@ -252,18 +256,14 @@ def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows
             f"{workspace.database}: was changed since the last run ({found}), and {original} is "
             "gone, of which it is a copy; put that back, or give another by --from-database"
         )
+    kept = _put_aside(workspace)
     logger.warning(
-        "%s: was changed since the last run (%s); it is made again from %s, what was there is %s",
+        "%s: was changed since the last run (%s); it is made again from %s%s",
         workspace.database,
         found,
         original or f"{workspace.features.name} and {workspace.matches.name}",
-        workspace.changed_database.name,
+        f", what was there is {kept.name}" if kept else "",
     )
-    kept = database_files(workspace.changed_database)
-    for file, target in zip(database_files(workspace.database), kept, strict=True):
-        target.unlink(missing_ok=True)
-        if file.exists():
-            file.replace(target)
     has_voted = _has_voted(workspace)
     workspace.rewind()
     if not (follows and "verify" in begun):
@@ -280,6 +280,18 @@ def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows
         choose_cameras(context)
     if "guide" in begun:
         guide(context)
+
+
+def _put_aside(workspace: Workspace) -> Path | None:
+    """Rename a database that others have changed, and return its new name, None if it is gone."""
+    if not workspace.database.exists():
+        return None
+    names = (f"database.changed{number or ''}.db" for number in count())
+    kept = next(path for name in names if not (path := workspace.path / name).exists())
+    for file, target in zip(database_files(workspace.database), database_files(kept), strict=True):
+        if file.exists():
+            file.replace(target)
+    return kept
 
 
 def _has_voted(workspace: Workspace) -> bool:

@@ -10,7 +10,7 @@ import pytest
 
 import colmap_affrect
 from colmap_affrect.errors import OptionError
-from colmap_affrect.project.outputs import new_results, refuse_photographs
+from colmap_affrect.project.outputs import new_results, publish, refuse_photographs
 from colmap_affrect.project.workspace import Workspace
 
 PACKAGE = Path(colmap_affrect.__file__).parent
@@ -99,12 +99,17 @@ def test_what_is_in_the_way_is_refused_before_anything_is_made(
 def test_links_may_not_lead_out_of_a_folder(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "box").symlink_to(tmp_path)
+    (tmp_path / "new").touch()
     target = tmp_path / "out" / "box" / "a.txt"
-    with (
-        pytest.raises(OptionError, match="leads out of"),
-        new_results(target, folder=tmp_path / "out"),
-    ):
-        pytest.fail("nothing may be made")
+    with pytest.raises(OptionError, match="leads out of"):
+        publish([(tmp_path / "new", target)], tmp_path / "out")
+    assert not target.exists()
+
+
+def test_nothing_is_made_beside_the_models_of_a_run(tmp_path: Path) -> None:
+    Workspace(tmp_path).begin()
+    with pytest.raises(OptionError, match="lies beside the models of a run"):
+        make(tmp_path / "sparse" / "metric", then=list)
 
 
 def test_among_photographs_only_work_folders_are_written(tmp_path: Path) -> None:
@@ -126,12 +131,15 @@ OUTSIDE = ("interop", "comparison", "evaluation", "report", "cli", "images/conve
 """Where results are made for other folders than those of runs."""
 
 CHANGING = {
-    "copy", "copy2", "copyfile", "copytree", "hardlink_to", "mkdir", "move", "rename", "rmdir",
-    "rmtree", "savefig", "symlink_to", "touch", "unlink", "write_bytes", "write_text",
+    "copy", "copy2", "copyfile", "copytree", "export_PLY", "hardlink_to", "imwrite", "link",
+    "mkdir", "move", "rename", "rmdir", "rmtree", "savefig", "symlink_to", "touch", "unlink",
+    "write_bytes", "write_model", "write_text",
 }  # fmt: skip
 
 IN_TEMPORARY_FOLDERS = {
-    ("export.py", "_nerfstudio"), ("export.py", "_text"), ("hdf5_layouts.py", "created"),
+    ("align.py", "align"), ("pycolmap_mapping.py", "incremental_mapping"),
+    ("export.py", "_points"), ("export.py", "_nerfstudio"), ("export.py", "_text"),
+    ("hdf5_layouts.py", "created"),
     ("inspection.py", "inspect_image"), ("sheet.py", "figure_page"), ("conversion.py", "_convert"),
     ("compare.py", "_make_shared"), ("worker.py", "_run_seed"), ("worker.py", "_seed_result"),
     ("datasets.py", "read_views"),
@@ -152,6 +160,8 @@ def changes(call: ast.Call) -> bool:
     texts = [value.value for value in values if isinstance(value, ast.Constant)]
     if name in ("open", "File"):
         return any(isinstance(text, str) and set("wax+") & set(text) for text in texts)
+    if name == "replace":  # of a path, not of a text
+        return len(call.args) == 1 and not call.keywords
     # shutil.copy, not the copy of an array
     return name in CHANGING and not (name == "copy" and not values)
 

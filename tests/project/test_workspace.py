@@ -191,6 +191,19 @@ def test_links_in_the_place_of_our_files_are_refused(tmp_path: Path, name: str) 
     assert not (tmp_path / "elsewhere").exists()
 
 
+@pytest.mark.parametrize("name", ["metric/cameras.bin", "0/notes.txt", "notes.txt"])
+def test_models_that_somebody_put_beside_ours_are_not_removed(
+    workspace: Workspace, name: str
+) -> None:
+    workspace.record_options("extract", {})
+    foreign = workspace.sparse / name
+    foreign.parent.mkdir(parents=True, exist_ok=True)
+    foreign.touch()
+    with pytest.raises(StaleStoreError, match="was not made by this run and would be removed"):
+        workspace.record_options("extract", {}, overwrite=True)
+    assert foreign.exists()
+
+
 def test_require_of_a_stage_not_run_says_what_to_run(workspace: Workspace) -> None:
     with pytest.raises(OptionError, match=r"run 'colmap-affrect match' .* first"):
         workspace.require("match")

@@ -108,7 +108,7 @@ def test_missing_and_exchanged_databases_are_made_again(
     finished: Path, out: Path, call: Call
 ) -> None:
     (out / "database.db").unlink()
-    assert "it is gone" in again(call, finished, out, "map")[0]
+    assert "it is missing" in again(call, finished, out, "map")[0]
     assert results(out) == results(finished / "out")
     (out / "database.db").unlink()
     with open_database(out / "database.db"):
