@@ -1,8 +1,8 @@
 """The command line as a process: ``python -m colmap_affrect``, or ``colmap-affrect``.
 
-A second process does the work and the first one waits for it, so that Ctrl-C ends a command
-whatever native code is in the middle of, and a crash in it is told of in one line. Nothing heavy is
-imported here: a Ctrl-C while the rest is loaded finds its handler in place.
+On Linux the command runs in a child process. The parent kills it where it does not end within four
+seconds of Ctrl-C or SIGTERM, as in native code that never returns, and says in one line when native
+code has crashed. Nothing heavy is imported here, so that Ctrl-C is handled while the rest is loaded.
 """
 
 import os

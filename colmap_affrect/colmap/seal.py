@@ -1,9 +1,10 @@
-"""What we left in a database, so that what others have changed in it since can be told.
+"""What a command left in a database, to tell what others have changed in it since.
 
-``database.db.parts`` has digests of all rows, ``database.db.seal`` size and times of the file.
-While a command works the seal has another name, and where anything is written it is removed
-(:func:`colmap_affrect.colmap.database.open_database`); in the end it is made anew. So a database
-that nobody has touched is not read, and one without a seal was left by a process that was killed.
+- ``database.db.parts``: digests of all rows, by image, camera and pair.
+- ``database.db.seal``: size and times of the file, while no command works with it. A database that
+  has them still is not read.
+- ``database.db.seal-open``: the same while a command works. ``open_database`` removes it when
+  anything is written, so a database without a seal was left by a process that was killed.
 """
 
 import hashlib

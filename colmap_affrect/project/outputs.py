@@ -75,7 +75,7 @@ def folder_of(names: Collection[str], target: Path) -> Path | None:
 def refuse_photographs(target: Path, photographs: Path) -> None:
     """Refuse to write among photographs, where results would be taken for some; OptionError.
 
-    A work folder of ours in their folder is passed over when they are looked for.
+    Work folders of ours are allowed there: the search for photographs skips them.
     """
     place, folder = _resolved(target), photographs.resolve()
     inside = [p for p in (place, *place.parents) if folder in p.parents]

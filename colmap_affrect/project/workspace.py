@@ -123,7 +123,8 @@ class Workspace:
     def require_own(self, photographs: Path | None = None) -> None:
         """Refuse a folder that is not empty and not ours, and links that would be followed.
 
-        So is the folder of the photographs itself; one in it is allowed. Raises OptionError.
+        The folder of the photographs is refused, too; a folder inside it is allowed. Raises
+        OptionError.
         """
         if photographs and self.path.resolve() == photographs.resolve():
             raise OptionError(
