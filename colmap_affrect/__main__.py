@@ -2,7 +2,7 @@
 
 On Linux the command runs in a child process. The parent kills it where it does not end within four
 seconds of Ctrl-C or SIGTERM, as in native code that never returns, and says in one line when native
-code has crashed. Nothing heavy is imported here, so that Ctrl-C is handled while the rest is loaded.
+code has crashed. Nothing heavy is imported here: Ctrl-C is handled while the rest is loaded.
 """
 
 import os
