@@ -5,6 +5,7 @@ Many more: tests/benchmarks/campaign.py; of other commands: test_campaign.py.
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 from command import FAST, run_in_process_of_its_own, start
 from ended import end_again_and_again
-from results import Undisturbed, results, run_arguments
+from results import Undisturbed, results, run_arguments, wait_until_at_work
 
 
 def finish(photos: Path, out: Path, options: Sequence[str]) -> dict[str, Any]:
@@ -42,10 +43,13 @@ def test_two_runs_at_once_are_one_that_works_and_one_that_is_refused(
 ) -> None:
     out = tmp_path / "out"
     arguments = run_arguments(photos, out, FAST)
-    with start(*arguments) as first, start(*arguments) as second:
-        printed = [process.communicate(timeout=120)[1] for process in (first, second)]
-    assert sorted([first.returncode, second.returncode]) == [0, 1]
-    refused = printed[first.returncode == 0].splitlines()
-    assert len(refused) == 1
-    assert "another colmap-affrect is working in this folder" in refused[0]
+    with start(*arguments) as first:
+        wait_until_at_work(first, out)
+        children = Path(f"/proc/{first.pid}/task/{first.pid}/children").read_text().split()
+        os.kill(int(children[0]), signal.SIGSTOP)
+        refused = run_in_process_of_its_own(*arguments)
+        os.kill(int(children[0]), signal.SIGCONT)
+        first.communicate(timeout=120)
+    assert (first.returncode, refused.code, len(refused.stderr)) == (0, 1, 1)
+    assert "another colmap-affrect is working in this folder" in refused.stderr[0]
     assert results(out) == undisturbed.results
