@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import random
 import signal
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 import pytest
 from command import FAST, run_in_process_of_its_own, start
 from ended import end_again_and_again
-from results import Undisturbed, results, run_arguments, wait_until_at_work
+from results import Undisturbed, results, run_arguments
 
 
 def finish(photos: Path, out: Path, options: Sequence[str]) -> dict[str, Any]:
@@ -44,7 +45,8 @@ def test_two_runs_at_once_are_one_that_works_and_one_that_is_refused(
     out = tmp_path / "out"
     arguments = run_arguments(photos, out, FAST)
     with start(*arguments) as first:
-        wait_until_at_work(first, out)
+        while not (out / "config.toml").exists():
+            time.sleep(0.005)
         children = Path(f"/proc/{first.pid}/task/{first.pid}/children").read_text().split()
         os.kill(int(children[0]), signal.SIGSTOP)
         refused = run_in_process_of_its_own(*arguments)
