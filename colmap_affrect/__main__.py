@@ -107,7 +107,10 @@ def _work() -> NoReturn:
         from colmap_affrect.cli import main_of_process
 
         main_of_process()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Exception) as error:
+        # Libraries turn a KeyboardInterrupt in their callbacks into errors of their own.
+        if not (told or isinstance(error, KeyboardInterrupt)):
+            raise
         _say(INTERRUPTED)
         os._exit(128 + signal.SIGINT)
 
