@@ -93,8 +93,8 @@ class DepthFilesOptions(DepthOptions):
 
     name: Literal["files"] = "files"
     path: str = ""
-    """Folder of depth maps, named as the images: ``a/b.jpg`` has ``a/b.npy``, or .npz, .png, .exr,
-    .h5 (also after the image's full name, ``a/b.jpg.npy``)."""
+    """Folder of depth maps, named as the images: ``a/b.jpg`` has ``a/b.npy``, or .npz, .png,
+    .tif (also after the image's full name, ``a/b.jpg.npy``)."""
     png_scale: Annotated[float, within(1e-12, 1e12)] = 0.001
     """Depth of one step of a 16-bit PNG; only the ratio of depths matters."""
 
