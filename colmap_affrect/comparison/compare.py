@@ -8,6 +8,7 @@ import hashlib
 import json
 import pickle
 import signal
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -325,11 +326,10 @@ def _finished(task: MethodTask) -> MethodResult | None:
 
 def _run(task: MethodTask, progress: Progress, title: str) -> MethodResult:
     """Run a method in a process of its own; what it prints goes to ``run.log`` in its folder."""
-    path, log_path, failed = task.folder / "task.pickle", Workspace(task.folder).log, ""
-    path.write_bytes(pickle.dumps(task))
+    log_path, failed = Workspace(task.folder).log, ""
     with (
         log_path.open("a", encoding="utf-8") as log,
-        child(worker.__name__, str(path), stderr=log) as process,
+        child(worker.__name__, b64encode(pickle.dumps(task)).decode(), stderr=log) as process,
         ExitStack() as stage,
     ):
         advance: Advance = stage.enter_context(SILENT.stage("", 0, ""))

@@ -1,4 +1,4 @@
-"""One method of a comparison, in a process of its own: ``python -m ... TASK.pickle``.
+"""One method of a comparison, in a process of its own: ``python -m ... TASK``.
 
 Its peak memory is the method's, and when it dies the other methods go on. What was done stays:
 run again, it goes on. Progress, and how it ended, are lines of JSON on stdout; everything else
@@ -12,6 +12,7 @@ import pickle
 import shutil
 import sys
 import time
+from base64 import b64decode
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -72,7 +73,7 @@ def main() -> None:
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     logger.addHandler(handler)
     try:
-        task: MethodTask = pickle.loads(Path(sys.argv[1]).read_bytes())  # noqa: S301 (our own)
+        task: MethodTask = pickle.loads(b64decode(sys.argv[1]))  # noqa: S301 (of our parent)
         with Workspace(task.folder).locked():
             compute(task, _Reported(parent))
     except AffrectError as error:
