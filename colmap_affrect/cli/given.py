@@ -54,7 +54,7 @@ def _refuse_unknown(record: Mapping[str, Any], where: str) -> None:
     """Refuse sections, and options of extraction, that no run has recorded: typos of an editor."""
     from colmap_affrect.project.workspace import STAGES
     from colmap_affrect.recipes import ExtractionOptions
-    from colmap_affrect.stages.extract import Inputs
+    from colmap_affrect.stages.inputs import Inputs
 
     sections = {"format_version", "recipe", "begun", *STAGES}
     of_extract = {*Inputs.model_fields, *ExtractionOptions.model_fields, WEIGHTS}

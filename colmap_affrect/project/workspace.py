@@ -212,6 +212,11 @@ class Workspace:
             _require_complete(record)
         return record
 
+    @property
+    def is_copy(self) -> bool:
+        """Whether the folder holds a copy of another program's database."""
+        return "copy" in self.recorded().get("begun", [])
+
     def recipe(self) -> str:
         """Return the name of the recipe that the features were made with."""
         self.require("extract")

@@ -36,7 +36,7 @@ from colmap_affrect.project.workspace import Workspace, database_files
 from colmap_affrect.shown import such_as
 from colmap_affrect.stages.cameras import choose_cameras
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.copy import copy_verified, is_copy
+from colmap_affrect.stages.copy import copy_verified
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import write_matches
@@ -187,7 +187,7 @@ def mend(context: Context, *, follows: bool) -> None:
     begun = workspace.recorded().get("begun", [])
     if not begun or not (path.exists() or "verify" in begun):
         return
-    found, is_copied = edits_of(path), is_copy(workspace)
+    found, is_copied = edits_of(path), workspace.is_copy
     if found and not str(found) and not (is_copied or seal_of(path).exists()):
         found = Edits(_unlike_features(context))
     if not (found and str(found)):
@@ -250,7 +250,7 @@ def _without_others(context: Context, found: Edits) -> Edits:
 
 def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows: bool) -> None:
     workspace, record = context.workspace, context.workspace.recorded()
-    original = Path(record["copy"]["database"]) if is_copy(workspace) else None
+    original = Path(record["copy"]["database"]) if workspace.is_copy else None
     if original and not original.exists():
         raise DatabaseError(
             f"{workspace.database}: was changed since the last run ({found}), and {original} is "

@@ -15,7 +15,8 @@ from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.extract import extract
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.pairs import choose_pairs
 
 SCENES = Path(__file__).parents[3] / "shared" / "scenes"
