@@ -2,7 +2,6 @@
 
 import json
 import platform
-import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -35,6 +34,7 @@ from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
@@ -374,10 +374,10 @@ def map_guided(
         again, models = map_images(context, mapper)
         reports += [guided, again]
         if _are_better(context, models, aside):
-            shutil.rmtree(aside)
+            remove_own([aside])
             return reports, models
         restore_exact(context, new)
-        shutil.rmtree(sparse)
+        remove_own([sparse])
     aside.rename(sparse)
     (sparse / GUIDED_BEFORE).unlink()
     report, models = map_images(context, mapper)  # which reads them

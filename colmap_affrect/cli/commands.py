@@ -52,8 +52,9 @@ def run(options: argparse.Namespace) -> int:
 
 def extract(options: argparse.Namespace) -> int:
     from colmap_affrect.stages import extract as stage
+    from colmap_affrect.stages.inputs import Inputs
 
-    inputs = stage.Inputs.of(
+    inputs = Inputs.of(
         options.image_path,
         image_list_path=options.image_list_path,
         from_database=options.from_database,

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from colmap_affrect.errors import OptionError, WorkspaceError
 from colmap_affrect.options import Options, suggestion
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.workspace import WEIGHTS, Workspace, placeless, without_digests
+from colmap_affrect.project.differences import WEIGHTS, placeless, without_digests
+from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap.verification import VerificationOptions

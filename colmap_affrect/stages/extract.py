@@ -17,8 +17,9 @@ from colmap_affrect.images.photographs import checked_names, left_out, not_named
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.project.contents import Contents
+from colmap_affrect.project.differences import WEIGHTS
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.workspace import WEIGHTS, Workspace
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe
 from colmap_affrect.shown import one_line
 from colmap_affrect.stages.changes import (

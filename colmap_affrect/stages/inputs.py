@@ -17,7 +17,8 @@ from colmap_affrect.images.photographs import (
     refuse_colliding_keys,
 )
 from colmap_affrect.options import Options
-from colmap_affrect.project.workspace import Workspace, database_files
+from colmap_affrect.project.outputs import database_files
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
 
 

@@ -6,7 +6,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from shutil import rmtree
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
@@ -25,6 +24,7 @@ from colmap_affrect.mappers.starts import holding
 from colmap_affrect.mappers.summaries import made_from, model_folders, read_summary, refuse_edited
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import INPUTS, Workspace
 from colmap_affrect.recipes import load_recipe
@@ -160,7 +160,7 @@ def _or_first_level(
         if _rank(firsts) <= _rank(models):
             return models
         logger.info("the model of the pairs before they climbed is better and is kept")
-        rmtree(context.workspace.sparse)
+        remove_own([context.workspace.sparse])
         sparse.rename(context.workspace.sparse)
     return firsts
 
@@ -200,7 +200,7 @@ def _map(
         held = holding(task, model, models[0], path.with_name("held.db"))
         others = map_database(mapper, held, every, _ignore)
         if _rank(others) >= _rank(models):
-            rmtree(sparse)
+            remove_own([sparse])
             every.rename(sparse)
             return others, len(rejected)
     return models, len(rejected)

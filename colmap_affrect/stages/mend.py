@@ -22,17 +22,18 @@ from colmap_affrect.colmap.seal import (
     begin_work,
     changes,
     end_work,
+    has_seal,
     is_untouched,
     keep_seal,
     remove_seal,
-    seal_of,
 )
 from colmap_affrect.colmap.tables import Tables, delete_rows, open_read_only, read_tables
 from colmap_affrect.colmap.useless_keypoints import KINDS
 from colmap_affrect.errors import AffrectError, DatabaseError
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.project.workspace import Workspace, database_files
+from colmap_affrect.project.outputs import database_files
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.shown import such_as
 from colmap_affrect.stages.cameras import choose_cameras
 from colmap_affrect.stages.context import Context
@@ -116,7 +117,7 @@ def _edits(found: dict[str, Change], tables: Tables) -> Edits:
     lost = ["its tables are others"] * ("tables" in found)
     for part, what in (("images", tables.names), ("cameras", {})):
         if part in found:
-            lost.append(_told(part, found[part], what))
+            lost.append(_changed_rows(part, found[part], what))
     pairs = [found[part] for part in ("matches", "geometries") if part in found]
     if any(0 < change.num_before == len(change.gone) for change in pairs):
         lost.append("all pairs are gone")
@@ -143,7 +144,7 @@ def _counted(count: int, what: str) -> str:
     return f"{count} {what}{'s' * (count != 1)}"
 
 
-def _told(part: str, change: Change, names: dict[int, str]) -> str:
+def _changed_rows(part: str, change: Change, names: dict[int, str]) -> str:
     parts = [(change.changed, "changed"), (change.added, "added"), (change.gone, "gone")]
     texts = [
         f"{len(keys)} {what}"
@@ -188,10 +189,10 @@ def mend(context: Context, *, follows: bool) -> None:
     if not begun or not (path.exists() or "verify" in begun):
         return
     found, is_copied = edits_of(path), workspace.is_copy
-    if found and not str(found) and not (is_copied or seal_of(path).exists()):
+    if found and not str(found) and not (is_copied or has_seal(path)):
         found = Edits(_unlike_features(context))
     if not (found and str(found)):
-        if found and seal_of(path).exists():
+        if found and has_seal(path):
             keep_seal(path)
         return
     if not is_copied:
