@@ -8,8 +8,6 @@ from numpy.testing import assert_allclose
 from strategies import Array, affine_shapes, frames, homographies, turns
 
 from colmap_affrect.geometry.affine import (
-    compose_affine,
-    determinants,
     ellipse_extents,
     homography_errors,
     lafs_from_keypoints,
@@ -23,21 +21,6 @@ ROUNDING = 1e-9
 
 JACOBIAN_ERROR = 1e-5
 """Central differences with a step of 1e-3 px: curvature of the homography and rounding."""
-
-
-def test_rotation_turns_x_axis_towards_y_axis() -> None:
-    assert_allclose(rotation(np.pi / 6) @ [2.0, 0.0], [np.sqrt(3.0), 1.0], atol=ROUNDING)
-
-
-def test_determinants_have_the_sign_of_the_orientation() -> None:
-    matrices = np.array([[[2.0, 1.0], [0.5, 3.0]], [[0.0, 1.0], [4.0, 0.0]]])
-    assert_allclose(determinants(matrices), [5.5, -4.0])
-    assert_allclose(determinants(matrices[0].astype(np.float32)), 5.5)
-
-
-def test_compose_affine_multiplies_scale_psi_tilt_phi_in_this_order() -> None:
-    expected = 1.5 * rotation(0.7) @ np.diag([3.0, 1.0]) @ rotation(2.1)
-    assert_allclose(compose_affine(1.5, 0.7, 3.0, 2.1), expected, atol=ROUNDING)
 
 
 def test_homography_errors_are_distances_from_the_nearest_true_match() -> None:
@@ -55,12 +38,6 @@ def test_homography_errors_are_distances_from_the_nearest_true_match() -> None:
     back = homography_errors(np.linalg.inv(tilted), others, points)
     assert_allclose(there, back, rtol=0.02)
     assert (there < np.linalg.norm(offsets / 6, axis=1)).all()
-
-
-def test_project_divides_by_the_third_coordinate() -> None:
-    homography = np.array([[2.0, 0.0, 1.0], [0.0, 3.0, -1.0], [0.1, 0.2, 1.0]])
-    # (5, 10): x = 11, y = 29, w = 0.5 + 2 + 1.
-    assert_allclose(project(homography, np.array([[5.0, 10.0]])), [[11 / 3.5, 29 / 3.5]])
 
 
 def test_transform_frames_carries_warp_frame_to_image_by_inverse_on_the_left() -> None:
@@ -94,10 +71,6 @@ def test_transform_frames_by_homography_has_the_jacobian_of_finite_differences(
         ahead, behind = project(homography, centers + move), project(homography, centers - move)
         derivative = (ahead - behind) / (2 * step)
         assert_allclose(mapped[:, :, column], derivative, rtol=1e-4, atol=JACOBIAN_ERROR)
-
-
-def test_transform_frames_of_no_frames_returns_none() -> None:
-    assert transform_frames(np.eye(3), np.zeros((0, 2, 3))).shape == (0, 2, 3)
 
 
 def test_lafs_from_keypoints_point_their_first_column_along_the_orientation() -> None:

@@ -25,14 +25,12 @@ from synthetic import blobs
 
 from colmap_affrect.conventions import camera_matrix
 from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan
-from colmap_affrect.errors import OptionError
 from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.images.warping import warp, warp_mask
 from colmap_affrect.rectifiers.base import RectifierInputs
 from colmap_affrect.rectifiers.depth_planes import (
-    MAX_DEPTH_SIZE_PX,
     DepthPlanes,
     DepthPlanesOptions,
     PlanarSegment,
@@ -169,17 +167,6 @@ def test_planar_segments_of_unknown_depth_or_a_scattered_surface_are_none() -> N
         assert planar_segments(corner_room().photograph(), depth, PlaneOptions()) == []
 
 
-@pytest.mark.long
-def test_planar_segments_shrink_depth_maps_that_are_too_fine() -> None:
-    # In windows of the full size, noise of 0.2 % would hide the plane.
-    wall = slanted_wall([0.4, 0.2, -0.9])
-    depth, _ = wall.depth((2 * MAX_DEPTH_SIZE_PX, MAX_DEPTH_SIZE_PX))
-    depth *= 1.0 + 2e-3 * np.random.default_rng(0).standard_normal(depth.shape)
-    (segment,) = planar_segments(wall.photograph(), depth, PlaneOptions())
-    assert angles_deg(segment.normal, wall.normals[0]) < 0.5
-    assert segment.region.area_px > 0.98 * 400 * 300
-
-
 def test_plan_keeps_features_of_the_photograph_everywhere_or_outside() -> None:
     wall = slanted_wall([0.5, 0.1, -0.85])
     depth, _ = wall.depth((200, 150))
@@ -192,20 +179,6 @@ def test_plan_keeps_features_of_the_photograph_everywhere_or_outside() -> None:
     np.testing.assert_array_equal(
         outside.original_region, np.broadcast_to(np.arange(400) >= 240, (300, 400))
     )
-
-
-def test_plan_without_segments_has_no_warps_and_keeps_all_features() -> None:
-    room = corner_room()
-    depth = np.full((80, 90), np.nan)
-    plan = plan_planes(room.photograph(), depth, keep_original="outside")
-    assert plan.items == ()
-    assert plan.original_region.all()
-    assert plan_planes(room.photograph(), depth) == RectificationPlan(room.size)
-
-
-def test_depth_planes_without_depth_is_an_option_error() -> None:
-    with pytest.raises(OptionError, match="depth"):
-        DepthPlanes(DepthPlanesOptions(), RectifierInputs())
 
 
 def canvas_in_plane(item: Rectification, room: Room) -> tuple[Array, Array]:

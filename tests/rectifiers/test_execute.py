@@ -221,20 +221,6 @@ def test_found_again_needs_the_same_place_and_scale() -> None:
     assert found_again(original, rectified).tolist() == expected
 
 
-def test_found_again_uses_the_geometric_mean_of_elliptic_frames() -> None:
-    original = features_at([(60, 40)], [4.0])
-    rectified = features_at([(60.5, 40)], [4.0])
-    lafs = rectified.lafs.copy()
-    lafs[0, :, :2] = MEASUREMENT_SIGMAS * np.diag([8.0, 2.0])
-    assert found_again(original, rectified.with_frames(lafs)).tolist() == [True]
-
-
-@pytest.mark.parametrize(("count1", "count2"), [(0, 0), (0, 3), (3, 0)])
-def test_found_again_without_features_finds_none(count1: int, count2: int) -> None:
-    first, second = (features_at([(9.0, 9.0)] * n, [3.0] * n) for n in (count1, count2))
-    assert found_again(first, second).tolist() == [False] * count1
-
-
 def oblique_view(
     frontal: GrayImage, tilt_deg: float, size: tuple[int, int]
 ) -> tuple[GrayImage, Array]:
