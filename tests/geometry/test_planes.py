@@ -171,14 +171,6 @@ def test_cluster_normals_obeys_the_limit_on_planes(limit: int) -> None:
     assert len(clustered(three_planes()[0], max_num_planes=limit).normals) == min(limit, 3)
 
 
-def test_cluster_normals_of_nothing_has_no_planes() -> None:
-    for normals in (np.full((3, 4, 3), np.nan), np.zeros((0, 4, 3))):
-        clusters = clustered(normals, orthogonal=True)
-        assert clusters.normals.shape == (0, 3)
-        assert (clusters.labels == -1).all()
-        assert clusters.labels.shape == normals.shape[:2]
-
-
 def test_cluster_normals_lets_the_rest_vote_again_after_each_choice() -> None:
     # Candidates may be close: without a second vote a bin that is 20 degrees from the first
     # plane, and still holds it, would win over the second plane.

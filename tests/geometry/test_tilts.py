@@ -7,9 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from strategies import Array, affine_shapes, classes, scales, tilt_distance, turns
+from strategies import (
+    Array,
+    affine_shapes,
+    classes,
+    compose_affine,
+    scales,
+    tilt_distance,
+    turns,
+)
 
-from colmap_affrect.geometry.affine import compose_affine
 from colmap_affrect.geometry.tilts import (
     IDENTITY_LABEL,
     UNCOVERED_LABEL,

@@ -118,17 +118,6 @@ def test_plan_dense_shapes_skips_regions_below_the_smallest_share() -> None:
     assert (len(kept.items), len(skipped.items)) == (1, 0)
 
 
-def test_plan_dense_shapes_obeys_the_limit_on_warps() -> None:
-    rng = np.random.default_rng(4)
-    classes = [(float(t), float(a)) for t in (2.5, 5.0) for a in np.arange(8) * np.pi / 8]
-    grid = shape_grid(classes, rng.integers(0, 16, (40, 50)))
-    for limit in (0, 1, 3):
-        options = DenseShapesOptions(max_num_rectifications=limit, min_region_frac=0.0)
-        plan = plan_dense_shapes(grid, (200, 160), options)
-        assert len({(item.tilt, item.tilt_angle_rad) for item in plan.items}) == limit
-        check_invariants(plan, (200, 160))
-
-
 def test_plan_dense_shapes_does_not_let_untextured_blocks_vote_or_join() -> None:
     labels = np.zeros((10, 20), int)
     labels[:, 10:] = 1

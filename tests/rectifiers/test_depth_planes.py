@@ -21,11 +21,9 @@ from planar_scenes import (
 )
 from small_scene import cached_texture
 from strategies import Array
-from synthetic import blobs
 
 from colmap_affrect.conventions import camera_matrix
 from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan
-from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.images.warping import warp, warp_mask
@@ -37,7 +35,6 @@ from colmap_affrect.rectifiers.depth_planes import (
     PlaneOptions,
     planar_segments,
 )
-from colmap_affrect.rectifiers.execute import extract_rectified
 
 COURTYARD = Path(__file__).parents[2] / "sample_scenes" / "courtyard"
 
@@ -45,8 +42,6 @@ CREASE_PX = 3.0
 """Pixels of the image nearer to a crease may get the label of the other plane: two pixels of the
 depth map, which is smaller than the image."""
 
-DOT_ERROR_PX = 0.25
-"""Of SIFT on dots whose ellipses are those of the map's linear part only."""
 
 MIN_CORRELATION = 0.95
 """Of a warp and the texture rendered from the front; half a pixel of error costs more."""
@@ -214,32 +209,6 @@ def test_warp_of_a_slanted_wall_is_its_frontal_view(normal: tuple[float, float, 
     # What the warp shows is the texture of the plane.
     frontal = look_up(pattern, *np.moveaxis(120.0 * shown, -1, 0))
     assert np.corrcoef(warp(image, item)[inside], frontal[inside])[0, 1] > MIN_CORRELATION
-
-
-@pytest.mark.parametrize("normal", NORMALS[:3])
-def test_features_of_a_slanted_wall_lie_where_its_dots_are(
-    normal: tuple[float, float, float],
-) -> None:
-    room = slanted_wall(normal)
-    depth, _ = room.depth((200, 150))
-    dots = np.array([[150.0, 90.0], [220.0, 160.0], [260.0, 110.0], [180.0, 210.0]])
-    (item,) = plan_planes(room.photograph(), depth).items
-    # Dots that are round in the warp, drawn in the image as the ellipses that they are there.
-    frames = np.array([jacobian(item, dot) for dot in dots])
-    image = blobs(room.size, dots, 4.6 * np.linalg.inv(frames), amplitude=150)
-    plan = RectificationPlan(room.size, (item,))
-    features = extract_rectified(image, plan, RootSift(SiftOptions()), 5000, with_original=False)
-    distances = np.linalg.norm(features.keypoints[:, None] - dots[None], axis=2).min(axis=0)
-    assert (features.rectification_ids == 1).all()
-    assert distances.max() < DOT_ERROR_PX
-
-
-def jacobian(item: Rectification, point: Array) -> Array:
-    """Local linear part of a map, by finite differences."""
-    step = 1e-4
-    moved = point + step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    right, left, down, up = project(item.rectified_from_image, moved)
-    return np.stack([right - left, down - up], axis=1) / (2 * step)
 
 
 def courtyard_view(name: str) -> tuple[Photograph, Array, Array]:
