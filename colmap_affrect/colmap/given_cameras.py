@@ -17,7 +17,7 @@ CENTER = ("cx", "cy")
 COLUMNS = ("name", "camera", "model", "params", "focal_px", "focal_mm", *WIDTHS, *CENTER)
 """Of tables of cameras; only the name is needed."""
 
-EXCLUSIVE = (
+EXCLUSIVE: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
     (("params",), COLUMNS[4:]),
     (("focal_px",), ("focal_mm", *WIDTHS)),
     (WIDTHS[:1], WIDTHS[1:]),
