@@ -77,7 +77,10 @@ class Adjuster:
         max_iterations: int,
         image_ids: Iterable[int] | None = None,
     ) -> None:
-        """Adjust poses, points and cameras in place; of some images only, the others stay."""
+        """Adjust poses, points and cameras in place.
+
+        Of some images only, the others stay, and so do the cameras that they share.
+        """
         pyceres = _pyceres()
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)
         options.min_track_length = 3 if has_long_tracks(model) else 2
@@ -88,7 +91,9 @@ class Adjuster:
         for image_id in images:
             config.add_image(image_id)
         used = {model.images[image_id].camera_id for image_id in images}
-        held = {key for key in used if key in self.constant or not self.priors[key].sigma}
+        others = set(model.reg_image_ids()) - set(images)
+        held = {model.images[image_id].camera_id for image_id in others} & used
+        held |= {key for key in used if key in self.constant or not self.priors[key].sigma}
         for key in sorted(held):
             config.set_constant_cam_intrinsics(key)
         if image_ids is None:
@@ -113,8 +118,8 @@ class Adjuster:
         mean, sigma = camera.params.copy(), np.full(len(camera.params), UNKNOWN_SIGMA)
         mean[focal], sigma[focal] = prior.focal_px, prior.sigma * prior.focal_px
         mean[extra], sigma[extra] = 0.0, DISTORTION_SIGMA
-        # Reprojection errors are in px, not in units of the noise: so is the prior.
-        covariance = np.diag((sigma * self.noise_px) ** 2)
+        # Reprojection errors are in px, priors in units of their deviation times the noise.
+        covariance = np.diag((sigma / self.noise_px) ** 2)
         normal = _pyceres().factors.NormalPrior(mean, covariance)
         problem.add_residual_block(normal, None, [camera.params])
 

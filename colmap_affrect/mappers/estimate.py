@@ -163,6 +163,8 @@ class EstimateMapper(IncrementalMapper):
         native.mapper.init_max_forward_motion = 1.0  # the evidence decides about such pairs
         cameras = {camera.camera_id: camera for camera in graph.cameras.values()}
         priors = {key: FocalPrior.of(c, task.cameras.get(key)) for key, c in cameras.items()}
+        if not self.options.keep_given_intrinsics:
+            priors = {k: replace(p, sigma=p.sigma or EXIF_SIGMA) for k, p in priors.items()}
         adjuster = Adjuster(
             priors, self.options.noise_px, frozenset(task.constant_cameras(self.options))
         )
@@ -202,7 +204,7 @@ class _Search:
         return self.evidence.of_best(model.reconstruction for model in models)
 
     def best(self, graph: PairGraph) -> list[MappedModel]:
-        """Return the best model, and then the best of what it has no image of."""
+        """Return the best model, and then the best ones of images that none before has."""
         best: list[MappedModel] = []
         for adjuster in self._hypotheses():
             found = self._near(graph, Grower(graph.cache, adjuster, self.native))
@@ -239,10 +241,13 @@ class _Search:
         for index, model in enumerate(models[:NUM_STARTS]):
             grown, bridges, _ = joiner.grow(model, models[:index] + models[index + 1 :])
             joined.append((grown, bridges))
-        best, bridges = max(joined, key=lambda found: self.evidence.of(found[0]))
-        inside = set(best.reg_image_ids())
-        apart = [model for model in models if inside.isdisjoint(model.reg_image_ids())]
-        return [MappedModel(best, tuple(bridges)), *map(MappedModel, apart[:1])]
+        best, bridges = max(joined, key=lambda pair: self.evidence.of(pair[0]))
+        found, inside = [MappedModel(best, tuple(bridges))], set(best.reg_image_ids())
+        for model in models:
+            if inside.isdisjoint(model.reg_image_ids()):
+                found.append(MappedModel(model))
+                inside.update(model.reg_image_ids())
+        return found
 
     def _grown(self, graph: PairGraph, grower: Grower) -> Models:
         """Return models of different images, that with most evidence first."""
