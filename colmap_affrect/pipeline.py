@@ -71,7 +71,8 @@ from colmap_affrect.stages.verify import recorded_verification, verify_matches
 FocalVote = Literal["auto", "always", "never"]
 
 REPORTED_PACKAGES = (
-    "colmap-affrect", "pycolmap", "opencv-python-headless", "numpy", "h5py", "torch", "kornia",
+    "colmap-affrect", "pycolmap", "pyceres", "opencv-python-headless", "numpy", "h5py", "torch",
+    "kornia",
 )  # fmt: skip
 
 

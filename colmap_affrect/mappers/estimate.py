@@ -150,6 +150,7 @@ class EstimateMapper(IncrementalMapper):
     """Maps small sets as one estimate; large ones, rigs and models to extend go COLMAP's way."""
 
     Options = EstimateOptions
+    options: EstimateOptions
 
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
