@@ -12,10 +12,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import NoReturn
 
-from colmap_affrect.shown import INTERRUPTED
+from colmap_affrect.parallel.subprocesses import end_with
+from colmap_affrect.shown import INTERRUPTED, say
 
 PATIENCE_S = 4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
-PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent dies
 SIGNALS = {signal.SIGINT, signal.SIGTERM}
 
 
@@ -39,7 +39,7 @@ def main() -> NoReturn:
     except OSError:  # too many processes
         _work()
     if not worker:
-        _end_with(parent)
+        end_with(parent)
         _work()
     signal.signal(signal.SIGALRM, lambda *_: _kill(worker, signal.SIGKILL))
     _handle(stop)
@@ -68,28 +68,14 @@ def _exit_code(code: int, told: list[int]) -> int:
     if code >= 0:
         return 128 + told[0] if told and code else code
     if told:
-        _say(INTERRUPTED)
+        say(INTERRUPTED)
         return 128 + told[0]
     cause = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
-    _say(
+    say(
         f"error: ended by {signal.Signals(-code).name}{cause}; run.log may say why, and what was "
         "done before is kept: run the same command again, or 'colmap-affrect doctor'"
     )
     return 1
-
-
-def _say(line: str) -> None:
-    with suppress(OSError):  # nobody reads it any more
-        print(line, file=sys.stderr, flush=True)
-
-
-def _end_with(parent: int) -> None:
-    """Let the system kill this process when its parent is killed."""
-    import ctypes
-
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def _work() -> NoReturn:
@@ -111,7 +97,7 @@ def _work() -> NoReturn:
         # Libraries turn a KeyboardInterrupt in their callbacks into errors of their own.
         if not (told or isinstance(error, KeyboardInterrupt)):
             raise
-        _say(INTERRUPTED)
+        say(INTERRUPTED)
         os._exit(128 + signal.SIGINT)
 
 

@@ -1,8 +1,11 @@
 """How long a whole run takes, roughly: from what its first images and pairs have taken."""
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+
+logger = logging.getLogger(__name__)
 
 COSTS = {"extract": 1.0, "match": 0.25, "match by network": 0.7, "verify": 0.15, "map": 0.7}
 """What one unit of a stage takes in the time that one image takes in ``extract``, of a stage that
@@ -20,6 +23,7 @@ class _Stage:
     ahead: int
     done: int = 0
     elapsed_s: float = 0.0
+    is_logged: bool = False  # that the run takes long
 
     @property
     def is_measured(self) -> bool:
@@ -73,12 +77,17 @@ class Forecast:
         for name in ("match", "verify"):
             self._stages[name].ahead = count
 
-    def advance(self, count: int) -> None:
-        """So many units of the stage that began last are done."""
+    def advance(self, count: int) -> str:
+        """So many units of the stage that began last are done; return and log :meth:`text`."""
         stage = self._stages[self._current]
         stage.done += count
         stage.ahead = max(stage.ahead - count, 0)
         stage.elapsed_s = self._clock() - self._start_s
+        text = self.text()
+        if text and not stage.is_logged:
+            stage.is_logged = True
+            logger.info("%s", text)
+        return text
 
     def end(self) -> None:
         """The stage that began last is over, whatever it has done."""
