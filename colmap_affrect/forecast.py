@@ -43,12 +43,12 @@ class Forecast:
         num_pairs: int,
         *,
         by_network: bool = False,
-        may_climb: bool = False,
+        may_escalate: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Take what is ahead, if all images are new.
 
-        ``by_network``: a network matches; ``may_climb``: pairs may be matched again with more
+        ``by_network``: a network matches; ``may_escalate``: pairs may be matched again with more
         warps, how many nobody knows before.
         """
         match_cost = COSTS["match by network" if by_network else "match"]
@@ -58,7 +58,7 @@ class Forecast:
             "verify": _Stage(COSTS["verify"], num_pairs),
             "map": _Stage(COSTS["map"] + MAP_COST_PER_IMAGE * num_images, num_images),
         }
-        self._may_climb, self._clock = may_climb, clock
+        self._may_escalate, self._clock = may_escalate, clock
         self._current, self._start_s = "", 0.0
 
     def begin(self, name: str, total: int) -> None:
@@ -70,7 +70,7 @@ class Forecast:
         if name == "match":
             self._expect_pairs(total)
         self._stages[name] = _Stage(known.cost, total)
-        self._may_climb &= name not in ("cameras", "guide", "map")
+        self._may_escalate &= name not in ("cameras", "guide", "map")
         self._current, self._start_s = name, self._clock()
 
     def _expect_pairs(self, count: int) -> None:
@@ -114,7 +114,7 @@ class Forecast:
         left_s = self.left_s() or 0.0
         if left_s < 60 or not self._stages["map"].ahead or self._current == "map":
             return ""
-        but = " without further warps" if self._may_climb else ""
+        but = " without further warps" if self._may_escalate else ""
         return f"whole run: {duration_text(left_s)} left{but}"
 
 
