@@ -152,7 +152,7 @@ class RunOptions(InputOptions):
             num_images,
             expected_num_pairs(self.pairs, num_images),
             by_network=bool(self.recipe.matching.weights),
-            may_climb=bool(self.recipe.extraction.escalation),
+            may_escalate=bool(self.recipe.extraction.escalation),
         )
 
 
