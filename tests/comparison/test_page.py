@@ -274,10 +274,11 @@ def test_models_are_drawn_in_one_frame(page: Page) -> None:
 
 def test_matches_lie_where_the_features_are(comparison: Comparison, folder: Path) -> None:
     pair = (NAMES[0], NAMES[1])
-    chosen = [item for item in choose_pairs(comparison.finished, ["default"]) if item.names == pair]
-    assert [(item.before.name, item.after.name) for item in chosen] == [("sift", "default")]
+    methods = choose_pairs(comparison.finished, ["default"])[pair]
     pictures = {name: Picture("", 80, 60) for name in NAMES}
-    ((before, after),) = [item.plots.values() for item in plot_pairs(chosen, pictures, folder)]
+    (item,) = plot_pairs({pair: methods}, pictures, folder)
+    assert list(item["plots"]) == ["sift", "default"]
+    before, after = item["plots"].values()
     assert (before.num_inliers, before.plain, before.warped) == (0, "", "")
     assert after.num_inliers == comparison.methods[2].seeds[0].pair_inliers[pair]
     with open_copy(folder / "methods/default/seed-0/database.db") as database:
