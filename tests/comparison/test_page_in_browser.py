@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -103,13 +102,3 @@ def test_models_are_printed(browser: Browser) -> None:
         assert browser.run(shown, "nav") == 0
     finally:
         browser.command("Emulation.setEmulatedMedia", media="")
-
-
-def test_page_of_200_photographs_opens_in_3_seconds(
-    running: Browser, large_page_path: Path
-) -> None:
-    start = time.monotonic()
-    running.open(large_page_path)
-    until_drawn(running)
-    assert time.monotonic() - start < 3.0
-    assert running.log() == []
