@@ -34,12 +34,13 @@ from colmap_affrect.options import Options
 from colmap_affrect.pairs.base import Pair, PairOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.parallel.subprocesses import child
-from colmap_affrect.pipeline import InputOptions, installed_versions
+from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.differences import first_difference
 from colmap_affrect.project.outputs import new_results, remove_own
+from colmap_affrect.project.versions import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 
