@@ -120,9 +120,7 @@ def test_pairs_without_an_image_or_pose_are_left_out_and_named(svp: Path) -> Non
 @pytest.mark.parametrize(("file", "old", "new"), [
     ("cameras.txt", "SIMPLE_RADIAL", "ROUND"),
     ("cameras.txt", "300.0", "nan"),
-    ("cameras.txt", "1 SIMPLE", "9 SIMPLE"),
     ("images.txt", "1 0.99", "1 2.99"),
-    ("images.txt", "1 0.99", "1 inf"),
 ])  # fmt: skip
 def test_unusable_cameras_and_poses_are_refused(svp: Path, file: str, old: str, new: str) -> None:
     path = svp / "0" / file
@@ -197,7 +195,6 @@ def test_names_with_dashes_and_pairs_of_unknown_images(imc: Path) -> None:
 
 @pytest.mark.parametrize(("changes", "fault"), [
     ({"K": np.diag([np.nan, 300, 1])}, "K is empty or has values that are not finite"),
-    ({"K": np.eye(2)}, r"K has shape \(2, 2\)"),
     ({"K": np.diag([300.0, 300, 1])}, r"K is not \[\[fx, 0, cx\]"),
     ({"T": None}, "cannot be read"),
     ({"R": 2 * pose(0)[0]}, "R is not orthonormal"),
@@ -306,7 +303,6 @@ def test_poses_and_points_in_pixels_of_both_origins(
     ({"homography": [[1, 2], [3, 4]]}, r"has shape \(2, 2\)"),
     ({"relative_pose": posed(rotation=(2 * np.eye(3)).tolist())}, "not orthonormal"),
     ({"relative_pose": posed(centre=[0, 0, 0])}, "relative_pose needs"),
-    ({"correspondences": []}, "has shape"),
     ({"correspondences": "../points.txt"}, "must be a file in the folder"),
 ])  # fmt: skip
 def test_unusable_truth_fails_its_pair(
@@ -323,10 +319,8 @@ SAME = '{"image1": "a.png", "image2": "b.png", "homography": "h.txt"}'
 
 @pytest.mark.parametrize(("content", "message"), [
     ("[]", "cannot be read"),
-    ("{", "cannot be read"),
     ('{"pairs": [1]}', r"pairs\[0\]: expected options, got 1"),
     ('{"pairs": [], "pixel_origin": "left"}', r"cannot be read \(KeyError\('left'\)\)"),
-    ('{"pairs": [{"image1": "a.png"}]}', "image2 is missing"),
     (
         '{"pairs": [{"image1": "../a.png", "image2": "b.png", "homography": []}]}',
         "must be path",

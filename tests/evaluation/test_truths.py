@@ -22,7 +22,6 @@ from colmap_affrect.evaluation.truths import (
     pose_columns,
     recalls,
     symmetric_epipolar_distances,
-    transfer_errors,
 )
 
 TRUTH = np.array([[0.9, 0.2, 30.0], [-0.1, 1.1, -20.0], [3e-4, -1e-4, 1.0]])
@@ -41,16 +40,6 @@ BEHIND = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.01, 0.0, 1.0]])
 
 def error_px(estimate: np.ndarray | None) -> float:
     return TrueHomography(TRUTH, SIZE1, SIZE2).error_px(estimate)
-
-
-def test_transfer_error_of_one_match_by_hand() -> None:
-    points1 = np.array([[100.0, 50.0]])
-    exact = np.array([(90 + 10 + 30) / 1.025, (-10 + 55 - 20) / 1.025])
-    errors = transfer_errors(TRUTH, points1, exact[None] + [3.0, 4.0])
-    np.testing.assert_allclose(errors, [5.0], atol=ROUNDING_PX)
-    points = np.array([[200.0, 40.0], [100.0, 7.0]])
-    errors = transfer_errors(BEHIND, points, np.array([[-200.0, -40.0], [0.0, 0.0]]))
-    assert np.isinf(errors).all()
 
 
 @pytest.mark.parametrize(("truth", "size2", "first", "last"), [
