@@ -71,7 +71,8 @@ from colmap_affrect.stages.verify import recorded_verification, verify_matches
 FocalVote = Literal["auto", "always", "never"]
 
 REPORTED_PACKAGES = (
-    "colmap-affrect", "pycolmap", "opencv-python-headless", "numpy", "h5py", "torch", "kornia",
+    "colmap-affrect", "pycolmap", "pyceres", "opencv-python-headless", "numpy", "h5py", "torch",
+    "kornia",
 )  # fmt: skip
 
 
@@ -151,7 +152,7 @@ class RunOptions(InputOptions):
             num_images,
             expected_num_pairs(self.pairs, num_images),
             by_network=bool(self.recipe.matching.weights),
-            may_climb=bool(self.recipe.extraction.escalation),
+            may_escalate=bool(self.recipe.extraction.escalation),
         )
 
 

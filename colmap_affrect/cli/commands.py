@@ -208,9 +208,7 @@ def evaluate(options: argparse.Namespace) -> int:
     from colmap_affrect.evaluation.evaluate import EvaluateOptions, evaluate
     from colmap_affrect.recipes import with_settings
 
-    for setting in options.protocol_options:
-        if "=" not in setting:
-            raise OptionError(f"--protocol-options {setting}: expected KEY=VALUE")
+    given.key_values("--protocol-options", options.protocol_options)
     changed = with_settings({}, options.protocol_options)
     evaluation = evaluate(
         options.protocol,

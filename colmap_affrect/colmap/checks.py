@@ -28,6 +28,7 @@ from colmap_affrect.colmap.tables import (
 )
 from colmap_affrect.colmap.useless_keypoints import MAX_SIDE_PX, useless
 from colmap_affrect.errors import DatabaseError
+from colmap_affrect.images.exif import PLAUSIBLE_FOCALS
 from colmap_affrect.project.outputs import leads_outside
 from colmap_affrect.shown import such_as
 
@@ -51,6 +52,11 @@ CHECKS: dict[str, Check] = {
         "cameras whose parameters are more or fewer than their model has, a focal length that is "
         "not positive, or not finite numbers",
         "import their images again into a new database"),
+    "implausible-focal": ("warning",
+        "cameras with focal lengths that hardly any photograph has, in px of the image and longer "
+        "sides",
+        "give the right ones in a table (--cameras-path), or let the pairs vote on them: "
+        "--ignore-exif for photographs, --focal-vote always for scans"),
     "no-prior-focal": ("note", "cameras whose focal length is a guess",
         "if you know the intrinsics, give them: --cameras-path or --focal-length-px here, "
         "--ImageReader.camera_params in COLMAP"),
@@ -233,6 +239,11 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
             or (params[0, like.focal_length_idxs()] <= 0.0).any()
         ):
             found["camera-params"].append(label)
+        elif indices := like.focal_length_idxs():
+            focal_px, longer = float(params[0, indices].mean()), max(camera.width, camera.height)
+            focal = focal_px / max(longer, 1)
+            if longer <= MAX_SIDE_PX and not PLAUSIBLE_FOCALS[0] <= focal <= PLAUSIBLE_FOCALS[1]:
+                found["implausible-focal"].append(f"{label}: {focal_px:.0f} px, {focal:.2g}")
         if not all(0 < side <= MAX_SIDE_PX for side in (camera.width, camera.height)):
             found["camera-size"].append(f"{label}: {camera.width} x {camera.height} px")
 

@@ -73,19 +73,6 @@ class Tables:
     matches: dict[int, int]  # number of raw matches by pair id
     geometries: dict[int, tuple[int, int]]  # number of inliers and configuration by pair id
 
-    def num_keypoints(self) -> dict[str, int]:
-        """Return the number of keypoints of the images that have a row of them, by name."""
-        return {
-            name: self.keypoints[image_id][0]
-            for image_id, name in self.names.items()
-            if image_id in self.keypoints
-        }
-
-    def matched_pairs(self) -> set[tuple[str, str]]:
-        """Return the sorted names of each pair that has a row of raw matches."""
-        pairs = (sorted(map(self._label, pair_images(pair_id))) for pair_id in self.matches)
-        return {(first, second) for first, second in pairs}
-
     def pair_label(self, pair_id: int) -> str:
         """Return the names of a pair for a message."""
         return " - ".join(self.pair_names(pair_id))

@@ -6,7 +6,9 @@ masks, pairs, verification, mapping and seeds are the same for all.
 
 import hashlib
 import json
+import pickle
 import signal
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -22,9 +24,9 @@ from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
 from colmap_affrect.comparison.methods import SIFT_COLMAP, Method, parse_methods, without_weights
 from colmap_affrect.comparison.page import write_page
-from colmap_affrect.comparison.request import Layout, Request
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
-from colmap_affrect.comparison.tables import to_csv, to_json
+from colmap_affrect.comparison.tables import to_json
+from colmap_affrect.comparison.task import Layout, MethodTask
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
 from colmap_affrect.features.weights import install_hint, resolve
 from colmap_affrect.mappers.base import MAPPERS
@@ -74,25 +76,24 @@ def compare(
 
     Each method runs in a process of its own. One that fails is reported as failed, and the others
     go on; with ``overwrite`` methods run again though they have results there. What is returned is
-    also written to ``comparison.json``, ``comparison.csv`` and ``report.html`` in the output
-    folder, which is made if missing. Raises AffrectError for anything that the caller can mend,
-    before any method is run.
+    also written to ``comparison.json`` and ``report.html`` in the output folder, which is made if
+    missing. Raises AffrectError for anything that the caller can mend, before any method is run.
     """
     options = options or CompareOptions()
     Workspace(output_path).require_own(image_path)
     plan = _Plan.checked(image_path, Layout(output_path), options)
-    requests = plan.requests()
-    todo = [item.method.recipe for item in requests if overwrite or not _finished(item)]
+    tasks = plan.tasks()
+    todo = [item.method.recipe for item in tasks if overwrite or not _finished(item)]
     keys = {key for recipe in todo if recipe for key in recipe.weights}
     resolve(sorted(keys), options.resources.weights_path, progress=progress)
     with Workspace(output_path).locked():
         unreadable = _share(plan, overwrite=overwrite)
-        for request in requests:
-            _record(request, overwrite=overwrite)
+        for task in tasks:
+            _begin(task, overwrite=overwrite)
         results = []
-        for number, request in enumerate(requests, 1):
-            title = f"method {number} of {len(requests)}, {request.method.label}"
-            result = _finished(request) or _run(request, progress, title)
+        for number, task in enumerate(tasks, 1):
+            title = f"method {number} of {len(tasks)}, {task.method.label}"
+            result = _finished(task) or _run(task, progress, title)
             results.append(replace(result, failures={**unreadable, **result.failures}))
         comparison = Comparison(
             image_names=tuple(plan.names),
@@ -104,7 +105,6 @@ def compare(
             versions=installed_versions(),
         )
         replace_text(output_path / "comparison.json", to_json(comparison))
-        replace_text(output_path / "comparison.csv", to_csv(comparison))
         write_page(comparison, output_path, progress, options.resources)
     return comparison
 
@@ -196,13 +196,13 @@ class _Plan:
             "mapping": inputs["mapping"],
         }
 
-    def requests(self) -> list[Request]:
+    def tasks(self) -> list[MethodTask]:
         options = self.options
         ours = options.verification, options.mapping, options.holds_vote
         mapper = MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset("colmap")
         colmaps = VerificationOptions.preset("colmap"), mapper, False
         return [
-            Request(
+            MethodTask(
                 method=method,
                 output_path=self.layout.path.resolve(),
                 image_path=self.image_path.resolve(),
@@ -297,35 +297,39 @@ def _make_shared(plan: _Plan, inputs: Mapping[str, Any]) -> None:
         replace_text(new.inputs, json.dumps(inputs, indent=1))
 
 
-def _record(request: Request, *, overwrite: bool) -> None:
-    folder, path, name = request.folder, request.path, request.method.label
-    if path.exists() and overwrite:
-        remove_own([folder])
-    known = Request.read(path).decisive() if path.exists() else request.decisive()
-    if difference := first_difference(known, request.decisive()):
-        raise StaleStoreError(
-            f"{folder}: {name} was run there with {difference}; use --overwrite to redo the "
-            "methods that are named, another name (NAME=RECIPE), or another --output-path"
-        )
-    Workspace(folder).begin()
-    replace_text(path, request.to_json())
+def _begin(task: MethodTask, *, overwrite: bool) -> None:
+    """Refuse a folder in which a method of this name has finished with other options."""
+    if overwrite:
+        remove_own([task.folder])
+    if task.result.exists():
+        content = json.loads(task.result.read_text(encoding="utf-8"))
+        known, now = content["result"]["options"], json.loads(json.dumps(task.options))
+        if task.method.climbs:
+            known["seed"], now["seed"] = content["seeds"][0], task.seeds[0]
+        if difference := first_difference(known, now):
+            raise StaleStoreError(
+                f"{task.folder}: {task.method.label} was run there with {difference}; use "
+                "--overwrite to redo the methods that are named, another name (NAME=RECIPE), or "
+                "another --output-path"
+            )
+    Workspace(task.folder).begin()
 
 
-def _finished(request: Request) -> MethodResult | None:
+def _finished(task: MethodTask) -> MethodResult | None:
     """Return the result of a method that has been run with the same seeds."""
-    if request.result.exists():
-        content = json.loads(request.result.read_text(encoding="utf-8"))
-        if content["seeds"] == list(request.seeds):
-            return MethodResult.from_mapping(request.method.label, content["result"])
+    if task.result.exists():
+        content = json.loads(task.result.read_text(encoding="utf-8"))
+        if content["seeds"] == list(task.seeds):
+            return MethodResult.from_mapping(task.method.label, content["result"])
     return None
 
 
-def _run(request: Request, progress: Progress, title: str) -> MethodResult:
+def _run(task: MethodTask, progress: Progress, title: str) -> MethodResult:
     """Run a method in a process of its own; what it prints goes to ``run.log`` in its folder."""
-    failed = ""
+    log_path, failed = Workspace(task.folder).log, ""
     with (
-        request.log.open("a", encoding="utf-8") as log,
-        child(worker.__name__, str(request.path), stderr=log) as process,
+        log_path.open("a", encoding="utf-8") as log,
+        child(worker.__name__, b64encode(pickle.dumps(task)).decode(), stderr=log) as process,
         ExitStack() as stage,
     ):
         advance: Advance = stage.enter_context(SILENT.stage("", 0, ""))
@@ -341,13 +345,10 @@ def _run(request: Request, progress: Progress, title: str) -> MethodResult:
             else:
                 failed = event["failed"]
     if process.returncode and not failed:
-        failed = f"its process ended {_ending(process.returncode)}; {request.log} may say why"
-    result = None if failed else _finished(request)
+        failed = f"its process ended {_ending(process.returncode)}; {log_path} may say why"
+    result = None if failed else _finished(task)
     return result or MethodResult(
-        request.method.label,
-        summary=request.method.summary,
-        folder=request.folder.relative_to(request.output_path).as_posix(),
-        failed=failed,
+        task.method.label, summary=task.method.summary, folder=task.shown_folder, failed=failed
     )
 
 

@@ -1,7 +1,7 @@
 """What a comparison found, as frozen data.
 
 Everything derived (means, who registers what alone) is computed here from the results of single
-seeds, so that terminal, page, JSON and CSV cannot disagree.
+seeds, so that terminal, page and JSON cannot disagree.
 """
 
 from collections import Counter
@@ -124,7 +124,7 @@ MEASURES: dict[str, Callable[[SeedResult], float]] = {
     "mean_observations": lambda seed: seed.mean_observations,
     "mean_reprojection_error_px": lambda seed: seed.mean_reprojection_error_px,
 }
-"""Numbers of every seed, by their names in JSON and CSV."""
+"""Numbers of every seed, by their names in JSON."""
 
 MEASURES_OF_MODEL = {
     "points3D", "mean_track_length", "mean_observations", "mean_reprojection_error_px",

@@ -1,14 +1,12 @@
-"""A comparison as a table for the terminal, as CSV and as JSON."""
+"""A comparison as a table for the terminal and as JSON."""
 
 import json
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import zip_longest
-from typing import Any
 
-from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult, Span
+from colmap_affrect.comparison.results import Comparison, MethodResult, Span
 from colmap_affrect.comparison.verdict import verdict
-from colmap_affrect.project.report import csv_text
 
 WIDTH = 88
 
@@ -72,36 +70,3 @@ def to_json(comparison: Comparison) -> str:
     """Return ``comparison.json``: all results, and the verdict first."""
     values = {"verdict": verdict(comparison), **comparison.to_mapping()}
     return json.dumps(values, indent=2, ensure_ascii=False) + "\n"
-
-
-def to_csv(comparison: Comparison) -> str:
-    """Return ``comparison.csv``: a row for each method and seed, and for each failed method."""
-    images = len(comparison.image_names)
-    rows = [_cells(method, seed, images) for method in comparison.finished for seed in method.seeds]
-    rows += [
-        {"method": method.name, "images": images, "failed": method.failed}
-        for method in comparison.methods
-        if method.failed
-    ]
-    return csv_text(rows)
-
-
-def _cells(method: MethodResult, seed: SeedResult, images: int) -> dict[str, Any]:
-    cells = {
-        "method": method.name,
-        "images": images,
-        "failed": "",
-        "keypoints": sum(method.num_keypoints.values()),
-        "raw_matches": sum(method.raw_matches.values()),
-        "peak_memory_bytes": method.peak_memory_bytes,
-        **_numbers(seed.to_mapping()),
-    }
-    if seed.scores:
-        scores = seed.scores.to_mapping()
-        cells |= {"correct": len(seed.scores.correct_names), **_numbers(scores)}
-        cells |= {f"auc_{limit}": value for limit, value in scores["auc"].items()}
-    return cells | {f"{key}_s": value for key, value in {**method.wall_s, **seed.wall_s}.items()}
-
-
-def _numbers(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in values.items() if isinstance(value, int | float)}

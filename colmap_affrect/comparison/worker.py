@@ -1,18 +1,18 @@
-"""One method of a comparison, in a process of its own: ``python -m ... REQUEST.json``.
+"""One method of a comparison, in a process of its own: ``python -m ... TASK``.
 
 Its peak memory is the method's, and when it dies the other methods go on. What was done stays:
-run again, it goes on. It tells of its progress and of how it ended by lines of JSON on stdout;
-everything else that is printed goes to stderr.
+run again, it goes on. Progress, and how it ended, are lines of JSON on stdout; everything else
+that is printed goes to stderr.
 """
 
 import json
 import logging
 import os
-import resource
+import pickle
 import shutil
 import sys
-import threading
 import time
+from base64 import b64decode
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -35,16 +35,16 @@ from colmap_affrect.colmap.verification import (
     verify,
 )
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP
-from colmap_affrect.comparison.request import Request
 from colmap_affrect.comparison.results import MethodResult, SeedResult
-from colmap_affrect.comparison.sift import describe_options, extract_sift, match_sift, rename_images
+from colmap_affrect.comparison.sift import extract_sift, match_sift, rename_images
+from colmap_affrect.comparison.task import MethodTask
 from colmap_affrect.errors import AffrectError
 from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.pairs.base import Pair, PairOptions
 from colmap_affrect.pairs.lists import read_pairs
-from colmap_affrect.parallel.executor import BYTES_PER_RSS, peak_memory_bytes
-from colmap_affrect.parallel.subprocesses import end_with_parent
+from colmap_affrect.parallel.executor import peak_memory_bytes
+from colmap_affrect.parallel.subprocesses import end_with
 from colmap_affrect.pipeline import map_guided
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
@@ -64,20 +64,18 @@ from colmap_affrect.stages.verify import extracted_px, verify_matches
 
 logger = logging.getLogger("colmap_affrect")
 
-SAVE_EVERY_S = 1.0  # how often the costs so far are written down, in case the process is killed
-
 
 def main() -> None:
-    """Run the method that the request asks for, unless its parent ends before."""
-    end_with_parent()
+    """Run the method that the task asks for, unless its parent ends before."""
+    end_with(int(sys.argv[2]))
     parent = _take_stdout()
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     logger.addHandler(handler)
     try:
-        request = Request.read(Path(sys.argv[1]))
-        with Workspace(request.folder).locked():
-            compute(request, _Reported(parent))
+        task: MethodTask = pickle.loads(b64decode(sys.argv[1]))  # noqa: S301 (of our parent)
+        with Workspace(task.folder).locked():
+            compute(task, _Reported(parent))
     except AffrectError as error:
         _tell(parent, failed=str(error))
     except Exception as error:
@@ -85,46 +83,44 @@ def main() -> None:
         _tell(parent, failed=f"{type(error).__name__}: {error}")
 
 
-def compute(request: Request, progress: Progress) -> None:
+def compute(task: MethodTask, progress: Progress) -> None:
     """Extract, match, verify and map, and write ``result.json``; what is there is kept."""
-    costs = _Costs(request.folder / "costs.json")
-    recipe = request.method.recipe
-    if recipe is None:
-        affine = request.method.label == SIFT_AFFINE_DSP
-        options = describe_options(affine=affine)
-        _match_sift(request, costs, progress, affine=affine)
+    costs = _Costs(task.folder / "costs.json")
+    if task.method.recipe:
+        _match_recipe(task, task.method.recipe, costs, progress)
     else:
-        options = recipe.to_mapping()
-        _match_recipe(request, recipe, costs, progress)
-    num_keypoints, raw_matches = _count_features(request.folder / "database.db")
+        _match_sift(task, costs, progress)
+    num_keypoints, raw_matches = _count_features(task.folder / "database.db")
+    seeds = tuple(_run_seed(task, seed, progress) for seed in task.seeds)
+    costs.save()
     result = MethodResult(
-        name=request.method.label,
-        summary=request.method.summary,
+        name=task.method.label,
+        summary=task.method.summary,
         num_keypoints=num_keypoints,
         raw_matches=raw_matches,
-        seeds=tuple(_run_seed(request, seed, progress) for seed in request.seeds),
+        seeds=seeds,
         wall_s=costs.wall_s,
-        peak_memory_bytes=costs.peak_memory_bytes(),
+        peak_memory_bytes=costs.peak_memory_bytes,
         failures=costs.failures,
-        options=options,
-        folder=request.folder.relative_to(request.output_path).as_posix(),
+        options=task.options,
+        folder=task.shown_folder,
     )
-    costs.save()
-    content = {"seeds": request.seeds, "result": result.to_mapping()}
-    replace_text(request.result, json.dumps(content, indent=1, ensure_ascii=False))
+    content = {"seeds": task.seeds, "result": result.to_mapping()}
+    replace_text(task.result, json.dumps(content, indent=1, ensure_ascii=False))
 
 
-def _match_sift(request: Request, costs: "_Costs", progress: Progress, *, affine: bool) -> None:
-    path, base = request.folder / "database.db", request.layout.database
+def _match_sift(task: MethodTask, costs: "_Costs", progress: Progress) -> None:
+    affine = task.method.label == SIFT_AFFINE_DSP
+    path, base = task.folder / "database.db", task.layout.database
     if not path.exists():
         copy_database(base, path)
     rename_images(path, {image_id: name for name, image_id in image_ids(base).items()})
-    names = request.layout.image_names()
-    pairs = read_pairs(request.layout.pairs, names)
+    names = task.layout.image_names()
+    pairs = read_pairs(task.layout.pairs, names)
 
     def extract_all() -> None:
         with progress.stage("extract", len(names), "images") as advance:
-            images = request.image_path, names, request.masks
+            images = task.image_path, names, task.masks
             costs.failures = extract_sift(path, *images, affine=affine)
             advance(len(names))
 
@@ -137,23 +133,23 @@ def _match_sift(request: Request, costs: "_Costs", progress: Progress, *, affine
     costs.stage("match", match_all)
 
 
-def _match_recipe(request: Request, recipe: Recipe, costs: "_Costs", progress: Progress) -> None:
-    context = Context(Workspace(request.folder), request.resources, progress=progress)
+def _match_recipe(task: MethodTask, recipe: Recipe, costs: "_Costs", progress: Progress) -> None:
+    context = Context(Workspace(task.folder), task.resources, progress=progress)
     inputs = Inputs.of(
-        request.image_path,
-        image_list_path=request.layout.images,
-        from_database=request.layout.database,
-        masks=request.masks,
+        task.image_path,
+        image_list_path=task.layout.images,
+        from_database=task.layout.database,
+        masks=task.masks,
     )
 
     def extract_all() -> None:
         costs.failures = extract(context, inputs, recipe).failures
 
     costs.stage("extract", extract_all)
-    choose_pairs(context, PairOptions(match_list_path=str(request.layout.pairs.resolve())))
+    choose_pairs(context, PairOptions(match_list_path=str(task.layout.pairs.resolve())))
     costs.stage("match", lambda: match(context))
-    if request.method.climbs:
-        verification = request.verification.changed(random_seed=request.seeds[0])
+    if task.method.climbs:
+        verification = task.verification.changed(random_seed=task.seeds[0])
         verify_matches(replace(context, progress=SILENT), verification)
         costs.stage("escalate", lambda: escalate(context))
 
@@ -174,36 +170,36 @@ def _pair(names: Mapping[int, str], ids: tuple[int, int]) -> Pair:
     return first, second
 
 
-def _run_seed(request: Request, seed: int, progress: Progress) -> SeedResult:
+def _run_seed(task: MethodTask, seed: int, progress: Progress) -> SeedResult:
     """Verify and map a copy of the database of the method, unless that is done."""
-    folder = request.folder / f"seed-{seed}"
+    folder = task.folder / f"seed-{seed}"
     result_path = folder / "result.json"
     if result_path.exists():
         return SeedResult.from_mapping(json.loads(result_path.read_text(encoding="utf-8")))
     with new_results(folder) as (new,):
         new.mkdir()
-        result = _seed_result(request, seed, new, progress)
+        result = _seed_result(task, seed, new, progress)
         replace_text(new / result_path.name, json.dumps(result.to_mapping(), ensure_ascii=False))
     return result
 
 
-def _seed_result(request: Request, seed: int, folder: Path, progress: Progress) -> SeedResult:
+def _seed_result(task: MethodTask, seed: int, folder: Path, progress: Progress) -> SeedResult:
     """Verify and map in a folder that is called after the seed when all is done."""
     database_path = folder / "database.db"
-    copy_database(request.folder / "database.db", database_path)
+    copy_database(task.folder / "database.db", database_path)
     with open_database(database_path) as database:
         database.clear_two_view_geometries()
         names = {image.image_id: image.name for image in database.read_all_images()}
     watch, told = Stopwatch(), _OfSeed(progress, seed)
-    options = request.verification.changed(random_seed=seed)
-    mapper = MAPPERS.make(request.mapping.changed(random_seed=seed))
-    if request.method.recipe:
-        workspace = Workspace(request.folder).branch(folder)
-        context = Context(workspace, request.resources, progress=told)
+    options = task.verification.changed(random_seed=seed)
+    mapper = MAPPERS.make(task.mapping.changed(random_seed=seed))
+    if task.method.recipe:
+        workspace = Workspace(task.folder).branch(folder)
+        context = Context(workspace, task.resources, progress=told)
         with watch.step("verify"):
             verify_matches(context, options)
             silent = unmeasured_pairs(context)
-            _vote(request, workspace, options, extracted_px(context), silent)
+            _vote(task, workspace, options, extracted_px(context), silent)
         with watch.step("map"):
             guide(context)
             _, models = map_guided(context, mapper)
@@ -212,21 +208,20 @@ def _seed_result(request: Request, seed: int, folder: Path, progress: Progress) 
         with watch.step("verify"), told.stage("verify", num_pairs, "pairs") as advance:
             verify(database_path, options, advance=advance)
             workspace = Workspace(folder)
-            shutil.copy(request.layout.cameras, workspace.cameras)
-            _vote(request, workspace, options)
+            shutil.copy(task.layout.cameras, workspace.cameras)
+            _vote(task, workspace, options)
         with watch.step("map"), told.stage("map", len(names), "images") as advance:
             records = read_camera_records(workspace.cameras)
-            task = MappingTask(database_path, request.image_path, cameras=records)
-            models = map_database(mapper, task, folder / "sparse", advance)
+            mapping = MappingTask(database_path, task.image_path, cameras=records)
+            models = map_database(mapper, mapping, folder / "sparse", advance)
     largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
     model_path = folder / "sparse" / "0" if models else None
     model = pycolmap.Reconstruction(model_path) if model_path else pycolmap.Reconstruction()
-    inliers = verified_pairs(database_path, request.verification.min_num_inliers)
-    shown_path = request.folder.relative_to(request.output_path) / folder.name / "sparse" / "0"
+    inliers = verified_pairs(database_path, task.verification.min_num_inliers)
     return SeedResult(
         seed=seed,
         model_names=tuple(item.registered_names for item in models),
-        model_path=shown_path.as_posix() if models else "",
+        model_path=f"{task.shown_folder}/{folder.name}/sparse/0" if models else "",
         num_points3D=largest.num_points3D,
         mean_track_length=largest.mean_track_length,
         mean_observations=float(model.compute_mean_observations_per_reg_image()) if models else 0.0,
@@ -244,21 +239,21 @@ def _seed_result(request: Request, seed: int, folder: Path, progress: Progress) 
 
 
 def _vote(
-    request: Request,
+    task: MethodTask,
     workspace: Workspace,
     verification: VerificationOptions,
     size_px: ExtractedPx = None,
     silent: Collection[Pair] = (),
 ) -> None:
-    if request.focal_vote:
-        paths, may_share = (workspace.database, workspace.cameras), request.may_share
+    if task.focal_vote:
+        paths, may_share = (workspace.database, workspace.cameras), task.may_share
         hold_vote(*paths, verification, size_px, may_share=may_share, silent=silent)
 
 
 class _Costs:
-    """Seconds and memory that a method has taken, over all processes that worked on it.
+    """Seconds of the stages that are done, memory, and images that could not be used, on disk.
 
-    Also its failures: images that could not be used, with the reason.
+    A stage that was killed counts from where it went on.
     """
 
     def __init__(self, path: Path) -> None:
@@ -266,44 +261,18 @@ class _Costs:
         known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         self.wall_s: dict[str, float] = known.get("wall_s", {})
         self.failures: dict[str, str] = known.get("failures", {})
-        self._finished: list[str] = known.get("finished", [])
-        self._earlier_peak = int(known.get("peak_memory_bytes", 0))
+        self.peak_memory_bytes: int = known.get("peak_memory_bytes", 0)
 
     def stage(self, name: str, work: Callable[[], object]) -> None:
-        if name in self._finished:
-            return
-        ended, start, before = threading.Event(), time.perf_counter(), self.wall_s.get(name, 0.0)
-
-        def measure() -> None:
-            self.wall_s[name] = before + time.perf_counter() - start
+        if name not in self.wall_s:
+            start = time.perf_counter()
+            work()
+            self.wall_s[name] = time.perf_counter() - start
             self.save()
 
-        def measure_regularly() -> None:
-            while not ended.wait(SAVE_EVERY_S):
-                measure()
-
-        thread = threading.Thread(target=measure_regularly, daemon=True)
-        thread.start()
-        try:
-            work()
-            self._finished = sorted({*self._finished, name})
-        finally:
-            ended.set()
-            thread.join()
-            measure()
-
-    def peak_memory_bytes(self) -> int:
-        """Return the most memory that one process has had so far, COLMAP's own ones included."""
-        children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * BYTES_PER_RSS
-        return max(self._earlier_peak, peak_memory_bytes(), children)
-
     def save(self) -> None:
-        values = {
-            "wall_s": self.wall_s,
-            "failures": self.failures,
-            "finished": self._finished,
-            "peak_memory_bytes": self.peak_memory_bytes(),
-        }
+        self.peak_memory_bytes = max(self.peak_memory_bytes, peak_memory_bytes())
+        values = {key: value for key, value in vars(self).items() if key != "_path"}
         replace_text(self._path, json.dumps(values))
 
 

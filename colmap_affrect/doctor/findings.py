@@ -53,22 +53,6 @@ TEXTS: dict[str, Check] = CHECKS | {
         "(schema {version}); nothing is lost, and COLMAP 4 or pycolmap puts it right",
         "for an older COLMAP: colmap-affrect export-database {path} {copy}"),
     "database-damaged": ("error", "{error}", f"{RECOVER} of it; else make it anew"),
-    "implausible-focal": ("warning",
-        "cameras with focal lengths that hardly any photograph has, in px of the image and longer "
-        "sides",
-        "give the right ones in a table (--cameras-path), or let the pairs vote on them: "
-        "--ignore-exif for photographs, --focal-vote always for scans"),
-    "contradicted-focal": ("warning",
-        "cameras whose pairs contradict the focal length that is known of them; px, and what pairs "
-        "say",
-        "run again with --ignore-exif if it is from EXIF, or give others (--cameras-path)"),
-    "cameras-not-shared": ("note",
-        "images of one size with a camera each, though pairs say that they share one",
-        "run again with --focal-vote always or, if all images are by one camera, "
-        "--camera-mode single"),
-    "cameras-shared": ("warning",
-        "images that share a camera, though pairs say that they do not",
-        "run again with --camera-mode per-image"),
     # an output folder
     "foreign-folder": ("note",
         "is no output folder of colmap-affrect (it has no config.toml); only its database is "
@@ -96,16 +80,9 @@ TEXTS: dict[str, Check] = CHECKS | {
     "database-missing": ("error", "is missing", f"{SAME_RUN} to make it anew"),
     "database-changed": ("warning", "was changed since the last run: {edits}",
         f"{SAME_RUN}, or any stage: what features.h5 and matches.h5 hold is made again from these"),
-    "features-not-in-database": ("warning", "images whose features are not in the database",
-        SAME_RUN),
-    "levels-not-in-database": ("warning",
-        "images with features of escalation that the database lacks",
-        "run 'colmap-affrect escalate --output-path {folder}'"),
-    "other-keypoints": ("error", "images with other keypoints than in features.h5", EXTRACT_AGAIN),
     "pairs-changed": ("error", "is not the list whose pairs were matched",
         f"if you have edited it, {MATCH}; else {PAIRS_AGAIN}"),
     "pairs-not-matched": ("warning", "listed pairs that are not matched", MATCH),
-    "matches-not-in-database": ("warning", "pairs whose matches are not in the database", MATCH),
     "map-unfinished": ("warning", "mapping did not finish", MAP),
     "map-stale": ("warning", "the models were made before pairs were verified anew", MAP),
     "summary-damaged": ("error",

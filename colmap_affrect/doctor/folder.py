@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import geometry_digest
 from colmap_affrect.colmap.model_files import SUMMARY, registered_names
-from colmap_affrect.colmap.tables import Tables
 from colmap_affrect.doctor.database import examine_database, examined_copy
 from colmap_affrect.doctor.findings import (
     MATCH_AGAIN,
@@ -95,16 +94,13 @@ class _FolderExamination:
             return
         own_advice = {} if self.workspace.users_database else OWN_ADVICE
         edits = None if self.workspace.users_database else edits_of(database)
-        with examined_copy(self.found, database, image_path, own_advice) as examined:
-            if examined is None:
+        with examined_copy(self.found, database, image_path, own_advice) as copy:
+            if copy is None:
                 return
-            copy, tables = examined
             if edits and str(edits):
                 self._add("database-changed", database, edits=edits)
-            elif features is not None:
-                self._compare_keypoints(features, tables)
-                if "match" in done:
-                    self._matches(tables, sorted(images.union(features)))
+            elif features is not None and "match" in done:
+                self._matches(sorted(images.union(features)))
             if inputs and not inputs.startswith(geometry_digest(copy)):
                 self._add("map-stale", self.workspace.sparse)
 
@@ -199,24 +195,7 @@ class _FolderExamination:
             if known and name in names and known != contents.digest(inputs.files(name, options))
         ]
 
-    def _compare_keypoints(self, features: Mapping[str, int], tables: Tables) -> None:
-        counts, store = tables.num_keypoints(), Context(self.workspace).features
-        missing, behind, differ = [], [], []
-        for name, count in features.items():
-            if name not in counts:
-                missing.append(name)
-            elif counts[name] != count:
-                # Escalation adds features behind the existing ones.
-                if counts[name] in store.level_ends(name):
-                    behind.append(name)
-                else:
-                    differ.append(f"{name} has {counts[name]} of {count}")
-        database = self.workspace.database
-        self._add_items("features-not-in-database", database, missing)
-        self._add_items("levels-not-in-database", database, behind)
-        self._add_items("other-keypoints", database, differ)
-
-    def _matches(self, tables: Tables, names: Sequence[str]) -> None:
+    def _matches(self, names: Sequence[str]) -> None:
         path, listed = self.workspace.matches, self.workspace.pairs
         store = Context(self.workspace).matches
         pairs = self._read(
@@ -232,15 +211,10 @@ class _FolderExamination:
         if store.finished_list() not in (None, "", sha256_of(listed)):
             self._add("pairs-changed", listed)
         self.found.checked.append(f"{path}: matches of {is_there.sum()} pairs of {len(pairs)}")
-        known, written = set(tables.names.values()), tables.matched_pairs()
-        missing, lost = [], []
-        for pair, is_matched in zip(pairs, is_there, strict=True):
-            if not is_matched:
-                missing.append(" - ".join(pair))
-            elif known.issuperset(pair) and pair not in written:
-                lost.append(" - ".join(pair))
+        missing = [
+            " - ".join(p) for p, is_matched in zip(pairs, is_there, strict=True) if not is_matched
+        ]
         self._add_items("pairs-not-matched", path, missing)
-        self._add_items("matches-not-in-database", self.workspace.database, lost)
 
     def _records(self) -> None:
         """Read what is beside features, matches and models."""

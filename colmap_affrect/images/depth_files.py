@@ -2,29 +2,27 @@
 
 - ``.npy``: the map. ``.npz``: the array ``depth``, or the only one.
 - ``.png``: 16 bit, in steps of any size.
-- ``.exr``: one channel; only if OpenCV was built with OpenEXR (wheels of 4.x, not of 5.0).
-- ``.h5``, ``.hdf5``: the dataset ``depth``, or the only one of two dimensions.
+- ``.tif``, ``.tiff``: one channel of floating point numbers, or of 16 bits.
 
 Files may come from anywhere: whatever is wrong with one ends in :class:`UnusableMap`, and no header
 is trusted with more memory than a depth map may need.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from math import prod
 from pathlib import Path
 from typing import IO, Any
 from zipfile import ZipFile, is_zipfile
 
 import cv2
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.images.headers import header_size
 
 MAX_NUM_VALUES_PER_PX = 4  # of a map, for each pixel of its photograph; more is taken for damage
 MIN_LARGEST_MAP = 1 << 22  # a map of so many values is read whatever the size of the photograph
-EXR_WINDOW = b"dataWindow\0box2i\0\x10\0\0\0"  # before first and last column and row
 Require = Callable[..., None]  # takes the shape of a map, and its type if that may be no number
 
 
@@ -67,9 +65,8 @@ def _read_numpy(path: Path, require: Require) -> NDArray[np.generic]:
         with ZipFile(stream) as archive:
             names = sorted(name.removesuffix(".npy") for name in archive.namelist())
             if "depth" not in names and len(names) != 1:
-                raise UnusableMap(
-                    f"expected one array, or one named 'depth', found {_listed(names)}"
-                )
+                found = ", ".join(names) or "none"
+                raise UnusableMap(f"expected one array, or one named 'depth', found {found}")
             with archive.open(f"{'depth' if 'depth' in names else names[0]}.npy") as member:
                 return _read_array(member, require)
 
@@ -84,68 +81,25 @@ def _read_array(stream: IO[bytes], require: Require) -> NDArray[np.generic]:
     return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
 
 
-def _read_hdf5(path: Path, require: Require) -> NDArray[np.generic]:
-    maps: dict[str, h5py.Dataset] = {}
-
-    def collect(name: str, item: h5py.Dataset | h5py.Group) -> None:
-        if isinstance(item, h5py.Dataset) and (item.ndim == 2 or name == "depth"):
-            maps[name] = item
-
-    with h5py.File(path, "r") as file:
-        file.visititems(collect)
-        if "depth" not in maps and len(maps) != 1:
-            raise UnusableMap(
-                "expected one dataset of two dimensions, or one named 'depth', found "
-                f"{_listed(maps)}"
-            )
-        chosen = maps.get("depth") or next(iter(maps.values()))
-        require(chosen.shape, chosen.dtype)
-        if chosen.external or chosen.is_virtual:
-            raise UnusableMap("its values are in other files; save it as one file")
-        return np.asarray(chosen[()])
-
-
-def _read_png(path: Path, require: Require) -> NDArray[np.generic]:
-    data = np.fromfile(path, np.uint8)
-    if data[:8].tobytes() != b"\x89PNG\r\n\x1a\n":
+def _read_image(path: Path, require: Require) -> NDArray[np.generic]:
+    size = header_size(path)
+    if size is None:
         raise ValueError
-    require(data[16:24].view(">u4").tolist())  # width and height
-    values = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    require(size[::-1])
+    values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None:
         raise ValueError
-    if values.dtype != np.uint16:
-        raise UnusableMap("an 8-bit PNG is a preview, too coarse for depth; give 16 bit, or .npy")
+    if values.dtype == np.uint8:
+        raise UnusableMap("8 bits are a preview, too coarse for depth; give 16 bits, or .npy")
     return np.asarray(values)
-
-
-def _read_exr(path: Path, require: Require) -> NDArray[np.generic]:
-    data = np.fromfile(path, np.uint8)
-    window = data.tobytes().partition(EXR_WINDOW)[2][:16]
-    left, top, right, bottom = np.frombuffer(window, "<i4").tolist() or (0, 0, 0, 0)
-    require((bottom - top + 1, right - left + 1))
-    try:
-        values = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        values = None
-    if values is None:
-        raise UnusableMap(
-            f"OpenCV {cv2.__version__} cannot read it; save the map as .npy, or install "
-            "'opencv-python-headless<5' and set the environment variable OPENCV_IO_ENABLE_OPENEXR=1"
-        )
-    return np.asarray(values)
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(names) or "none"
 
 
 _READERS: dict[str, Callable[[Path, Require], NDArray[np.generic]]] = {
     ".npy": _read_numpy,
     ".npz": _read_numpy,
-    ".png": _read_png,
-    ".exr": _read_exr,
-    ".h5": _read_hdf5,
-    ".hdf5": _read_hdf5,
+    ".png": _read_image,
+    ".tif": _read_image,
+    ".tiff": _read_image,
 }
 
 SUFFIXES = tuple(_READERS)  # of files of depth maps, in the order in which they are looked for

@@ -83,7 +83,8 @@ def map_database(
         shutil.rmtree(old, ignore_errors=True)
     try:
         best = _best_attempt(mapper, task, sparse_path, partial, next_image)
-        if not task.extend and _adjust_weak(mapper, task, best):
+        is_final = task.extend or mapper.options.is_complete
+        if not is_final and _adjust_weak(mapper, task, best):
             best = sorted(_possible(best, task), key=_size, reverse=True)
         summaries = []
         for index, model in enumerate(best):
@@ -146,8 +147,8 @@ class _Attempts:
     def __init__(self, mapper: Mapper, task: MappingTask, num_images: int) -> None:
         self._mapper, self._num_images = mapper, num_images
         self._given = self._task = task
-        is_large = num_images >= LARGE_MODEL
-        self._starts = [Start()] if task.extend or is_large else starts(task)
+        once = task.extend or num_images >= LARGE_MODEL or mapper.options.is_complete
+        self._starts = [Start()] if once else starts(task)
         num = 1 if task.extend else mapper.options.max_num_attempts
         self._limit = max(num, len(self._starts))
         self._most = self._limit + MAX_HOLDING_ATTEMPTS
@@ -158,7 +159,8 @@ class _Attempts:
     def go_on(self, best: list[MappedModel]) -> bool:
         """Tell whether there is another attempt, after the best models so far."""
         task = self._task
-        if self._ran - task.held and not task.extend and self._done < self._most:
+        is_final = task.extend or self._mapper.options.is_complete
+        if self._ran - task.held and not is_final and self._done < self._most:
             self._task = replace(task, held=task.held | self._ran)
             self._limit = max(self._limit, self._done + 1)
             return True

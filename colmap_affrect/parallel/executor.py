@@ -94,18 +94,23 @@ def unless_gpu_is_full(work: Callable[[], Result], instead: Callable[[], Result]
 
 
 def peak_memory_bytes() -> int:
-    """Return the most memory that this process has had.
+    """Return the most memory that this process or one that it waited for has had; 0 on Windows.
 
     Not by ``getrusage`` where it can be helped: Linux counts there what the process that started
     this one had.
     """
+    try:
+        import resource
+    except ImportError:
+        return 0
+    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * BYTES_PER_RSS
     status = Path("/proc/self/status")
     if status.exists():
         lines = status.read_text(encoding="ascii", errors="replace").splitlines()
-        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_RSS
+        own = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
+    else:
+        own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_RSS
+    return max(own, children)
 
 
 def return_freed_memory() -> None:

@@ -12,17 +12,13 @@ from colmap_affrect.data import (
     Photograph,
     Rectification,
     RectificationPlan,
-    ShapeSamples,
     View,
 )
-from colmap_affrect.features.base import FeatureExtractor, ShapeSource
-from colmap_affrect.geometry.arrays import Floats
-from colmap_affrect.images.depth import DepthSource
+from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.project.stopwatch import Stopwatch
 from colmap_affrect.rectifiers.base import RectifierOptions
-from colmap_affrect.rectifiers.dense import DenseShapesOptions
 from colmap_affrect.report.regions import bounding_box, region_area_px
-from colmap_affrect.stages.one_image import MIN_RECTIFIABLE_PX, ImageExtractor
+from colmap_affrect.stages.one_image import ImageExtractor
 
 PIXELS_PER_MEGAPIXEL = 1_000_000
 
@@ -42,8 +38,6 @@ class InspectedLevel:
     views: Mapping[int, View]
     found: Mapping[int, LocalFeatures]  # all features detected there, frames in px of the view
     features: LocalFeatures  # those of all views that were kept
-    shapes: ShapeSamples | None  # what the rectifier read; None if it reads no shapes
-    depth: Floats | None  # (h, w) z-depth that it read; None if it reads no depth
     seconds: Mapping[str, float]
 
     def kept_of(self, rectification_id: int) -> LocalFeatures:
@@ -78,59 +72,30 @@ def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int
         dict(enumerate(recorder.views, first_id)),
         dict(enumerate(recorder.found, first_id)),
         features,
-        *_read_again(extractor, photograph, number, with_depth=not warning),
         watch.seconds,
     )
 
 
-class TimedFeatures:
-    """A feature extractor that takes the time of the steps of another one."""
+class _Recorder:
+    """A feature extractor that times another one, and keeps in order what it is shown and finds."""
 
     def __init__(self, extractor: FeatureExtractor, watch: Stopwatch) -> None:
         self.extractor, self.watch = extractor, watch
         self.descriptor_size = extractor.descriptor_size
-
-    def detect(self, view: View) -> LocalFeatures:
-        """See :class:`FeatureExtractor`."""
-        with self.watch.step("detect"):
-            return self.extractor.detect(view)
-
-    def describe(
-        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
-    ) -> list[LocalFeatures]:
-        """See :class:`FeatureExtractor`."""
-        with self.watch.step("describe"):
-            return self.extractor.describe(images, detected)
-
-
-class _Recorder(TimedFeatures):
-    """Keeps too, in order, what the extractor is shown and finds in it."""
-
-    def __init__(self, extractor: FeatureExtractor, watch: Stopwatch) -> None:
-        super().__init__(extractor, watch)
         self.views: list[View] = []
         self.found: list[LocalFeatures] = []
 
     def detect(self, view: View) -> LocalFeatures:
         self.views.append(view)
-        self.found.append(super().detect(view))
+        with self.watch.step("detect"):
+            self.found.append(self.extractor.detect(view))
         return self.found[-1]
 
-
-def _read_again(
-    extractor: ImageExtractor, photograph: Photograph, number: int, *, with_depth: bool
-) -> tuple[ShapeSamples | None, Floats | None]:
-    """Read the shapes and the depth map that the rectifier of a level has read; None for none."""
-    is_asked = min(photograph.size) >= MIN_RECTIFIABLE_PX
-    rectifier = extractor.rectifiers[number] if is_asked else None
-    source: ShapeSource | None = getattr(rectifier, "shapes", None)
-    shapes = None
-    if source and isinstance(extractor.options.levels[number].rectifier, DenseShapesOptions):
-        shapes = source.grid(photograph.gray).samples()
-    elif source:
-        shapes = source.samples(photograph.gray)
-    depth: DepthSource | None = getattr(rectifier, "depth", None)
-    return shapes, depth.depth(photograph) if depth and with_depth else None
+    def describe(
+        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
+    ) -> list[LocalFeatures]:
+        with self.watch.step("describe"):
+            return self.extractor.describe(images, detected)
 
 
 def describe_level(level: InspectedLevel) -> dict[str, Any]:

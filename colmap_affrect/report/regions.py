@@ -3,9 +3,8 @@
 import cv2
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap, to_rgb
-from numpy.typing import NDArray
 
-from colmap_affrect.data import Mask, Rectification, RectificationPlan
+from colmap_affrect.data import ColorImage, Mask, Photograph, Rectification, RectificationPlan
 from colmap_affrect.geometry.affine import project, transform_frames
 from colmap_affrect.geometry.arrays import Array
 
@@ -18,6 +17,8 @@ ANGLE_COLORS = LinearSegmentedColormap.from_list(
     "tilt angle", [PALETTE[index] for index in (0, 5, 2, 6, 1, 4, 3, 0)]
 )
 """For more maps than the palette has colours: a circle, since the tilt angle has period pi."""
+
+TINT = 0.45  # share of the colour over a region
 
 TURN = np.linspace(0.0, 2.0 * np.pi, 25)
 UNIT_CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)])
@@ -39,12 +40,22 @@ def warp_colors(plan: RectificationPlan) -> list[Color]:
     return [to_rgb(PALETTE[groups.index(key)]) for key in keys]
 
 
-def region_pixels(item: Rectification) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows and the columns in the image of the pixels of a region; none without one."""
-    if item.region is None:
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    rows, columns = np.nonzero(item.region)
-    return rows + item.region_origin[1], columns + item.region_origin[0]
+def largest_warps(plan: RectificationPlan, count: int) -> list[int]:
+    """Return the indices of the warps with the largest canvases, the largest first."""
+    order = sorted(range(len(plan.items)), key=lambda index: -plan.items[index].canvas_area_px)
+    return order[:count]
+
+
+def tinted(photograph: Photograph, plan: RectificationPlan) -> ColorImage:
+    """Return the (H, W, 3) photograph with each region in the colour of its warp."""
+    image = np.repeat(photograph.gray[:, :, None], 3, axis=2)
+    for item, color in zip(plan.items, warp_colors(plan), strict=True):
+        if item.region is not None:
+            rows, columns = np.nonzero(item.region)
+            pixels = rows + item.region_origin[1], columns + item.region_origin[0]
+            mixed = (1.0 - TINT) * photograph.gray[pixels][:, None] + TINT * 255.0 * np.array(color)
+            image[pixels] = np.rint(mixed).astype(np.uint8)
+    return image
 
 
 def region_area_px(item: Rectification, image_size: Size) -> int:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.colors import to_hex
 
-from colmap_affrect.data import ColorImage, Photograph, RectificationPlan
+from colmap_affrect.data import Photograph, RectificationPlan
 from colmap_affrect.images.reading import shrink_to
 from colmap_affrect.images.warping import warp
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.pictures import Picture
-from colmap_affrect.report.regions import region_pixels, warp_colors
+from colmap_affrect.report.regions import largest_warps, tinted, warp_colors
 from colmap_affrect.stages.context import Resources
 from colmap_affrect.stages.extract import Inputs, image_tasks, recorded_extraction
 from colmap_affrect.stages.one_image import prepare
@@ -19,7 +19,6 @@ from colmap_affrect.stages.one_image import prepare
 MAP_SIZE_PX = 480
 WARP_SIZE_PX = 200
 MAX_NUM_WARPS = 6
-TINT = 0.45
 
 
 @dataclass(frozen=True)
@@ -77,9 +76,8 @@ def _view(
     photograph: Photograph, plan: RectificationPlan, level: int, rectifier: str
 ) -> WarpedPhotograph:
     colors = warp_colors(plan)
-    by_area = sorted(range(len(plan.items)), key=lambda index: -plan.items[index].canvas_area_px)
     views = []
-    for index in by_area[:MAX_NUM_WARPS]:
+    for index in largest_warps(plan, MAX_NUM_WARPS):
         item = plan.items[index]
         picture = Picture.jpeg(shrink_to(warp(photograph.gray, item), WARP_SIZE_PX))
         angle_deg = float(np.rad2deg(item.tilt_angle_rad))
@@ -93,16 +91,6 @@ def _view(
         tuple(views),
         any(item.region is not None for item in plan.items),
     )
-
-
-def tinted(photograph: Photograph, plan: RectificationPlan) -> ColorImage:
-    """Return the (H, W, 3) photograph with each region in the colour of its warp."""
-    image = np.repeat(photograph.gray[:, :, None], 3, axis=2)
-    for item, color in zip(plan.items, warp_colors(plan), strict=True):
-        pixels = region_pixels(item)
-        mixed = (1.0 - TINT) * photograph.gray[pixels][:, None] + TINT * 255.0 * np.array(color)
-        image[pixels] = np.rint(mixed).astype(np.uint8)
-    return image
 
 
 def rectifies(workspace: Workspace) -> bool:

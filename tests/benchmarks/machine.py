@@ -4,44 +4,14 @@ from __future__ import annotations
 
 import os
 import platform
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-
-import cv2
-import numpy as np
-from threadpoolctl import threadpool_limits
 
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.pipeline import installed_versions
 
 MATRIX_SIZE = 2048
 NUM_PRODUCTS = 5
-
-
-@contextmanager
-def one_core() -> Iterator[None]:
-    """Let the libraries use one thread each in the block."""
-    num_threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        cv2.setNumThreads(num_threads)
-
-
-def core_gflops() -> float:
-    """Return the best speed of one core at products of float32 matrices."""
-    left = np.random.default_rng(0).random((MATRIX_SIZE, MATRIX_SIZE), dtype=np.float32)
-    seconds = []
-    with one_core():
-        for _ in range(NUM_PRODUCTS):
-            start = time.process_time()
-            left @ left.T
-            seconds.append(time.process_time() - start)
-    return float(2.0 * MATRIX_SIZE**3 / 1e9 / min(seconds))
 
 
 def describe_machine() -> str:

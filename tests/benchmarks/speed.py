@@ -1,14 +1,7 @@
-"""Speed beside COLMAP's SIFT: whole commands, stages of extraction, growth.
+"""Speed beside COLMAP's SIFT: extraction and matching by the whole commands, on all cores.
 
-All methods run on the same photographs in one process, in turn, in several rounds. Sections:
-
-    commands  extraction and matching by the whole commands, on all cores
-    stages    where the time of extraction goes, in core seconds; recipes with RootSIFT
-    pixels    extraction of one picture at 320 to 2400 px, in core seconds
-    features  matching of 1000 to 16000 features, ours and COLMAP's, in core seconds
-
-Prints Markdown of everything in the JSON file; sections that are not run this time are kept. Other
-load on the machine shows in the ranges. Usage:
+All methods run on the same photographs in one process, in turn, in several rounds. Prints a
+table, and writes all numbers as JSON. Other load on the machine shows in the ranges. Usage:
 
     python tests/benchmarks/speed.py --image-path ../shared/scenes/strecha_fountain_p11/images \
         --output-path out/speed.json
@@ -20,14 +13,12 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import numpy as np
 from machine import describe_machine, table
-from speed_by_core import feature_growth, pixel_growth, stage_seconds
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
@@ -44,7 +35,6 @@ from colmap_affrect.stages.context import Resources
 
 Row = dict[str, float]
 
-SECTIONS = ("commands", "stages", "pixels", "features")
 DEFAULT_METHODS = [SIFT, SIFT_AFFINE_DSP, "unrectified-rootsift", "default"]
 SEED = 0
 
@@ -157,50 +147,6 @@ def commands_table(results: dict[str, list[Row]]) -> str:
     )
 
 
-def stages_table(results: dict[str, list[Row]]) -> str:
-    """Show where the time of each method goes."""
-    rows = [
-        (name, stage, f"{median(s):.3f} [{min(s):.3f}-{max(s):.3f}]")
-        for name, rounds in results.items()
-        for stage in rounds[0]
-        for s in [[seconds[stage] for seconds in rounds]]
-    ]
-    title = "Core seconds of extraction per image by stage, median [range] over rounds.\n\n"
-    return title + table(("method", "stage", "core seconds"), rows)
-
-
-def growth_exponent(curve: Iterable[Sequence[float]]) -> float:
-    """Return p of seconds ~ size^p, by least squares of logarithms.
-
-    >>> round(growth_exponent([(size, 0.5 * size**1.5) for size in (1.0, 3.0, 10.0)]), 6)
-    1.5
-    """
-    sizes, seconds = np.log(np.array(list(curve), dtype=np.float64)).T
-    return float(np.polyfit(sizes, seconds, 1)[0])
-
-
-def growth_table(results: dict[str, Sequence[Sequence[float]]], size_name: str) -> str:
-    """Show core seconds by size, and the exponents of growth."""
-    rows = [
-        (f"{points[0][0]:.0f}", *(f"{point[1]:.3g} s" for point in points))
-        for points in zip(*results.values(), strict=True)
-    ]
-    rows.append(("exponent", *(f"{growth_exponent(curve):.2f}" for curve in results.values())))
-    return f"Core seconds by {size_name}.\n\n" + table((size_name, *results), rows)
-
-
-def report(results: dict[str, Any]) -> str:
-    """Format all sections that there are results of."""
-    tables: dict[str, Callable[[Any], str]] = {
-        "commands": commands_table,
-        "stages": stages_table,
-        "pixels": lambda curves: growth_table(curves, "pixels of an image"),
-        "features": lambda curves: growth_table(curves, "features of each image of a pair"),
-    }
-    parts = [tables[section](results[section]) for section in SECTIONS if section in results]
-    return "\n".join([results["machine"] + "\n", *parts])
-
-
 def parse_arguments() -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -212,40 +158,25 @@ def parse_arguments() -> argparse.Namespace:
         help=f"{SIFT}, {SIFT_AFFINE_DSP} or [LABEL=]RECIPE[:KEY=VALUE[,...]]; the first is the "
         "reference",
     )  # fmt: skip
-    parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=SECTIONS)
     parser.add_argument("--weights", type=Path, help="folder of the networks' weights")
     parser.add_argument("--output-path", type=Path, required=True, help="JSON file")
     return parser.parse_args()
 
 
 def main() -> None:
-    """Run the sections and print the tables."""
+    """Run the methods in turn and print the table."""
     arguments = parse_arguments()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     output_path, rounds = arguments.output_path, range(arguments.num_rounds)
     paths = sorted(arguments.image_path.iterdir())[: arguments.num_images]
     methods = [parse_method(text) for text in arguments.methods]
     resources = Resources(arguments.weights)
-    fast = [method for method in methods if method.label != SIFT_AFFINE_DSP]
-
-    def in_turn(measure: Callable[[Method], Row], methods: Sequence[Method]) -> Any:
-        rows = [[measure(method) for method in methods] for _ in rounds]
-        return {m.label: list(of) for m, of in zip(methods, zip(*rows, strict=True), strict=True)}
-
-    sections: dict[str, Callable[[], Any]] = {
-        "commands": lambda: in_turn(lambda m: run_commands(m, paths, resources), methods),
-        "stages": lambda: in_turn(
-            lambda m: stage_seconds(m, paths), [m for m in methods if m.recipe]
-        ),
-        "pixels": lambda: pixel_growth(fast, paths, len(rounds), resources),
-        "features": lambda: feature_growth(paths, len(rounds)),
-    }
-    results = json.loads(output_path.read_text()) if output_path.exists() else {}
-    results["machine"] = describe_machine()
-    for section in arguments.sections:
-        results[section] = sections[section]()
-        output_path.write_text(json.dumps(results, indent=1) + "\n")
-    print(report(results))
+    rows = [[run_commands(method, paths, resources) for method in methods] for _ in rounds]
+    by_method = zip(methods, zip(*rows, strict=True), strict=True)
+    commands = {method.label: list(each) for method, each in by_method}
+    results = {"machine": describe_machine(), "commands": commands}
+    output_path.write_text(json.dumps(results, indent=1) + "\n")
+    print(f"{results['machine']}\n\n{commands_table(commands)}")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 import signal
@@ -23,9 +22,9 @@ from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, methods, worker
 from colmap_affrect.comparison import compare as module
 from colmap_affrect.comparison.compare import CompareOptions, compare
-from colmap_affrect.comparison.request import Request
 from colmap_affrect.comparison.results import MEASURES, Comparison, MethodResult
 from colmap_affrect.comparison.tables import summary
+from colmap_affrect.comparison.task import MethodTask
 from colmap_affrect.comparison.verdict import verdict
 from colmap_affrect.errors import (
     ComparisonError,
@@ -188,32 +187,22 @@ def test_methods_had_the_same_cameras_images_and_pairs(compared) -> None:
     assert len({tuple(sorted(method.raw_matches)) for method in comparison.finished}) == 1
 
 
-def test_json_and_csv_hold_the_same_figures(compared) -> None:
+def test_json_holds_the_figures_of_the_seeds(compared) -> None:
     comparison, out = compared
-    text = (out / "comparison.json").read_text(encoding="utf-8")
-    values = json.loads(text)
+    values = json.loads((out / "comparison.json").read_text(encoding="utf-8"))
     assert values["verdict"] == list(verdict(comparison))
     assert values["registered_by_none"] == ["broken.png"]
     assert next(iter(values["methods"]["depth-planes-recommended"])) == "failed"
-    with (out / "comparison.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [(row["method"], row["seed"]) for row in rows] == [
-        *((name, seed) for name in METHODS[:2] for seed in "01"),
-        (METHODS[2], ""),
-    ]
-    for name in METHODS[:2]:
-        method, mine = values["methods"][name], [row for row in rows if row["method"] == name]
-        for key in MEASURES:
-            numbers = [float(row[key]) for row in mine]
+    for result in comparison.finished:
+        method = values["methods"][result.name]
+        for key, measure in MEASURES.items():
+            numbers = [measure(seed) for seed in result.seeds]
             assert method[key] == {
                 "mean": fmean(numbers), "min": min(numbers), "max": max(numbers),
             }  # fmt: skip
-        assert method["correct"]["mean"] == fmean(float(row["correct"]) for row in mine)
-        assert method["wall_s"]["map"] == pytest.approx(fmean(float(r["map_s"]) for r in mine))
-        assert method["wall_s"]["extract"] == float(mine[0]["extract_s"])
+            assert [seed[key] for seed in method["seeds"]] == numbers
+        assert method["wall_s"]["map"] == fmean(seed.wall_s["map"] for seed in result.seeds)
         assert list(method["registered_names"]) == ["0", "1"]
-        assert float(mine[1]["auc_5"]) == method["seeds"][1]["scores"]["auc"]["5"]
-        assert int(mine[0]["keypoints"]) == sum(method["num_keypoints"].values())
 
 
 def test_summary_shows_every_method_and_the_verdict(compared) -> None:
@@ -256,7 +245,7 @@ def test_photographs_that_moved_are_the_same_and_others_are_refused(
         ),
         (
             {"methods": ["unrectified-rootsift=default"]},
-            r"unrectified-rootsift was run there with recipe.rectifier.name='identity', and it is",
+            r"unrectified-rootsift was run there with rectifier.name='identity', and it is",
         ),
     ],
 )
@@ -320,16 +309,10 @@ def test_folders_that_were_not_made_here_are_left_alone(scene, options, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["methods"]
 
 
-def test_request_of_another_version_is_one_line(tmp_path) -> None:
-    (tmp_path / "request.json").write_text('{"label": "sift", "seeds": [0]}')
-    with pytest.raises(StaleStoreError, match=r"request\.json: is of another version"):
-        Request.read(tmp_path / "request.json")
-
-
-def run_here(request: Request, progress: Progress, _: str) -> MethodResult:
-    """Run a method in this process, by way of the request that its own would read."""
-    worker.compute(Request.read(request.path), progress)
-    return module._finished(request)
+def run_here(task: MethodTask, progress: Progress, _: str) -> MethodResult:
+    """Run a method in this process."""
+    worker.compute(task, progress)
+    return module._finished(task)
 
 
 class Names(Progress):
@@ -372,7 +355,6 @@ def test_recipes_are_guided_seed_by_seed(
 @pytest.mark.long
 @pytest.mark.usefixtures("no_page")
 def test_device_reaches_matching(scene, options, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By way of the request that a method's process reads."""
     devices: list[str] = []
     monkeypatch.setattr(nearest, "coarse_descriptors", lambda _, device: devices.append(device))
     monkeypatch.setattr(module, "_run", run_here)
@@ -491,7 +473,7 @@ def test_missing_weights_of_any_method_are_told_before_the_first(
 def test_colmaps_sift_is_verified_and_mapped_as_colmap_does_it(scene, tmp_path) -> None:
     options = CompareOptions(methods=["sift-colmap", "sift"])
     plan = module._Plan.checked(scene / "images", module.Layout(tmp_path), options)
-    colmaps, ours = plan.requests()
+    colmaps, ours = plan.tasks()
     presets = [(r.verification.preset_name, r.mapping.preset_name) for r in (colmaps, ours)]
     assert presets == [("colmap", "colmap"), ("sparse", "sparse")]
     assert (colmaps.mapping.name, ours.mapping.name) == ("incremental", "sparse")

@@ -1,4 +1,4 @@
-"""The matcher and the extractor of ARCHITECTURE.md, registered as it says, do their work."""
+"""The parts of ARCHITECTURE.md, registered as it says, do their work."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from pathlib import Path
 
 import pytest
 from contracts.matcher_contract import MatcherContract
+from small_scene import NAMES
 from synthetic import texture, write_image
 
 from colmap_affrect.features.base import EXTRACTORS
+from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.matchers.base import MATCHERS, Matcher, MatcherContext
 from colmap_affrect.options import Registry
+from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
@@ -74,3 +77,14 @@ def test_new_extractor_and_matcher_are_chosen_by_name(
     right = abs(shifts - (11.0, 0.0)).max(axis=1) < 1.5
     assert right.sum() > 30
     assert right.mean() > 0.8
+
+
+def test_new_mapper_is_chosen_by_name(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    register(MAPPERS, "plain", tmp_path, monkeypatch)
+    options = RunOptions(
+        recipe=load_recipe("unrectified-rootsift"), mapping=MAPPERS.options("plain")
+    )
+    report = run(photos, tmp_path / "out", options)
+    assert report.registered_names == tuple(sorted(NAMES))

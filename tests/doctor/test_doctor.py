@@ -25,7 +25,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.doctor import Diagnosis, Finding, diagnose
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.pipeline import RunOptions, run
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 
 NUM_IMAGES = 3
@@ -179,17 +178,6 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
         Finding("warning", "{out}/database.db",
                 "was changed since the last run: keypoints of 1 image", "is made again from these"),
     ),
-    "keypoint removed by a killed run": (
-        lambda f: (
-            (f.out / "database.db.seal").unlink(),
-            f.execute(
-                "UPDATE keypoints SET rows = rows - 1, data = substr(data, 1, rows * 24 - 24) "
-                "WHERE image_id = 3"
-            ),
-        ),
-        Finding("error", "{out}/database.db", "images with other keypoints than in features.h5 (1)",
-                "--overwrite"),
-    ),
     "pair not matched": (
         lambda f: break_h5(f.out / "matches.h5", unmatch),
         Finding("warning", "{out}/matches.h5",
@@ -199,15 +187,6 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
     "pair deleted": (
         lambda f: f.execute("DELETE FROM matches WHERE pair_id = 2147483649"),
         Finding("warning", "{out}/database.db", "1 pair deleted (a.png - b c.png)", "any stage"),
-    ),
-    "matches not in the database": (
-        lambda f: (
-            (f.out / "database.db.seal").unlink(),
-            f.execute("DELETE FROM matches WHERE pair_id = 2147483649"),
-        ),
-        Finding("warning", "{out}/database.db",
-                "pairs whose matches are not in the database (1): a.png - b c.png",
-                "run 'colmap-affrect match --output-path {out}'"),
     ),
     "matches of another program": (
         lambda f: shutil.copy(f.out / "features.h5", f.out / "matches.h5"),
@@ -331,17 +310,6 @@ def test_photograph_that_was_deleted_is_found(folders: Folders) -> None:
     assert gone.what.endswith("not listed any more (1): b c.png")
     kinds = [found.what for found in findings(folders.out, folders.photos)]
     assert "images whose file is missing (1): b c.png" in kinds
-
-
-def test_features_that_the_database_lacks_are_found(folders: Folders) -> None:
-    store = FeatureStore(folders.out / "features.h5")
-    store.extend("a.png", store.read("b c.png"))
-    shutil.copy(folders.photos / "b c.png", folders.photos / "z.png")
-    break_h5(folders.out / "features.h5", lambda file: file.copy("b c.png", "z.png"))
-    missing, behind = findings(folders.out)
-    assert missing.what == "images whose features are not in the database (1): z.png"
-    assert behind.what.endswith("of escalation that the database lacks (1): a.png")
-    assert "colmap-affrect escalate --output-path" in behind.advice
 
 
 def test_advice_for_a_database_of_ours_names_our_commands(folders: Folders) -> None:

@@ -1,0 +1,81 @@
+"""What one method of a comparison is to do, and where everything lies.
+
+``shared/`` has what all methods begin with: a database of cameras and images, and the lists of
+images and pairs. ``methods/NAME/`` is a workspace with the features and raw matches of a method,
+and ``methods/NAME/seed-K/`` has the two-view geometries and models of one seed.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from colmap_affrect.colmap.verification import VerificationOptions
+from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP, Method
+from colmap_affrect.comparison.sift import describe_options
+from colmap_affrect.images.photographs import MaskOptions
+from colmap_affrect.mappers.base import MapperOptions
+from colmap_affrect.stages.context import Resources
+
+
+class Layout:
+    """Paths below the folder of a comparison.
+
+    ``inputs`` records what ``shared`` was made from, and the options that all methods have.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.shared, self.methods = path / "shared", path / "methods"
+        self.inputs = self.shared / "inputs.json"
+        self.database = self.shared / "database.db"
+        self.cameras = self.shared / "cameras.json"
+        self.images = self.shared / "images.txt"
+        self.pairs = self.shared / "pairs.txt"
+
+    def image_names(self) -> list[str]:
+        """Read the list of images."""
+        return self.images.read_text(encoding="utf-8").splitlines()
+
+
+@dataclass(frozen=True)
+class MethodTask:
+    """What one process is to do."""
+
+    method: Method
+    output_path: Path
+    image_path: Path
+    masks: MaskOptions
+    verification: VerificationOptions
+    mapping: MapperOptions
+    focal_vote: bool  # whether verified pairs vote on cameras that nobody knows
+    may_share: bool  # whether images of one size may then turn out to share a camera
+    seeds: tuple[int, ...]  # of verification and mapping; escalation has the first
+    resources: Resources
+
+    @property
+    def layout(self) -> Layout:
+        """Paths of the comparison."""
+        return Layout(self.output_path)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the results of the method."""
+        return self.layout.methods / self.method.folder_name
+
+    @property
+    def shown_folder(self) -> str:
+        """The same, relative to the folder of the comparison."""
+        return self.folder.relative_to(self.output_path).as_posix()
+
+    @property
+    def result(self) -> Path:
+        """The result of the method, there when it has finished."""
+        return self.folder / "result.json"
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of features and matching, for the record."""
+        recipe = self.method.recipe
+        if recipe is None:
+            return describe_options(affine=self.method.label == SIFT_AFFINE_DSP)
+        return recipe.to_mapping()
