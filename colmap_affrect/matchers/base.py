@@ -43,16 +43,10 @@ class MatcherOptions(NetworkOptions):
 
 @dataclass(frozen=True)
 class MatcherContext(NetworkContext):
-    """What a matcher works with.
+    """What a matcher works with."""
 
-    Attributes:
-        weights: files by key, found beforehand (:mod:`colmap_affrect.features.weights`).
-        device: as given, also ``auto``.
-        num_similarities: about how many pairs of features there will be to compare in all.
-    """
-
-    device: str = "auto"
-    num_similarities: float = 0
+    device: str = "auto"  # as given
+    num_similarities: float = 0  # about how many pairs of features will be compared in all
 
 
 @dataclass(frozen=True)

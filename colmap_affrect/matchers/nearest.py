@@ -85,10 +85,10 @@ class NearestNeighbors:
 
     def match(self, first: MatchableImage, second: MatchableImage) -> Matches:
         """Match two images."""
-        exact = [replace(image, coarse=None) for image in (first, second)]
+        exact1, exact2 = (replace(image, coarse=None) for image in (first, second))
         return unless_gpu_is_full_or_say(
             partial(match_features, first, second, self.options),
-            partial(match_features, *exact, self.options),
+            partial(match_features, exact1, exact2, self.options),
         )
 
 
