@@ -61,13 +61,6 @@ def test_options_of_a_recipe_survive_being_written_down(name: str) -> None:
 LEARNED = [name for name in NAMES if name.endswith(("lightglue", "lighterglue"))]
 
 
-def test_default_and_unrectified_differ_in_the_rectifier_only() -> None:
-    default, plain = load_recipe("default"), load_recipe("unrectified-rootsift")
-    assert plain.extraction.rectifier.name == "identity"
-    assert plain.extraction.features == default.extraction.features
-    assert plain.matching == default.matching
-
-
 @pytest.mark.parametrize(("name", "rectifier"), OF_THE_PAPER.items())
 def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> None:
     recipe = load_recipe(name)

@@ -173,18 +173,6 @@ def test_describe_leaves_out_degenerate_shapes(
     assert_allclose(described.keypoints, detected.keypoints[described.rectification_ids])
 
 
-def test_without_affine_shape_frames_are_similarities_and_affnet_is_not_needed(
-    weights: dict[str, Path], image: GrayImage
-) -> None:
-    needed = {key: weights[key] for key in ("orinet", "tfeat")}
-    profile = make(needed, affine_shape=False)
-    described = describe_one(profile, image, profile.detect((image, None)))
-    shapes = described.lafs[:, :, :2] / described.scales[:, None, None]
-    assert_allclose(
-        shapes @ shapes.transpose(0, 2, 1), np.tile(np.eye(2), (len(shapes), 1, 1)), atol=1e-9
-    )
-
-
 # Batches.
 
 

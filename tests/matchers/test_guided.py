@@ -112,17 +112,6 @@ def test_points_without_a_place_match_nothing() -> None:
         assert np.isfinite(second.points[found[:, 1]]).all()
 
 
-def test_without_features() -> None:
-    first, second = random_images(3)
-    none = GuidableImage(np.zeros((0, 8), np.float32), np.zeros((0, 2)))
-    for one, other in ((first, none), (none, second), (none, none)):
-        for guide in (
-            EpipolarGuide(fundamental((1, 0.2, 0.1)), one.points, other.points, 3.0),
-            HomographyGuide(HOMOGRAPHY, one.points, other.points, 3.0),
-        ):
-            assert nearest_allowed(one, other, guide, OPTIONS).shape == (0, 2)
-
-
 def plane_pair(wrong: int = 0) -> tuple[GuidableImage, GuidableImage, list[Guide]]:
     """200 features of a plane seen by two cameras; the frames of the first ones turned by 50."""
     rng = np.random.default_rng(8)
