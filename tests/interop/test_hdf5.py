@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -32,7 +28,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.interop.hdf5 import export_h5
-from colmap_affrect.interop.hdf5_layouts import ForeignFiles, Source
 
 
 @pytest.fixture
@@ -358,37 +353,12 @@ def test_matches_of_another_layout_than_asked_for_are_refused(files: Files) -> N
         files.import_all(layout="kapture")
 
 
-WRITER = """
-import sys, time, h5py
-file = h5py.File(sys.argv[1], "w", libver="latest")
-file["a.png/keypoints"] = [[1.0, 2.0]]
-file.flush()
-print("written", flush=True)
-time.sleep(60)
-"""
-
-
-def test_file_in_writing_and_of_a_killed_writer_are_told_apart(files: Files) -> None:
-    command = [sys.executable, "-c", WRITER, str(files.features)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
-        assert writer.stdout.readline() == "written\n"
-        with pytest.raises(StoreError, match="another program is writing it"):
-            files.import_all()
-        os.kill(writer.pid, signal.SIGKILL)
-    with pytest.raises(StoreError, match=r"h5clear --status features\.h5"):
-        files.import_all()
-
-
 @pytest.mark.parametrize(("width", "fits"), [(2051, True), (2057, False)])
-def test_size_in_float16_is_compared_as_it_is_rounded(
-    tmp_path: Path, width: int, fits: bool
-) -> None:
+def test_size_in_float16_is_compared_as_it_is_rounded(files: Files, width: int, fits: bool) -> None:
     """As deep-image-matching writes it: 2051 px are stored as 2052."""
-    path = tmp_path / "features.h5"
-    with h5py.File(path, "w") as file:
-        file["a/image_size"] = np.array([2051, 1500], np.float16)
-    with h5py.File(path, "r") as file:
-        source = Source(path, file, {"a/image_size": (2,)})
-        files = ForeignFiles(source, source, "hloc", {"a": "a"}, {}, [])
-        with nullcontext() if fits else pytest.raises(StoreError, match="was 2052 x 1500 px"):
-            files.check_size("a", (width, 1500))
+    write_photos(files.photos, ["a.png"], (width, 8))
+    group = hloc_group(1, image_size=np.array([2051, 8], np.float16))
+    write_h5(files.features, {"a.png": group})
+    write_h5(files.matches, {})
+    with nullcontext() if fits else pytest.raises(StoreError, match="was 2052 x 8 px"):
+        files.import_all()
