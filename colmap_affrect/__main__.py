@@ -12,10 +12,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import NoReturn
 
-from colmap_affrect.shown import INTERRUPTED
+from colmap_affrect.parallel.subprocesses import end_with
+from colmap_affrect.shown import INTERRUPTED, say
 
 PATIENCE_S = 4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
-PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent dies
 SIGNALS = {signal.SIGINT, signal.SIGTERM}
 
 
@@ -23,12 +23,12 @@ def main() -> NoReturn:
     """Run the command line in a process of its own, where the system can do that, and end."""
     if sys.platform != "linux":  # elsewhere libraries of the system do not survive a fork
         _work()
-    told: list[int] = []
+    signals: list[int] = []
 
     def stop(number: int, _: object) -> None:
-        if not told:
+        if not signals:
             signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
-        told.append(number)
+        signals.append(number)
         _kill(worker, signal.SIGTERM)
 
     parent = os.getpid()
@@ -39,14 +39,14 @@ def main() -> NoReturn:
     except OSError:  # too many processes
         _work()
     if not worker:
-        _end_with(parent)
+        end_with(parent)
         _work()
     signal.signal(signal.SIGALRM, lambda *_: _kill(worker, signal.SIGKILL))
     _handle(stop)
     _, status = os.waitpid(worker, 0)
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    sys.exit(_exit_code(os.waitstatus_to_exitcode(status), told))
+    sys.exit(_exit_code(os.waitstatus_to_exitcode(status), signals))
 
 
 def _handle(handler: Callable[[int, object], None]) -> None:
@@ -63,43 +63,29 @@ def _kill(worker: int, number: int) -> None:
         os.kill(worker, number)
 
 
-def _exit_code(code: int, told: list[int]) -> int:
+def _exit_code(code: int, signals: list[int]) -> int:
     """Return the exit code of the command, and say why it ended where it could not do that."""
     if code >= 0:
-        return 128 + told[0] if told and code else code
-    if told:
-        _say(INTERRUPTED)
-        return 128 + told[0]
+        return 128 + signals[0] if signals and code else code
+    if signals:
+        say(INTERRUPTED)
+        return 128 + signals[0]
     cause = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
-    _say(
+    say(
         f"error: ended by {signal.Signals(-code).name}{cause}; run.log may say why, and what was "
         "done before is kept: run the same command again, or 'colmap-affrect doctor'"
     )
     return 1
 
 
-def _say(line: str) -> None:
-    with suppress(OSError):  # nobody reads it any more
-        print(line, file=sys.stderr, flush=True)
-
-
-def _end_with(parent: int) -> None:
-    """Let the system kill this process when its parent is killed."""
-    import ctypes
-
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
-
-
 def _work() -> NoReturn:
     """Run the command in this process, which Ctrl-C and SIGTERM interrupt."""
-    told: list[int] = []
+    signals: list[int] = []
 
     def interrupt(number: int, _: object) -> None:
-        if number == signal.SIGTERM and told:
+        if number == signal.SIGTERM and signals:
             return  # of the first process, for a Ctrl-C that came here, too
-        told.append(number)
+        signals.append(number)
         raise KeyboardInterrupt
 
     try:
@@ -109,9 +95,9 @@ def _work() -> NoReturn:
         main_of_process()
     except (KeyboardInterrupt, Exception) as error:
         # Libraries turn a KeyboardInterrupt in their callbacks into errors of their own.
-        if not (told or isinstance(error, KeyboardInterrupt)):
+        if not (signals or isinstance(error, KeyboardInterrupt)):
             raise
-        _say(INTERRUPTED)
+        say(INTERRUPTED)
         os._exit(128 + signal.SIGINT)
 
 

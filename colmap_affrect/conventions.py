@@ -43,14 +43,9 @@ def pixel_from_colmap(points: NDArray[np.floating]) -> NDArray[np.floating]:
 def resized_from_original(
     original_size: tuple[int, int], resized_size: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Map pixel-centre coordinates of an image to those of its resized version.
+    """Return the (3, 3) map of pixel-centre px of an image to those of its resized version.
 
-    Args:
-        original_size: (width, height) in px.
-        resized_size: (width, height) in px.
-
-    Returns:
-        (3, 3) float64 affine map ``resized_from_original``.
+    Both sizes are (width, height) in px.
 
     >>> resized_from_original((4, 6), (8, 3)) @ np.array([0.0, 1.0, 1.0])
     array([0.5 , 0.25, 1.  ])
@@ -69,9 +64,7 @@ def camera_matrix(
 ) -> NDArray[np.float64]:
     """Return (3, 3) pinhole intrinsics in pixel-centre px, principal point in the middle.
 
-    Args:
-        image_size: (width, height) in px.
-        focal: (fx, fy) in px; by default ``DEFAULT_FOCAL_RATIO`` times the longer side.
+    From (width, height) and (fx, fy) in px, by default ``DEFAULT_FOCAL_RATIO`` longer sides.
 
     >>> camera_matrix((10, 5))
     array([[12. ,  0. ,  4.5],
@@ -95,15 +88,9 @@ def grid_origin(step_px: int) -> float:
 def is_inside(
     points: NDArray[np.floating], size: tuple[int, int], margin_px: NDArray[np.floating] | float = 0
 ) -> NDArray[np.bool_]:
-    """Tell which (N, 2) points lie in an image of (width, height), ``margin_px`` from its edge.
+    """Return (N,) whether (N, 2) pixel-centre points lie in an image of (width, height).
 
-    Args:
-        points: (N, 2) pixel-centre px.
-        size: (width, height) of the image in px.
-        margin_px: scalar, or (N, 2) distance in x and y that each point must keep.
-
-    Returns:
-        (N,) bool.
+    They keep ``margin_px`` from its edge: a number, or (N, 2) distances in x and y.
     """
     low = points >= -HALF_PIXEL + margin_px
     high = points <= np.asarray(size) - HALF_PIXEL - margin_px

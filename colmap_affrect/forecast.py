@@ -1,8 +1,11 @@
 """How long a whole run takes, roughly: from what its first images and pairs have taken."""
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+
+logger = logging.getLogger(__name__)
 
 COSTS = {"extract": 1.0, "match": 0.25, "match by network": 0.7, "verify": 0.15, "map": 0.7}
 """What one unit of a stage takes in the time that one image takes in ``extract``, of a stage that
@@ -20,6 +23,7 @@ class _Stage:
     ahead: int
     done: int = 0
     elapsed_s: float = 0.0
+    is_logged: bool = False  # that the run takes long
 
     @property
     def is_measured(self) -> bool:
@@ -39,12 +43,12 @@ class Forecast:
         num_pairs: int,
         *,
         by_network: bool = False,
-        may_climb: bool = False,
+        may_escalate: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Take what is ahead, if all images are new.
 
-        ``by_network``: a network matches; ``may_climb``: pairs may be matched again with more
+        ``by_network``: a network matches; ``may_escalate``: pairs may be matched again with more
         warps, how many nobody knows before.
         """
         match_cost = COSTS["match by network" if by_network else "match"]
@@ -54,7 +58,7 @@ class Forecast:
             "verify": _Stage(COSTS["verify"], num_pairs),
             "map": _Stage(COSTS["map"] + MAP_COST_PER_IMAGE * num_images, num_images),
         }
-        self._may_climb, self._clock = may_climb, clock
+        self._may_escalate, self._clock = may_escalate, clock
         self._current, self._start_s = "", 0.0
 
     def begin(self, name: str, total: int) -> None:
@@ -66,19 +70,24 @@ class Forecast:
         if name == "match":
             self._expect_pairs(total)
         self._stages[name] = _Stage(known.cost, total)
-        self._may_climb &= name not in ("cameras", "guide", "map")
+        self._may_escalate &= name not in ("cameras", "guide", "map")
         self._current, self._start_s = name, self._clock()
 
     def _expect_pairs(self, count: int) -> None:
         for name in ("match", "verify"):
             self._stages[name].ahead = count
 
-    def advance(self, count: int) -> None:
-        """So many units of the stage that began last are done."""
+    def advance(self, count: int) -> str:
+        """So many units of the stage that began last are done; return and log :meth:`text`."""
         stage = self._stages[self._current]
         stage.done += count
         stage.ahead = max(stage.ahead - count, 0)
         stage.elapsed_s = self._clock() - self._start_s
+        text = self.text()
+        if text and not stage.is_logged:
+            stage.is_logged = True
+            logger.info("%s", text)
+        return text
 
     def end(self) -> None:
         """The stage that began last is over, whatever it has done."""
@@ -105,7 +114,7 @@ class Forecast:
         left_s = self.left_s() or 0.0
         if left_s < 60 or not self._stages["map"].ahead or self._current == "map":
             return ""
-        but = " without further warps" if self._may_climb else ""
+        but = " without further warps" if self._may_escalate else ""
         return f"whole run: {duration_text(left_s)} left{but}"
 
 

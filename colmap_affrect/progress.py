@@ -1,17 +1,15 @@
 """Progress of long stages: a tqdm bar on a terminal, plain lines elsewhere, or silence."""
 
-import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
+from dataclasses import dataclass
 from typing import Self, TextIO
 
 from tqdm import tqdm
 
 from colmap_affrect.forecast import Forecast
 from colmap_affrect.shown import shown
-
-logger = logging.getLogger(__name__)
 
 Advance = Callable[[int], None]  # report that so many more units are done
 NUM_PLAIN_LINES = 10
@@ -36,17 +34,21 @@ class Progress:
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
         """Show one stage of ``total`` units for as long as the context lasts."""
-        told = _Told(self._forecast, name, total)
+        forecast = self._forecast
+        if forecast:
+            forecast.begin(name, total)
+        left = forecast.advance if forecast else _not_known
         if self._stream is None or total == 0:
-            yield _ignore
+            yield lambda _: None
         elif self._stream.isatty():
             with tqdm(total=total, desc=name, unit=unit, file=self._stream) as bar:
-                yield lambda count: _update(bar, count, told)
+                yield lambda count: _update(bar, count, left(count))
         else:
-            lines = _PlainLines(self._stream, name, total, unit, self._num_plain_lines, told)
-            yield lines
+            lines = _PlainLines(self._stream, name, total, unit, self._num_plain_lines, left)
+            yield lines.advance
             lines.finish()
-        told.end()
+        if forecast:
+            forecast.end()
 
 
 SILENT = Progress()
@@ -57,64 +59,42 @@ def show(text: object, *, file: TextIO | None = None, end: str = "\n") -> None:
     print(shown(str(text)), file=file, end=end)
 
 
-class _Told:
-    """Tells a forecast, if there is one, of a stage, and logs what it says first."""
-
-    def __init__(self, forecast: Forecast | None, name: str, total: int) -> None:
-        self._forecast = forecast
-        self._was_logged = False
-        if forecast:
-            forecast.begin(name, total)
-
-    def advance(self, count: int) -> str:
-        """Return what the forecast says now."""
-        if not self._forecast:
-            return ""
-        self._forecast.advance(count)
-        text = self._forecast.text()
-        if text and not self._was_logged:
-            self._was_logged = True
-            logger.info("%s", text)
-        return text
-
-    def end(self) -> None:
-        if self._forecast:
-            self._forecast.end()
+def _not_known(count: int) -> str:
+    del count
+    return ""
 
 
-def _update(bar: "tqdm[None]", count: int, told: _Told) -> None:
-    bar.set_postfix_str(told.advance(count), refresh=False)
+def _update(bar: "tqdm[None]", count: int, left: str) -> None:
+    bar.set_postfix_str(left, refresh=False)
     bar.update(count)
 
 
-def _ignore(count: int) -> None:
-    pass
-
-
+@dataclass
 class _PlainLines:
-    """A few lines, evenly over the whole stage."""
+    """A few lines, evenly over the whole stage; ``left`` says how long the rest takes."""
 
-    def __init__(
-        self, stream: TextIO, name: str, total: int, unit: str, num_lines: int, told: _Told
-    ) -> None:
-        self._stream, self._name, self._total, self._unit = stream, name, total, unit
-        self._num_lines, self._told = num_lines, told
-        self._done = self._printed = 0
-        self._forecast = ""
+    stream: TextIO
+    name: str
+    total: int
+    unit: str
+    num_lines: int
+    left: Callable[[int], str]
+    done: int = 0
+    printed: int = 0
 
-    def __call__(self, count: int) -> None:
-        self._done += count
-        self._forecast = self._told.advance(count)
-        part = self._done * self._num_lines // self._total
-        if part > self._printed:
-            self._printed = part
-            self._print()
+    def advance(self, count: int) -> None:
+        self.done += count
+        left = self.left(count)
+        part = self.done * self.num_lines // self.total
+        if part > self.printed:
+            self.printed = part
+            self._print(left)
 
     def finish(self) -> None:
         """Say how far it came if nothing was said before."""
-        if not self._printed:
-            self._print()
+        if not self.printed:
+            self._print("")
 
-    def _print(self) -> None:
-        line = f"{self._name}: {self._done}/{self._total} {self._unit}"
-        show(", ".join(filter(None, [line, self._forecast])), file=self._stream)
+    def _print(self, left: str) -> None:
+        line = f"{self.name}: {self.done}/{self.total} {self.unit}"
+        show(f"{line}, {left}" if left else line, file=self.stream)

@@ -1,6 +1,8 @@
 """One filter for everything that is shown: names come out of files, and may be made to mislead."""
 
+import sys
 from collections.abc import Iterable
+from contextlib import suppress
 
 MAX_NAMES = 3  # examples in a line
 INTERRUPTED = "interrupted; run the same command again to go on"
@@ -31,6 +33,14 @@ def one_line(text: str) -> str:
     'a\\u000ab'
     """
     return shown(text).replace("\n", _escaped("\n"))
+
+
+def say(line: str) -> None:
+    """Print a line on stderr, which nobody may read any more."""
+    with suppress(OSError):
+        if sys.stderr:  # it may have been closed
+            sys.stderr.write(f"{line}\n")
+            sys.stderr.flush()
 
 
 def such_as(names: Iterable[str], most: int = MAX_NAMES) -> str:

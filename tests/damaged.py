@@ -148,11 +148,17 @@ PROBES = (
 )
 
 
-def execute(path: Path, statement: str) -> None:
-    """Execute a statement on a database."""
+Statement = str | tuple[str, list[object]]
+"""What SQLite is to do; perhaps with the values of its question marks."""
+
+
+def execute(path: Path, *statements: Statement) -> None:
+    """Execute statements on a database."""
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("PRAGMA foreign_keys = OFF")
-        connection.execute(statement)
+        for statement in statements:
+            query, values = (statement, []) if isinstance(statement, str) else statement
+            connection.execute(query, values)
         connection.commit()
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from colmap_affrect.geometry.affine import compose_affine
+from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.tilts import cosh_distances, metrics_from_tilts
 
 Array = NDArray[np.float64]
@@ -19,6 +19,11 @@ tilts = st.floats(1.0, 8.0)
 tilt_angles = st.floats(0.0, np.pi, exclude_max=True)
 turns = st.floats(-np.pi, np.pi)
 scales = st.floats(0.1, 10.0)
+
+
+def compose_affine(scale: float, psi_rad: float, tilt: float, phi_rad: float) -> Array:
+    """Return the (2, 2) map scale R(psi) diag(tilt, 1) R(phi)."""
+    return np.asarray(scale * rotation(psi_rad) @ np.diag([tilt, 1.0]) @ rotation(phi_rad))
 
 
 def tilt_distance(tilt1: float, angle1_rad: float, tilt2: float, angle2_rad: float) -> float:

@@ -90,13 +90,6 @@ def test_is_inside_accepts_whole_pixels_up_to_their_outer_edge() -> None:
     assert is_inside(points, (5, 3)).tolist() == [True, True, False, False, False, True, False]
 
 
-def test_is_inside_keeps_the_margin_of_each_point_and_axis() -> None:
-    points = np.array([[2.0, 4.0], [2.0, 4.0], [2.0, 4.0]])
-    margins = np.array([[2.5, 4.5], [2.6, 0.0], [0.0, 4.6]])
-    assert is_inside(points, (20, 10), margins).tolist() == [True, False, False]
-    assert is_inside(points[:1], (20, 10), 2.6).tolist() == [False]
-
-
 @pytest.mark.parametrize(
     ("direction", "angle_deg"), [((1, 0), 0.0), ((0, 1), 90.0), ((-1, 0), 180.0), ((0, -1), -90.0)]
 )

@@ -72,7 +72,7 @@ def test_images_that_are_known_leave_their_pairs_out() -> None:
 
 def test_stages_that_nothing_was_known_of_count_from_when_they_begin() -> None:
     clock = Clock()
-    forecast = Forecast(10, 0, may_climb=True, clock=clock)
+    forecast = Forecast(10, 0, may_escalate=True, clock=clock)
     run_stage(forecast, clock, "HardTFeat.pth", 10, 1.0)  # a download says nothing of the rest
     assert forecast.left_s() is None
     run_stage(forecast, clock, "extract", 10, 60.0)

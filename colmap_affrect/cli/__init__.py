@@ -13,16 +13,11 @@ from typing import NoReturn, TextIO
 
 from colmap_affrect import __version__
 from colmap_affrect.cli.parser import build_parser
-from colmap_affrect.errors import (
-    MEMORY_HINT,
-    AffrectError,
-    OptionError,
-    lacks_memory,
-)
+from colmap_affrect.errors import MEMORY_HINT, AffrectError, OptionError, lacks_memory
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.shown import INTERRUPTED, one_line
+from colmap_affrect.shown import INTERRUPTED, one_line, say
 
 logger = logging.getLogger("colmap_affrect")
 
@@ -53,8 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         return _fail(f"{MEMORY_HINT}: what was done before is kept")
     except KeyboardInterrupt:
-        with suppress(OSError):  # nobody reads it any more
-            print(INTERRUPTED, file=sys.stderr)
+        say(INTERRUPTED)
         return EXIT_INTERRUPTED
 
 
@@ -94,7 +88,7 @@ def _interrupt_again(passed_over: "sys.UnraisableHookArgs") -> None:
 
 def _fail(message: str, code: int = EXIT_FAILED) -> int:
     """Print one line; odd characters, out of files perhaps, must not reach the terminal."""
-    print(f"error: {one_line(message)}", file=sys.stderr)
+    say(f"error: {one_line(message)}")
     return code
 
 

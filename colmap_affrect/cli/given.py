@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from colmap_affrect.errors import OptionError, WorkspaceError
 from colmap_affrect.options import Options, suggestion
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.workspace import WEIGHTS, Workspace, placeless, without_digests
+from colmap_affrect.project.differences import WEIGHTS, placeless, without_digests
+from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap.verification import VerificationOptions
@@ -54,7 +55,7 @@ def _refuse_unknown(record: Mapping[str, Any], where: str) -> None:
     """Refuse sections, and options of extraction, that no run has recorded: typos of an editor."""
     from colmap_affrect.project.workspace import STAGES
     from colmap_affrect.recipes import ExtractionOptions
-    from colmap_affrect.stages.extract import Inputs
+    from colmap_affrect.stages.inputs import Inputs
 
     sections = {"format_version", "recipe", "begun", *STAGES}
     of_extract = {*Inputs.model_fields, *ExtractionOptions.model_fields, WEIGHTS}
@@ -129,7 +130,7 @@ def depth_settings(options: argparse.Namespace) -> list[str]:
         raise OptionError(f"--depth-path {path}: no such folder; give the folder of the depth maps")
     given = {
         "name": "monocular" if model else "files" if path else None,
-        "path": str(path.resolve()) if path else None,
+        "path": _text(path),
         "model": model,
         "kind": options.depth_kind,
     }
@@ -183,7 +184,7 @@ def cameras(options: argparse.Namespace) -> CameraOptions:
         model=options.camera_model,
         params=options.camera_params,
         ignore_exif=options.ignore_exif,
-        cameras_path=str(options.cameras_path.resolve()) if options.cameras_path else "",
+        cameras_path=_text(options.cameras_path),
         focal_length_px=options.focal_length_px,
         principal_point=options.principal_point,
     )
@@ -192,9 +193,11 @@ def cameras(options: argparse.Namespace) -> CameraOptions:
 def masks(options: argparse.Namespace) -> MaskOptions:
     from colmap_affrect.images.photographs import MaskOptions
 
-    paths = (options.mask_path, options.camera_mask_path)
-    folder, camera = (str(path.resolve()) if path else "" for path in paths)
-    return MaskOptions(path=folder, camera_path=camera)
+    return MaskOptions(path=_text(options.mask_path), camera_path=_text(options.camera_mask_path))
+
+
+def _text(path: Path | None) -> str:
+    return str(path.resolve()) if path else ""
 
 
 def pair_options(
@@ -203,12 +206,11 @@ def pair_options(
     """Return what is given on the command line, over what is on record."""
     from colmap_affrect.pairs.base import PairOptions
 
-    listed = options.match_list_path
     given = {
         "methods": options.pairs,
         "num_neighbors": options.num_neighbors,
         "max_distance_m": options.max_distance_m,
-        "match_list_path": str(listed.resolve()) if listed else None,
+        "match_list_path": _text(options.match_list_path) or None,
     }
     chosen = {key: value for key, value in given.items() if value is not None}
     return PairOptions.from_mapping({**(recorded or {}), **chosen}, "pairs")
@@ -238,18 +240,24 @@ def mapping(
     from colmap_affrect.mappers.base import MAPPERS
     from colmap_affrect.recipes import Recipe
 
-    native = {}
-    for setting in options.mapper_options:
-        key, separator, value = setting.partition("=")
-        if not separator or not key.strip():
-            raise OptionError(f"--mapper-options {setting}: expected KEY=VALUE")
-        native[key.strip()] = value
+    native = key_values("--mapper-options", options.mapper_options)
     given = {**seed(options), **({"mapper_options": native} if native else {})}
     if recorded and not (options.preset or options.mapper):
         found: MapperOptions = MAPPERS.options({**recorded, **given})
         return found
     recipe = recipe or Recipe("")
     return recipe.mapper_options(options.preset or "sparse", options.mapper or "", **given)
+
+
+def key_values(option: str, settings: Sequence[str]) -> dict[str, str]:
+    """Split settings at their first '='; OptionError where there is none, or no key."""
+    found = {}
+    for setting in settings:
+        key, separator, value = setting.partition("=")
+        if not separator or not key.strip():
+            raise OptionError(f"{option} {setting}: expected KEY=VALUE")
+        found[key.strip()] = value
+    return found
 
 
 def changed(context: Context, stage: str, section: str, settings: Sequence[str]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Cameras that the user gives: by options, in a COLMAP model, or in a table by image name."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,8 +12,16 @@ from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.project.tables import read_lines, read_table
 
 WIDTHS = ("sensor_width_mm", "plate_width_mm")
-COLUMNS = ("name", "camera", "model", "params", "focal_px", "focal_mm", *WIDTHS, "cx", "cy")
+CENTER = ("cx", "cy")
+COLUMNS = ("name", "camera", "model", "params", "focal_px", "focal_mm", *WIDTHS, *CENTER)
 """Of tables of cameras; only the name is needed."""
+
+EXCLUSIVE: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
+    (("params",), COLUMNS[4:]),
+    (("focal_px",), ("focal_mm", *WIDTHS)),
+    (WIDTHS[:1], WIDTHS[1:]),
+)
+"""Columns of which a row may fill those of one side only."""
 
 
 @dataclass(frozen=True)
@@ -165,47 +173,56 @@ def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
 
 
 def _read_row(row: Mapping[str, str], others: GivenCamera, where: str) -> GivenCamera:
-    def positive(column: str) -> float:
-        values = _numbers(row.get(column, ""), f"{where}: {column}")
-        if column in row and (len(values) != 1 or values[0] <= 0.0):
-            raise OptionError(f"{where}: {column} {row[column]}: not a positive number")
-        return values[0] if values else 0.0
+    """Return the camera of a row; what it says nothing of is as in the options."""
+    _refuse_contradictions(row, where)
+    focal_px, focal_mm, *widths = (_positive(row, column, where) for column in COLUMNS[4:8])
+    center = tuple(_coordinate(row, column, where) for column in CENTER if column in row)
+    model = row.get("model", others.model)
+    _require_model(model, f"{where}: model")
+    params = _numbers(row.get("params", ""), f"{where}: params")
+    has_focal = bool(params or focal_mm or focal_px)
+    says_nothing = row.keys() <= {"name", "camera"}
+    given = GivenCamera(
+        model,
+        params or (others.params if says_nothing else ()),
+        focal_px or (0.0 if has_focal else others.focal_px),
+        focal_mm / max(widths) if focal_mm else 0.0,
+        center or (() if params else others.principal_point),
+        label=f"label/{row['camera']}" if "camera" in row else "",
+        where=where,
+    )
+    _require_params(given, f"{where}: params")
+    return given
 
-    def together(first: Iterable[str], second: Iterable[str], problem: str) -> None:
-        both = [[column for column in columns if column in row] for columns in (first, second)]
-        if all(both):
-            raise OptionError(f"{where}: {both[0][0]} and {both[1][0]} {problem}")
 
-    together(["params"], [*COLUMNS[4:]], "say the same twice; leave one out")
-    together(["focal_px"], ["focal_mm", *WIDTHS], "say the same twice; leave one out")
-    together(WIDTHS[:1], WIDTHS[1:], "say the same twice; leave one out")
-    widths = [positive(column) for column in WIDTHS if column in row]
-    if ("focal_mm" in row) != bool(widths):
+def _refuse_contradictions(row: Mapping[str, str], where: str) -> None:
+    for columns in EXCLUSIVE:
+        first, second = ([name for name in names if name in row] for names in columns)
+        if first and second:
+            raise OptionError(
+                f"{where}: {first[0]} and {second[0]} say the same twice; leave one out"
+            )
+    if ("focal_mm" in row) != any(name in row for name in WIDTHS):
         raise OptionError(
             f"{where}: focal_mm needs sensor_width_mm or plate_width_mm, the width of what the "
             "whole image shows, and these need focal_mm"
         )
     if ("cx" in row) != ("cy" in row):
         raise OptionError(f"{where}: give both cx and cy, or none")
-    center = [_numbers(row[column], f"{where}: {column}") for column in ("cx", "cy") if "cx" in row]
-    if any(len(values) != 1 for values in center):
+
+
+def _positive(row: Mapping[str, str], column: str, where: str) -> float:
+    values = _numbers(row.get(column, ""), f"{where}: {column}")
+    if column in row and (len(values) != 1 or values[0] <= 0.0):
+        raise OptionError(f"{where}: {column} {row[column]}: not a positive number")
+    return values[0] if values else 0.0
+
+
+def _coordinate(row: Mapping[str, str], column: str, where: str) -> float:
+    values = _numbers(row[column], f"{where}: {column}")
+    if len(values) != 1:
         raise OptionError(f"{where}: cx and cy must be one number each")
-    model = row.get("model", others.model)
-    _require_model(model, f"{where}: model")
-    params = _numbers(row.get("params", ""), f"{where}: params")
-    focal_mm, focal_px = positive("focal_mm"), positive("focal_px")
-    has_focal = bool(params or focal_mm or focal_px)
-    given = GivenCamera(
-        model,
-        params or (others.params if len(row) == 1 + ("camera" in row) else ()),
-        focal_px or (0.0 if has_focal else others.focal_px),
-        focal_mm / widths[0] if widths else 0.0,
-        tuple(v for values in center for v in values) or (() if params else others.principal_point),
-        label=f"label/{row['camera']}" if "camera" in row else "",
-        where=where,
-    )
-    _require_params(given, f"{where}: params")
-    return given
+    return values[0]
 
 
 def unknown_names(

@@ -7,6 +7,7 @@ Models of ours have a digest of their files beside them.
 """
 
 import hashlib
+import json
 import math
 import struct
 from collections import Counter
@@ -18,7 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import (
@@ -232,19 +232,13 @@ def _is_binary(folder: Path) -> bool:
     return all((folder / name).exists() for name in OLD_RECORDS)
 
 
-class _Kept(BaseModel):
-    """What of the summary of a model tells whether it has changed since."""
-
-    model: dict[str, str] | str
-
-
 def kept_digests(folder: Path) -> dict[str, str] | str:
     """Return the digests of the files of a model of ours when they were written, else nothing."""
     try:
-        content = without_checksum((folder / SUMMARY).read_bytes())
-        return _Kept.model_validate_json(content).model
-    except (OSError, ValueError):
+        known = json.loads(without_checksum((folder / SUMMARY).read_bytes()))["model"]
+    except (OSError, ValueError, TypeError, KeyError):
         return {}
+    return known if isinstance(known, dict | str) else {}
 
 
 def file_digests(folder: Path) -> dict[str, str]:

@@ -10,7 +10,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats
-from colmap_affrect.geometry.pair_models import EpipolarModel
+from colmap_affrect.geometry.epipolar import EpipolarModel
 
 PLANAR = (
     pycolmap.TwoViewGeometryConfiguration.PLANAR,

@@ -1,7 +1,7 @@
 """Geometric verification of raw matches by pycolmap, and how significant what it finds is.
 
 Significance is of inliers, and of what their local affine frames say
-(:mod:`colmap_affrect.geometry.pair_models`).
+(:mod:`colmap_affrect.geometry.epipolar`).
 """
 
 import logging
@@ -29,8 +29,7 @@ from colmap_affrect.colmap.native_options import Plain, differences
 from colmap_affrect.colmap.two_views import PLANAR, epipolar_pair, keypoint_shapes
 from colmap_affrect.geometry.affine import homography_errors
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Indices, Singles
-from colmap_affrect.geometry.epipolar import common_sign
-from colmap_affrect.geometry.pair_models import HomographyModel, PairModel, Points, Rows
+from colmap_affrect.geometry.epipolar import HomographyModel, PairModel, Points, Rows, common_sign
 from colmap_affrect.geometry.shapes import of_unit_area, vary_singly
 from colmap_affrect.geometry.significance import log10_bayes_factor, log10_false_alarms, shuffled
 from colmap_affrect.options import MAX_SEED, PresetOptions, within

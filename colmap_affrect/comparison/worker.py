@@ -44,7 +44,7 @@ from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.pairs.base import Pair, PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import peak_memory_bytes
-from colmap_affrect.parallel.subprocesses import end_with_parent
+from colmap_affrect.parallel.subprocesses import end_with
 from colmap_affrect.pipeline import map_guided
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
@@ -56,8 +56,9 @@ from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import escalate, unmeasured_pairs
-from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import extracted_px, verify_matches
@@ -67,7 +68,7 @@ logger = logging.getLogger("colmap_affrect")
 
 def main() -> None:
     """Run the method that the task asks for, unless its parent ends before."""
-    end_with_parent()
+    end_with(int(sys.argv[2]))
     parent = _take_stdout()
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))

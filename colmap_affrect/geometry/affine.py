@@ -27,16 +27,6 @@ def adjugates(matrices: Floats) -> Floats:
     return np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
 
 
-def compose_affine(
-    scale: ArrayLike, psi_rad: ArrayLike, tilt: ArrayLike, phi_rad: ArrayLike
-) -> Array:
-    """Return A = scale R(psi) diag(tilt, 1) R(phi) of shape (..., 2, 2)."""
-    tilt = np.asarray(tilt, dtype=np.float64)
-    stretch = np.stack([tilt, np.ones_like(tilt)], -1)[..., :, None]
-    matrix = rotation(psi_rad) @ (stretch * rotation(phi_rad))
-    return np.asarray(np.asarray(scale, dtype=np.float64)[..., None, None] * matrix)
-
-
 def project(homography: Floats, points: Floats) -> Array:
     """Map (N, 2) points by a (3, 3) homography or affine map."""
     mapped = points @ homography[:, :2].T + homography[:, 2]

@@ -12,7 +12,7 @@ Bytes = NDArray[np.uint8]
 
 
 def rows_in(rows: Indices, others: Indices) -> Bools:
-    """Tell which of (N, 2) rows are among others, (M, 2)."""
+    """Return (N,) whether (N, 2) rows are among others, (M, 2)."""
     numbers = np.unique(np.concatenate([rows, others]), return_inverse=True)[1].reshape(-1, 2)
     keys = numbers[:, 0] * (numbers.max(initial=0) + 1) + numbers[:, 1]
     return np.isin(keys[: len(rows)], keys[len(rows) :])

@@ -1,16 +1,28 @@
-"""Epipolar geometry of two views, and what local affine frames say about it.
+"""Epipolar geometries and homographies: what they say of matches, and of their local affine frames.
 
 A match of two frames must carry the direction of the epipolar line in image 1 to the one in image 2
-(Barath, Hajder, Matas: epipolar geometry from affine correspondences). All points are (N, 2) px of
-any one convention, the one of the fundamental matrix F with ``x2^T F x1 = 0``; shapes are the
-(N, 2, 2) linear parts of frames, in the same axes.
+(Barath, Hajder, Matas: epipolar geometry from affine correspondences); under a homography frames
+must turn as it does. All points are (N, 2) px of any one convention, the one of the fundamental
+matrix F with ``x2^T F x1 = 0``; shapes are the (N, 2, 2) linear parts of frames, in the same axes.
 """
 
-import numpy as np
+from dataclasses import dataclass
+from typing import ClassVar
 
-from colmap_affrect.geometry.affine import adjugates
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_affrect.geometry.affine import (
+    adjugates,
+    determinants,
+    homography_errors,
+    transform_frames,
+)
 from colmap_affrect.geometry.arrays import Array, Floats
 from colmap_affrect.geometry.two_views import homogeneous
+
+Points = Array
+Rows = NDArray[np.integer]
 
 
 def epipolar_lines(fundamental: Floats, points1: Floats, points2: Floats) -> tuple[Array, Array]:
@@ -44,3 +56,53 @@ def direction_cosines(
 def common_sign(cosines: Floats) -> float:
     """Return the sign, 1 or -1, that most of the :func:`direction_cosines` of a pair have."""
     return -1.0 if np.sign(cosines).sum() < 0 else 1.0
+
+
+@dataclass(frozen=True)
+class EpipolarModel:
+    """What an epipolar geometry says of matches of features ``rows1`` with features ``rows2``."""
+
+    has_sign: ClassVar[bool] = True
+    """All cosines may have the other sign."""
+    fundamental: Points
+    points: tuple[Points, Points]
+    sample_size: int = 7
+
+    def errors(self, rows1: Rows, rows2: Rows) -> Points:
+        """Return (M,) px."""
+        return sampson_errors(self.fundamental, self.points[0][rows1], self.points[1][rows2])
+
+    def cosines(self, rows1: Rows, rows2: Rows, shapes: tuple[Points, Points]) -> Points:
+        """Return (M,) cosines between what frames carry over and what the geometry does."""
+        points = self.points[0][rows1], self.points[1][rows2]
+        return direction_cosines(self.fundamental, *points, shapes[0][rows1], shapes[1][rows2])
+
+
+@dataclass(frozen=True)
+class HomographyModel:
+    """As :class:`EpipolarModel`, of a homography."""
+
+    has_sign: ClassVar[bool] = False
+    sample_size: ClassVar[int] = 4
+    matrix: Points
+    points: tuple[Points, Points]
+
+    def errors(self, rows1: Rows, rows2: Rows) -> Points:
+        """Return (M,) px."""
+        return homography_errors(self.matrix, self.points[0][rows1], self.points[1][rows2])
+
+    def cosines(self, rows1: Rows, rows2: Rows, shapes: tuple[Points, Points]) -> Points:
+        """Return (M,) cosines between what frames carry over and what the geometry does."""
+        frames = np.concatenate([shapes[0][rows1], self.points[0][rows1, :, None]], axis=2)
+        return turn_cosines(transform_frames(self.matrix, frames)[:, :, :2], shapes[1][rows2])
+
+
+PairModel = EpipolarModel | HomographyModel
+
+
+def turn_cosines(shapes1: Points, shapes2: Points) -> Points:
+    """Return (N,) cosines of the angles by which frames are turned against others; -1 mirrored."""
+    turns = shapes2 @ adjugates(shapes1) * np.sign(determinants(shapes1))[:, None, None]
+    along, across = turns[:, 0, 0] + turns[:, 1, 1], turns[:, 1, 0] - turns[:, 0, 1]
+    cosines = along / np.maximum(np.hypot(along, across), np.finfo(float).tiny)
+    return np.where(determinants(turns) > 0.0, cosines, -1.0)

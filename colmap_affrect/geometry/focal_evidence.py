@@ -4,7 +4,7 @@ For given focal lengths the essential matrix is fitted that explains the matches
 not asked for is integrated out (Laplace's approximation): rotation, direction of the baseline,
 principal points and one coefficient of radial distortion each, which all stay near what they are
 without evidence. Without this integral the best fit is taken for the likely one, and long lenses
-look short: hardly any perspective is left to tell them, and a short lens has more ways to bend
+look short: hardly any perspective is left to see them by, and a short lens has more ways to bend
 into the noise.
 
 Points are (N, 2), from the image centre in units of the longer side; so are focal lengths.

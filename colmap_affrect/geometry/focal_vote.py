@@ -2,7 +2,7 @@
 
 Every pair votes for the focal lengths of its two images; a pair that is wrong counts for little
 more than one that is right (:data:`MAX_VOTE`). Images of one camera vote together. Cameras that are
-tied by pairs inform each other: belief propagation on the graph of the cameras.
+connected by pairs inform each other: belief propagation on the graph of the cameras.
 
 Focal lengths are in units of the longer side.
 """
@@ -83,7 +83,7 @@ def ballot(
 
 @lru_cache(maxsize=256)  # who shares a camera is asked first
 def _table(pair: MatchedPair) -> Array:
-    """Return the evidence for two cameras; hopeless candidates get what the best of them has."""
+    """Return the evidence for two cameras; others that do not fit get the best of theirs."""
     focals = FOCALS[::STEP]
     grid = np.stack(np.meshgrid(focals, focals, indexing="ij"), axis=2)
     table = np.full(grid.shape[:2], np.nan)

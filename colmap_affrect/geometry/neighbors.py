@@ -45,7 +45,7 @@ def neighbors_within(points: Floats, radius: float) -> NeighborLists:
 
 
 def without_duplicates(points1: Floats, points2: Floats, radius_px: float) -> Bools:
-    """Tell which of (M, 2) matches, best first, are not near a better one, kept, at both ends."""
+    """Return whether (M, 2) matches, best first, are not near a better one, kept, at both ends."""
     rows, others = neighbors_within(points1, radius_px).of(np.arange(len(points1)))
     near = ((points2[rows] - points2[others]) ** 2).sum(axis=1) <= radius_px**2
     near &= others < rows

@@ -19,9 +19,9 @@ MIN_DEPTH = 1e-3  # of a turned ray of length 1; what is behind lands far outsid
 DISPLACEMENT_PX = np.array([13.0, 7.0])  # so moved, keypoints meet others by chance only
 MIN_FREE_SHARE = 0.1  # where keypoints are so dense that chance leaves less, nothing can be told
 NUM_STARTS = 30
-"""Rotations of two matches each, of which least squares begin with the best. A strip that two views
-have in common tells their rotation badly, and where things repeat a quarter of its matches may be
-wrong, which have more weight then than the strip."""
+"""Rotations of two matches each; least squares begin with the best. The strip that two views have
+in common determines their rotation badly, and where things repeat, a quarter of its matches may be
+wrong, which then have more weight than the strip."""
 MAX_ITERATIONS = 3  # least squares are repeated without outliers
 
 

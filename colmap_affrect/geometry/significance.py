@@ -14,7 +14,7 @@ import numpy as np
 
 from colmap_affrect.geometry.arrays import Indices
 
-NUM_SHUFFLED = 4000  # about so many random matches tell 1 % within a sixth of itself
+NUM_SHUFFLED = 4000  # about so many random matches measure 1 % to a sixth of itself
 MIN_AGREEING = 0.5  # right pairs have at least this share of inliers with agreeing frames
 AGREEING_SHARES = np.linspace(0.0, 1.0, 51)[:-1]  # from ``MIN_AGREEING`` (0) to all (1)
 

@@ -110,15 +110,10 @@ def near_optimal_covering() -> Array:
 
 @dataclass(frozen=True)
 class Cover:
-    """Covering centres of a set of shapes and the centre nearest to each shape.
+    """Covering centres of a set of shapes and the centre nearest to each shape."""
 
-    Attributes:
-        centers: (K, 2) float64 rows (tilt, angle_rad) in order of choice; K may be 0.
-        labels: (N,) int32 index of the nearest centre, ``IDENTITY_LABEL`` where the
-            identity is nearest, ``UNCOVERED_LABEL`` outside every ball.
-    """
-
-    centers: Array
+    centers: Array  # (K, 2) rows (tilt, angle_rad) in order of choice; K may be 0
+    # (N,) index of the nearest centre, or IDENTITY_LABEL, or UNCOVERED_LABEL outside every ball
     labels: NDArray[np.int32]
 
 

@@ -34,8 +34,8 @@ MIN_VALID_FRAC = 0.01  # share of the pixels of a map that must be known
 MIN_DISPARITY_FRAC = 0.01  # inverse depth below this share of the largest is sky, i.e. unknown
 NETWORK_IMAGE_SIZE_PX = 1024  # longer side; most networks work at about 384 to 784 px
 
+# What numpy raises for a kept prediction that is missing or damaged.
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile, zlib.error)
-"""What numpy raises on a prediction that was kept and is missing or damaged."""
 
 
 class DepthSource(Protocol):
@@ -53,15 +53,10 @@ class DepthSource(Protocol):
 
 @dataclass(frozen=True)
 class DepthContext:
-    """What depth sources work with.
+    """What depth sources work with."""
 
-    Attributes:
-        cache_path: folder that keeps the predictions of a network; None keeps none.
-        device: where a network runs: ``cpu``, ``cuda``, ``cuda:1``, ``mps``.
-    """
-
-    cache_path: Path | None = None
-    device: str = "cpu"
+    cache_path: Path | None = None  # folder that keeps a network's predictions; None keeps none
+    device: str = "cpu"  # where a network runs: ``cpu``, ``cuda``, ``cuda:1``, ``mps``
 
 
 class DepthOptions(PartOptions):
@@ -109,7 +104,11 @@ class DepthFilesOptions(DepthOptions):
         return bool(self.path)
 
     def file(self, name: str) -> Path | None:
-        """Return the first that exists of the files that an image's map may be in."""
+        """Return the first of the files of an image's map that exists.
+
+        Of ``a/b.jpg`` these are ``a/b.jpg.npy`` and so on in the order of ``SUFFIXES``, then
+        ``a/b.npy`` and so on.
+        """
         stems = (name, splitext(name)[0])
         paths = (Path(self.path) / f"{stem}{suffix}" for stem in stems for suffix in SUFFIXES)
         return next((path for path in paths if path.is_file()), None)
@@ -136,12 +135,7 @@ DEPTH_SOURCES: Registry[DepthSource] = Registry(
 
 
 class DepthFiles:
-    """Depth maps in a folder, named as the images.
-
-    The map of ``a/b.jpg`` is the first that exists of ``a/b.jpg.npy``, ``a/b.jpg.npz`` and so on
-    in the order of ``SUFFIXES`` (see :mod:`.depth_files`), then ``a/b.npy``, ``a/b.npz`` and so on.
-    Values that are not finite or not positive are unknown.
-    """
+    """Depth maps in a folder; values that are not finite or not positive are unknown."""
 
     Options = DepthFilesOptions
 
@@ -190,8 +184,6 @@ class DepthFiles:
 
 @dataclass(frozen=True)
 class _Prediction:
-    """What a network predicts of an image."""
-
     values: Singles  # (h, w) depth or inverse depth
     inverse: bool  # whether the network predicts relative inverse depth
 
@@ -300,7 +292,7 @@ class MonocularDepth:
 
 
 def predicts_inverse_depth(config: Any) -> bool:
-    """Tell from the configuration of a model whether it predicts relative inverse depth.
+    """Return whether a model predicts relative inverse depth, by its configuration.
 
     Models of the type of Depth Anything say so. DPT does, as MiDaS was trained to, but for metric
     DPT heads on DINOv2, the ones with ``add_projection``. All others predict depth.

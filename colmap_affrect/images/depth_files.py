@@ -8,7 +8,7 @@ Files may come from anywhere: whatever is wrong with one ends in :class:`Unusabl
 is trusted with more memory than a depth map may need.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from math import prod
 from pathlib import Path
 from typing import IO, Any
@@ -65,9 +65,8 @@ def _read_numpy(path: Path, require: Require) -> NDArray[np.generic]:
         with ZipFile(stream) as archive:
             names = sorted(name.removesuffix(".npy") for name in archive.namelist())
             if "depth" not in names and len(names) != 1:
-                raise UnusableMap(
-                    f"expected one array, or one named 'depth', found {_listed(names)}"
-                )
+                found = ", ".join(names) or "none"
+                raise UnusableMap(f"expected one array, or one named 'depth', found {found}")
             with archive.open(f"{'depth' if 'depth' in names else names[0]}.npy") as member:
                 return _read_array(member, require)
 
@@ -93,10 +92,6 @@ def _read_image(path: Path, require: Require) -> NDArray[np.generic]:
     if values.dtype == np.uint8:
         raise UnusableMap("8 bits are a preview, too coarse for depth; give 16 bits, or .npy")
     return np.asarray(values)
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(names) or "none"
 
 
 _READERS: dict[str, Callable[[Path, Require], NDArray[np.generic]]] = {

@@ -1,6 +1,6 @@
 """What EXIF says of the camera of a photograph, and whether that can be true.
 
-EXIF tells of the file that a camera wrote. What has been shrunk, cropped or edited since often
+EXIF describes the file that a camera wrote. What has been shrunk, cropped or edited since often
 keeps it as it was, so that every statement is held against the others and against the file.
 """
 
@@ -47,7 +47,7 @@ class CameraTags:
 
     @property
     def identity(self) -> tuple[object, ...] | None:
-        """What photographs of one camera have in common; None where EXIF does not tell cameras."""
+        """What photographs of one camera have in common; None where EXIF has no camera."""
         make, model, _ = self.body
         if not (make and model and (self.focal_mm or self.equivalent_mm)) or self.was_cropped:
             return None
@@ -55,13 +55,13 @@ class CameraTags:
 
     @property
     def scale(self) -> float:
-        """Longer side in units of the one that EXIF tells of, whichever way it was turned."""
+        """Longer side in units of that of the file that EXIF describes, turned or not."""
         scale = max(self.size) / max(self.original_size or self.size)
         return 1.0 if _similar(scale, 1.0) else scale
 
     @property
     def was_cropped(self) -> bool:
-        """Whether the shape is not that of the pixels that EXIF tells of."""
+        """Whether the shape is not that of the file that EXIF describes."""
         return not _similar(_aspect(self.size), _aspect(self.original_size or self.size))
 
 

@@ -89,7 +89,7 @@ def _claimed_size(file: BinaryIO) -> tuple[int, int]:
 
 
 def is_too_large(size: tuple[int, int] | None) -> bool:
-    """Tell whether a header claims more pixels than photographs have."""
+    """Return whether a header claims more pixels than photographs have."""
     return size is not None and size[0] * size[1] > MAX_NUM_PX
 
 

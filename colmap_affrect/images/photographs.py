@@ -137,8 +137,7 @@ def list_images(image_path: Path, image_list_path: Path | None = None) -> list[s
     require_folder(image_path)
     if image_list_path is not None:
         return _listed_images(image_path, image_list_path)
-    files = _visible_files(image_path)
-    names = [name for name in files if _suffix(name) in IMAGE_SUFFIXES and not _odd(name)]
+    names = [name for name in photograph_files(image_path, IMAGE_SUFFIXES) if not _odd(name)]
     if not names:
         others = "".join(f"; {kind}: {what}" for kind, what in left_out(image_path).items())
         raise ImageError(f"{image_path}: holds no images ({', '.join(IMAGE_SUFFIXES)}){others}")
@@ -154,15 +153,16 @@ def require_folder(image_path: Path) -> None:
 
 
 def left_out(image_path: Path) -> dict[str, str]:
-    """Tell which photographs in a folder are passed over: for their format, names, or as pages."""
+    """Return why photographs in a folder are passed over: for their format, names, or as pages."""
     found: dict[str, list[str]] = {}
     notes: dict[str, str] = {}
-    for name in _visible_files(image_path):
-        if _suffix(name) in OTHER_IMAGE_SUFFIXES:
-            found.setdefault(f"*{_suffix(name)}", []).append(name)
-        elif _suffix(name) in IMAGE_SUFFIXES and _odd(name):
+    for name in photograph_files(image_path):
+        suffix = _suffix(name)
+        if suffix in OTHER_IMAGE_SUFFIXES:
+            found.setdefault(f"*{suffix}", []).append(name)
+        elif _odd(name):
             found.setdefault("names", []).append(name)
-        if _suffix(name) in TIFF_SUFFIXES and (count := len(pages(image_path / name))) > 1:
+        if suffix in TIFF_SUFFIXES and (count := len(pages(image_path / name))) > 1:
             notes[name] = (
                 f"has {count} pages, and only the first is used; colmap-affrect convert makes a "
                 "file of each"
@@ -175,29 +175,28 @@ def left_out(image_path: Path) -> dict[str, str]:
     return notes
 
 
-def photograph_files(folder: Path) -> list[str]:
-    """Return the sorted names of all photographs below a folder, in whatever format."""
-    suffixes = (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES)
-    return [name for name in _visible_files(folder) if _suffix(name) in suffixes]
-
-
 def not_named(image_path: Path, names: Collection[str]) -> dict[str, str]:
-    """Tell which photographs in a folder a database does not name."""
-    files = _visible_files(image_path)
-    found = [name for name in files if _suffix(name) in IMAGE_SUFFIXES and name not in names]
+    """Return a warning of the photographs in a folder that a database does not name, if any."""
+    files = photograph_files(image_path, IMAGE_SUFFIXES)
+    found = [name for name in files if name not in names]
     if not found:
         return {}
     why = f"{len(found)} photographs are left out, such as {one_line(found[0])}"
     return {str(image_path): f"{why}: the database does not name them"}
 
 
-def _visible_files(folder: Path) -> list[str]:
-    """Return the sorted names of all files below a folder, but for hidden ones and our output."""
+def photograph_files(
+    folder: Path, suffixes: Collection[str] = (*IMAGE_SUFFIXES, *OTHER_IMAGE_SUFFIXES)
+) -> list[str]:
+    """Return the sorted names of all photographs below a folder, not of hidden ones or our output.
+
+    Those that COLMAP reads have ``IMAGE_SUFFIXES``; by default it is all formats.
+    """
     found: list[str] = []
     for path, inner, files in os.walk(folder):
         inner[:] = [n for n in inner if n[0] != "." and not is_output_folder(Path(path, n))]
         below = "" if path == str(folder) else f"{Path(path).relative_to(folder).as_posix()}/"
-        found += (below + name for name in files if name[0] != ".")
+        found += (below + n for n in files if n[0] != "." and _suffix(n) in suffixes)
     return sorted(found)
 
 

@@ -1,7 +1,6 @@
 """From a verified database to a folder of models, by any mapper."""
 
 import logging
-import shutil
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -35,6 +34,7 @@ from colmap_affrect.mappers.starts import (
     unknown_cameras,
 )
 from colmap_affrect.mappers.summaries import model_folders, read_summary, write_summary
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary
 
 logger = logging.getLogger(__name__)
@@ -79,21 +79,21 @@ def map_database(
     if task.extend:
         require_extends(mapper.options)
     partial = sparse_path.with_name(sparse_path.name + ".partial")
-    for old in (partial,) if task.extend else (partial, sparse_path):
-        shutil.rmtree(old, ignore_errors=True)
+    remove_own([partial] if task.extend else [partial, sparse_path])
     try:
         best = _best_attempt(mapper, task, sparse_path, partial, next_image)
-        if not task.extend and _adjust_weak(mapper, task, best):
+        is_final = task.extend or mapper.options.is_complete
+        if not is_final and _adjust_weak(mapper, task, best):
             best = sorted(_possible(best, task), key=_size, reverse=True)
         summaries = []
         for index, model in enumerate(best):
             write_model(model.reconstruction, partial / str(index))
             summaries.append(summarize(model, task, is_largest=index == 0))
             write_summary(summaries[-1], partial / str(index))
-        shutil.rmtree(sparse_path, ignore_errors=True)
+        remove_own([sparse_path])
         partial.rename(sparse_path)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_own([partial])
     return summaries
 
 
@@ -125,7 +125,7 @@ def _best_attempt(
             raw = partial / "raw"
             raw.mkdir(parents=True)
             found = attempts.next(partial / "started.db", raw, show)
-            shutil.rmtree(raw)
+            remove_own([raw])
             if not task.extend:  # whose images stay, whatever they are
                 found = _possible(found, kept)
             found = sorted(found, key=_size, reverse=True)
@@ -146,8 +146,8 @@ class _Attempts:
     def __init__(self, mapper: Mapper, task: MappingTask, num_images: int) -> None:
         self._mapper, self._num_images = mapper, num_images
         self._given = self._task = task
-        is_large = num_images >= LARGE_MODEL
-        self._starts = [Start()] if task.extend or is_large else starts(task)
+        once = task.extend or num_images >= LARGE_MODEL or mapper.options.is_complete
+        self._starts = [Start()] if once else starts(task)
         num = 1 if task.extend else mapper.options.max_num_attempts
         self._limit = max(num, len(self._starts))
         self._most = self._limit + MAX_HOLDING_ATTEMPTS
@@ -158,7 +158,8 @@ class _Attempts:
     def go_on(self, best: list[MappedModel]) -> bool:
         """Tell whether there is another attempt, after the best models so far."""
         task = self._task
-        if self._ran - task.held and not task.extend and self._done < self._most:
+        is_final = task.extend or self._mapper.options.is_complete
+        if self._ran - task.held and not is_final and self._done < self._most:
             self._task = replace(task, held=task.held | self._ran)
             self._limit = max(self._limit, self._done + 1)
             return True

@@ -43,6 +43,8 @@ class MapperOptions(PartOptions, PresetOptions):
 
     extends: ClassVar[bool] = False
     """The mapper can register images into an existing model, ``MappingTask.extend``."""
+    is_complete: ClassVar[bool] = False
+    """The mapper tries first pairs and focal lengths itself, and adjusts models to the end."""
 
 
 DepthLookup = Callable[[str, NDArray[np.floating]], NDArray[np.float64]]
@@ -180,6 +182,7 @@ MAPPERS: Registry[Mapper] = Registry(
     group="colmap_affrect.mappers",
     built_in={
         "sparse": "colmap_affrect.mappers.sparse:SparseMapper",
+        "estimate": "colmap_affrect.mappers.estimate:EstimateMapper",
         "incremental": "colmap_affrect.mappers.incremental:IncrementalMapper",
         "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
     },

@@ -17,7 +17,7 @@ from colmap_affrect.errors import MappingError
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.mappers.last_adjustment import adjust
 from colmap_affrect.parallel.executor import return_freed_memory
-from colmap_affrect.parallel.subprocesses import child, end_with_parent
+from colmap_affrect.parallel.subprocesses import child, end_with
 
 TRACK_LENGTHS = (
     "mapper.track_min_num_views_per_track",
@@ -143,7 +143,7 @@ def map_globally(
 def main() -> None:
     """Map as the argument says."""
     database_path, image_path, output_path, values = json.loads(sys.argv[1])
-    end_with_parent()
+    end_with(int(sys.argv[2]))
     options = pycolmap.GlobalPipelineOptions()
     set_values(options, values)
     try:

@@ -85,10 +85,11 @@ class Joiner:
         """Keep what all steps need."""
         self.graph, self.native, self.show = graph, native, show
         self.bridges = Bridges(graph, native.random_seed)
+        self.score: Callable[[pycolmap.Reconstruction], float] = graph.score_of
 
     def join(self, models: Iterable[pycolmap.Reconstruction]) -> list[MappedModel]:
         """Let the best model grow, then the next one, with the models that are left."""
-        left = sorted(models, key=self.graph.score_of, reverse=True)
+        left = sorted(models, key=self.score, reverse=True)
         joined = []
         while left:
             model, bridges, left = self.grow(left[0], left[1:])
@@ -102,12 +103,12 @@ class Joiner:
     ) -> tuple[pycolmap.Reconstruction, list[Bridge], list[pycolmap.Reconstruction]]:
         """Bridge from a model until nothing joins; return it, its bridges and the other models."""
         built: list[Bridge] = []
-        score = self.graph.score_of(model)
+        score = self.score(model)
         while True:
             hypotheses = self.bridges.find(Part(model), [Part(other) for other in others])
             for hypothesis in hypotheses[:MAX_TRIALS]:
                 grown = self.applied(hypothesis, model)
-                new_score = self.graph.score_of(grown)
+                new_score = self.score(grown)
                 new = set(grown.reg_image_ids()) - set(model.reg_image_ids())
                 if new and new_score > score and self.graph.supports(grown, new):
                     break
@@ -139,11 +140,15 @@ class Joiner:
         mapper.begin_reconstruction(model)
         for image_id in hypothesis.poses:
             mapper.triangulate_image(self.native.get_triangulation(), image_id)
-        self._refine(mapper)
-        self._register_next(mapper)
+        self.finish(mapper)
         mapper.end_reconstruction(False)
         self.show(model.num_reg_images())
         return model
+
+    def finish(self, mapper: pycolmap.IncrementalMapper) -> None:
+        """Refine a model, and register what can be by its tracks now."""
+        self._refine(mapper)
+        self._register_next(mapper)
 
     def _register_next(self, mapper: pycolmap.IncrementalMapper) -> None:
         """Register images by their tracks as long as there are any, as COLMAP's pipeline does."""

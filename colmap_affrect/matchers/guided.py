@@ -18,8 +18,13 @@ import numpy as np
 
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Bools, Indices, Singles
-from colmap_affrect.geometry.epipolar import common_sign, epipolar_lines
-from colmap_affrect.geometry.pair_models import EpipolarModel, HomographyModel, PairModel
+from colmap_affrect.geometry.epipolar import (
+    EpipolarModel,
+    HomographyModel,
+    PairModel,
+    common_sign,
+    epipolar_lines,
+)
 from colmap_affrect.geometry.shapes import vary_singly
 from colmap_affrect.geometry.two_views import homogeneous
 from colmap_affrect.matchers.base import distance_ratios

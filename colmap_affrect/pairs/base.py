@@ -16,13 +16,9 @@ AT_ONCE = 1 << 16  # pairs that are given names together
 
 
 class PairList(Sequence[Pair]):
-    """Pairs as the numbers of their images, which get their names one after the other.
+    """Pairs as (N, 2) int32 ``numbers`` of their images in the sorted ``names``.
 
     All pairs of 5,000 images take 100 MB, as tuples of names they would take many times as much.
-
-    Attributes:
-        names: of the images, sorted.
-        numbers: (N, 2) int32, which of the names each pair has.
     """
 
     def __init__(self, names: Sequence[str], numbers: NDArray[np.integer]) -> None:

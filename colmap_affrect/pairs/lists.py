@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.colmap.database import nearest_positions
 from colmap_affrect.errors import OptionError, PairListError
 from colmap_affrect.geometry.arrays import Indices, Singles
-from colmap_affrect.pairs.base import Pair, PairList, PairOptions
+from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.project.atomic_files import replace_lines
 
 MAX_NAMES_IN_MESSAGE = 5
@@ -33,18 +32,6 @@ def sequence_pairs(names: Sequence[str], num_neighbors: int) -> list[Pair]:
         for index, first in enumerate(ordered)
         for second in ordered[index + 1 : index + 1 + num_neighbors]
     )
-
-
-def pairs_by_place(names: Sequence[str], database_path: Path, options: PairOptions) -> set[Pair]:
-    """Return pairs by ``gps`` (DatabaseError without positions) and ``sequence``, as asked for."""
-    pairs: set[Pair] = set()
-    if "sequence" in options.methods:
-        pairs |= set(sequence_pairs(names, options.num_neighbors))
-    if "gps" in options.methods:
-        near = nearest_positions(database_path, options.num_neighbors, options.max_distance_m)
-        known = set(names)
-        pairs |= {pair for pair in near if known.issuperset(pair)}
-    return pairs
 
 
 def _by_numbers(name: str) -> tuple[list[str | int], str]:

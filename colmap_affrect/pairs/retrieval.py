@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.arrays import Indices, Singles
-from colmap_affrect.matchers.base import Matches
-from colmap_affrect.pairs.base import Pair
-from colmap_affrect.pairs.lists import most_similar_pairs
+from colmap_affrect.pairs.base import Pair, PairList
+from colmap_affrect.pairs.lists import most_similar_pairs, ordered_for_reuse
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
 
@@ -122,30 +121,19 @@ IMAGES_AT_ONCE = 256  # pairs are matched in blocks of that many images with tha
 
 
 def low_resolution_pairs(
-    names: Sequence[str], match: Callable[[Pair], Matches], num_neighbors: int, progress: Progress
+    names: Sequence[str], count: Callable[[Pair], int], num_neighbors: int, progress: Progress
 ) -> list[Pair]:
     """Return the pairs of images of which the strongest features have the most matches.
 
-    ``match`` should keep ``2 * IMAGES_AT_ONCE`` images; neighbours are counted on average.
+    ``count`` matches a pair; it should keep ``2 * IMAGES_AT_ONCE`` images. ``num_neighbors`` of an
+    image is an average.
     """
     counts = np.zeros((len(names), len(names)), np.uint16)
-
-    def count(pair: tuple[int, int]) -> tuple[int, int, int]:
-        return *pair, len(match((names[pair[0]], names[pair[1]])).indices)
-
-    num_pairs = len(names) * (len(names) - 1) // 2
-    with progress.stage("low resolution", num_pairs, "pairs") as advance:
-        for i, j, matches in map_ordered(count, in_blocks(len(names)), available_cores()):
-            counts[i, j] = counts[j, i] = matches
+    every = PairList(names, np.stack(np.triu_indices(len(names), 1), axis=1))
+    pairs = ordered_for_reuse(every, IMAGES_AT_ONCE)
+    with progress.stage("low resolution", len(pairs), "pairs") as advance:
+        found = map_ordered(count, pairs, available_cores())
+        for (i, j), num_matches in zip(pairs.numbers, found, strict=True):
+            counts[i, j] = counts[j, i] = num_matches
             advance(1)
     return most_similar_pairs(names, counts, num_neighbors)
-
-
-def in_blocks(count: int) -> Iterator[tuple[int, int]]:
-    """Yield all pairs of numbers below ``count``, those of the same numbers close together."""
-    begins = range(0, count, IMAGES_AT_ONCE)
-    for begin1 in begins:
-        for begin2 in begins[begin1 // IMAGES_AT_ONCE :]:
-            for i in range(begin1, min(begin1 + IMAGES_AT_ONCE, count)):
-                for j in range(max(i + 1, begin2), min(begin2 + IMAGES_AT_ONCE, count)):
-                    yield i, j

@@ -3,30 +3,35 @@
 Started by their module's name, not by ``multiprocessing``, which would run a user's script again.
 """
 
+import ctypes
 import os
 import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO
+
+PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent dies
+WATCH_S = 0.5  # elsewhere: how often a process looks whether its parent lives
 
 
 @contextmanager
 def child(
     module: str, argument: str, *, stderr: IO[str] | None = None
 ) -> Iterator[subprocess.Popen[str]]:
-    """Run a module of this package with one argument; its stdout is piped.
+    """Run a module of this package with one argument and our process id; its stdout is piped.
 
     If the block raises, also for Ctrl-C, the child is killed; otherwise it is waited for. The
-    module must call :func:`end_with_parent` first.
+    module must call :func:`end_with` first, with the process id.
     """
     # -P and the path: the package is found as it was here, and nothing in the current folder.
     search_path = os.pathsep.join(filter(None, sys.path))
     with subprocess.Popen(  # noqa: S603  (this Python and a module of ours)
-        [sys.executable, "-P", "-m", module, argument],
-        stdin=subprocess.PIPE,
+        [sys.executable, "-P", "-m", module, argument, str(os.getpid())],
+        stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=stderr,
         env={**os.environ, "PYTHONPATH": search_path},
@@ -43,11 +48,20 @@ def child(
             raise
 
 
-def end_with_parent() -> None:
-    """Make this process end when the one that started it ends, which closes our stdin."""
+def end_with(parent: int) -> None:
+    """Make this process end when its parent, of this process id, has ended.
+
+    On Linux the system kills it then, also in native code that holds Python's lock.
+    """
 
     def wait_and_end() -> None:
-        os.read(sys.stdin.fileno(), 1)  # nothing is ever sent: it returns when the pipe is closed
+        while os.getppid() == parent:
+            time.sleep(WATCH_S)
         os.kill(os.getpid(), signal.SIGKILL)
 
-    threading.Thread(target=wait_and_end, daemon=True).start()
+    if sys.platform != "linux":
+        threading.Thread(target=wait_and_end, daemon=True).start()
+        return
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before
+        os.kill(os.getpid(), signal.SIGKILL)

@@ -29,15 +29,10 @@ class Rectifier(Protocol):
 
 @dataclass(frozen=True)
 class RectifierInputs:
-    """What a rectifier may read beside the photograph.
+    """What a rectifier may read beside the photograph."""
 
-    Attributes:
-        shapes: the source that its options name; None if they name none.
-        depth: None when the recipe needs no depth.
-    """
-
-    shapes: ShapeSource | None = None
-    depth: DepthSource | None = None
+    shapes: ShapeSource | None = None  # the source that its options name, if any
+    depth: DepthSource | None = None  # None when the recipe needs no depth
 
 
 class RectifierOptions(PartOptions):

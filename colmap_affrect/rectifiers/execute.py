@@ -84,7 +84,7 @@ def _carried(features: LocalFeatures, rectification: Rectification | None) -> Lo
 def _usable(
     features: LocalFeatures, rectification: Rectification | None, plan: RectificationPlan
 ) -> Mask:
-    """Tell which features, frames in image px, belong to their part of the image.
+    """Return which features, frames in image px, belong to their part of the image.
 
     Those of a warp must have their measurement region inside the image: what lies outside
     is invented by the warp.
@@ -111,7 +111,7 @@ def _keep_strongest(keep: list[Mask], features: list[LocalFeatures], limit: int)
 
 
 def found_again(original: LocalFeatures, rectified: LocalFeatures) -> Mask:
-    """Tell which features of the image itself a warp shows at the same place and scale.
+    """Return which features of the image itself a warp shows at the same place and scale.
 
     Same means centres within half a sigma and scales within ``SAME_SCALE_RATIO`` in the
     image, whatever the orientation. The region of a warp holds just those pixels whose shape

@@ -42,7 +42,7 @@ class Region:
         return np.array([columns.mean(), rows.mean()]) + self.origin
 
     def contains(self, points: Floats) -> Mask:
-        """Tell which (N, 2) points, rounded to pixels, belong to it."""
+        """Return which (N, 2) points, rounded to pixels, belong to it."""
         return in_mask(self.mask, points, self.origin)
 
 

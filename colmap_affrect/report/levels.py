@@ -76,38 +76,26 @@ def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int
     )
 
 
-class TimedFeatures:
-    """A feature extractor that takes the time of the steps of another one."""
+class _Recorder:
+    """A feature extractor that times another one, and keeps in order what it is shown and finds."""
 
     def __init__(self, extractor: FeatureExtractor, watch: Stopwatch) -> None:
         self.extractor, self.watch = extractor, watch
         self.descriptor_size = extractor.descriptor_size
-
-    def detect(self, view: View) -> LocalFeatures:
-        """See :class:`FeatureExtractor`."""
-        with self.watch.step("detect"):
-            return self.extractor.detect(view)
-
-    def describe(
-        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
-    ) -> list[LocalFeatures]:
-        """See :class:`FeatureExtractor`."""
-        with self.watch.step("describe"):
-            return self.extractor.describe(images, detected)
-
-
-class _Recorder(TimedFeatures):
-    """Keeps too, in order, what the extractor is shown and finds in it."""
-
-    def __init__(self, extractor: FeatureExtractor, watch: Stopwatch) -> None:
-        super().__init__(extractor, watch)
         self.views: list[View] = []
         self.found: list[LocalFeatures] = []
 
     def detect(self, view: View) -> LocalFeatures:
         self.views.append(view)
-        self.found.append(super().detect(view))
+        with self.watch.step("detect"):
+            self.found.append(self.extractor.detect(view))
         return self.found[-1]
+
+    def describe(
+        self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
+    ) -> list[LocalFeatures]:
+        with self.watch.step("describe"):
+            return self.extractor.describe(images, detected)
 
 
 def describe_level(level: InspectedLevel) -> dict[str, Any]:

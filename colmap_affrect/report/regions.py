@@ -40,6 +40,12 @@ def warp_colors(plan: RectificationPlan) -> list[Color]:
     return [to_rgb(PALETTE[groups.index(key)]) for key in keys]
 
 
+def largest_warps(plan: RectificationPlan, count: int) -> list[int]:
+    """Return the indices of the warps with the largest canvases, the largest first."""
+    order = sorted(range(len(plan.items)), key=lambda index: -plan.items[index].canvas_area_px)
+    return order[:count]
+
+
 def tinted(photograph: Photograph, plan: RectificationPlan) -> ColorImage:
     """Return the (H, W, 3) photograph with each region in the colour of its warp."""
     image = np.repeat(photograph.gray[:, :, None], 3, axis=2)

@@ -24,6 +24,7 @@ from colmap_affrect.report.regions import (
     Color,
     Size,
     circle_origin,
+    largest_warps,
     region_middle,
     tinted,
     warp_colors,
@@ -58,8 +59,7 @@ def draw_sheet(level: InspectedLevel, stored_size: Size, path: Path) -> None:
     """
     colors = warp_colors(level.plan)
     items = level.plan.items
-    by_area = sorted(range(len(items)), key=lambda index: -items[index].canvas_area_px)
-    chosen = sorted(by_area[:MAX_NUM_WARPS])
+    chosen = sorted(largest_warps(level.plan, MAX_NUM_WARPS))
     rows = [chosen[first : first + WARPS_PER_ROW] for first in range(0, len(chosen), WARPS_PER_ROW)]
     heights = [TOP_INCHES]
     for row in rows:

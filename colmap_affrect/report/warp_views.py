@@ -11,9 +11,10 @@ from colmap_affrect.images.reading import shrink_to
 from colmap_affrect.images.warping import warp
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.pictures import Picture
-from colmap_affrect.report.regions import tinted, warp_colors
+from colmap_affrect.report.regions import largest_warps, tinted, warp_colors
 from colmap_affrect.stages.context import Resources
-from colmap_affrect.stages.extract import Inputs, image_tasks, recorded_extraction
+from colmap_affrect.stages.extract import image_tasks
+from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.one_image import prepare
 
 MAP_SIZE_PX = 480
@@ -76,9 +77,8 @@ def _view(
     photograph: Photograph, plan: RectificationPlan, level: int, rectifier: str
 ) -> WarpedPhotograph:
     colors = warp_colors(plan)
-    by_area = sorted(range(len(plan.items)), key=lambda index: -plan.items[index].canvas_area_px)
     views = []
-    for index in by_area[:MAX_NUM_WARPS]:
+    for index in largest_warps(plan, MAX_NUM_WARPS):
         item = plan.items[index]
         picture = Picture.jpeg(shrink_to(warp(photograph.gray, item), WARP_SIZE_PX))
         angle_deg = float(np.rad2deg(item.tilt_angle_rad))

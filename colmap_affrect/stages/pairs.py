@@ -9,18 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_affrect.colmap.database import nearest_positions
 from colmap_affrect.errors import PairListError
-from colmap_affrect.matchers.base import Matches
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair, PairList, PairOptions
-from colmap_affrect.pairs.lists import exhaustive_pairs, pairs_by_place, read_pairs, write_pairs
+from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, sequence_pairs, write_pairs
 from colmap_affrect.pairs.retrieval import NUM_STRONGEST, low_resolution_pairs, retrieved_pairs
 from colmap_affrect.project.atomic_files import replace_lines
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import Inputs, write_images_and_keypoints
+from colmap_affrect.stages.extract import write_images_and_keypoints
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 
 logger = logging.getLogger(__name__)
@@ -96,13 +97,17 @@ def _all_pairs(
 def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
     """Return the pairs that are listed or chosen by names and positions."""
     context.workspace.require("extract")
-    names = context.features.names()
+    names, pairs = context.features.names(), set[Pair]()
+    known = set(names)
+    if "sequence" in options.methods:
+        pairs |= set(sequence_pairs(names, options.num_neighbors))
     if "gps" in options.methods:
         write_images_and_keypoints(context)
-    pairs = pairs_by_place(names, context.workspace.database, options)
+        limits = options.num_neighbors, options.max_distance_m
+        near = nearest_positions(context.workspace.database, *limits)
+        pairs |= {pair for pair in near if known.issuperset(pair)}
     if options.match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
-        known = set(names)
         all_names = Inputs.recorded(context.workspace).names()
         listed = read_pairs(Path(options.match_list_path), all_names)
         return pairs | {pair for pair in listed if known.issuperset(pair)}
@@ -126,10 +131,10 @@ def _similar_pairs(context: Context, options: PairOptions, there: Collection[Pai
         matching = Matching(features, NearestOptions(), max_num_features=NUM_STRONGEST)
         strongest = CachedMatcher(matching)
 
-        def match(pair: Pair) -> Matches:
-            return strongest.match(*map(strongest.prepared, pair))
+        def count_matches(pair: Pair) -> int:
+            return len(strongest.match(*map(strongest.prepared, pair)).indices)
 
-        pairs += low_resolution_pairs(names, match, options.num_neighbors, progress)
+        pairs += low_resolution_pairs(names, count_matches, options.num_neighbors, progress)
     return set(pairs)
 
 

@@ -36,9 +36,15 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from attacks import ended
 from command import Ended, start
-from ended import assert_readable, end_again_and_again
 from machine import describe_machine, table
-from results import Undisturbed, results, run_arguments, run_undisturbed
+from results import (
+    Undisturbed,
+    assert_readable,
+    end_again_and_again,
+    results,
+    run_arguments,
+    run_undisturbed,
+)
 
 SAMPLE = Path(__file__).parents[2] / "sample_scenes" / "courtyard" / "images"
 KILLS_IN_ONE_FOLDER = 3

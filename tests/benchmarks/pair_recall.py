@@ -22,7 +22,7 @@ from pathlib import Path
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.data import LocalFeatures
-from colmap_affrect.matchers.base import MatcherContext, Matches
+from colmap_affrect.matchers.base import MatcherContext
 from colmap_affrect.matchers.nearest import MatchableImage, NearestNeighbors, NearestOptions
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.pairs.lists import sequence_pairs
@@ -83,14 +83,14 @@ def ways_to_choose(folder_of: dict[str, Workspace]) -> dict[str, Callable[[int],
         )
         return image
 
-    def match(pair: Pair) -> Matches:
-        return matcher.match(strongest(pair[0]), strongest(pair[1]))
+    def count(pair: Pair) -> int:
+        return len(matcher.match(strongest(pair[0]), strongest(pair[1])).indices)
 
     def retrieved(num: int) -> list[Pair]:
         return retrieved_pairs(names, read, num, SILENT)
 
     def low_resolution(num: int) -> list[Pair]:
-        return low_resolution_pairs(names, match, num, SILENT)
+        return low_resolution_pairs(names, count, num, SILENT)
 
     def either(num: int) -> list[Pair]:
         half = -(-num // 2)

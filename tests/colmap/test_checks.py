@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import random
-import sqlite3
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from damaged import Statement, execute
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.checks import check_database, check_image_files
@@ -57,17 +56,6 @@ def write_database(path: Path, *, descriptors: bool = False) -> Path:
 @pytest.fixture
 def database_path(tmp_path: Path) -> Path:
     return write_database(tmp_path / "database.db")
-
-
-Statement = tuple[str, list[object]] | str
-
-
-def execute(path: Path, *statements: Statement) -> None:
-    with closing(sqlite3.connect(path)) as connection:
-        for statement in statements:
-            query, values = (statement, []) if isinstance(statement, str) else statement
-            connection.execute(query, values)
-        connection.commit()
 
 
 def pair_id(first: int, second: int) -> int:

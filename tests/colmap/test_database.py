@@ -82,16 +82,6 @@ def test_import_images_adds_what_is_new_and_names_what_colmap_cannot_read(
         assert (database.num_images(), database.num_frames()) == (4, 4)
 
 
-def test_import_images_takes_the_camera_that_is_given(tmp_path: Path, image_folder: Path) -> None:
-    options = CameraOptions(mode="single", model="PINHOLE", params="100,101,45,30")
-    import_images(tmp_path / "database.db", image_folder, NAMES[:2], options)
-    with open_database(tmp_path / "database.db") as database:
-        (camera,) = database.read_all_cameras()
-    assert camera.model == pycolmap.CameraModelId.PINHOLE
-    assert_allclose(camera.params, [100, 101, 45, 30])
-    assert (camera.width, camera.height) == (90, 60)
-
-
 @pytest.mark.parametrize("mode", ["single", "per-folder", "per-image"])
 @pytest.mark.parametrize("first", [["a.png"], ["b.png", "wing/a.png"]])
 def test_images_that_come_later_share_the_cameras_of_those_that_are_there(

@@ -99,6 +99,8 @@ def test_wrong_tables_are_one_clear_line(tmp_path: Path, lines: list[str], messa
         ({"focal_length_px": float("nan")}, "focal_length_px"),
         ({"params": "900,450,300,0", "focal_length_px": 5.0}, "--camera-params: has focal length"),
         ({"params": "900,450,300,0", "principal_point": "1,2"}, "leave out --focal-length-px"),
+        ({"model": "PINHOL"}, "--camera-model PINHOL: not one of"),
+        ({"model": "PINHOLE", "params": "1,2,3"}, r"params: PINHOLE needs 4 values .*, not 3"),
         ({"params": "0,450,300,0"}, "--camera-params: a focal length of 0 px cannot be"),
         ({"params": "inf,450,300,0"}, "--camera-params inf,450,300,0: has a number that is not"),
         ({"principal_point": "1"}, "--principal-point 1: give cx,cy, two numbers"),

@@ -24,7 +24,7 @@ from colmap_affrect.colmap.verification import (
 )
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.affine import project, rotation, transform_frames
-from colmap_affrect.geometry.pair_models import turn_cosines
+from colmap_affrect.geometry.epipolar import turn_cosines
 
 SIZE = (640, 480)
 K = np.array([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])

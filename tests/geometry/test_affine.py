@@ -1,43 +1,33 @@
-"""Properties of affine maps and local affine frames."""
+"""Properties of affine maps, of local affine frames, and of the canvases of rectifying warps."""
 
 from __future__ import annotations
 
 import numpy as np
 from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from strategies import Array, affine_shapes, frames, homographies, turns
+from strategies import Array, affine_shapes, classes, frames, homographies, turns
 
 from colmap_affrect.geometry.affine import (
-    compose_affine,
-    determinants,
     ellipse_extents,
+    fit_canvas,
     homography_errors,
     lafs_from_keypoints,
     project,
+    rectifying_affine,
     rotation,
     transform_frames,
 )
+from colmap_affrect.geometry.tilts import metrics_from_tilts, unit_metrics
 
 ROUNDING = 1e-9
 """Some hundred float64 operations on numbers of order 100."""
 
+CANVAS_ROUNDING = 1e-8
+"""The canvas forgives 1e-9 px so that rounding cannot add a column."""
+
 JACOBIAN_ERROR = 1e-5
 """Central differences with a step of 1e-3 px: curvature of the homography and rounding."""
-
-
-def test_rotation_turns_x_axis_towards_y_axis() -> None:
-    assert_allclose(rotation(np.pi / 6) @ [2.0, 0.0], [np.sqrt(3.0), 1.0], atol=ROUNDING)
-
-
-def test_determinants_have_the_sign_of_the_orientation() -> None:
-    matrices = np.array([[[2.0, 1.0], [0.5, 3.0]], [[0.0, 1.0], [4.0, 0.0]]])
-    assert_allclose(determinants(matrices), [5.5, -4.0])
-    assert_allclose(determinants(matrices[0].astype(np.float32)), 5.5)
-
-
-def test_compose_affine_multiplies_scale_psi_tilt_phi_in_this_order() -> None:
-    expected = 1.5 * rotation(0.7) @ np.diag([3.0, 1.0]) @ rotation(2.1)
-    assert_allclose(compose_affine(1.5, 0.7, 3.0, 2.1), expected, atol=ROUNDING)
 
 
 def test_homography_errors_are_distances_from_the_nearest_true_match() -> None:
@@ -55,12 +45,6 @@ def test_homography_errors_are_distances_from_the_nearest_true_match() -> None:
     back = homography_errors(np.linalg.inv(tilted), others, points)
     assert_allclose(there, back, rtol=0.02)
     assert (there < np.linalg.norm(offsets / 6, axis=1)).all()
-
-
-def test_project_divides_by_the_third_coordinate() -> None:
-    homography = np.array([[2.0, 0.0, 1.0], [0.0, 3.0, -1.0], [0.1, 0.2, 1.0]])
-    # (5, 10): x = 11, y = 29, w = 0.5 + 2 + 1.
-    assert_allclose(project(homography, np.array([[5.0, 10.0]])), [[11 / 3.5, 29 / 3.5]])
 
 
 def test_transform_frames_carries_warp_frame_to_image_by_inverse_on_the_left() -> None:
@@ -96,10 +80,6 @@ def test_transform_frames_by_homography_has_the_jacobian_of_finite_differences(
         assert_allclose(mapped[:, :, column], derivative, rtol=1e-4, atol=JACOBIAN_ERROR)
 
 
-def test_transform_frames_of_no_frames_returns_none() -> None:
-    assert transform_frames(np.eye(3), np.zeros((0, 2, 3))).shape == (0, 2, 3)
-
-
 def test_lafs_from_keypoints_point_their_first_column_along_the_orientation() -> None:
     points = np.array([[3.0, 5.0], [8.0, 1.0]])
     lafs = lafs_from_keypoints(points, np.array([2.0, 4.0]), np.deg2rad([90.0, 30.0]))
@@ -117,3 +97,37 @@ def test_ellipse_extents_bound_the_ellipse_whatever_its_orientation(
     extents = ellipse_extents((shape @ rotation(turn))[None])[0]
     # The largest of 720 samples misses the extreme by at most 1 - cos(0.25 deg).
     assert_allclose(np.abs(outline).max(axis=1), extents, rtol=2e-5)
+
+
+points_in_image = st.lists(
+    st.tuples(st.integers(0, 400), st.integers(0, 250)), min_size=1, max_size=20
+).map(lambda points: np.array(points, dtype=float))
+
+
+@given(classes())
+def test_rectifying_affine_has_unit_area_and_the_class_asked_for(cls: tuple[float, float]) -> None:
+    matrix = rectifying_affine(*cls)
+    assert_allclose(np.linalg.det(matrix), 1.0)
+    assert_allclose(unit_metrics(matrix), metrics_from_tilts(*cls), atol=1e-12)
+
+
+def test_rectifying_affine_stretches_the_direction_of_minus_phi() -> None:
+    # R(phi) turns the direction -phi to the x axis, which is then stretched by sqrt(t).
+    direction = np.array([np.cos(-0.4), np.sin(-0.4)])
+    assert_allclose(rectifying_affine(4.0, 0.4) @ direction, [2.0, 0.0], atol=1e-12)
+
+
+@given(classes(), points_in_image, st.sampled_from([0.0, 2.5, 16.0]))
+def test_fit_canvas_holds_all_points_with_margin_and_no_smaller_canvas_does(
+    cls: tuple[float, float], points: Array, margin_px: float
+) -> None:
+    linear = rectifying_affine(*cls)
+    matrix, (width, height) = fit_canvas(linear, points, margin_px)
+    assert_allclose(matrix[:2, :2], linear)
+    assert_allclose(matrix[2], [0.0, 0.0, 1.0])
+    mapped = project(matrix, points)
+    assert_allclose(mapped.min(axis=0), margin_px, atol=CANVAS_ROUNDING)
+    reach = mapped.max(axis=0) + margin_px
+    last = np.array([width, height]) - 1
+    assert (reach <= last + CANVAS_ROUNDING).all()
+    assert (reach > last - 1 - CANVAS_ROUNDING).all()

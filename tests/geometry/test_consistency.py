@@ -65,9 +65,3 @@ def test_many_matches_are_compared_block_by_block(monkeypatch: pytest.MonkeyPatc
     whole = num_consistent_matches(first, second)
     monkeypatch.setattr(consistency, "ROWS_AT_ONCE", 9)
     assert num_consistent_matches(first, second) == whole > 40
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 3])
-def test_a_match_needs_two_others(count: int) -> None:
-    first = random_frames(count, 7)
-    assert num_consistent_matches(first, carried(first)) == (3 if count == 3 else 0)

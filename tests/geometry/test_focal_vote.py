@@ -102,13 +102,6 @@ def test_sharing_is_decided_right(seed: int) -> None:
     assert shared_against_single((0.8, 2.0, 1.2), seed)[0] < 1.0
 
 
-def test_a_good_pair_between_the_first_candidates_votes() -> None:
-    """The first candidates fit badly, the best of them by chance far from the truth."""
-    ids, pair = scene((1.0, 1.5, 1.2), 8)[1]
-    (found,) = ballots([(ids, pair)], shared=False)
-    assert np.ptp(found.evidence) > 0.0
-
-
 @pytest.mark.parametrize("side", [0, 1])
 def test_a_known_camera_tells_the_other(side: int) -> None:
     pairs = scene((0.9, 1.7), 8)
@@ -173,12 +166,3 @@ def test_without_a_peak_the_focal_length_is_unknown() -> None:
         found = count([Ballot((0, 0), evidence)] * 6, [0]).estimates[0]
         assert found == FocalEstimate(PRIOR_FOCAL, FOCALS[0], FOCALS[-1])
     assert count([], [4]).estimates[4].spread > 3.0
-
-
-def test_an_interval_is_about_its_focal_length() -> None:
-    """A candidate stands for all that is nearest to it."""
-    sharp = np.full(len(FOCALS), -30.0)
-    sharp[20] = 0.0
-    found = count([Ballot((0, 0), sharp)] * 4, [0]).estimates[0]
-    assert found.low < FOCALS[20] < found.high
-    assert FOCALS[20] / found.low == pytest.approx(found.high / FOCALS[20], rel=0.02)

@@ -46,12 +46,6 @@ def test_of_lists_the_neighbors_of_the_points_asked_for_in_order(
         assert sorted(neighbors[rows == position].tolist()) == expected[point]
 
 
-def test_neighbors_within_includes_points_at_exactly_the_radius_and_the_point_itself() -> None:
-    lists = neighbors_within(np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 4.125]]), 5.0)
-    assert sorted(lists.of(np.array([0]))[1].tolist()) == [0, 1]
-    assert sorted(lists.of(np.array([2]))[1].tolist()) == [1, 2]
-
-
 def test_neighbors_within_does_not_join_row_ends_with_the_next_row() -> None:
     # The last cell of one row of cells and the first of the next have neighbouring keys.
     xs, ys = np.meshgrid(np.arange(0.0, 50.0, 0.5), np.arange(0.0, 5.0, 0.5))

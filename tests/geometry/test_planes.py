@@ -12,7 +12,6 @@ from strategies import Array
 
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.planes import (
-    MAX_SLANT_COS,
     WINDOW_SIGMA_PX,
     PlaneClusters,
     cluster_normals,
@@ -78,14 +77,6 @@ def test_normals_are_unknown_where_a_plane_has_no_hold() -> None:
     assert not known[:, 40:].any()
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (30, 1), (2, 2), (3, 7)])
-def test_normals_of_tiny_maps_have_the_shape_of_the_map(shape: tuple[int, int]) -> None:
-    normals = normals_from_depth(np.full(shape, 3.0), CAMERA)
-    assert normals.shape == (*shape, 3)
-    expected = np.isfinite(normals).all() if min(shape) > 1 else np.isnan(normals).all()
-    assert expected
-
-
 def test_normals_are_weighted_least_squares_fits_of_inverse_depth() -> None:
     rng = np.random.default_rng(3)
     depth = plane_depth([0.4, -0.3, -0.8]) * (1.0 + 1e-3 * rng.standard_normal((70, 90)))
@@ -97,15 +88,6 @@ def test_normals_are_weighted_least_squares_fits_of_inverse_depth() -> None:
     fitted, *_ = np.linalg.lstsq(root * directions, root[:, 0] / depth[rows, columns].ravel())
     normal = normals_from_depth(depth, CAMERA)[row, column]
     assert_allclose(normal, -unit(fitted), atol=1e-9)
-
-
-def test_planes_seen_at_less_than_the_largest_slant_are_not_taken_for_discontinuities() -> None:
-    # Seen at 83.5 degrees in the middle of the image and at up to 84.5 in it.
-    camera = np.array([[2500.0, 0.0, 45.0], [0.0, 2600.0, 35.0], [0.0, 0.0, 1.0]])
-    normal = np.array([np.sin(np.deg2rad(83.5)), 0.0, -np.cos(np.deg2rad(83.5))])
-    assert viewing_cosines(normal, camera, SIZE).min() > MAX_SLANT_COS
-    depth, _ = Room(normal[None], np.array([1.0]), camera, SIZE).depth(SIZE)
-    assert angles_deg(normals_from_depth(depth, camera), normal).max() < EXACT_DEG
 
 
 def test_shrink_depth_keeps_planes_exact_and_says_where_pixels_went() -> None:
@@ -126,15 +108,6 @@ def test_shrink_depth_leaves_small_maps_and_spreads_the_unknown() -> None:
     depth[5, 7] = np.nan
     shrunk, _ = shrink_depth(depth, 45)
     assert np.argwhere(np.isnan(shrunk)).tolist() == [[2, 3]]
-
-
-@pytest.mark.parametrize("shape", [(1, 100), (100, 1), (7, 100)])
-def test_shrink_depth_of_thin_maps_keeps_them_thin(shape: tuple[int, int]) -> None:
-    shrunk, shrunk_from_depth = shrink_depth(np.full(shape, 2.0), 10)
-    expected = tuple(10 if extent == 100 else 1 for extent in shape)
-    assert shrunk.shape == expected
-    middle = np.array([[shape[1] - 1.0, shape[0] - 1.0]]) / 2.0
-    assert_allclose(project(shrunk_from_depth, middle)[0], [(n - 1) / 2 for n in expected[::-1]])
 
 
 @pytest.mark.parametrize("num_points", [10, 300, 500, 2000])
@@ -193,25 +166,9 @@ def test_cluster_normals_finds_planes_by_falling_size() -> None:
     assert clusters.labels.dtype == np.int32
 
 
-def test_cluster_normals_counts_votes_in_shares_of_all_pixels() -> None:
-    normals, labels, _ = three_planes()
-    clusters = clustered(normals, min_votes_frac=0.2)  # the third plane has 350 of 2000
-    assert len(clusters.normals) == 2
-    np.testing.assert_array_equal(clusters.labels, np.where(labels == 2, -1, labels))
-    assert len(clustered(normals, min_votes_frac=0.17).normals) == 3
-
-
 @pytest.mark.parametrize("limit", [1, 2, 3, 9])
 def test_cluster_normals_obeys_the_limit_on_planes(limit: int) -> None:
     assert len(clustered(three_planes()[0], max_num_planes=limit).normals) == min(limit, 3)
-
-
-def test_cluster_normals_of_nothing_has_no_planes() -> None:
-    for normals in (np.full((3, 4, 3), np.nan), np.zeros((0, 4, 3))):
-        clusters = clustered(normals, orthogonal=True)
-        assert clusters.normals.shape == (0, 3)
-        assert (clusters.labels == -1).all()
-        assert clusters.labels.shape == normals.shape[:2]
 
 
 def test_cluster_normals_lets_the_rest_vote_again_after_each_choice() -> None:
@@ -227,16 +184,6 @@ def test_cluster_normals_lets_the_rest_vote_again_after_each_choice() -> None:
     assert angles_deg(clusters.normals, planes).max() < 1.0
 
 
-def test_cluster_normals_keeps_candidates_apart_that_are_nearer_than_the_separation() -> None:
-    rng = np.random.default_rng(2)
-    planes = unit([[0.0, 0.0, -1.0], [np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)]])
-    normals = np.concatenate(
-        [scattered(planes[0], 600, 4.0, rng), scattered(planes[1], 400, 4.0, rng)]
-    )
-    (normal,) = clustered(normals[None], bin_angle_rad=np.deg2rad(20.0)).normals
-    assert angles_deg(normal, planes[0]) < 1.0
-
-
 def test_cluster_normals_takes_opposite_normals_as_one_plane_only_if_told() -> None:
     rng = np.random.default_rng(8)
     right = unit([1.0, 0.1, -0.1])
@@ -247,14 +194,6 @@ def test_cluster_normals_takes_opposite_normals_as_one_plane_only_if_told() -> N
     together = clustered(normals[None], antipodal=True)
     assert angles_deg(together.normals, right[None]).max() < 1.0
     assert (together.labels == 0).all()
-
-
-def test_cluster_normals_labels_by_orthogonal_planes_if_told() -> None:
-    normals, labels, planes = three_planes()
-    clusters = clustered(normals, orthogonal=True)
-    assert_allclose(clusters.normals @ clusters.normals.T, np.eye(3), atol=1e-12)
-    assert angles_deg(clusters.normals, planes).max() < 1.0
-    np.testing.assert_array_equal(clusters.labels, labels)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -276,13 +215,6 @@ def test_orthogonalized_keeps_both_sides_of_a_street_opposite() -> None:
     assert_allclose(result[2], -result[0])
     assert_allclose(result[[0, 1, 3]] @ result[[0, 1, 3]].T, np.eye(3), atol=1e-12)
     assert angles_deg(result, street).max() < 6.0
-
-
-def test_orthogonalized_leaves_what_fits_to_no_axis() -> None:
-    odd = unit([1.0, 1.0, -1.0])
-    normals = np.concatenate([corner_room().normals, (corner_room().normals * odd).sum(0)[None]])
-    normals[3] = unit(corner_room().normals.sum(axis=0))  # 54.7 degrees from each axis
-    assert_allclose(orthogonalized(normals), normals, atol=1e-12)
 
 
 @given(visible_normals(), st.floats(0.0, np.pi), st.tuples(st.floats(0, 89), st.floats(0, 69)))

@@ -29,11 +29,6 @@ def test_rectifying_metrics_are_those_of_the_inverse(shape: Array) -> None:
     assert_allclose(rectifying_metrics(shape), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_rectifying_metrics_of_a_long_frame_stretch_across_it() -> None:
-    # A frame three times longer along x is rectified by stretching y.
-    assert_allclose(rectifying_metrics(np.diag([6.0, 2.0])), [1 / 3, 3.0, 0.0])
-
-
 @given(classes(), st.floats(1e-3, 1e3))
 def test_log_metrics_are_matrix_logarithms_whatever_the_scale(shape: Class, scale: float) -> None:
     metric = metrics_from_tilts(*shape)
@@ -47,12 +42,6 @@ def test_log_metrics_are_matrix_logarithms_whatever_the_scale(shape: Class, scal
 def test_metrics_from_log_inverts_log_metrics(shape: Class) -> None:
     metric = metrics_from_tilts(*shape)
     assert_allclose(metrics_from_log(log_metrics(metric)), metric, rtol=SINGLE, atol=SINGLE)
-
-
-def test_mean_of_logs_along_one_direction_is_the_geometric_mean_of_tilts() -> None:
-    metrics = metrics_from_tilts([2.0, 4.5], 0.7)
-    tilt, angle = tilts_from_metrics(metrics_from_log(log_metrics(metrics).mean(axis=0)))
-    assert_allclose([tilt, angle], [3.0, 0.7], rtol=SINGLE)
 
 
 def test_log_metrics_of_stripes_and_of_nothing_are_finite() -> None:

@@ -7,11 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from strategies import Array, affine_shapes, classes, scales, tilt_distance, turns
+from strategies import (
+    Array,
+    affine_shapes,
+    classes,
+    compose_affine,
+    scales,
+    tilt_distance,
+    turns,
+)
 
-from colmap_affrect.geometry.affine import compose_affine
 from colmap_affrect.geometry.tilts import (
-    GRID_TILTS,
     IDENTITY_LABEL,
     UNCOVERED_LABEL,
     ball_threshold,
@@ -83,24 +89,6 @@ def test_tilts_from_metrics_name_the_class_of_the_map(matrix: Array) -> None:
     assert_allclose(transition_tilt(matrix, same_class), 1.0, atol=1e-5)
 
 
-def test_cosh_distances_are_a_matrix_of_first_by_second() -> None:
-    metrics1 = metrics_from_tilts([1.0, 2.0, 3.0], [0.0, 0.4, 1.1])
-    metrics2 = metrics_from_tilts([5.0, 1.5], [2.0, 0.7])
-    distances = np.arccosh(cosh_distances(metrics1, metrics2))
-    assert distances.shape == (3, 2)
-    assert_allclose(distances[2, 0], tilt_distance(3.0, 1.1, 5.0, 2.0))
-    assert_allclose(distances[1, 1], tilt_distance(2.0, 0.4, 1.5, 0.7))
-
-
-def test_covering_grid_has_six_tilts_by_32_angles() -> None:
-    grid = covering_grid()
-    assert grid.shape == (192, 2)
-    assert_allclose(GRID_TILTS, [2.0, 2.50945, 3.14866, 3.95070, 4.95703, 6.21970], atol=1e-5)
-    assert_allclose(np.unique(grid[:, 0]), np.sort(GRID_TILTS))
-    assert_allclose(np.unique(grid[:, 1]), np.arange(32) * np.pi / 32)
-    assert len(np.unique(grid, axis=0)) == 192
-
-
 @pytest.mark.parametrize(("tilt", "half_width_deg"), [(2.0, 20.97), (3.9507, 8.35)])
 def test_ball_of_1_7_has_the_angular_half_width_of_the_paper(
     tilt: float, half_width_deg: float
@@ -121,23 +109,11 @@ def test_covering_grid_and_identity_cover_the_disc_up_to_5_8() -> None:
     assert np.count_nonzero(labels == UNCOVERED_LABEL) == 0
 
 
-def test_covering_grid_does_not_cover_tilt_11() -> None:
-    # 6.2197 * 1.7 = 10.6: the outer rim of the outer ring of balls.
-    labels = nearest_centers(metrics_from_tilts([10.4, 11.0], 0.0), covering_grid(), RADIUS)
-    assert labels[0] >= 0
-    assert labels[1] == UNCOVERED_LABEL
-
-
 def test_nearest_centers_choose_by_distance_and_within_the_ball() -> None:
     centers = np.array([[2.0, 0.3], [4.0, 0.3], [4.0, 1.8]])
     metrics = metrics_from_tilts([1.2, 2.1, 3.5, 4.2, 4.0], [2.5, 0.35, 0.3, 1.75, 1.05])
     labels = nearest_centers(metrics, centers, RADIUS)
     assert labels.tolist() == [IDENTITY_LABEL, 0, 1, 2, UNCOVERED_LABEL]
-
-
-def test_nearest_centers_without_centers_knows_only_the_identity() -> None:
-    labels = nearest_centers(metrics_from_tilts([1.0, 1.6, 1.8], 0.9), np.zeros((0, 2)), RADIUS)
-    assert labels.tolist() == [IDENTITY_LABEL, IDENTITY_LABEL, UNCOVERED_LABEL]
 
 
 @given(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from depth_photographs import (
@@ -17,15 +15,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import write_image
 
 from colmap_affrect.colmap.poses import read_poses
-from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError, OptionError
 from colmap_affrect.images.depth import DepthFiles, DepthFilesOptions
-from colmap_affrect.images.reading import read_gray
 
 PNG_METRES = 0.002
 """One step of the courtyard's depth maps."""
 
-MEGADEPTH = Path(__file__).parents[3] / "shared" / "pairs" / "svp_sample"
 
 PAVING_TOLERANCE_M = 0.5 * PNG_METRES
 """Rounding of the courtyard's maps. It moves a point along its ray, which meets the paving at
@@ -100,23 +95,13 @@ def test_the_only_map_of_a_file_is_taken_or_the_one_named_depth(tmp_path):
 
 def test_places_are_searched_in_the_documented_order(tmp_path):
     suffixes = (".npy", ".npz", ".png", ".tif", ".tiff")
-    places = [f"{stem}{suffix}" for stem in ("sub/a.jpg", "sub/a") for suffix in suffixes]
+    places = [f"{stem}{suffix}" for stem in ("v1.2/č d.x.jpg", "v1.2/č d.x") for suffix in suffixes]
     for number, place in enumerate(places, 1):
         write_map(tmp_path / place, np.full((4, 6), number, np.uint16))
     for number, place in enumerate(places, 1):
-        depth = source(tmp_path, png_scale=1.0).depth(photograph("sub/a.jpg"))
+        depth = source(tmp_path, png_scale=1.0).depth(photograph("v1.2/č d.x.jpg"))
         assert (depth == number).all(), place
         (tmp_path / place).unlink()
-
-
-@pytest.mark.parametrize("name", ["a b/c d.jpg", "dům/Žižkův dům #1.JPG", "v1.2/x.y.tif"])
-@pytest.mark.parametrize("suffix", [".npy", ".npz", ".png", ".tif"])
-def test_nested_names_with_spaces_dots_and_letters_of_all_kinds(tmp_path, name, suffix):
-    values = (100 * asymmetric_map()).astype(np.uint16)
-    stem = name.rpartition(".")[0]
-    write_map(tmp_path / f"{stem}{suffix}", values)
-    depth = source(tmp_path, png_scale=1.0).depth(photograph(name))
-    assert_array_equal(depth, values)
 
 
 def test_values_that_are_no_depth_are_unknown_and_raise_no_warning(tmp_path):
@@ -235,17 +220,6 @@ def test_map_without_depths_is_refused(tmp_path, kind, value):
         source(tmp_path, kind=kind).depth(photograph())
 
 
-def test_one_percent_of_the_map_must_be_known(tmp_path):
-    values, image = np.zeros((30, 50)), photograph(size=(100, 60))
-    values.ravel()[:15] = 2.0
-    write_map(tmp_path / "a.npy", values)
-    assert np.isfinite(source(tmp_path).depth(image)).sum() == 15
-    values[0, 0] = 0.0
-    write_map(tmp_path / "a.npy", values)
-    with pytest.raises(DepthError, match=r"0\.93 % of the values"):
-        source(tmp_path).depth(image)
-
-
 def test_require_some_needs_a_map_of_one_image(tmp_path):
     with pytest.raises(OptionError, match="no such folder"):
         source(tmp_path / "nowhere").require_some(["a.jpg"])
@@ -267,7 +241,7 @@ def world_points(depth, camera_matrix, pose):
     return (points - translation) @ rotation
 
 
-@pytest.mark.parametrize("number", range(1, 10))
+@pytest.mark.parametrize("number", [1, 5, 9])
 def test_paving_of_the_courtyard_is_the_plane_z_0_of_the_world(number):
     name = f"court_{number}.jpg"
     image = courtyard_photograph(name)
@@ -285,29 +259,3 @@ def test_paving_of_the_courtyard_is_the_plane_z_0_of_the_world(number):
     assert share_on_paving(depth) > 0.3
     # Read as distances along rays the same map is bent.
     assert share_on_paving(source(**options, kind="ray").depth(image)) < 0.02
-
-
-@pytest.mark.shared
-@pytest.mark.skipif(not MEGADEPTH.is_dir(), reason="the photographs of ../shared are not here")
-@pytest.mark.parametrize("name", ["frame_0000000305_1.jpg", "frame_0000001535_4.jpg"])
-@pytest.mark.parametrize("kind", ["z", "ray"])
-def test_megadepth_maps_of_the_paper_are_read(name, kind):
-    path = MEGADEPTH / "scene1" / "images" / name
-    camera = np.array([[1530.0, 0.0, 539.5], [0.0, 1530.0, 959.5], [0.0, 0.0, 1.0]])
-    image = Photograph(read_gray(path), name, path, camera)
-    # The folder also holds previews, scene1/<name>.jpg: they are not taken for maps.
-    folder = MEGADEPTH / "depth" / "mega_depth" / "scene1"
-    depths = source(folder, kind=kind)
-    depths.require_some([name])
-    depth = depths.depth(image)
-    stored = np.load(folder / name.replace(".jpg", ".npy"))
-    assert depth.shape == (512, 288)
-    assert np.isfinite(depth).all()
-    ratio = stored / depth
-    if kind == "z":
-        assert_array_equal(ratio, 1.0)
-    else:
-        # At the corner x = 540 / 1530 and y = 960 / 1530, less half a px of the map.
-        corner = np.sqrt(1 + (540 / 1530) ** 2 + (960 / 1530) ** 2)
-        assert_allclose(ratio[[0, 0, -1, -1], [0, -1, 0, -1]], corner, rtol=2e-3)
-        assert_allclose(ratio[255:257, 143:145], 1.0, atol=1e-5)

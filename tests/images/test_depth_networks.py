@@ -25,7 +25,7 @@ from depth_photographs import (
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import write_image
 
-from colmap_affrect.errors import DepthError, ImageError
+from colmap_affrect.errors import DepthError
 from colmap_affrect.images.depth import (
     NETWORK_IMAGE_SIZE_PX,
     DepthContext,
@@ -129,14 +129,6 @@ def test_network_stored_in_half_precision_computes_in_float32(transformers, mode
     depth = monocular(half, None).depth(COURT_1)
     assert len(np.unique(depth)) > 10_000  # float16 has 1024 steps from 1 to 2
     assert_allclose(depth, monocular(model, None).depth(COURT_1), rtol=0.05)
-
-
-@pytest.mark.long
-def test_image_without_a_file_goes_to_the_network_in_gray(model, tmp_path):
-    path = write_image(tmp_path / "gray.png", COURT_1.gray)
-    network = monocular(model, None)
-    in_memory = network.depth(replace(COURT_1, path=None))
-    assert_array_equal(in_memory, network.depth(replace(COURT_1, path=path)))
 
 
 @pytest.mark.long
@@ -250,14 +242,6 @@ def test_prediction_becomes_depth_by_its_kind(fake, config, kind, predicted, exp
     assert_allclose(network.depth(photograph()), expected, rtol=FLOAT32_RTOL)
 
 
-@pytest.mark.parametrize("config", [RELATIVE, METRIC])
-@pytest.mark.parametrize("value", [-2.0, np.nan])
-def test_prediction_without_depths_is_an_error(fake, config, value):
-    fake(np.full((4, 6), value), **config)
-    with pytest.raises(DepthError, match=r"a\.jpg: depth by some/model: 0 % of the values"):
-        monocular("some/model", None).depth(photograph())
-
-
 def test_photographs_reach_the_network_shrunk_and_as_rgb(fake, tmp_path, monkeypatch):
     fake([[1.0, 2.0]], **METRIC)
     seen = []
@@ -267,16 +251,6 @@ def test_photographs_reach_the_network_shrunk_and_as_rgb(fake, tmp_path, monkeyp
     monocular("m", None).depth(photograph(path=path))
     assert seen[0].shape == (154, NETWORK_IMAGE_SIZE_PX, 3)
     assert seen[0][0, 0].tolist() == [200, 60, 10]
-
-
-@pytest.mark.usefixtures("transformers")
-def test_photograph_that_is_gone_or_damaged_is_an_image_error(tmp_path):
-    network = monocular("m", None)
-    for name, content in (("gone.jpg", None), ("empty.jpg", b""), ("broken.jpg", b"no image")):
-        if content is not None:
-            (tmp_path / name).write_bytes(content)
-        with pytest.raises(ImageError, match=name):
-            network.depth(photograph(path=tmp_path / name))
 
 
 PREDICTION = [[5.0, 2.5, 0.5], [0.3, 0.2, 0.125]]
@@ -324,37 +298,11 @@ def test_damaged_cache_is_written_again(fake, tmp_path, damage):
     assert len(pipelines.sizes) == 2
 
 
-def test_run_killed_while_writing_leaves_no_prediction(fake, tmp_path, monkeypatch):
-    pipelines = fake(PREDICTION, **METRIC)
-
-    def half(stream, **_):
-        stream.write(b"PK half of a file")
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(np, "savez", half)
-        with pytest.raises(KeyboardInterrupt):
-            monocular("m", tmp_path).depth(COURT_1)
-    assert not (tmp_path / "court_1.jpg.npz").exists()
-    monocular("m", tmp_path).depth(COURT_1)
-    assert len(pipelines.sizes) == 2
-    assert [path.name for path in tmp_path.iterdir()] == ["court_1.jpg.npz"]
-
-
 def test_cache_that_cannot_be_written_is_a_depth_error(fake, tmp_path):
     fake(PREDICTION, **METRIC)
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(DepthError, match=r"court_1\.jpg\.npz: depth cannot be kept there"):
         monocular("m", tmp_path / "file").depth(COURT_1)
-
-
-def test_require_some_loads_the_network_once_if_any_prediction_is_missing(fake, tmp_path):
-    pipelines = fake(PREDICTION, **METRIC)
-    monocular("m", tmp_path).depth(COURT_1)
-    network = monocular("m", tmp_path)
-    network.require_some(["court_1.jpg", "court_2.jpg"])
-    network.require_some(["court_1.jpg", "court_2.jpg"])
-    assert pipelines.loaded == [("m", "cpu")] * 2
 
 
 def test_threads_share_one_network_and_take_turns(fake, tmp_path):

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from photographs_with_exif import BODY, LENS_50, write_photograph
-from PIL import ExifTags, Image, TiffImagePlugin
+from PIL import ExifTags, TiffImagePlugin
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.images.exif import CameraTags, ExifFocal, exif_focal, read_camera_tags
@@ -75,11 +75,6 @@ def test_cropped_ones_thumbnails_and_impossible_views_are_distrusted(
     found = exif_focal(tags_of(tmp_path / "a.jpg", size, {**LENS_50, **tags}))
     assert found.focal_px is None
     assert why in found.why
-
-
-def test_cropped_photographs_share_no_camera(tmp_path: Path) -> None:
-    original = {"ExifImageWidth": 4368, "ExifImageHeight": 2912}
-    assert tags_of(tmp_path / "a.jpg", (1092, 600), {**LENS_50, **original}).identity is None
 
 
 def tags(size: tuple[int, int], **values: Any) -> CameraTags:
@@ -159,18 +154,6 @@ def test_damaged_headers_never_raise(tmp_path: Path, num_bytes: int) -> None:
     found = read_camera_tags(path)
     if found:
         exif_focal(found)
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".tif", ".png", ".bmp", ".pgm"])
-def test_size_is_that_of_the_stored_pixels(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a{suffix}"
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    Image.new("L", (50, 30)).save(path, **({"exif": exif} if suffix != ".pgm" else {}))
-    found = read_camera_tags(path)
-    bitmap = pycolmap.Bitmap.read(path, as_rgb=False)
-    assert found is not None
-    assert found.size == (bitmap.width, bitmap.height) == (50, 30)
 
 
 def test_a_pipe_has_no_header_and_is_not_waited_for(tmp_path: Path) -> None:

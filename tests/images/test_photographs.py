@@ -70,22 +70,6 @@ def test_features_of_the_image_and_of_all_warps_keep_to_the_mask(photo_path: Pat
     assert (inside.rectification_ids > 0).sum() > 0.8 * len(inside)
 
 
-@pytest.mark.long
-def test_mask_is_applied_before_the_strongest_features_are_chosen(photo_path: Path) -> None:
-    mask = np.zeros(IMAGE_SIZE[::-1], bool)
-    mask[150:, 200:] = True
-    options = ExtractionOptions.from_mapping(
-        {
-            "rectifier": {"name": "asift"},
-            "features": {"max_num_features": 200, "max_num_rectified_features": 300},
-        },
-        "test",
-    )
-    features = prepare(options).extract_file(photo_path, mask=mask).features
-    assert (features.rectification_ids > 0).sum() > 280  # a few are at the mask's very edge
-    assert (features.rectification_ids == 0).sum() > 30
-
-
 def test_mask_of_a_shrunk_image_is_exact_in_its_own_pixels(photo_path: Path) -> None:
     mask = diagonal_mask()
     options = ExtractionOptions(rectifier=AsiftOptions(), max_image_size_px=131)

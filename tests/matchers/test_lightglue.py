@@ -14,12 +14,12 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from random_weights import write_comparing_lightglue
+from strategies import compose_affine
 
 from colmap_affrect.data import LocalFeatures, union
 from colmap_affrect.errors import OptionError, WeightsError
 from colmap_affrect.features.weights import WEIGHT_FILES, describe_weights
 from colmap_affrect.geometry.affine import (
-    compose_affine,
     lafs_from_keypoints,
     rotation,
     transform_frames,

@@ -75,12 +75,6 @@ def test_vector_is_that_of_a_plain_loop() -> None:
     assert_allclose(image_vector(descriptors, vocabulary), expected.ravel(), atol=1e-3)
 
 
-def test_image_without_descriptors_has_a_vector_of_zeros() -> None:
-    vocabulary = unit(np.random.default_rng(2).random((4, 8)))
-    vector = image_vector(np.zeros((0, 8), np.float32), vocabulary)
-    assert (vector.shape, vector.dtype, vector.any()) == ((32,), np.float16, False)
-
-
 def test_vocabulary_is_nearer_to_the_descriptors_than_where_it_began(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -100,12 +94,6 @@ def test_vocabulary_is_nearer_to_the_descriptors_than_where_it_began(
     assert mean_distance(words) < 0.8 * mean_distance(begin)
     again = build_vocabulary(samples, np.random.default_rng(4))
     assert np.array_equal(again, words), "the same samples and seed give the same words"
-
-
-def test_vocabulary_of_few_descriptors_is_these() -> None:
-    samples = unit(np.random.default_rng(5).random((7, SIZE)))
-    words = build_vocabulary(samples, np.random.default_rng(6))
-    assert sorted(words.tolist()) == sorted(samples.tolist())
 
 
 @pytest.mark.parametrize("at_once", [1, 3, 100])

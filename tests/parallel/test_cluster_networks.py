@@ -12,13 +12,14 @@ import torch
 from random_weights import write_comparing_lightglue
 from results import hdf5_content
 
-from colmap_affrect.errors import OptionError, StaleStoreError, WeightsError
+from colmap_affrect.errors import StaleStoreError, WeightsError
 from colmap_affrect.parallel.cluster import connected
 from colmap_affrect.parallel.executor import Executor, Threads
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context, Resources
-from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.extract import extract
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match, recorded_matching
 from colmap_affrect.stages.one_pair import CachedMatcher, Matching, iterate_matches
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
@@ -114,11 +115,3 @@ def test_workers_with_other_weights_are_refused(
     )
     with pytest.raises(WeightsError, match=r"sift_lightglue\.pth: is another file than"):
         rebuild(*given)
-
-
-def test_matcher_that_was_trained_for_other_features_is_refused() -> None:
-    with pytest.raises(OptionError, match="recipe default: matching: trained_for='aliked' takes"):
-        load_recipe("default", ["matching.name=lightglue"])
-    context = Context(Workspace(Path("nowhere")))
-    with pytest.raises(OptionError, match="takes features of rootsift, not of disk"):
-        CachedMatcher(Matching(context.features, RECIPE.matching, extractor="disk"))

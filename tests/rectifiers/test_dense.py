@@ -118,17 +118,6 @@ def test_plan_dense_shapes_skips_regions_below_the_smallest_share() -> None:
     assert (len(kept.items), len(skipped.items)) == (1, 0)
 
 
-def test_plan_dense_shapes_obeys_the_limit_on_warps() -> None:
-    rng = np.random.default_rng(4)
-    classes = [(float(t), float(a)) for t in (2.5, 5.0) for a in np.arange(8) * np.pi / 8]
-    grid = shape_grid(classes, rng.integers(0, 16, (40, 50)))
-    for limit in (0, 1, 3):
-        options = DenseShapesOptions(max_num_rectifications=limit, min_region_frac=0.0)
-        plan = plan_dense_shapes(grid, (200, 160), options)
-        assert len({(item.tilt, item.tilt_angle_rad) for item in plan.items}) == limit
-        check_invariants(plan, (200, 160))
-
-
 def test_plan_dense_shapes_does_not_let_untextured_blocks_vote_or_join() -> None:
     labels = np.zeros((10, 20), int)
     labels[:, 10:] = 1
@@ -142,36 +131,6 @@ def test_plan_dense_shapes_does_not_let_untextured_blocks_vote_or_join() -> None
     np.testing.assert_array_equal(
         image_region(plan.items[0], (80, 40)), np.kron(textured, np.ones((4, 4), bool))
     )
-
-
-def test_plan_dense_shapes_warps_scattered_parts_of_a_region_apart() -> None:
-    # Two places of the same class 20 blocks apart, and crumbs 1 block from the first.
-    labels = np.zeros((30, 60), int)
-    labels[4:14, 3:13] = 1
-    labels[4:14, 14] = 1
-    labels[10:25, 35:55] = 1
-    grid = shape_grid([(1.0, 0.0), (4.0, 0.9)], labels)
-    size = (240, 120)
-    plan = plan_dense_shapes(grid, size, DenseShapesOptions())
-    check_invariants(plan, size)
-    assert len(plan.items) == 2
-    assert {(item.tilt, item.tilt_angle_rad) for item in plan.items} == {
-        (plan.items[0].tilt, plan.items[0].tilt_angle_rad)
-    }
-    blocks = np.kron(labels == 1, np.ones((4, 4), bool))
-    left, right = sorted(plan.items, key=lambda item: item.region_origin)
-    np.testing.assert_array_equal(image_region(left, size)[:, :100], blocks[:, :100])
-    np.testing.assert_array_equal(image_region(right, size)[:, 100:], blocks[:, 100:])
-
-
-def test_plan_dense_shapes_leaves_out_parts_below_their_smallest_share() -> None:
-    labels = np.zeros((30, 60), int)
-    labels[4:24, 3:23] = 1
-    labels[10:13, 45:48] = 1  # 9 of 1800 blocks, 0.5 %
-    grid = shape_grid([(1.0, 0.0), (4.0, 0.9)], labels)
-    for min_part_frac, count in [(0.004, 2), (0.006, 1)]:
-        options = DenseShapesOptions(min_part_frac=min_part_frac)
-        assert len(plan_dense_shapes(grid, (240, 120), options).items) == count
 
 
 @pytest.mark.parametrize("size", [(80, 61), (1, 1), (90, 1), (1, 90), (7, 9)])

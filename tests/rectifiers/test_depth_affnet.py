@@ -7,7 +7,7 @@ import functools
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from planar_scenes import FixedDepth, FixedShapes, corner_room, slanted_wall
+from planar_scenes import FixedDepth, FixedShapes, corner_room
 from strategies import Array, tilt_distance
 
 from colmap_affrect.data import RectificationPlan
@@ -89,32 +89,6 @@ def test_segments_without_tilted_shapes_have_no_warps() -> None:
     assert plan_room(upright).items == ()
     assert plan_room(np.zeros((0, 4))) == RectificationPlan(ROOM.size)
     assert len(plan_room(upright, tilt_radius=1.4).items) >= 3
-
-
-def test_shapes_of_no_segment_do_not_count() -> None:
-    outside = np.array([[-40.0, -3.0], [900.0, 20.0], [20.0, 900.0], [-1.0, -1.0]])
-    assert plan_room(shapes_at(outside, 4.0, 0.5)).items == ()
-
-
-def test_warps_magnify_nothing_if_they_need_not_keep_the_area() -> None:
-    shapes = shapes_at(points_in(0), 4.0, 0.9)
-    (item,) = plan_room(shapes, area_preserving=False).items
-    (larger,) = plan_room(shapes).items
-    assert_allclose(
-        item.rectified_from_image[:2, :2],
-        rectifying_affine(item.tilt, item.tilt_angle_rad, area_preserving=False),
-    )
-    assert larger.canvas_area_px > 1.5 * item.canvas_area_px
-
-
-def test_an_image_without_planes_has_no_warps() -> None:
-    wall = slanted_wall([0.2, 0.1, -1.0])
-    sources = RectifierInputs(
-        FixedShapes(shapes_at(np.full((50, 2), 30.0), 3.0, 0.5)),
-        FixedDepth(np.full((30, 40), np.nan)),
-    )
-    plan = DepthAffNet(DepthAffNetOptions(), sources).plan(wall.photograph())
-    assert plan == RectificationPlan(wall.size)
 
 
 @pytest.mark.parametrize("missing", ["shapes", "depth"])

@@ -21,25 +21,20 @@ from planar_scenes import (
 )
 from small_scene import cached_texture
 from strategies import Array
-from synthetic import blobs
 
 from colmap_affrect.conventions import camera_matrix
 from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan
-from colmap_affrect.errors import OptionError
-from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.images.warping import warp, warp_mask
 from colmap_affrect.rectifiers.base import RectifierInputs
 from colmap_affrect.rectifiers.depth_planes import (
-    MAX_DEPTH_SIZE_PX,
     DepthPlanes,
     DepthPlanesOptions,
     PlanarSegment,
     PlaneOptions,
     planar_segments,
 )
-from colmap_affrect.rectifiers.execute import extract_rectified
 
 COURTYARD = Path(__file__).parents[2] / "sample_scenes" / "courtyard"
 
@@ -47,8 +42,6 @@ CREASE_PX = 3.0
 """Pixels of the image nearer to a crease may get the label of the other plane: two pixels of the
 depth map, which is smaller than the image."""
 
-DOT_ERROR_PX = 0.25
-"""Of SIFT on dots whose ellipses are those of the map's linear part only."""
 
 MIN_CORRELATION = 0.95
 """Of a warp and the texture rendered from the front; half a pixel of error costs more."""
@@ -169,17 +162,6 @@ def test_planar_segments_of_unknown_depth_or_a_scattered_surface_are_none() -> N
         assert planar_segments(corner_room().photograph(), depth, PlaneOptions()) == []
 
 
-@pytest.mark.long
-def test_planar_segments_shrink_depth_maps_that_are_too_fine() -> None:
-    # In windows of the full size, noise of 0.2 % would hide the plane.
-    wall = slanted_wall([0.4, 0.2, -0.9])
-    depth, _ = wall.depth((2 * MAX_DEPTH_SIZE_PX, MAX_DEPTH_SIZE_PX))
-    depth *= 1.0 + 2e-3 * np.random.default_rng(0).standard_normal(depth.shape)
-    (segment,) = planar_segments(wall.photograph(), depth, PlaneOptions())
-    assert angles_deg(segment.normal, wall.normals[0]) < 0.5
-    assert segment.region.area_px > 0.98 * 400 * 300
-
-
 def test_plan_keeps_features_of_the_photograph_everywhere_or_outside() -> None:
     wall = slanted_wall([0.5, 0.1, -0.85])
     depth, _ = wall.depth((200, 150))
@@ -192,20 +174,6 @@ def test_plan_keeps_features_of_the_photograph_everywhere_or_outside() -> None:
     np.testing.assert_array_equal(
         outside.original_region, np.broadcast_to(np.arange(400) >= 240, (300, 400))
     )
-
-
-def test_plan_without_segments_has_no_warps_and_keeps_all_features() -> None:
-    room = corner_room()
-    depth = np.full((80, 90), np.nan)
-    plan = plan_planes(room.photograph(), depth, keep_original="outside")
-    assert plan.items == ()
-    assert plan.original_region.all()
-    assert plan_planes(room.photograph(), depth) == RectificationPlan(room.size)
-
-
-def test_depth_planes_without_depth_is_an_option_error() -> None:
-    with pytest.raises(OptionError, match="depth"):
-        DepthPlanes(DepthPlanesOptions(), RectifierInputs())
 
 
 def canvas_in_plane(item: Rectification, room: Room) -> tuple[Array, Array]:
@@ -241,32 +209,6 @@ def test_warp_of_a_slanted_wall_is_its_frontal_view(normal: tuple[float, float, 
     # What the warp shows is the texture of the plane.
     frontal = look_up(pattern, *np.moveaxis(120.0 * shown, -1, 0))
     assert np.corrcoef(warp(image, item)[inside], frontal[inside])[0, 1] > MIN_CORRELATION
-
-
-@pytest.mark.parametrize("normal", NORMALS[:3])
-def test_features_of_a_slanted_wall_lie_where_its_dots_are(
-    normal: tuple[float, float, float],
-) -> None:
-    room = slanted_wall(normal)
-    depth, _ = room.depth((200, 150))
-    dots = np.array([[150.0, 90.0], [220.0, 160.0], [260.0, 110.0], [180.0, 210.0]])
-    (item,) = plan_planes(room.photograph(), depth).items
-    # Dots that are round in the warp, drawn in the image as the ellipses that they are there.
-    frames = np.array([jacobian(item, dot) for dot in dots])
-    image = blobs(room.size, dots, 4.6 * np.linalg.inv(frames), amplitude=150)
-    plan = RectificationPlan(room.size, (item,))
-    features = extract_rectified(image, plan, RootSift(SiftOptions()), 5000, with_original=False)
-    distances = np.linalg.norm(features.keypoints[:, None] - dots[None], axis=2).min(axis=0)
-    assert (features.rectification_ids == 1).all()
-    assert distances.max() < DOT_ERROR_PX
-
-
-def jacobian(item: Rectification, point: Array) -> Array:
-    """Local linear part of a map, by finite differences."""
-    step = 1e-4
-    moved = point + step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    right, left, down, up = project(item.rectified_from_image, moved)
-    return np.stack([right - left, down - up], axis=1) / (2 * step)
 
 
 def courtyard_view(name: str) -> tuple[Photograph, Array, Array]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -13,23 +12,18 @@ from synthetic import blobs, texture
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.data import (
-    GrayImage,
     LocalFeatures,
     Mask,
     Rectification,
     RectificationPlan,
 )
-from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import (
     ellipse_extents,
     fit_canvas,
     lafs_from_keypoints,
-    project,
     rectifying_affine,
 )
-from colmap_affrect.matchers.nearest import NearestOptions, match_features, matchable
-from colmap_affrect.rectifiers.dense import DenseShapesOptions, plan_dense_shapes
 from colmap_affrect.rectifiers.execute import extract_rectified, found_again
 
 KEYPOINT_ERROR_PX = 0.1
@@ -134,15 +128,6 @@ def test_extract_rectified_keeps_centers_in_the_region_of_their_warp() -> None:
     assert upper_right[y[ids == 0], x[ids == 0]].any()
 
 
-def test_extract_rectified_without_warps_returns_the_features_of_the_image() -> None:
-    image = texture((200, 150), seed=23)
-    expected = PROFILE.detect((image, None))
-    actual = extract_rectified(image, RectificationPlan((200, 150), ()), PROFILE, 5000)
-    np.testing.assert_array_equal(actual.lafs, expected.lafs)
-    np.testing.assert_array_equal(actual.descriptors, expected.descriptors)
-    assert (actual.rectification_ids == 0).all()
-
-
 @pytest.mark.long
 def test_extract_rectified_keeps_the_strongest_features_of_all_warps() -> None:
     image = texture(SIZE, seed=24)
@@ -219,94 +204,3 @@ def test_found_again_needs_the_same_place_and_scale() -> None:
     # Radius half a sigma: 2 px, and 1 px for the last; scales within 2^(1/3) = 1.26.
     expected = [True, False, False, True, True, False]
     assert found_again(original, rectified).tolist() == expected
-
-
-def test_found_again_uses_the_geometric_mean_of_elliptic_frames() -> None:
-    original = features_at([(60, 40)], [4.0])
-    rectified = features_at([(60.5, 40)], [4.0])
-    lafs = rectified.lafs.copy()
-    lafs[0, :, :2] = MEASUREMENT_SIGMAS * np.diag([8.0, 2.0])
-    assert found_again(original, rectified.with_frames(lafs)).tolist() == [True]
-
-
-@pytest.mark.parametrize(("count1", "count2"), [(0, 0), (0, 3), (3, 0)])
-def test_found_again_without_features_finds_none(count1: int, count2: int) -> None:
-    first, second = (features_at([(9.0, 9.0)] * n, [3.0] * n) for n in (count1, count2))
-    assert found_again(first, second).tolist() == [False] * count1
-
-
-def oblique_view(
-    frontal: GrayImage, tilt_deg: float, size: tuple[int, int]
-) -> tuple[GrayImage, Array]:
-    """Photograph a picture that is turned about its vertical axis; and view_from_frontal."""
-    distance = 1400.0
-    angle = np.deg2rad(tilt_deg)
-    to_center, from_center = np.eye(3), np.eye(3)
-    to_center[:2, 2] = -(np.array(frontal.shape[::-1]) - 1) / 2
-    from_center[:2, 2] = (np.array(size) - 1) / 2
-    turn = np.array(
-        [
-            [distance * np.cos(angle), 0.0, 0.0],
-            [0.0, distance, 0.0],
-            [np.sin(angle), 0.0, distance],
-        ]
-    )
-    view_from_frontal = from_center @ turn @ to_center
-    factor = 4
-    enlarged = np.diag([factor, factor, 1.0])
-    enlarged[:2, 2] = (factor - 1) / 2
-    large = cv2.warpPerspective(
-        frontal,
-        enlarged @ view_from_frontal,
-        (factor * size[0], factor * size[1]),
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=128,
-    )
-    return cv2.resize(large, size, interpolation=cv2.INTER_AREA), view_from_frontal
-
-
-def rectified_features(image: GrayImage) -> LocalFeatures:
-    """Features with the default rectifier."""
-    size = (image.shape[1], image.shape[0])
-    grid = SecondMoment(SecondMomentOptions()).grid(image)
-    plan = plan_dense_shapes(grid, size, DenseShapesOptions())
-    return extract_rectified(image, plan, PROFILE, SiftOptions().max_num_rectified_features)
-
-
-def correct_matches(first: LocalFeatures, second: LocalFeatures, homography: Array) -> int:
-    """Number of matches whose second keypoint is within 3 px of its true place."""
-    options = NearestOptions()
-    matches = match_features(
-        matchable(first.descriptors, first.keypoints, options),
-        matchable(second.descriptors, second.keypoints, options),
-        options,
-    ).indices
-    predicted = project(homography, first.keypoints[matches[:, 0]])
-    errors = np.linalg.norm(predicted - second.keypoints[matches[:, 1]], axis=1)
-    return int(np.count_nonzero(errors < 3.0))
-
-
-@pytest.mark.parametrize(("tilt_deg", "min_gain"), [(60.0, 700), (75.0, 80)])
-def test_rectified_features_of_an_oblique_plane_match_more_often_than_plain_ones(
-    tilt_deg: float, min_gain: int
-) -> None:
-    frontal = texture((480, 400), seed=30, finest_sigma_px=2.0)
-    oblique, homography = oblique_view(frontal, tilt_deg, (300, 400))
-    reference = PROFILE.detect((frontal, None))
-    plain = correct_matches(reference, PROFILE.detect((oblique, None)), homography)
-    rectified = correct_matches(reference, rectified_features(oblique), homography)
-    assert rectified > 3 * plain
-    assert rectified - plain > min_gain
-
-
-def test_extract_rectified_uses_regions_that_are_cropped_to_a_part_of_the_image() -> None:
-    image = texture(SIZE, seed=27)
-    region = np.zeros(SIZE[::-1], bool)
-    region[90:230, 150:330] = True
-    region[90:150, 150:200] = False
-    whole = one_warp(2.5, 0.6, SIZE, region)
-    cropped = replace(whole.items[0], region=region[90:230, 150:330], region_origin=(150, 90))
-    expected = extract_rectified(image, whole, PROFILE, 5000)
-    actual = extract_rectified(image, RectificationPlan(SIZE, (cropped,)), PROFILE, 5000)
-    assert len(of_warps(expected)) > 30
-    np.testing.assert_array_equal(actual.lafs, expected.lafs)

@@ -94,11 +94,3 @@ def test_affnet_shapes_warps_by_the_classes_that_are_there() -> None:
     )
     assert labels.tolist() == [0, 1, UNCOVERED_LABEL]
     assert len(classes) == 2
-
-
-@pytest.mark.parametrize(("covered_frac", "expected"), [(0.4, 0), (0.8, 1), (0.95, 2), (1.0, 3)])
-def test_cover_stops_at_the_share_that_is_asked_for(covered_frac, expected) -> None:
-    shapes = fixed_shapes([(1.0, 0.0), (3.0, 0.7), (4.0, 2.2), (4.0, 1.4)], [60, 25, 10, 5])
-    options = AffNetShapesOptions(covered_frac=covered_frac)
-    plan = AffNetShapes(options, RectifierInputs(shapes)).plan(photograph_of(texture(SIZE, 1)))
-    assert len(plan.items) == expected

@@ -41,7 +41,6 @@ from colmap_affrect.rectifiers.base import (
 from colmap_affrect.rectifiers.dense import DenseShapesOptions
 from colmap_affrect.rectifiers.depth_planes import DepthPlanesOptions
 from colmap_affrect.rectifiers.whole_image import (
-    AffNetShapesOptions,
     AsiftOptions,
     IdentityOptions,
     plan_whole_image,
@@ -269,17 +268,6 @@ def test_sheet_of_plan(kind: str, extractor: GridFeatures, tmp_path: Path, photo
     (level,), _ = inspect(extractor_of(PLANS[kind], extractor=extractor), photo, tmp_path / "out")
     assert (level["totals"]["keypoints"] == 0) == (extractor is NO_FEATURES)
     assert len(level["warps"]) == len(PLANS[kind].items)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("options", [DenseShapesOptions(), AffNetShapesOptions()])
-def test_sheet_of_a_rectifier_that_reads_shapes(
-    options: RectifierOptions, tmp_path: Path, photo: Path
-) -> None:
-    write_image(photo, cv2.resize(texture((100, 200), 3), SIZE))
-    extractor = extractor_with(options, RECTIFIERS.make(options, SHAPES))
-    (level,), _ = inspect(extractor, photo, tmp_path / "out")
-    assert level["warps"]
 
 
 @pytest.mark.parametrize("size", [(1, 1), (20, 31), (600, 33)])

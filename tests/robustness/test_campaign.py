@@ -48,7 +48,7 @@ from attacks import (
     tree,
 )
 from command import FAST, Ended
-from damaged import HARMS, MEANT, STATEMENTS, damage, execute, rows
+from damaged import MEANT, STATEMENTS, damage, execute, rows
 from results import database_content, results
 
 pytestmark = pytest.mark.long
@@ -353,18 +353,6 @@ def test_meant_edit_is_kept_and_said(
         warnings = [line for line in end.stderr if line.lower().startswith("warning")]
         assert any("database" in line for line in warnings), f"kept silently: {end.stderr}"
     else:
-        assert_right("run", out, tmp_path, expected)
-
-
-@trials(10)
-def test_damaged_database_is_made_again_or_refused(
-    scene: Scene, expected: dict[str, Any], tmp_path: Path, number: int
-) -> None:
-    chance, out = random.Random(f"database {number}"), scene.copy(tmp_path)
-    tell(damage(out / "database.db", chance, [HARMS[number % len(HARMS)]]))
-    end = ended(*scene.run(out))
-    assert_clear(end, 0, 1, 2)
-    if end.code == 0:
         assert_right("run", out, tmp_path, expected)
 
 

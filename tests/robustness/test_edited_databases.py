@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import random
 import shutil
-import sqlite3
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import Call, on_photographs
-from damaged import bits, cut, damage, noise, zeros
+from damaged import bits, cut, damage, execute, noise, zeros
 from results import database_content, model_names, results
 from small_scene import write_photographs
 
@@ -65,13 +63,6 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def out(finished: Path, tmp_path: Path) -> Path:
     """A copy of the output folder, to be changed."""
     return Path(shutil.copytree(finished / "out", tmp_path / "out"))
-
-
-def execute(path: Path, statement: str) -> None:
-    with closing(sqlite3.connect(path)) as connection:
-        connection.execute("PRAGMA foreign_keys = OFF")
-        connection.execute(statement)
-        connection.commit()
 
 
 def again(call: Call, finished: Path, out: Path, command: str) -> list[str]:

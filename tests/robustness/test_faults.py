@@ -215,23 +215,6 @@ def test_model_that_was_damaged_later_is_named(disturbed: Disturbed) -> None:
     assert results(disturbed.out) == disturbed.undisturbed.results
 
 
-def test_hdf5_file_that_was_damaged_later_is_named(disturbed: Disturbed) -> None:
-    disturbed.begin_without("database.db")
-    features = disturbed.workspace.features
-    content, num_refused = features.read_bytes(), 0
-    for start in range(0, 6000, 200):
-        damaged = bytearray(content)
-        damaged[start : start + 64] = b"\xa5" * 64
-        features.write_bytes(damaged)
-        ended = disturbed.call("pairs", "--output-path", disturbed.out, "-q")
-        if ended.code:
-            num_refused += 1
-            (line,) = ended.stderr
-            assert line.startswith(f"error: {features}: ")
-            assert "--overwrite" in line or "another --output-path" in line
-    assert num_refused > 2
-
-
 @pytest.mark.skipif(os.geteuid() == 0, reason="permissions do not stop root")
 def test_output_folder_that_may_not_be_written_is_refused(disturbed: Disturbed) -> None:
     disturbed.out.mkdir(mode=0o555)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import FAST, Call
+from damaged import Statement, execute
 from small_scene import write_photographs
 
 from colmap_affrect.colmap import pycolmap
@@ -21,35 +22,15 @@ from colmap_affrect.interop.pycolmap_api import extract_features
 from colmap_affrect.progress import SILENT
 
 ROWS = [
-    (
-        "UPDATE images SET camera_id = 999 WHERE image_id = 1",
-        "images whose camera does not exist (",
-    ),
-    (
-        "UPDATE images SET name = x'ff00fe' WHERE image_id = 1",
-        "with one that is not UTF-8 (image 1",
-    ),
-    ("UPDATE keypoints SET rows = 100000 WHERE image_id = 1", "less data than rows and columns ("),
+    ("UPDATE images SET camera_id = 999 WHERE image_id = 1", "images whose camera does not exist"),
     ("UPDATE keypoints SET rows = -1 WHERE image_id = 1", "less data than rows and columns ("),
-    ("UPDATE keypoints SET data = substr(data, 1, 100)", "less data than rows and columns ("),
-    ("UPDATE matches SET rows = 100000", "less data than rows and 2 columns ("),
-    ("UPDATE matches SET rows = -1", "less data than rows and 2 columns ("),
-    ("UPDATE matches SET data = substr(data, 1, 9)", "less data than rows and 2 columns ("),
     ("UPDATE matches SET data = x'ffffffffffffffff', rows = 1", "at which COLMAP crashes"),
-    ("UPDATE cameras SET model = 12345 WHERE camera_id = 1", "(camera 1: model 12345)"),
-    ("UPDATE cameras SET width = 9223372036854775807", "of a size that no photograph has"),
     ("UPDATE cameras SET width = 9223372036854775808.0", "of a size that no photograph has"),
-    ("UPDATE cameras SET params = x'00'", "are more or fewer than their model has"),
-    ("UPDATE cameras SET params = ?", "or not finite numbers (camera 1, camera 2)"),
     ("UPDATE frames SET rig_id = 99", "rows of rigs and frames that belong to nothing"),
-    ("UPDATE two_view_geometries SET F = x'00'", "matrices or cameras have more or less data"),
-    ("UPDATE two_view_geometries SET camera2 = x'01'", "(camera2 of pair_id "),
     ("UPDATE two_view_geometries SET qvec = zeroblob(32), tvec = NULL", "(qvec and tvec of pair"),
     ("UPDATE cameras SET width = 'wide'", "damaged"),
 ]
-"""What is done to a database, and what is said of it."""
-
-NOT_NUMBERS = np.full(4, np.nan).tobytes()
+"""What is done to a database, and what is said of it; more kinds are in the tests of checks."""
 
 
 @pytest.fixture(scope="module")
@@ -73,14 +54,10 @@ def num_errors(path: Path) -> int:
     return findings.diagnosis().num_errors
 
 
-def changed(healthy: Path, path: Path, statement: str, value: bytes = NOT_NUMBERS) -> Path:
+def changed(healthy: Path, path: Path, statement: Statement) -> Path:
     """Make a copy on which a statement was executed."""
     shutil.copy(healthy, path)
-    values = [value] if "?" in statement else []
-    with closing(sqlite3.connect(path)) as connection:
-        connection.execute("PRAGMA foreign_keys = OFF")
-        connection.execute(statement, values)
-        connection.commit()
+    execute(path, statement)
     return path
 
 
@@ -112,7 +89,7 @@ def test_panoramas_are_refused_before_anything_is_recorded(
 ) -> None:
     statement = f"UPDATE cameras SET model = {PANORAMA}, params = ? WHERE camera_id = 2"
     params = np.array([320.0, 240.0]).tobytes()
-    path = changed(healthy, tmp_path / "any.db", statement, params)
+    path = changed(healthy, tmp_path / "any.db", (statement, [params]))
     given = ["--output-path", tmp_path / "out", "--image-path", healthy.parent / "photos"]
     for command in (["extract", *given], ["run", *given], ["map", *given[:2]]):
         ended = call(*command, "-q", "--from-database", path)
@@ -128,7 +105,7 @@ def test_panoramas_are_refused_before_anything_is_recorded(
     assert call("extract", "-q", *given, "--from-database", healthy, *FAST[:2]).code == 0
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_damaged_pages_are_one_line(healthy: Path, tmp_path: Path, call: Call, seed: int) -> None:
     rng = np.random.default_rng(seed)
     data = bytearray(healthy.read_bytes())

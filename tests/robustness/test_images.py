@@ -18,7 +18,7 @@ import PIL.Image
 import pytest
 from command import CAMERA, FAST, Ended, run_in_process_of_its_own
 from numpy.testing import assert_array_equal
-from results import database_content
+from results import database_content, state
 from small_scene import IMAGE_SIZE, NAMES, photograph, write_photographs
 from synthetic import jpeg_with_orientation, write_image
 
@@ -67,14 +67,6 @@ def write_bad_images(folder: Path) -> None:
     photo.save(folder / "x.webp")
     photo.save(folder / "side" / "y.WebP", format="webp")
     photo.save(folder / "z.gif")
-
-
-def state(folder: Path) -> dict[str, tuple[bytes, int]]:
-    """Content and time of all files and folders of a tree."""
-    return {
-        str(path): (path.read_bytes() if path.is_file() else b"", path.lstat().st_mtime_ns)
-        for path in [folder, *folder.rglob("*")]
-    }
 
 
 @dataclass(frozen=True)
@@ -285,14 +277,6 @@ def test_same_names_in_folders_are_different_images(tmp_path, run_images) -> Non
 
 
 @pytest.mark.long
-def test_same_photograph_twice_registers_both(trio, run_images) -> None:
-    (trio / "copy.png").write_bytes((trio / "a.png").read_bytes())
-    ended = run_images(trio)
-    assert ended.code == 0, ended.stderr
-    assert ended.report["registered_names"] == sorted([*TRIO, "copy.png"])
-
-
-@pytest.mark.long
 def test_names_of_all_kinds_go_through(tmp_path, run_images, call) -> None:
     accented = "ž é.png"
     names = [
@@ -331,14 +315,6 @@ def test_name_that_lists_cannot_hold_is_left_out(tmp_path, character) -> None:
     (told,) = left_out(tmp_path).values()
     assert f"such as a\\u{ord(character):04x}b.png" in told
     assert "rename it" in told
-
-
-def test_run_goes_on_without_a_name_that_lists_cannot_hold(trio, call, tmp_path) -> None:
-    (trio / "a\nb.png").write_bytes((trio / "a.png").read_bytes())
-    ended = call("extract", "--image-path", trio, "--output-path", tmp_path / "out", *FAST)
-    assert ended.code == 0
-    assert any("such as a\\u000ab.png" in line for line in ended.stderr)
-    assert "extract: 3 done" in ended.stdout
 
 
 def test_file_that_became_a_folder_of_images(trio, call, tmp_path) -> None:

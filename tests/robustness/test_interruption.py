@@ -15,8 +15,7 @@ from typing import Any
 
 import pytest
 from command import FAST, run_in_process_of_its_own, start
-from ended import end_again_and_again
-from results import Undisturbed, results, run_arguments
+from results import Undisturbed, end_again_and_again, results, run_arguments
 
 
 def finish(photos: Path, out: Path, options: Sequence[str]) -> dict[str, Any]:

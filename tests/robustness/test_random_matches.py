@@ -9,13 +9,7 @@ import pytest
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database, write_keypoints, write_matches
-from colmap_affrect.colmap.verification import (
-    PairVerifier,
-    VerificationOptions,
-    verified_pairs,
-    verify,
-)
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
 from colmap_affrect.geometry.affine import rotation
 
 SIZE = (1600, 1200)
@@ -66,15 +60,3 @@ def test_random_matches_are_accepted_by_colmaps_default(tmp_path: Path) -> None:
     options = pycolmap.TwoViewGeometryOptions(ransac=dict(random_seed=1))
     pycolmap.geometric_verification(path, two_view_geometry_options=options)
     assert len(verified_pairs(path, 1)) == 1
-
-
-def test_random_matches_are_no_inliers_for_escalation(tmp_path: Path) -> None:
-    random_pairs(tmp_path / "database.db", 1000, 1, prior=False)
-    with open_database(tmp_path / "database.db") as database:
-        keypoints = [database.read_keypoints(i) for i in (1, 2)]
-        indices = database.read_matches(1, 2)
-    verifier = PairVerifier(tmp_path / "database.db", VerificationOptions())
-    frames = [np.tile(MEASUREMENT_SIGMAS * np.eye(2, 3), (1000, 1, 1)) for _ in keypoints]
-    for lafs, points in zip(frames, keypoints, strict=True):
-        lafs[:, :, 2] = points[:, :2] - 0.5
-    assert not len(verifier.inliers(("1.png", "2.png"), (frames[0], frames[1]), indices))

@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import pytest
 from command import FAST, Call
+from results import state
 from small_scene import write_photographs
 
 import colmap_affrect
@@ -28,15 +29,6 @@ def test_no_source_can_load_code_with_data() -> None:
         # Workers unpickle what the command that leads them sends, and nothing that a file holds.
         unpickles = path.name in ("cluster.py", "worker.py")
         assert unpickles or not re.search("noqa.*S(102|30[127]|60[245])", source)
-
-
-def state(folder: Path, *, without: Path) -> dict[str, tuple[bytes, int]]:
-    """Content and time of all files and folders of a tree but for one of its folders."""
-    return {
-        str(path): (path.read_bytes() if path.is_file() else b"", path.lstat().st_mtime_ns)
-        for path in folder.rglob("*")
-        if path != without and without not in path.parents
-    }
 
 
 @pytest.mark.long

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import shutil
 from pathlib import Path
@@ -18,7 +17,6 @@ from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, nearest_positions, open_database
 from colmap_affrect.errors import DatabaseError, OptionError
-from colmap_affrect.pairs import retrieval as pair_selection
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.project.report import EXIT_INTERRUPTED
 from colmap_affrect.project.workspace import Workspace
@@ -218,25 +216,3 @@ def test_many_images_get_a_hint(
 def test_wrong_options_are_refused(values: dict[str, object], named: str) -> None:
     with pytest.raises(OptionError, match=named):
         PairOptions.from_mapping(values, "pairs")
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 5, 11])
-def test_blocks_hold_every_pair_once(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pair_selection, "IMAGES_AT_ONCE", 5)
-    pairs = list(pair_selection.in_blocks(count))
-    assert sorted(pairs) == list(itertools.combinations(range(count), 2))
-
-
-def test_blocks_need_few_images_to_be_read_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pair_selection, "IMAGES_AT_ONCE", 5)
-
-    def num_read(pairs: list[tuple[int, int]]) -> int:
-        kept: list[int] = []
-        count = 0
-        for index in itertools.chain.from_iterable(pairs):
-            count += index not in kept
-            kept = [index, *(other for other in kept if other != index)][:10]
-        return count
-
-    pairs = list(pair_selection.in_blocks(40))
-    assert num_read(pairs) <= 8 * 9 // 2 * 10 < num_read(sorted(pairs)) // 2

@@ -1,0 +1,145 @@
+"""Bundle adjustment that knows what is known of the cameras.
+
+It minimises robust reprojection errors and, of each camera that is not held, how far focal length
+and distortion are from what is known of them beforehand. COLMAP's own adjustment has no such
+priors: where few points are seen by many images, its focal lengths run away.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import TRUSTED, CameraRecord
+from colmap_affrect.errors import MappingError
+
+USUAL_FOCAL = 1.15  # longer sides: the median of usual lenses, which are of 25 to 70 mm on film
+USUAL_SIGMA = 0.4  # deviation of the logarithm of a focal length of which nothing is known
+EXIF_SIGMA = 0.08  # the same of one by EXIF: rounded, and of another distance of focus
+DISTORTION_SIGMA = 0.07  # of the coefficients of a lens that is no fisheye
+UNKNOWN_SIGMA = 1e6  # of parameters that have no prior
+DENSE_LIMIT = 60  # images up to which Ceres' dense solver is the faster one
+MIN_LONG_TRACKS = 100  # of three images, that each image needs to do without tracks of two
+FAST, FINAL = 15, 300
+"""Iterations of adjustments on the way, which are stopped early, and of the last ones."""
+
+
+@dataclass(frozen=True)
+class FocalPrior:
+    """What is known of a focal length.
+
+    Attributes:
+        focal_px: its median.
+        sigma: standard deviation of its logarithm; 0 where it is given and held.
+    """
+
+    focal_px: float
+    sigma: float
+
+    @classmethod
+    def of(cls, camera: pycolmap.Camera, record: CameraRecord | None) -> "FocalPrior":
+        """Return what is known of a camera of a database, by the record of it if there is one."""
+        focal_px = float(camera.mean_focal_length())
+        if record and "focal" in record.given:
+            return cls(focal_px, 0.0)
+        is_known = record.source in TRUSTED if record else camera.has_prior_focal_length
+        if is_known:
+            return cls(focal_px, EXIF_SIGMA)
+        return cls(USUAL_FOCAL * max(camera.width, camera.height), USUAL_SIGMA)
+
+    def cost(self, focal_px: float) -> float:
+        """Return how much a focal length costs, in nats."""
+        if not self.sigma:
+            return 0.0
+        return 0.5 * (math.log(max(focal_px, 1e-9) / self.focal_px) / self.sigma) ** 2
+
+
+@dataclass(frozen=True)
+class Adjuster:
+    """Adjusts models.
+
+    Attributes:
+        priors: of the focal lengths, by camera id.
+        noise_px: standard deviation of the keypoints, the scale of the robust loss.
+        constant: ids of the cameras of which nothing is refined.
+    """
+
+    priors: Mapping[int, FocalPrior]
+    noise_px: float
+    constant: frozenset[int]
+
+    def adjust(
+        self,
+        model: pycolmap.Reconstruction,
+        max_iterations: int,
+        image_ids: Iterable[int] | None = None,
+    ) -> None:
+        """Adjust poses, points and cameras in place.
+
+        Of some images only, the others stay, and so do the cameras that they share.
+        """
+        pyceres = _pyceres()
+        options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+        options.min_track_length = 3 if has_long_tracks(model) else 2
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = self.noise_px
+        config = pycolmap.BundleAdjustmentConfig()
+        images = sorted(model.reg_image_ids() if image_ids is None else set(image_ids))
+        for image_id in images:
+            config.add_image(image_id)
+        used = {model.images[image_id].camera_id for image_id in images}
+        others = set(model.reg_image_ids()) - set(images)
+        held = {model.images[image_id].camera_id for image_id in others} & used
+        held |= {key for key in used if key in self.constant or not self.priors[key].sigma}
+        for key in sorted(held):
+            config.set_constant_cam_intrinsics(key)
+        if image_ids is None:
+            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
+        for key in sorted(used - held):
+            self._add_prior(problem, model.cameras[key])
+        solver = pyceres.SolverOptions()
+        solver.max_num_iterations, solver.num_threads = max_iterations, 1
+        solver.function_tolerance = 1e-5 if max_iterations <= FAST else 1e-7
+        kinds = pyceres.LinearSolverType
+        is_small = len(images) <= DENSE_LIMIT
+        solver.linear_solver_type = kinds.DENSE_SCHUR if is_small else kinds.SPARSE_SCHUR
+        pyceres.solve(solver, problem, pyceres.SolverSummary())
+        model.update_point_3d_errors()
+
+    def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:
+        if not problem.has_parameter_block(camera.params):
+            return
+        prior = self.priors[camera.camera_id]
+        focal, extra = list(camera.focal_length_idxs()), list(camera.extra_params_idxs())
+        mean, sigma = camera.params.copy(), np.full(len(camera.params), UNKNOWN_SIGMA)
+        mean[focal], sigma[focal] = prior.focal_px, prior.sigma * prior.focal_px
+        mean[extra], sigma[extra] = 0.0, DISTORTION_SIGMA
+        # Reprojection errors are in px, priors in units of their deviation times the noise.
+        covariance = np.diag((sigma / self.noise_px) ** 2)
+        normal = _pyceres().factors.NormalPrior(mean, covariance)
+        problem.add_residual_block(normal, None, [camera.params])
+
+
+def _pyceres() -> Any:
+    try:
+        import pyceres
+    except ImportError as error:
+        raise MappingError(
+            f"the mapper 'estimate' needs pyceres ({error}): pip install pyceres"
+        ) from error
+    return pyceres
+
+
+def has_long_tracks(model: pycolmap.Reconstruction) -> bool:
+    """Tell whether each image sees enough points of three images to do without those of two."""
+    counts = dict.fromkeys(model.reg_image_ids(), 0)
+    for point in model.points3D.values():
+        elements = point.track.elements
+        if len(elements) > 2:
+            for element in elements:
+                counts[element.image_id] += 1
+    return min(counts.values(), default=0) >= MIN_LONG_TRACKS

@@ -1,0 +1,212 @@
+"""Mapping as one estimate: priors of focal lengths, evidence, models."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mapping_tasks import WHOLE, task_with_given_cameras
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.mappers import adjustment
+from colmap_affrect.mappers.adjustment import (
+    EXIF_SIGMA,
+    FINAL,
+    USUAL_FOCAL,
+    USUAL_SIGMA,
+    Adjuster,
+    FocalPrior,
+)
+from colmap_affrect.mappers.attempts import map_database
+from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.mappers.evidence import Evidence, pair_evidence
+from colmap_affrect.mappers.pair_graph import PairGraph
+
+TRUE_FOCAL, SIZE, NUM_IMAGES = 1280.0, (1024, 768), 4
+NOISE_PX = 0.5
+UNKNOWN = CameraRecord(("a",), "guess", 1000.0, 500.0, 2000.0, size=SIZE)
+Scene = tuple[Path, pycolmap.Reconstruction]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """A verified database of images with a camera each, and the truth."""
+    path = tmp_path_factory.mktemp("scene") / "database.db"
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=NUM_IMAGES, num_frames_per_rig=1, num_points3D=150
+    )
+    pycolmap.set_random_seed(3)
+    with open_database(path) as database:
+        truth = pycolmap.synthesize_dataset(options, database)
+        noise = pycolmap.SyntheticNoiseOptions(point2D_stddev=NOISE_PX)
+        pycolmap.synthesize_noise(noise, truth, database)
+    return path, truth
+
+
+@pytest.fixture
+def model(scene: Scene) -> pycolmap.Reconstruction:
+    return pycolmap.Reconstruction(scene[1])
+
+
+def task_of(scene: Scene, record: CameraRecord) -> MappingTask:
+    cameras = {key: replace(record) for key in scene[1].cameras}
+    return MappingTask(scene[0], None, cameras=cameras)
+
+
+def mapper_of(**options: Any) -> Any:
+    return MAPPERS.make(MAPPERS.options({"name": "estimate", **options}))
+
+
+def focals(model: pycolmap.Reconstruction) -> list[float]:
+    return [camera.mean_focal_length() for camera in model.cameras.values()]
+
+
+def adjuster(
+    model: pycolmap.Reconstruction, prior: FocalPrior, noise_px: float = NOISE_PX
+) -> Adjuster:
+    return Adjuster(dict.fromkeys(model.cameras, prior), noise_px, frozenset())
+
+
+@pytest.mark.parametrize(
+    ("record", "focal_px", "sigma"),
+    [
+        (WHOLE, TRUE_FOCAL, 0.0),
+        (replace(UNKNOWN, source="exif"), TRUE_FOCAL, EXIF_SIGMA),
+        (UNKNOWN, USUAL_FOCAL * SIZE[0], USUAL_SIGMA),
+        (None, USUAL_FOCAL * SIZE[0], USUAL_SIGMA),
+    ],
+)
+def test_what_is_known_of_a_focal_length(
+    record: CameraRecord | None, focal_px: float, sigma: float
+) -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", TRUE_FOCAL, *SIZE)
+    assert FocalPrior.of(camera, record) == FocalPrior(focal_px, sigma)
+
+
+def test_a_prior_costs_by_its_deviation_and_nothing_where_it_is_held() -> None:
+    prior = FocalPrior(1000.0, 0.2)
+    assert prior.cost(1000.0) == 0.0
+    assert prior.cost(1000.0 * math.exp(0.4)) == pytest.approx(2.0)
+    assert prior.cost(1000.0 * math.exp(-0.4)) == pytest.approx(2.0)
+    assert FocalPrior(1000.0, 0.0).cost(2000.0) == 0.0
+
+
+def test_adjustment_finds_focal_lengths_that_points_know(model: pycolmap.Reconstruction) -> None:
+    for camera in model.cameras.values():
+        camera.params = camera.params * np.where(np.arange(len(camera.params)) == 0, 1.1, 1.0)
+    adjuster(model, FocalPrior(USUAL_FOCAL * SIZE[0], USUAL_SIGMA)).adjust(model, FINAL)
+    assert focals(model) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.02)
+
+
+def test_noisier_keypoints_leave_focal_lengths_nearer_to_the_prior(
+    model: pycolmap.Reconstruction,
+) -> None:
+    prior = FocalPrior(0.8 * TRUE_FOCAL, 0.05)
+    exact, noisy = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
+    adjuster(exact, prior, 0.4).adjust(exact, FINAL)
+    adjuster(noisy, prior, 3.0).adjust(noisy, FINAL)
+    assert np.mean(focals(noisy)) < np.mean(focals(exact)) - 0.01 * TRUE_FOCAL
+
+
+def test_given_cameras_stay_to_the_bit(model: pycolmap.Reconstruction) -> None:
+    for camera in model.cameras.values():
+        camera.params = camera.params * np.where(np.arange(len(camera.params)) == 0, 1.1, 1.0)
+    before = [camera.params.tolist() for camera in model.cameras.values()]
+    adjuster(model, FocalPrior(1.1 * TRUE_FOCAL, 0.0)).adjust(model, FINAL)
+    assert [camera.params.tolist() for camera in model.cameras.values()] == before
+
+
+def test_an_adjustment_of_some_images_leaves_the_others_where_they_are(
+    model: pycolmap.Reconstruction,
+) -> None:
+    *some, last = sorted(model.reg_image_ids())
+    before = model.images[last].cam_from_world().matrix()
+    adjuster(model, FocalPrior(TRUE_FOCAL, 0.0)).adjust(model, FINAL, some)
+    assert (model.images[last].cam_from_world().matrix() == before).all()
+
+
+@pytest.mark.parametrize(("agreeing", "num"), [(20, 20), (40, 40)])
+def test_more_agreement_is_more_evidence_and_contradiction_costs_little(
+    agreeing: int, num: int
+) -> None:
+    shares = [pair_evidence(agreeing * part / 4, num) for part in range(5)]
+    assert shares == sorted(shares)
+    assert shares[0] < 0 < shares[-1]
+    assert shares[0] >= math.log(0.05)
+
+
+def test_a_wrong_pose_and_an_unlikely_lens_have_less_evidence(
+    scene: Scene, model: pycolmap.Reconstruction
+) -> None:
+    prior = dict.fromkeys(model.cameras, FocalPrior(TRUE_FOCAL, EXIF_SIGMA))
+    graph = PairGraph.read(scene[0])
+    right = Evidence(graph, prior).of(model)
+    unlikely = dict.fromkeys(model.cameras, FocalPrior(2 * TRUE_FOCAL, EXIF_SIGMA))
+    assert Evidence(graph, unlikely).of(model) < right - 3.0
+    image = model.images[max(model.reg_image_ids())]
+    turned = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.5, 0.0])), np.zeros(3))
+    image.frame.rig_from_world = turned * image.frame.rig_from_world
+    assert Evidence(graph, prior).of(model) < right - 3.0
+
+
+@pytest.fixture
+def found(scene: Scene, tmp_path: Path) -> list[Any]:
+    """Summaries of the models of cameras that nobody knows."""
+    return map_database(mapper_of(), task_of(scene, UNKNOWN), tmp_path / "sparse", lambda _: None)
+
+
+def test_cameras_that_nobody_knows_come_out_right_and_the_same_each_time(
+    scene: Scene, found: list[Any], tmp_path: Path
+) -> None:
+    assert [len(model.registered_names) for model in found] == [NUM_IMAGES]
+    assert list(found[0].focals_px.values()) == pytest.approx([TRUE_FOCAL] * NUM_IMAGES, rel=0.05)
+    again = map_database(mapper_of(), task_of(scene, UNKNOWN), tmp_path / "again", lambda _: None)
+    assert again[0].focals_px == found[0].focals_px
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_given_focal_lengths_are_refined_where_that_is_asked_for(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, keep: bool
+) -> None:
+    held = []
+    adjust = adjustment.Adjuster.adjust
+
+    def recorded(self: Adjuster, *given: Any) -> None:
+        held.append({key for key, prior in self.priors.items() if not prior.sigma})
+        adjust(self, *given)
+
+    monkeypatch.setattr(adjustment.Adjuster, "adjust", recorded)
+    mapper = mapper_of(keep_given_intrinsics=keep)
+    task = task_with_given_cameras(scene[0])
+    (model,) = map_database(mapper, task, tmp_path / "sparse", lambda _: None)
+    assert set().union(*held) == (set(task.cameras) if keep else set())
+    assert (set(model.focals_px.values()) == {TRUE_FOCAL}) is keep
+
+
+def test_an_adjustment_of_some_images_holds_cameras_that_others_share() -> None:
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=4, num_points3D=150)
+    pycolmap.set_random_seed(3)
+    model = pycolmap.synthesize_dataset(options)
+    (camera,) = model.cameras.values()
+    camera.params = camera.params * np.where(np.arange(len(camera.params)) == 0, 1.05, 1.0)
+    before, some = camera.params.tolist(), sorted(model.reg_image_ids())[:3]
+    adjuster(model, FocalPrior(TRUE_FOCAL, USUAL_SIGMA)).adjust(model, FINAL, some)
+    assert camera.params.tolist() == before
+
+
+def test_mapping_that_is_interrupted_leaves_nothing(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(adjustment.Adjuster, "adjust", stop)
+    with pytest.raises(KeyboardInterrupt):
+        map_database(mapper_of(), task_of(scene, UNKNOWN), tmp_path / "sparse", lambda _: None)
+    assert not list(tmp_path.iterdir())
