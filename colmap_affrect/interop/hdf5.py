@@ -174,8 +174,8 @@ def _fill_database(path: Path, files: ForeignFiles, pixel_origin: str, progress:
             for pair in files.pairs:
                 indices = files.read_indices(pair, counts[pair[0]])
                 _check_range(files.matches.path, pair, indices, counts)
-                ids = (images[name].image_id for name in pair)
-                write_matches(database, *ids, indices)
+                id1, id2 = (images[name].image_id for name in pair)
+                write_matches(database, id1, id2, indices)
                 advance(1)
 
 
