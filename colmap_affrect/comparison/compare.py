@@ -198,19 +198,23 @@ class _Plan:
         mapper = MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset("colmap")
         colmaps = VerificationOptions.preset("colmap"), mapper, False
         ours = options.verification, options.mapping, options.holds_vote
-        return [
-            MethodTask(
-                method,
-                self.layout.path.resolve(),
-                self.image_path.resolve(),
-                options.masks,
-                *(colmaps if method.label == SIFT_COLMAP else ours),
+        tasks = []
+        for method in self.methods:
+            verification, mapping, focal_vote = colmaps if method.label == SIFT_COLMAP else ours
+            task = MethodTask(
+                method=method,
+                output_path=self.layout.path.resolve(),
+                image_path=self.image_path.resolve(),
+                masks=options.masks,
+                verification=verification,
+                mapping=mapping,
+                focal_vote=focal_vote,
                 may_share=options.cameras.mode == "auto",
                 seeds=tuple(options.seeds),
                 resources=options.resources,
             )
-            for method in self.methods
-        ]
+            tasks.append(task)
+        return tasks
 
 
 def _without_seed(options: Options) -> dict[str, Any]:

@@ -328,7 +328,7 @@ def choose_pairs(
             both = min(methods, key=key), max(methods, key=key)
         chosen[pair] = contrast(list(map(key, both))), both
     uses: Counter[str] = Counter()
-    found = {}
+    found: dict[Pair, tuple[MethodResult, MethodResult]] = {}
     for pair, (difference, both) in sorted(chosen.items(), key=lambda item: (-item[1][0], item[0])):
         fits = all(uses[name] < MAX_PAIRS_OF_IMAGE for name in pair)
         if fits and difference > 0 and len(found) < MAX_NUM_PAIRS:
