@@ -46,20 +46,12 @@ def make_comparison(folder: Path) -> Comparison:
     default = _write_method(folder, "default", truth, NAMES[:5], SIMILARITY)
     _write_features(folder / "methods" / "default")
     fewer = {pair: count for pair, count in pair_inliers.items() if pair != NAMES[:2]}
+    first, second = _seed(0, default, pair_inliers, wrong=[NAMES[4]]), _seed(1, default, fewer)
+    models = tuple(sorted(NAMES[:4])), tuple(NAMES[4:])
     methods = (
         _method("sift", [_seed(0, sift, fewer), _seed(1, sift, fewer)]),
         _method("broken", [], failed="weights <affnet> & more are missing"),
-        _method(
-            "default",
-            [
-                _seed(0, default, pair_inliers, wrong=[NAMES[4]]),
-                replace(
-                    _seed(1, default, fewer),
-                    model_names=(tuple(sorted(NAMES[:4])), tuple(NAMES[4:])),
-                    num_points3D=70,
-                ),
-            ],
-        ),
+        _method("default", [first, replace(second, model_names=models, num_points3D=70)]),
     )
     settings, versions = {"camera": {"mode": "auto"}}, {"pycolmap": pycolmap.__version__}
     return Comparison(

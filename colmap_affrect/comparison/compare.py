@@ -16,6 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
+from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
@@ -272,12 +273,14 @@ def _make_shared(plan: _Plan) -> None:
     with new_results(plan.layout.shared) as (folder,):
         new, options = Layout(folder.parent), plan.options
         folder.mkdir()
+        initial, known = None, None
         if options.from_database:
             copy_without_features(options.from_database, new.database)
+            known = read_camera_records(options.from_database.with_name(new.cameras.name))
         else:
             import_images(new.database, plan.image_path, plan.names, options.cameras)
-            cameras = options.inputs(plan.image_path).initial_cameras
-            record_cameras(new.database, new.cameras, cameras)
+            initial = options.inputs(plan.image_path).initial_cameras
+        record_cameras(new.database, new.cameras, initial, known)
         taken = image_ids(new.database)
         names = [name for name in plan.names if name in taken]
         pairs = [pair for pair in plan.pairs if set(pair) <= taken.keys()]

@@ -271,6 +271,21 @@ def test_fewer_than_two_images_are_refused(tmp_path, num_readable) -> None:
     assert not (tmp_path / "out" / "shared").exists()
 
 
+@pytest.mark.long
+@pytest.mark.usefixtures("no_page")
+def test_all_methods_take_the_cameras_of_a_database(scene, compared, tmp_path) -> None:
+    database = tmp_path / "given.db"
+    shutil.copy(compared[1] / "shared" / "database.db", database)
+    options = CompareOptions(methods=METHODS[:2], seeds=(0,), from_database=database)
+    comparison = compare(scene / "images", tmp_path / "out", options)
+    assert [method.failed for method in comparison.methods] == ["", ""]
+    for method in comparison.methods:
+        (camera, *_) = pycolmap.Reconstruction(
+            tmp_path / "out" / method.seeds[0].model_path
+        ).cameras.values()
+        assert camera.model_name == "PINHOLE"
+
+
 class Names(Progress):
     """Keeps the names of the stages."""
 
