@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from colmap_affrect.geometry import consistency
 from colmap_affrect.geometry.consistency import num_consistent_matches
 
 SIZE = np.array([1200.0, 700.0])
@@ -57,11 +56,3 @@ def test_copies_of_one_place_are_no_neighbours() -> None:
     first = random_frames(30, 4)
     first[:, :, 2] = 500.0 + first[:, :, 2] / 1000.0
     assert num_consistent_matches(first, carried(first)) == 0
-
-
-def test_many_matches_are_compared_block_by_block(monkeypatch: pytest.MonkeyPatch) -> None:
-    first = random_frames(70, 5)
-    second = np.concatenate([carried(first[:50]), random_frames(20, 6)])
-    whole = num_consistent_matches(first, second)
-    monkeypatch.setattr(consistency, "ROWS_AT_ONCE", 9)
-    assert num_consistent_matches(first, second) == whole > 40

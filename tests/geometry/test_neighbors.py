@@ -44,12 +44,3 @@ def test_of_lists_the_neighbors_of_the_points_asked_for_in_order(
     assert (np.diff(rows) >= 0).all()
     for position, point in enumerate(asked):
         assert sorted(neighbors[rows == position].tolist()) == expected[point]
-
-
-def test_neighbors_within_does_not_join_row_ends_with_the_next_row() -> None:
-    # The last cell of one row of cells and the first of the next have neighbouring keys.
-    xs, ys = np.meshgrid(np.arange(0.0, 50.0, 0.5), np.arange(0.0, 5.0, 0.5))
-    points = np.stack([xs.ravel(), ys.ravel()], axis=1)
-    rows, neighbors = neighbors_within(points, 1.0).of(np.arange(len(points)))
-    assert np.linalg.norm(points[rows] - points[neighbors], axis=1).max() <= 1.0
-    assert len(rows) == sum(map(len, all_neighbors(points, 1.0)))

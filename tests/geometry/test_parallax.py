@@ -29,7 +29,7 @@ def strip_of_turned_view(num: int) -> tuple[np.ndarray, np.ndarray]:
     return points1, turned[:, :2] / turned[:, 2:]
 
 
-@pytest.mark.parametrize("share_wrong", [0.0, 0.1, 0.25])
+@pytest.mark.parametrize("share_wrong", [0.0, 0.25])
 def test_turned_views_of_which_things_that_repeat_match_too(share_wrong: float) -> None:
     points1, points2 = strip_of_turned_view(400)
     num_wrong = int(share_wrong * 400)

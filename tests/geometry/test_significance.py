@@ -31,22 +31,6 @@ def test_false_alarms_are_those_of_the_formula() -> None:
     assert log10_false_alarms(40, 7, 7, 0.02) == math.inf
 
 
-def test_random_inliers_are_expected_and_many_are_not() -> None:
-    rng = np.random.default_rng(4)
-    for num_matches in (100, 1000, 10000):
-        by_chance = 7 + int(rng.binomial(num_matches, 0.01, 1000).max())
-        assert log10_false_alarms(num_matches, by_chance, 7, 0.01) > 0.0
-        assert log10_false_alarms(num_matches, 10 + 5 * by_chance, 7, 0.01) < -5.0
-
-
-def test_frames_speak_for_a_pair_only_where_chance_would_not_do_it() -> None:
-    assert log10_bayes_factor(20, 17, 0.12) > 9.0
-    assert log10_bayes_factor(20, 3, 0.12) < -2.0
-    assert abs(log10_bayes_factor(20, 20, 0.99)) < 0.1
-    values = [log10_bayes_factor(20, count, 0.12) for count in range(21)]
-    assert values == sorted(values)
-
-
 def test_factor_is_fair_under_chance() -> None:
     # Its mean over what chance brings is 1: it may be multiplied with the false alarms.
     counts = np.arange(13)

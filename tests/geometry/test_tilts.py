@@ -155,25 +155,6 @@ def test_cover_shapes_covers_the_share_asked_for_or_reaches_a_limit(
     assert enough or len(cover.centers) == max_num_centers or stuck
 
 
-@given(st.integers(0, 10_000), st.integers(2, 80))
-def test_cover_shapes_does_not_depend_on_the_order_of_the_shapes(seed: int, count: int) -> None:
-    tilts, angles = random_classes(seed, count, MAX_TILT)
-    order = np.random.default_rng(seed + 1).permutation(count)
-    first, second = (
-        cover_shapes(
-            metrics_from_tilts(tilts[index], angles[index]),
-            np.ones(count),
-            radius=RADIUS,
-            max_tilt=MAX_TILT,
-            covered_frac=0.9,
-            max_num_centers=5,
-        )
-        for index in (np.arange(count), order)
-    )
-    assert_allclose(first.centers, second.centers)
-    np.testing.assert_array_equal(first.labels[order], second.labels)
-
-
 def cover_with_defaults(tilts: list[float], angles: list[float], weights: list[float]) -> Array:
     """Centres that cover all votes with at most 8 balls of 1.7."""
     cover = cover_shapes(
@@ -199,10 +180,9 @@ def test_cover_shapes_takes_the_heaviest_votes_first() -> None:
     [
         ([1.0, 1.4, 1.69], [0.0, 0.9, 2.5], [1.0, 1.0, 1.0]),
         ([5.9, 7.0, 1.0], [0.5, 0.5, 0.0], [9.0, 9.0, 1.0]),
-        ([3.0, 4.0], [0.5, 2.0], [0.0, 0.0]),
         ([], [], []),
     ],
-    ids=["near the identity", "beyond the largest tilt", "without weight", "nothing"],
+    ids=["near the identity", "beyond the largest tilt", "nothing"],
 )
 def test_cover_shapes_needs_no_center(
     tilts: list[float], angles: list[float], weights: list[float]
