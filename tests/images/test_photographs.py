@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import PIL.ExifTags
 import PIL.Image
@@ -70,15 +68,6 @@ def test_features_of_the_image_and_of_all_warps_keep_to_the_mask(photo_path: Pat
     assert (inside.rectification_ids > 0).sum() > 0.8 * len(inside)
 
 
-def test_mask_of_a_shrunk_image_is_exact_in_its_own_pixels(photo_path: Path) -> None:
-    mask = diagonal_mask()
-    options = ExtractionOptions(rectifier=AsiftOptions(), max_image_size_px=131)
-    features = prepare(options).extract_file(photo_path, mask=mask).features
-    columns, rows = np.rint(features.keypoints).astype(int).T
-    assert len(features) > 100
-    assert mask[rows, columns].all()
-
-
 def test_shrunk_mask_keeps_its_place() -> None:
     mask = np.zeros((90, 120), bool)
     mask[30:, 20:60] = True
@@ -87,20 +76,10 @@ def test_shrunk_mask_keeps_its_place() -> None:
     np.testing.assert_array_equal(shrink_mask(mask, (40, 30)), expected)
 
 
-@pytest.mark.parametrize("white", [1, 77, 255])
+@pytest.mark.parametrize("white", [1, 255])
 def test_only_black_is_left_out(tmp_path: Path, white: int) -> None:
     write_mask(tmp_path / "m.png", diagonal_mask((40, 90)), white)
     np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), diagonal_mask((40, 90)))
-
-
-def test_colour_and_16_bit_masks_are_read(tmp_path: Path) -> None:
-    mask = diagonal_mask((50, 80))
-    colour = np.zeros((*mask.shape, 4), np.uint8)
-    colour[..., 1], colour[..., 3] = mask * 200, 255
-    cv2.imwrite(str(tmp_path / "rgba.png"), colour)
-    cv2.imwrite(str(tmp_path / "deep.png"), mask.astype(np.uint16))
-    for name in ("rgba.png", "deep.png"):
-        np.testing.assert_array_equal(read_mask(tmp_path / name), mask)
 
 
 @pytest.mark.parametrize("mask_name", ["wing/a b.jpg.png", "wing/a b.png"])
@@ -249,15 +228,6 @@ def test_list_images_takes_those_of_a_list(tmp_path: Path) -> None:
     text = "\ufeff# comment\nb c.png\n\n./deep//č.png\nb c.png\n"
     listed.write_text(text, encoding="utf-8")
     assert list_images(tmp_path, listed) == ["b c.png", "deep/č.png"]
-
-
-def test_list_images_leaves_out_a_name_that_is_not_utf8(tmp_path: Path) -> None:
-    Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.png")).write_bytes(b"")
-    with pytest.raises(
-        ImageError, match=r"names: 1 left out, such as \\udcff.png: the name is"
-    ) as error:
-        list_images(tmp_path)
-    str(error.value).encode("utf-8")
 
 
 @pytest.mark.parametrize("line", ["d.png", "../photos/a.png", "{folder}/a.png", "# a.png", ""])
