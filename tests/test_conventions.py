@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,6 @@ from numpy.testing import assert_allclose
 from strategies import Array
 from synthetic import blobs, centroid
 
-import colmap_affrect
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.conventions import (
     colmap_from_pixel,
@@ -169,17 +167,3 @@ def test_convention_database_swaps_the_columns_of_a_reversed_pair(
     raw_database.write_matches(2, 1, matches)
     np.testing.assert_array_equal(raw_database.read_matches(2, 1), matches)
     np.testing.assert_array_equal(raw_database.read_matches(1, 2), matches[:, ::-1])
-
-
-def test_half_pixels_occur_only_in_conventions() -> None:
-    shift = re.compile(r"[+-]=?\s*(np\.float\d+\()?0?\.5(?![\d])(?!\s*\*)")
-    package = Path(colmap_affrect.__path__[0])
-    sources = {path.relative_to(package).as_posix(): path for path in package.rglob("*.py")}
-    guilty = [
-        f"{name}:{number}: {line.strip()}"
-        for name, path in sorted(sources.items())
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
-        if shift.search(line.split("#")[0])
-    ]
-    assert shift.search("points + 0.5"), "the pattern is blind"
-    assert [line for line in guilty if not line.startswith("conventions.py:")] == []

@@ -58,18 +58,6 @@ def test_what_has_begun_is_measured_and_the_rest_is_guessed_from_it() -> None:
     assert forecast.text() == ""
 
 
-def test_images_that_are_known_leave_their_pairs_out() -> None:
-    clock = Clock()
-    forecast = Forecast(100, 4950, clock=clock)
-    run_stage(forecast, clock, "extract", 10, 1.0)
-    pairs_ahead = round(4950 * (1 - 0.9**2))
-    left_s = pairs_ahead * (COSTS["match"] + COSTS["verify"]) + 100 * MAP_COST
-    assert forecast.left_s() == pytest.approx(left_s)
-    run_stage(forecast, clock, "match", 0, 0.0)
-    run_stage(forecast, clock, "verify", 0, 0.0)
-    assert forecast.left_s() == pytest.approx(100 * MAP_COST)
-
-
 def test_stages_that_nothing_was_known_of_count_from_when_they_begin() -> None:
     clock = Clock()
     forecast = Forecast(10, 0, may_escalate=True, clock=clock)

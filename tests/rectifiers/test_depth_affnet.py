@@ -5,13 +5,11 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 from planar_scenes import FixedDepth, FixedShapes, corner_room
 from strategies import Array, tilt_distance
 
 from colmap_affrect.data import RectificationPlan
-from colmap_affrect.errors import OptionError
 from colmap_affrect.geometry.affine import rectifying_affine
 from colmap_affrect.rectifiers.base import RectifierInputs
 from colmap_affrect.rectifiers.depth_planes import (
@@ -89,10 +87,3 @@ def test_segments_without_tilted_shapes_have_no_warps() -> None:
     assert plan_room(upright).items == ()
     assert plan_room(np.zeros((0, 4))) == RectificationPlan(ROOM.size)
     assert len(plan_room(upright, tilt_radius=1.4).items) >= 3
-
-
-@pytest.mark.parametrize("missing", ["shapes", "depth"])
-def test_depth_affnet_without_a_source_is_an_option_error(missing: str) -> None:
-    sources = {"shapes": FixedShapes(np.zeros((0, 4))), "depth": FixedDepth(np.ones((3, 4)))}
-    with pytest.raises(OptionError, match=missing):
-        DepthAffNet(DepthAffNetOptions(), RectifierInputs(**{**sources, missing: None}))

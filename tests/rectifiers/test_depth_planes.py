@@ -69,7 +69,7 @@ def near_crease(labels: NDArray[np.intp]) -> Mask:
     return cv2.distanceTransform(1 - edges, cv2.DIST_L2, 5) <= CREASE_PX
 
 
-@pytest.mark.parametrize("depth_size", [(160, 100), (400, 300), (700, 525)])
+@pytest.mark.parametrize("depth_size", [(160, 100), (700, 525)])
 def test_planar_segments_of_a_room_are_its_walls_and_floor(depth_size: tuple[int, int]) -> None:
     room = corner_room()
     depth, _ = room.depth(depth_size)
@@ -140,28 +140,6 @@ def test_planar_segments_are_connected_and_large_enough() -> None:
     np.testing.assert_array_equal(large.region.mask, segments[0].region.mask)
 
 
-def test_planar_segments_of_a_corridor_face_the_camera_if_opposite_walls_are_one() -> None:
-    normals = unit([[1.0, 0.0, -0.25], [-1.0, 0.0, -0.25], [0.0, 0.05, -1.0]])
-    camera = np.array([[150.0, 0, 205], [0, 150.0, 140], [0, 0, 1.0]])
-    room = Room(normals, np.array([1.0, 1.2, 1.6]), camera, (400, 300))
-    depth, labels = room.depth((400, 300))
-    options = PlaneOptions(antipodal=True, min_separation_deg=60.0)
-    segments = planar_segments(room.photograph(), depth, options)
-    assert len(segments) == 3
-    clear = ~near_crease(labels)
-    for segment in segments:
-        rows, columns = np.nonzero(image_mask(segment, room.size) & clear)
-        (label,) = np.unique(labels[rows, columns])
-        # The two walls, 29 degrees from opposite, share one direction.
-        assert angles_deg(segment.normal, room.normals[label]) < 20.0
-
-
-def test_planar_segments_of_unknown_depth_or_a_scattered_surface_are_none() -> None:
-    scattered = np.random.default_rng(0).uniform(1.0, 9.0, (120, 160))
-    for depth in (np.full((80, 90), np.nan), scattered):
-        assert planar_segments(corner_room().photograph(), depth, PlaneOptions()) == []
-
-
 def test_plan_keeps_features_of_the_photograph_everywhere_or_outside() -> None:
     wall = slanted_wall([0.5, 0.1, -0.85])
     depth, _ = wall.depth((200, 150))
@@ -188,7 +166,7 @@ def canvas_in_plane(item: Rectification, room: Room) -> tuple[Array, Array]:
     return canvas, plane_coordinates(normal, points).reshape(canvas.shape)
 
 
-NORMALS = [(0.7, 0.2, -0.68), (-0.85, 0.1, -0.5), (0.1, -0.9, -0.42), (0.02, 0.01, -1.0)]
+NORMALS = [(0.7, 0.2, -0.68), (0.1, -0.9, -0.42)]
 
 
 @pytest.mark.parametrize("normal", NORMALS)
@@ -225,17 +203,14 @@ def courtyard_view(name: str) -> tuple[Photograph, Array, Array]:
     return Photograph(gray, path.name, path, camera), depth, up
 
 
-@pytest.mark.parametrize(
-    ("name", "wall_frac"), [("court_2", 0.4), ("court_4", 0.7), ("court_6", 0.7), ("court_8", 0.35)]
-)
-def test_plan_of_the_courtyard_shows_its_wall_and_its_ground(name: str, wall_frac: float) -> None:
-    photograph, depth, up = courtyard_view(name)
+def test_plan_of_the_courtyard_shows_its_wall_and_its_ground() -> None:
+    photograph, depth, up = courtyard_view("court_2")
     segments = planar_segments(photograph, depth, PlaneOptions())
     assert len(segments) == 2
     wall, ground = segments
     assert angles_deg(ground.normal, up) < 2.0
     assert abs(90.0 - np.rad2deg(np.arccos(wall.normal @ up))) < 2.0
-    assert wall.region.area_px > wall_frac * photograph.gray.size
+    assert wall.region.area_px > 0.4 * photograph.gray.size
     assert ground.region.area_px > 0.1 * photograph.gray.size
     plan = plan_planes(photograph, depth)
     assert [len(item.region) for item in plan.items] == [len(s.region.mask) for s in segments]
