@@ -151,15 +151,6 @@ def test_convention_database_stores_wrapped_and_fractional_indices_silently(
     assert raw_database.read_matches(1, 2).tolist() == [[4294941760, 3]]
 
 
-@pytest.mark.parametrize("columns", [2, 4, 6])
-def test_convention_database_returns_keypoints_of_all_layouts_exactly(
-    raw_database: pycolmap.Database, columns: int
-) -> None:
-    keypoints = np.arange(7 * columns, dtype=np.float32).reshape(7, columns) / 3
-    raw_database.write_keypoints(1, keypoints)
-    np.testing.assert_array_equal(raw_database.read_keypoints(1), keypoints)
-
-
 def test_convention_database_swaps_the_columns_of_a_reversed_pair(
     raw_database: pycolmap.Database,
 ) -> None:

@@ -77,13 +77,6 @@ def test_default_recipe_rectifies_with_the_values_of_the_paper() -> None:
     assert (rectifier.tilt_radius, rectifier.max_tilt, rectifier.covered_frac) == (1.7, 5.8, 0.95)
 
 
-def test_default_and_unrectified_differ_in_the_rectifier_only() -> None:
-    default, plain = load_recipe("default"), load_recipe("unrectified-rootsift")
-    assert plain.extraction.rectifier.name == "identity"
-    assert plain.extraction.features == default.extraction.features
-    assert plain.matching == default.matching
-
-
 @pytest.mark.parametrize(("name", "rectifier"), OF_THE_PAPER.items())
 def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> None:
     recipe = load_recipe(name)
@@ -97,20 +90,6 @@ def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> No
         cover = extraction.rectifier
         assert (cover.tilt_radius, cover.max_tilt, cover.covered_frac) == (1.7, 5.8, 0.95)
         assert (cover.shape_source.name, cover.area_preserving) == ("affnet", False)
-
-
-def test_levels_build_on_the_lowest_one_with_their_features() -> None:
-    recipe = load_recipe("on-demand-learned")
-    levels = recipe.extraction.levels
-    assert [level.base for level in levels] == [0, 0, 2, 3, 2]
-    assert [level.max_image_size_px for level in levels] == [2400, 2400, 1024, 2400, 1024]
-    assert [level.matching and level.matching.name for level in levels] == [
-        *(None, None, "lightglue"),
-        *(None, "lightglue"),
-    ]
-    assert len({level.name for level in levels}) == len(levels)
-    assert set(recipe.weights) == {"aliked-n16", "lightglue-aliked"}
-    assert load_recipe("on-demand").extraction.levels[3].base == 0
 
 
 TRAINED_FOR = "dog-affnet-hardnet-lightglue"

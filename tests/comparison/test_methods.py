@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 from small_scene import write_photographs
-from synthetic import png_of_size, write_image
 
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.initial_cameras import import_images
@@ -93,21 +92,3 @@ def test_sift_looks_at_the_masks_and_matches_the_pairs_of_the_list(tmp_path):
         assert database.exists_matches(ids[second], ids[third])
         assert not database.exists_matches(ids[first], ids[third])
         assert database.num_verified_image_pairs() == 0
-
-
-def test_sift_passes_over_photographs_and_masks_of_absurd_size(tmp_path):
-    names = write_photographs(tmp_path / "images", 3)
-    path, first = tmp_path / "database.db", tmp_path / "images" / names[0]
-    import_images(path, tmp_path / "images", names, CameraOptions())
-    first.write_bytes(png_of_size(32_000, 32_000))
-    mask = tmp_path / "masks" / f"{names[1]}.png"
-    (tmp_path / "masks" / "side").mkdir(parents=True)
-    write_image(tmp_path / "masks" / f"{names[2]}.png", np.full((240, 320), 255, np.uint8))
-    mask.write_bytes(png_of_size(32_000, 32_001))
-    options = MaskOptions(path=str(tmp_path / "masks"))
-    failures = extract_sift(path, tmp_path / "images", names, options, affine=False)
-    assert list(failures) == names[:2]
-    assert failures[names[0]].startswith(f"{first}: claims to be 32000 x 32000 px, and 512 megapix")
-    assert failures[names[1]].startswith(f"{mask}: claims to be 32000 x 32001 px")
-    only = extract_sift(path, tmp_path / "images", names[:1], options, affine=False)
-    assert list(only) == names[:1]

@@ -1,9 +1,12 @@
+"""The page of a comparison, number by number, and its recording for a viewer."""
+
 from __future__ import annotations
 
 import base64
 import json
 import re
 import struct
+import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,10 +18,11 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.comparison.method_table import columns_of
-from colmap_affrect.comparison.page import cards_of, choose_pairs, plot_pairs, write_page
+from colmap_affrect.comparison.page import choose_pairs, plot_pairs, write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.verdict import verdict
+from colmap_affrect.comparison.viewer import log_comparison
+from colmap_affrect.errors import ComparisonError
 from colmap_affrect.report.match_plots import PLOT_HEIGHT
 from colmap_affrect.report.pictures import Picture
 from colmap_affrect.report.view_graph import differing_edge_paths, lay_out
@@ -161,28 +165,6 @@ def test_marks_say_what_each_method_does_with_a_photograph(page: Page) -> None:
     assert {group: groups.count(group) for group in set(groups)} == expected
 
 
-def test_photographs_that_their_method_doubts_are_marked(comparison: Comparison) -> None:
-    method = without_truth(comparison.methods[2])
-    loose = [replace(seed, doubtful={NAMES[1]: "any focal length fits"}) for seed in method.seeds]
-    assert uncertain(comparison, replace(method, seeds=tuple(loose))) == [(NAMES[1], "default")]
-    flat = [replace(seed, doubts=("no parallax",)) for seed in method.seeds]
-    names = [name for name, _ in uncertain(comparison, replace(method, seeds=tuple(flat)))]
-    assert names == [name for name in NAMES if name in method.usually_registered]
-    assert len(names) > 1
-
-
-def without_truth(method: MethodResult) -> MethodResult:
-    """The same, measured against nothing."""
-    return replace(method, seeds=tuple(replace(seed, scores=None) for seed in method.seeds))
-
-
-def uncertain(comparison: Comparison, *methods: MethodResult) -> list[tuple[str, str]]:
-    """Photographs and methods that the contact sheet marks so."""
-    compared = replace(comparison, methods=methods)
-    cards = cards_of(columns_of(compared), compared)
-    return [(c.name, mark.column.name) for c in cards for mark in c.marks if mark.is_uncertain]
-
-
 def test_names_of_images_are_never_markup(page: Page) -> None:
     assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
     assert "x" not in page.values("img", "src")
@@ -301,3 +283,20 @@ def test_lost_models_and_databases_are_said_in_their_place(
     assert "The model cannot be shown" in page.text
     assert "The inliers cannot be drawn" in page.text
     assert page.number("registered", "sift") == 4
+
+
+def test_recording_has_cameras_and_points_of_all_methods(tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    path = log_comparison(make_comparison(tmp_path), tmp_path)
+    content = path.read_bytes()
+    for entity in (b"/sift/points", b"/default/points", b"/default/cameras/e.png"):
+        assert entity in content.replace(b"\\", b"")
+    assert b"/sift/cameras/e.png" not in content.replace(b"\\", b"")
+
+
+def test_without_rerun_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(ComparisonError, match=r"colmap-affrect\[viewer\]"):
+        log_comparison(make_comparison(tmp_path), tmp_path)

@@ -14,6 +14,8 @@ from colmap_affrect.comparison.verdict import Change, verdict
 NAMES = tuple("abcdef")
 IDENTITY = {"rectifier": {"name": "identity"}, "escalation": []}
 DENSE = {"rectifier": {"name": "dense-shapes"}, "escalation": []}
+
+
 def seed_result(names, seed=0, correct=None, points=500, track=3.0):
     scores = None if correct is None else PoseScores(tuple(correct), {}, 15, {}, None)
     return SeedResult(

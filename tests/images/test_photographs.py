@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,13 +12,13 @@ import PIL.Image
 import pytest
 from command import Call
 from small_scene import IMAGE_SIZE, photograph
-from synthetic import texture, write_image
+from synthetic import png_of_size, texture, write_image
 
 import colmap_affrect
 from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import Mask
-from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.errors import ImageError
 from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.images.masks import read_mask, shrink_mask
 from colmap_affrect.images.photographs import MaskOptions, Photographs, list_images
@@ -117,18 +116,15 @@ def test_mask_and_camera_mask_both_count(tmp_path: Path) -> None:
         Photographs(tmp_path, masks).mask("x.jpg")
 
 
-HUGE_PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(
-    ">IIBBBBBI", 32_000, 31_000, 8, 0, 0, 0, 0, 0
-)
-"""Only a header: whoever reads on finds it damaged."""
-
-
 @pytest.mark.parametrize(
     ("prepare_mask", "message"),
     [
         (lambda path: path.write_bytes(b""), "not a readable image"),
         (lambda path: write_mask(path, diagonal_mask((300, 240))), "320 x 240 px and its mask 300"),
-        (lambda path: path.write_bytes(HUGE_PNG), "320 x 240 px and its mask 32000 x 31000 px"),
+        (
+            lambda path: path.write_bytes(png_of_size(32_000, 31_000)),
+            "320 x 240 px and its mask 32000 x 31000 px",
+        ),
     ],
 )
 def test_image_with_a_wrong_mask_is_reported_and_the_others_go_on(
@@ -168,15 +164,6 @@ def test_photographs_without_a_mask_are_used_whole_and_named(
     store = FeatureStore(tmp_path / "out" / "features.h5")
     assert len(store.read("a b.png")) > 100
     assert len(store.read("good.png")) == 0
-
-
-def test_missing_folder_of_masks_is_one_clear_line(tmp_path: Path) -> None:
-    masks = MaskOptions(path=str(tmp_path / "nowhere"))
-    with pytest.raises(OptionError, match=r"--mask-path .*nowhere: no such folder"):
-        Photographs(tmp_path, masks).check()
-    masks = MaskOptions(camera_path=str(tmp_path / "nothing.png"))
-    with pytest.raises(OptionError, match=r"--camera-mask-path .*nothing\.png: no such file"):
-        Photographs(tmp_path, masks).check()
 
 
 def test_gps_position_and_focal_length_of_exif_are_taken_over(tmp_path: Path) -> None:
@@ -230,7 +217,7 @@ def test_list_images_takes_those_of_a_list(tmp_path: Path) -> None:
     assert list_images(tmp_path, listed) == ["b c.png", "deep/č.png"]
 
 
-@pytest.mark.parametrize("line", ["d.png", "../photos/a.png", "{folder}/a.png", "# a.png", ""])
+@pytest.mark.parametrize("line", ["d.png", "../photos/a.png", ""])
 def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: str) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()

@@ -172,15 +172,6 @@ def test_warp_by_a_homography_of_a_coordinate_ramp_shows_image_from_rectified(
     assert np.abs(design @ fitted).max() < PERSPECTIVE_RAMP_ERROR_PX
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 40)])
-def test_warps_of_tiny_flat_images_are_flat_and_of_the_planned_size(size: tuple[int, int]) -> None:
-    matrix = np.array([[3.0, 0.2, 4.0], [0.1, 2.5, 4.0], [1e-3, 2e-3, 1.0]])
-    for plan in (rectification(4.0, 0.8, size), Rectification(matrix, (150, 140), None, 1.0, 0.0)):
-        shown = warp(np.full(size[::-1], 90, np.uint8), plan)
-        assert shown.shape == warp_mask(plan, size).shape == plan.canvas_size[::-1]
-        assert np.unique(shown).tolist() == [90]
-
-
 @pytest.mark.parametrize("is_affine", [True, False])
 def test_warp_mask_marks_the_pixels_whose_source_is_in_the_region(is_affine: bool) -> None:
     region = np.zeros((45, 90), bool)

@@ -117,21 +117,6 @@ def test_plan_dense_shapes_skips_regions_below_the_smallest_share() -> None:
     assert (len(kept.items), len(skipped.items)) == (1, 0)
 
 
-def test_plan_dense_shapes_does_not_let_untextured_blocks_vote_or_join() -> None:
-    labels = np.zeros((10, 20), int)
-    labels[:, 10:] = 1
-    textured = np.ones(labels.shape, bool)
-    textured[:, 10:] = False
-    textured[:4, :10] = False
-    plan = plan_dense_shapes(
-        shape_grid([(3.0, 0.5), (3.0, 2.0)], labels, textured), (80, 40), DenseShapesOptions()
-    )
-    assert len(plan.items) == 1
-    np.testing.assert_array_equal(
-        image_region(plan.items[0], (80, 40)), np.kron(textured, np.ones((4, 4), bool))
-    )
-
-
 @pytest.mark.parametrize("size", [(80, 61), (1, 1), (1, 90)])
 def test_plan_of_a_flat_image_has_no_warps(size: tuple[int, int]) -> None:
     image = np.full(size[::-1], 140, np.uint8)

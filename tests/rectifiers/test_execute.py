@@ -21,10 +21,9 @@ from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import (
     ellipse_extents,
     fit_canvas,
-    lafs_from_keypoints,
     rectifying_affine,
 )
-from colmap_affrect.rectifiers.execute import extract_rectified, found_again
+from colmap_affrect.rectifiers.execute import extract_rectified
 
 KEYPOINT_ERROR_PX = 0.1
 BIAS_PX = 0.05
@@ -160,5 +159,3 @@ def test_extract_rectified_keeps_the_features_of_the_image_unless_the_plan_says_
     alone = extract_rectified(image, plan, PROFILE, 100_000, with_original=False)
     assert_allclose(alone.lafs, kept.lafs[kept.rectification_ids == 1])
     assert (alone.rectification_ids == 1).all()
-
-

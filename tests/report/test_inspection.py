@@ -31,7 +31,7 @@ from colmap_affrect.geometry.affine import (
     project,
     rectifying_affine,
 )
-from colmap_affrect.recipes import ExtractionOptions, LevelOptions
+from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.base import (
     RECTIFIERS,
     RectifierInputs,
@@ -58,21 +58,18 @@ SHAPES = RectifierInputs(SecondMoment(SecondMomentOptions()))
 
 
 class GridFeatures:
-    """A feature extractor that finds a feature every ``step_px``, wherever the mask is set."""
+    """A feature extractor that finds a feature every 20 px, wherever the mask is set."""
 
     descriptor_size = 3
-
-    def __init__(self, step_px: int = 20, radius_px: float = 12.0, first_px: int = 10) -> None:
-        self.step_px, self.radius_px, self.first_px = step_px, radius_px, first_px
 
     def detect(self, view: View) -> LocalFeatures:
         image, mask = view
         is_found = np.ones(image.shape, bool) if mask is None else mask > 0
         grid = np.zeros_like(is_found)
-        grid[self.first_px :: self.step_px, self.first_px :: self.step_px] = True
+        grid[10::20, 10::20] = True
         points = np.argwhere(grid & is_found)[:, ::-1].astype(float)
         count = len(points)
-        lafs = lafs_from_keypoints(points, np.full(count, self.radius_px), np.zeros(count))
+        lafs = lafs_from_keypoints(points, np.full(count, 12.0), np.zeros(count))
         responses = np.linspace(1, 2, count).astype(np.float32)
         return LocalFeatures(lafs, responses, np.zeros((count, 3), np.float32))
 
@@ -81,9 +78,6 @@ class GridFeatures:
     ) -> list[LocalFeatures]:
         assert len(images) == len(detected)
         return list(detected)
-
-
-NO_FEATURES = GridFeatures(first_px=10_000)
 
 
 class Planned:
@@ -117,24 +111,13 @@ def homography_warp(segment: int) -> Rectification:
     return Rectification(homography, (180, 160), region, 1.4, 0.25, (180, 90), segment)
 
 
-def extractor_of(
-    *plans: RectificationPlan, extractor: GridFeatures | None = None, **options: Any
-) -> ImageExtractor:
-    """Extractor whose levels have these plans."""
-    levels = [AsiftOptions() if plan.items else IdentityOptions() for plan in plans]
-    return ImageExtractor(
-        ExtractionOptions(
-            rectifier=levels[0],
-            escalation=tuple(LevelOptions(rectifier=item) for item in levels[1:]),
-            **options,
-        ),
-        (extractor or GridFeatures(),) * len(plans),
-        tuple(Planned(plan) for plan in plans),
-    )
-
-
 def extractor_with(options: RectifierOptions, rectifier: Any) -> ImageExtractor:
     return ImageExtractor(ExtractionOptions(rectifier=options), (GridFeatures(),), (rectifier,))
+
+
+def extractor_of(plan: RectificationPlan) -> ImageExtractor:
+    options = AsiftOptions() if plan.items else IdentityOptions()
+    return extractor_with(options, Planned(plan))
 
 
 @pytest.fixture
@@ -218,26 +201,6 @@ def test_unreadable_image_is_refused_before_anything_is_written(tmp_path: Path) 
 # --- Sheets
 
 
-PLANS = {
-    "no warps": RectificationPlan(SIZE),
-    "homography": RectificationPlan(SIZE, (homography_warp(0),)),
-}
-
-
-@pytest.mark.parametrize(
-    ("kind", "extractor"),
-    [
-        ("no warps", GridFeatures()),
-        ("homography", GridFeatures()),
-        ("homography", NO_FEATURES),
-    ],
-)
-def test_sheet_of_plan(kind: str, extractor: GridFeatures, tmp_path: Path, photo: Path) -> None:
-    (level,), _ = inspect(extractor_of(PLANS[kind], extractor=extractor), photo, tmp_path / "out")
-    assert (level["totals"]["keypoints"] == 0) == (extractor is NO_FEATURES)
-    assert len(level["warps"]) == len(PLANS[kind].items)
-
-
 @pytest.mark.parametrize("size", [(1, 1), (600, 33)])
 def test_sheet_of_small_and_flat_images(size: tuple[int, int], tmp_path: Path) -> None:
     path = write_image(tmp_path / "flat.png", np.full(size[::-1], 90, np.uint8))
@@ -248,7 +211,7 @@ def test_sheet_of_small_and_flat_images(size: tuple[int, int], tmp_path: Path) -
 def test_names_of_every_kind_are_written_and_drawn(tmp_path: Path) -> None:
     path = tmp_path / "a $x^{$ ü 漢字.png"
     write_image(path, texture(SIZE, 3))
-    inspect(extractor_of(PLANS["no warps"]), path, tmp_path / "Ausgabe ä")
+    inspect(extractor_of(RectificationPlan(SIZE)), path, tmp_path / "Ausgabe ä")
     assert (tmp_path / "Ausgabe ä" / "a $x^{$ ü 漢字-inspection.png").exists()
     assert printable("a ü Ж 漢") == "a ü Ж \N{REPLACEMENT CHARACTER}"
 
