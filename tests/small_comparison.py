@@ -19,7 +19,7 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.extract import Inputs
+from colmap_affrect.stages.inputs import Inputs
 
 NAMES = ("<img src=x onerror=alert(1)>.png", "a & b.png", "c.png", "d.png", "e.png", "f.png")
 IMAGE_SIZE = (160, 120)

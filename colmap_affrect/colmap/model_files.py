@@ -4,13 +4,13 @@ Models of ours have a digest of their files beside them.
 """
 
 import hashlib
+import json
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_records import (
@@ -65,19 +65,13 @@ def require_intact(folder: Path) -> None:
         )
 
 
-class _Kept(BaseModel):
-    """What of the summary of a model tells whether it has changed since."""
-
-    model: dict[str, str] | str
-
-
 def kept_digests(folder: Path) -> dict[str, str] | str:
     """Return the digests of the files of a model of ours when they were written, else nothing."""
     try:
-        content = without_checksum((folder / SUMMARY).read_bytes())
-        return _Kept.model_validate_json(content).model
-    except (OSError, ValueError):
+        known = json.loads(without_checksum((folder / SUMMARY).read_bytes()))["model"]
+    except (OSError, ValueError, TypeError, KeyError):
         return {}
+    return known if isinstance(known, dict | str) else {}
 
 
 def file_digests(folder: Path) -> dict[str, str]:

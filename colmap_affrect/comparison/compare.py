@@ -38,8 +38,9 @@ from colmap_affrect.pipeline import InputOptions, installed_versions
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import Contents
+from colmap_affrect.project.differences import first_difference
 from colmap_affrect.project.outputs import new_results, remove_own
-from colmap_affrect.project.workspace import Workspace, first_difference
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 
 DEFAULT_SEEDS = (0, 1, 2)

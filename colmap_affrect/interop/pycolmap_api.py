@@ -36,14 +36,9 @@ from colmap_affrect.stages import verify as verify_stage
 from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.escalate import escalate
-from colmap_affrect.stages.extract import (
-    Inputs,
-    extract,
-    recorded_extraction,
-    write_descriptors,
-    write_images_and_keypoints,
-)
+from colmap_affrect.stages.extract import extract, write_descriptors, write_images_and_keypoints
 from colmap_affrect.stages.guide import guide
+from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import add_pairs

@@ -26,7 +26,8 @@ from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import Inputs, extract, extract_images, prepared_recipe
+from colmap_affrect.stages.extract import extract, extract_images, prepared_recipe
+from colmap_affrect.stages.inputs import Inputs
 
 FIRST, SECOND = NAMES[:2]
 
