@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from strategies import Array
-from synthetic import blobs, centroid
+from synthetic import blobs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.conventions import (
@@ -65,17 +64,6 @@ def test_resized_from_original_scales_affine_shapes_by_rows() -> None:
     laf = np.array([[[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]])
     resized = transform_frames(resized_from_original((8, 8), (8, 4)), laf)
     assert_allclose(resized[0, :, :2], [[1.0, 2.0], [1.5, 2.0]])
-
-
-@pytest.mark.parametrize("resized", [(100, 60), (67, 60), (150, 33)])
-def test_resized_from_original_follows_a_blob_through_opencv_resize(
-    resized: tuple[int, int],
-) -> None:
-    original, center = (200, 120), np.array([[81.3, 47.6]])
-    image = blobs(original, center, 8.0 * np.eye(2), background=0.0)
-    small = cv2.resize(image, resized, interpolation=cv2.INTER_AREA)
-    expected = project(resized_from_original(original, resized), center)[0]
-    assert_allclose(centroid(small), expected, atol=0.02)
 
 
 @pytest.mark.parametrize("step_px", [1, 4, 5])

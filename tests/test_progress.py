@@ -81,22 +81,6 @@ def test_what_has_begun_is_measured_and_the_rest_is_guessed_from_it() -> None:
     assert forecast.text() == ""
 
 
-def test_stages_that_nothing_was_known_of_count_from_when_they_begin() -> None:
-    clock = Clock()
-    forecast = Forecast(10, 0, may_escalate=True, clock=clock)
-    run_stage(forecast, clock, "HardTFeat.pth", 10, 1.0)  # a download says nothing of the rest
-    assert forecast.left_s() is None
-    run_stage(forecast, clock, "extract", 10, 60.0)
-    assert forecast.text() == "whole run: about 8 min left without further warps"
-    forecast.begin("escalate, level 1", 90)
-    clock.now_s += 60.0
-    forecast.advance(9)
-    assert forecast.text() == "whole run: about 18 min left without further warps"
-    forecast.end()
-    forecast.begin("cameras", 10)
-    assert forecast.text() == "whole run: about 8 min left"
-
-
 def test_forecast_is_in_lines_and_log_and_not_where_nothing_is_shown(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

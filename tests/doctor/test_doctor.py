@@ -12,7 +12,6 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import h5py
 import numpy as np
 import pytest
@@ -256,17 +255,6 @@ def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(
     assert (model / "points3D.bin").read_bytes() == before
     assert main(["map", "--output-path", out, "--quiet", "--overwrite"]) == 0
     assert main(["export", *target, "--quiet"]) == 0
-
-
-def test_photographs_of_another_size_are_errors(folders: Folders) -> None:
-    path = folders.photos / "a.png"
-    cv2.imwrite(str(path), cv2.imread(str(path))[:200])
-    (found,) = findings(folders.database, folders.photos)
-    assert (found.severity, found.where) == ("error", str(folders.database))
-    assert found.what.endswith("than their camera (1): a.png is 320 x 200, its camera 320 x 240")
-    path.write_bytes(b"no image")
-    (found,) = findings(folders.database, folders.photos)
-    assert found.what == "images whose file cannot be read (1): a.png"
 
 
 def test_folder_in_use_is_left_alone(folders: Folders) -> None:

@@ -20,7 +20,13 @@ from colmap_affrect.errors import EvaluationError, OptionError
 from colmap_affrect.evaluation import evaluate as module
 from colmap_affrect.evaluation.data import ScoreOptions
 from colmap_affrect.evaluation.datasets import load_evd
-from colmap_affrect.evaluation.evaluate import PROTOCOLS, EvaluateOptions, evaluate
+from colmap_affrect.evaluation.evaluate import (
+    PROTOCOLS,
+    EvaluateOptions,
+    bootstrap_interval,
+    evaluate,
+    paired_test,
+)
 from colmap_affrect.evaluation.results import Evaluation, RecipeResult, Solved
 from colmap_affrect.evaluation.runner import RecipeRun
 from colmap_affrect.evaluation.truths import TrueHomography
@@ -228,3 +234,17 @@ def test_command_prints_tables_and_errors_are_one_line(dataset: Path, tmp_path: 
     assert missing.errors == [
         f"error: {tmp_path / 'nowhere'}: no such folder; give the folder of the dataset"
     ]
+
+
+def test_interval_of_a_mean_is_that_of_the_normal_distribution() -> None:
+    values = np.random.default_rng(3).normal(5.0, 2.0, 400)
+    half_width = 1.96 * values.std() / math.sqrt(400)
+    expected = values.mean() - half_width, values.mean() + half_width
+    assert bootstrap_interval(values, 0) == pytest.approx(expected, abs=0.02)
+
+
+def test_paired_test_of_ones_and_zeros_is_the_sign_test() -> None:
+    # Five pairs that only the first solves, one that only the second does: 14 of 64 ways.
+    a = np.array([1.0, 1, 1, 1, 1, 0, 1, 0])
+    b = np.array([0.0, 0, 0, 0, 0, 1, 1, 0])
+    assert paired_test(a, b, 0) == paired_test(b, a, 0) == pytest.approx(14 / 64)
