@@ -9,7 +9,7 @@ import pytest
 import tomli_w
 
 from colmap_affrect.errors import OptionError
-from colmap_affrect.features.shapes.second_moment import SecondMomentOptions
+from colmap_affrect.features.second_moment import SecondMomentOptions
 from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.recipes import (
@@ -24,11 +24,10 @@ from colmap_affrect.rectifiers.dense import DenseShapesOptions
 from colmap_affrect.rectifiers.whole_image import AffNetShapesOptions
 
 NAMES = [
-    "affnet-shapes", "affnet-shapes-recommended", "aliked-lightglue", "asift",
-    "asift-recommended", "default", "dense-affnet", "dense-affnet-recommended", "depth-affnet",
-    "depth-affnet-recommended", "depth-planes", "depth-planes-recommended", "disk-lightglue",
-    "dog-affnet-hardnet-lightglue", "on-demand", "on-demand-learned", "sift-lightglue",
-    "unrectified",
+    "affnet-shapes", "aliked-lightglue", "asift", "asift-recommended", "default", "dense-affnet",
+    "dense-affnet-recommended", "depth-affnet", "depth-affnet-recommended", "depth-planes",
+    "depth-planes-recommended", "disk-lightglue", "dog-affnet-hardnet-lightglue", "on-demand",
+    "on-demand-learned", "second-moment-shapes", "sift-lightglue", "unrectified",
     "unrectified-rootsift", "xfeat-lighterglue",
 ]  # fmt: skip
 
@@ -58,19 +57,6 @@ def test_options_of_a_recipe_survive_being_written_down(name: str) -> None:
     assert ExtractionOptions.from_mapping(written, "config.toml") == options
 
 
-LEARNED = [name for name in NAMES if name.endswith(("lightglue", "lighterglue"))]
-
-
-@pytest.mark.parametrize("name", LEARNED)
-def test_learned_recipes_match_what_their_authors_match(name: str) -> None:
-    recipe = load_recipe(name)
-    assert recipe.extraction.rectifier.name == "identity"
-    assert recipe.extraction.max_image_size_px == 1024
-    assert recipe.matching.name == "lightglue"
-    assert recipe.matching.max_num_features == recipe.extraction.features.max_num_features == 2048
-    assert set(recipe.weights) == {*recipe.extraction.weights, *recipe.matching.weights}
-
-
 def test_default_recipe_rectifies_with_the_values_of_the_paper() -> None:
     rectifier = load_recipe("default").extraction.rectifier
     assert (rectifier.name, rectifier.shape_source.name) == ("dense-shapes", "second-moment")
@@ -90,6 +76,20 @@ def test_recipes_of_the_paper_have_its_settings(name: str, rectifier: str) -> No
         cover = extraction.rectifier
         assert (cover.tilt_radius, cover.max_tilt, cover.covered_frac) == (1.7, 5.8, 0.95)
         assert (cover.shape_source.name, cover.area_preserving) == ("affnet", False)
+
+
+def test_levels_build_on_the_lowest_one_with_their_features() -> None:
+    recipe = load_recipe("on-demand-learned")
+    levels = recipe.extraction.levels
+    assert [level.base for level in levels] == [0, 0, 2, 3, 2]
+    assert [level.max_image_size_px for level in levels] == [2400, 2400, 1024, 2400, 1024]
+    assert [level.matching and level.matching.name for level in levels] == [
+        *(None, None, "lightglue"),
+        *(None, "lightglue"),
+    ]
+    assert len({level.name for level in levels}) == len(levels)
+    assert set(recipe.weights) == {"aliked-n16", "lightglue-aliked"}
+    assert load_recipe("on-demand").extraction.levels[3].base == 0
 
 
 TRAINED_FOR = "dog-affnet-hardnet-lightglue"
@@ -169,6 +169,8 @@ def test_wrong_setting_is_one_clear_line(setting: str, message: str) -> None:
 def test_unknown_recipe_is_named_with_a_suggestion_and_the_known_ones() -> None:
     with pytest.raises(OptionError, match=r"'defualt': did you mean 'default'\? known are affnet"):
         load_recipe("defualt")
+    with pytest.raises(OptionError, match="did you mean 'second-moment-shapes'"):
+        load_recipe("affnet-shapes-recommended")
 
 
 def test_recipe_file_is_read_and_what_it_leaves_out_is_default(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from strategies import tilt_distance
 
 from colmap_affrect.data import Mask, Rectification, RectificationPlan, ShapeGrid
-from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
+from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.geometry.affine import rectifying_affine
 from colmap_affrect.geometry.tilts import (
     metrics_from_tilts,
