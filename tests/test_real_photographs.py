@@ -1,4 +1,4 @@
-"""Memory, and learned features with published weights, on photographs of ../shared."""
+"""The claims of BENCHMARKS.md on real photographs in ../shared, which the project does not hold."""
 
 from __future__ import annotations
 
@@ -7,9 +7,15 @@ import sys
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from command import Call
 
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+from registration import compare, compare_subset
+
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.features.weights import missing
 from colmap_affrect.recipes import load_recipe
 
@@ -19,6 +25,52 @@ pytestmark = [
     pytest.mark.shared,
     pytest.mark.skipif(not SCENES.is_dir(), reason="the photographs of ../shared are not here"),
 ]
+
+
+@pytest.mark.parametrize(
+    ("recipe", "name", "min_correct", "median_error_deg"),
+    [
+        ("default", "fountain 0,5,10", 3, 0.5),
+        ("default", "herz 0,8,16,24", 4, 0.5),
+        ("default", "kermit /2", 6, 2.0),
+        ("default", "sacre_coeur /2", 5, 2.0),
+        ("on-demand", "herz 0,8,16,24", 4, 0.5),
+    ],
+)
+def test_sparse_subset_registers_correctly(recipe, name, min_correct, median_error_deg, tmp_path):
+    result = compare_subset(name, SCENES, tmp_path, [recipe], 5)["methods"][recipe]
+    scores = [seed["scores"] for seed in result["seeds"]]
+    assert sum(len(score["correct_names"]) >= min_correct for score in scores) >= 4
+    errors = sorted(score["median_rotation_error_deg"] for score in scores)
+    assert errors[2] < median_error_deg
+
+
+def count_distinct_inliers(database_path):
+    """Count matches by their places: of a place with two orientations COLMAP counts both."""
+    matches = inlier_matches(database_path, 1)
+    with open_database(database_path) as database:
+        points = {
+            image.image_id: np.asarray(database.read_keypoints(image.image_id))[:, :2]
+            for image in database.read_all_images()
+        }
+    return sum(
+        len(np.unique(np.hstack([points[first][rows[:, 0]], points[second][rows[:, 1]]]), axis=0))
+        for (first, second), rows in matches.items()
+    )
+
+
+@pytest.mark.parametrize("scene", ["strecha_fountain_p11", "strecha_herz_jesus_p25", "kermit"])
+def test_photographs_taken_close_together_match_in_as_many_places_as_with_sift(scene, tmp_path):
+    images = SCENES / scene / "images"
+    names = sorted(path.name for path in images.iterdir())[:3]
+    comparison = compare(images, names, tmp_path, ["sift", "default"], 1)
+    counts = {
+        label: count_distinct_inliers(
+            tmp_path / "compare" / of["folder"] / "seed-0" / "database.db"
+        )
+        for label, of in comparison["methods"].items()
+    }
+    assert counts["default"] >= counts["sift"] > 100
 
 
 def test_peak_memory_of_extraction_stays_under_1500_mb_on_12_megapixels(tmp_path):
