@@ -12,7 +12,7 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.poses import AUC_THRESHOLDS_DEG, PoseScores
+from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, PoseScores
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.pairs.base import Pair

@@ -12,7 +12,6 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -22,17 +21,13 @@ from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
+from colmap_affrect.project.feature_index import Entries, entries, forget
 from colmap_affrect.project.group_store import GroupStore, checked, complete_groups, is_complete
 
 MAX_INT16 = 32767
 STATIONARY = "stationary_cells"
 STEP = "step"
 FINISHED = "finished_list"
-
-Entries = dict[str, tuple[str, int, tuple[int, int]]]
-"""By image: the digest of the files that it was extracted from, the number of features, and
-(width, height) in px."""
-_known: dict[Path, tuple[list[int], Entries]] = {}  # with number, size and times of the file
 
 
 @dataclass(frozen=True)
@@ -74,16 +69,12 @@ class FeatureStore(GroupStore):
         if not self.path.exists():
             return {}
         with self._open("r") as file:
-            there = self.path.stat()
-            stamp = [there.st_ino, there.st_size, there.st_mtime_ns, there.st_ctime_ns]
-            if self.path not in _known or _known[self.path][0] != stamp:
-                _known[self.path] = stamp, dict(sorted(_entries_of(file).items()))
-            return _known[self.path][1]
+            return entries(self.path, lambda: _entries_of(file))
 
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:
         if mode != "r":
-            _known.pop(self.path, None)
+            forget(self.path)
         with super()._open(mode) as file:
             yield file
 

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.poses import (
-    Poses,
+from colmap_affrect.colmap.poses import Poses, read_poses
+from colmap_affrect.comparison.pose_scores import (
     area_under_curve,
     correct_images,
     disagreeing_images,
     pair_errors,
     pose_scores,
     position_errors,
-    read_poses,
 )
 from colmap_affrect.errors import ComparisonError
 
