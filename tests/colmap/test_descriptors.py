@@ -85,14 +85,6 @@ def test_signed_descriptors_of_networks_are_matched_too(tmp_path: Path) -> None:
     assert len(expected & found) >= 0.95 * len(expected)
 
 
-def test_rows_have_the_length_that_colmap_expects() -> None:
-    rng = np.random.default_rng(0)
-    for rows in (rng.normal(size=(40, 128)), rng.exponential(size=(40, 128))):
-        encoded = colmap_descriptors(rows / np.linalg.norm(rows, axis=1, keepdims=True))
-        lengths = np.linalg.norm(encoded.astype(float), axis=1)
-        np.testing.assert_allclose(lengths, 512.0, atol=4.0)
-
-
 def test_positive_descriptors_keep_their_values_and_none_or_zero_are_no_trouble() -> None:
     row = np.full((1, 128), np.sqrt((1.0 - 0.26) / 125))
     row[0, :3] = 0.3, 0.4, 0.1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -164,15 +163,6 @@ def test_shapes_that_are_all_alike_tell_nothing() -> None:
     assert telling_shapes(rows(lafs)) is None
 
 
-def test_shapes_that_are_those_of_views_tell_nothing() -> None:
-    lafs, _ = frames_of([HOMOGRAPHY], 90, 4)
-    views = np.array([np.eye(2), [[1.5, 0.4], [0.0, 0.6]], [[0.5, 0.0], [-0.8, 2.0]]])
-    lafs[:, :, :2] = 12.0 * views[np.arange(90) % 3]
-    assert telling_shapes(rows(lafs)) is None
-    lafs[:, :, :2] = lafs[:, :, :2] @ rotation(np.linspace(0, 3, 90))
-    assert telling_shapes(rows(lafs)) is not None
-
-
 def test_frames_of_a_plane_turn_as_its_homography_does() -> None:
     first, second = frames_of([HOMOGRAPHY], 40, 5)
     np.testing.assert_allclose(second[:, :, 2], project(HOMOGRAPHY, first[:, :, 2]))
@@ -265,25 +255,6 @@ def test_preset_colmap_writes_what_pycolmap_does(tmp_path: Path) -> None:
         assert ours.config == theirs.config
         np.testing.assert_array_equal(ours.inlier_matches, theirs.inlier_matches)
         np.testing.assert_array_equal(ours.E, theirs.E)
-
-
-def test_missing_shapes_are_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    for columns in (2, 6):
-        write_pairs(tmp_path / f"{columns}.db", columns)
-    with caplog.at_level(logging.WARNING):
-        verify(tmp_path / "6.db", VerificationOptions(max_num_trials=100))
-        assert not caplog.messages
-        verify(tmp_path / "2.db", VerificationOptions.preset("colmap", max_num_trials=100))
-        assert not caplog.messages
-    for _ in range(2):  # as a vote on cameras does
-        with open_database(tmp_path / "2.db") as database:
-            database.clear_two_view_geometries()
-        with caplog.at_level(logging.INFO):
-            verify(tmp_path / "2.db", VerificationOptions(max_num_trials=100))
-    assert [message.split(": ")[1] for message in caplog.messages] == [
-        "keypoints have no shapes; pairs need more inliers to count as verified, and sides that "
-        "look alike are not told apart"
-    ]
 
 
 def test_threshold_grows_with_photographs_that_were_shrunk() -> None:
