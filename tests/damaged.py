@@ -116,20 +116,6 @@ STATEMENTS = (
 """What nobody means to do to the rows of a database; ``{id}`` is one of the images."""
 
 
-PROBES = (
-    "SELECT image_id, name, camera_id FROM images ORDER BY name",
-    "SELECT * FROM cameras ORDER BY camera_id",
-    "SELECT count(*), total(length(data)), total(rows) FROM keypoints",
-    "SELECT pair_id, rows FROM matches ORDER BY pair_id",
-    "SELECT pair_id, rows, config FROM two_view_geometries ORDER BY pair_id",
-    "SELECT * FROM pose_priors",
-    "SELECT * FROM frames ORDER BY frame_id",
-    "SELECT count(*) FROM rigs",
-    "SELECT type, name FROM sqlite_master ORDER BY type, name",
-    "PRAGMA user_version",
-)
-
-
 Statement = str | tuple[str, list[object]]
 """What SQLite is to do; perhaps with the values of its question marks."""
 
@@ -142,9 +128,3 @@ def execute(path: Path, *statements: Statement) -> None:
             query, values = (statement, []) if isinstance(statement, str) else statement
             connection.execute(query, values)
         connection.commit()
-
-
-def rows(path: Path) -> dict[str, list[Any]]:
-    """What a database answers to the probes."""
-    with closing(sqlite3.connect(path)) as connection:
-        return {probe: connection.execute(probe).fetchall() for probe in PROBES}

@@ -32,7 +32,7 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.options import PRESETS
 from colmap_affrect.pipeline import InputOptions, holds_vote
 from colmap_affrect.stages import cameras as stage
@@ -174,20 +174,6 @@ def test_scans_of_one_camera_get_one_and_its_focal_length(scans: Path, voted: Pa
     assert len(pairs) == 3
     calibrated = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
     assert [config for config, _ in verified] == [calibrated] * 3
-
-
-def test_colmap_maps_what_the_vote_made(voted: Path, tmp_path: Path) -> None:
-    mapper = MAPPERS.make(MAPPERS.options({"name": "incremental"}))
-    path = copied(voted, tmp_path)
-    records = read_camera_records(path.with_name("cameras.json"))
-    task = MappingTask(path, None, cameras=records)
-    output = tmp_path / "models"
-    output.mkdir()
-    (model,) = mapper.map(task, output, 0, lambda _: None)
-    assert model.reconstruction.num_reg_images() == 3
-    assert (len(model.reconstruction.cameras), len(model.reconstruction.rigs)) == (2, 2)
-    for camera in model.reconstruction.cameras.values():
-        assert camera.mean_focal_length() == pytest.approx(1000 * FOCAL, rel=0.03)
 
 
 def test_images_of_a_model_bring_their_cameras_into_a_database(

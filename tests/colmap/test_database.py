@@ -16,7 +16,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
     colmap_keypoints,
     image_ids,
-    lack_matches,
     open_database,
     write_keypoints,
     write_matches,
@@ -95,13 +94,6 @@ def test_new_database_appears_with_all_images_or_not_at_all(
     import_images(path, image_folder, NAMES[:2], CameraOptions(mode="per-folder"))
     assert sorted(image_ids(path)) == NAMES[:2]
     assert sorted(file.name for file in tmp_path.glob("database.db*")) == ["database.db"]
-
-
-def test_image_ids_of_a_file_that_is_no_database_is_a_database_error(tmp_path: Path) -> None:
-    path = tmp_path / "not a database.db"
-    path.write_bytes(b"something else, long enough to have a header of its own" * 10)
-    with pytest.raises(DatabaseError, match=r"not a database\.db"):
-        image_ids(path)
 
 
 def test_colmap_keypoints_move_by_half_a_pixel_and_divide_shapes_by_six() -> None:
@@ -244,13 +236,3 @@ def test_database_that_cannot_be_made_on_a_full_disk_says_so(
         WorkspaceError, match=r"any\.db: cannot be written \(No space left on device"
     ):
         image_ids(tmp_path / "any.db")
-
-
-def test_pairs_without_a_row_of_matches_are_those_that_lack_them(database_path: Path) -> None:
-    with open_database(database_path) as database:
-        for image_id in (1, 2, 3):
-            write_keypoints(database, image_id, some_frames(3))
-        write_matches(database, 1, 2, np.zeros((0, 2), np.int64))
-        write_matches(database, 1, 3, np.array([[0, 1]]))
-        pairs = np.array([[2, 1], [1, 3], [3, 2], [0, 2]])
-        assert lack_matches(database, pairs).tolist() == [False, False, True, False]

@@ -60,25 +60,16 @@ def write_scene(scene: Scene) -> None:
     write_photographs(scene.photos)
     lines = [f"{NAMES[0]}\t{name}" for name in NAMES[1:]] + ["\t".join(NAMES[2:])]
     scene.file("pairs.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    rows = np.linspace(3.0, 6.0, IMAGE_SIZE[1], dtype=np.float32)
     for name in NAMES:
-        for folder in ("masks", "depth"):
-            (scene.file(folder) / name).parent.mkdir(parents=True, exist_ok=True)
+        (scene.file("masks") / name).parent.mkdir(parents=True, exist_ok=True)
         white = np.full(IMAGE_SIZE[::-1], 255, np.uint8)
         write_image(scene.file("masks") / f"{name}.png", white)
-        depth = np.repeat(rows[:, np.newaxis], IMAGE_SIZE[0], axis=1)
-        np.save(scene.file("depth") / f"{name}.npy", depth)
     image_ids(scene.file("source.db"))  # makes it
     pycolmap.import_images(scene.file("source.db"), scene.photos, pycolmap.CameraMode.PER_IMAGE)
 
 
 def masks(scene: Scene) -> list[object]:
     return [*FAST, "--mask-path", scene.file("masks")]
-
-
-def depth(scene: Scene) -> list[object]:
-    recipe = ["--recipe", "depth-planes", "--set", 'features="rootsift"']
-    return [*recipe, *FAST[2:], "--depth-path", scene.file("depth")]
 
 
 def pairs(scene: Scene) -> list[object]:
@@ -93,7 +84,7 @@ def plain(_: Scene) -> list[object]:
     return list(FAST)
 
 
-ARGUMENTS = {kind.__name__: kind for kind in (plain, masks, depth, pairs, source)}
+ARGUMENTS = {kind.__name__: kind for kind in (plain, masks, pairs, source)}
 
 
 @pytest.fixture(scope="module")
@@ -130,11 +121,6 @@ def mask_painted(scene: Scene) -> None:
     scene.repaint(f"masks/{FIRST}.png")
 
 
-def depth_changed(scene: Scene) -> None:
-    path = scene.file("depth") / f"{FIRST}.npy"
-    np.save(path, np.load(path)[:, ::-1] + np.linspace(0, 4, IMAGE_SIZE[0], dtype=np.float32))
-
-
 def list_changed(scene: Scene) -> None:
     path = scene.file("pairs.txt")
     lines = path.read_text(encoding="utf-8").splitlines()
@@ -169,7 +155,6 @@ CHANGES: list[tuple[str, Callable[[Scene], None], str]] = [
     ("plain", added, ""),
     ("plain", output_inside, ""),
     ("masks", mask_painted, "1 changed (a.png)"),
-    ("depth", depth_changed, "1 changed (a.png)"),
     ("pairs", list_changed, "1 pairs are not listed any more, such as a.png and side/č.png"),
     ("source", source_changed, "cameras are given by other files"),
 ]
@@ -270,17 +255,6 @@ def test_photographs_that_moved_or_are_gone_are_named_by_map(tmp_path: Path, cal
     scene.photos.rename(tmp_path / "moved")
     refused = call("map", "--output-path", scene.out)
     assert "no such folder; if the photographs have moved, run extract again" in refused.errors[0]
-
-
-def test_photographs_that_a_database_does_not_name_are_told(tmp_path: Path, call: Call) -> None:
-    scene = Scene(tmp_path)
-    write_photographs(scene.photos, 2)
-    image_ids(scene.file("source.db"))
-    pycolmap.import_images(scene.file("source.db"), scene.photos, pycolmap.CameraMode.PER_IMAGE)
-    write_photographs(scene.photos, 4)
-    ended = call("extract", "--image-path", scene.photos, "--output-path", scene.out, *FAST[:2],
-                 "--from-database", scene.file("source.db"))  # fmt: skip
-    assert "2 photographs are left out, such as side/d.png" in "".join(ended.stderr)
 
 
 def test_changed_photograph_of_a_users_database_is_named(tmp_path: Path) -> None:

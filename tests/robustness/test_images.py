@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import struct
-import subprocess
-import sys
 import unicodedata
 import zlib
 from dataclasses import dataclass
@@ -22,7 +20,6 @@ from synthetic import jpeg_with_orientation, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.images.photographs import left_out, list_images
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, read_gray
 from colmap_affrect.project.stores import FeatureStore
 
@@ -188,43 +185,6 @@ def test_tiny_images_are_no_obstacle(trio, run_images) -> None:
     assert set(ended.report["unregistered"].values()) <= {"no features", "no verified pair"}
 
 
-PEAK_MEMORY = """
-import sys
-from colmap_affrect.cli import main
-from colmap_affrect.parallel.executor import peak_memory_bytes
-code = main(sys.argv[1:])
-print("peak", peak_memory_bytes() // 1024)
-sys.exit(code)
-"""
-BYTES_PER_PIXEL = 10
-"""Of the largest image: the file, gray, and what COLMAP decodes."""
-
-
-@pytest.mark.slow
-def test_hundred_megapixels_fit_into_little_memory(trio, tmp_path) -> None:
-    def run_and_measure(out: str) -> tuple[str, float]:
-        arguments = ["run", "--image-path", trio, "--output-path", tmp_path / out, *FAST]
-        done = subprocess.run(
-            [sys.executable, "-c", PEAK_MEMORY, *map(str, arguments)],
-            capture_output=True, text=True, timeout=300, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        *summary, peak = done.stdout.splitlines()
-        return summary[0], int(peak.split()[1]) * 1024
-
-    _, usual = run_and_measure("small")
-    size = (12000, 8500)
-    large = cv2.resize(fifth_photograph(), size, interpolation=cv2.INTER_CUBIC)
-    write_image(trio / "large.png", large)
-    del large
-    registered, peak = run_and_measure("large")
-    assert registered in ("registered  3 of 4 images", "registered  4 of 4 images")
-    assert peak - usual < BYTES_PER_PIXEL * size[0] * size[1]
-    keypoints = FeatureStore(tmp_path / "large" / "features.h5").read("large.png").keypoints
-    assert len(keypoints) > 500
-    assert keypoints.max(axis=0)[0] > 10_000  # in px of the stored image
-
-
 @pytest.mark.long
 def test_names_of_all_kinds_go_through(tmp_path, run_images, call) -> None:
     accented = "ž é.png"
@@ -254,16 +214,6 @@ def test_names_of_all_kinds_go_through(tmp_path, run_images, call) -> None:
     # The list of pairs that the run wrote is one that it reads.
     ended = call("pairs", *again, "--match-list-path", tmp_path / "out" / "pairs.txt")
     assert ended.stdout.startswith("pairs: 10 done")
-
-
-@pytest.mark.parametrize("character", ["\n", "\t", "\u2028"])
-def test_name_that_lists_cannot_hold_is_left_out(tmp_path, character) -> None:
-    for name in ("a.png", f"a{character}b.png"):
-        (tmp_path / name).touch()
-    assert list_images(tmp_path) == ["a.png"]
-    (told,) = left_out(tmp_path).values()
-    assert f"such as a\\u{ord(character):04x}b.png" in told
-    assert "rename it" in told
 
 
 def test_float_pixels_that_are_not_finite_are_black_or_white(tmp_path) -> None:
