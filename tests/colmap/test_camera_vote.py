@@ -133,17 +133,6 @@ def test_given_focal_length_that_most_pairs_contradict(
     assert path.with_name("cameras.json").stat().st_mtime_ns == before
 
 
-def test_cameras_that_come_later_are_asked_with_those_before(tmp_path: Path) -> None:
-    path = write(tmp_path / "database.db", [FOCAL] * 4, [WIDE] * 4)
-    with_given(path, 500.0 * FOCAL)
-    records_path = path.with_name("cameras.json")
-    asked = {key: replace(r, is_contradicted=False) for key, r in vote(path).items()}
-    write_camera_records(records_path, asked)
-    assert vote(path) == asked
-    write_camera_records(records_path, asked | {3: replace(asked[3], is_contradicted=None)})
-    assert all(record.is_contradicted for record in vote(path).values())
-
-
 def test_scans_of_one_camera_get_one_and_its_focal_length(scans: Path, voted: Path) -> None:
     """A turned scan shares the focal length, not the camera: its sides are swapped."""
     records = read_camera_records(voted.with_name("cameras.json"))

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from small_scene import write_photographs
 
 import colmap_affrect
-from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
     colmap_descriptors,
@@ -96,23 +95,3 @@ def test_positive_descriptors_keep_their_values_and_none_or_zero_are_no_trouble(
 def test_descriptors_of_another_size_are_refused() -> None:
     with pytest.raises(DatabaseError, match=r"64 elements.*leave out --database-descriptors"):
         colmap_descriptors(np.ones((3, 64)))
-
-
-def test_descriptors_are_written_anew_after_an_escalation(tmp_path: Path) -> None:
-    write_photographs(tmp_path / "photos", 2)
-    arguments = ["--image-path", str(tmp_path / "photos"), "--output-path", str(tmp_path / "out")]
-    chosen = ["--recipe", "on-demand", "--database-descriptors", "-q"]
-    assert main(["extract", *arguments, *chosen]) == 0
-    path = tmp_path / "out" / "database.db"
-    with open_database(path) as database:
-        before = database.num_descriptors_for_image(1)
-        assert before == database.num_keypoints_for_image(1)
-    store = FeatureStore(tmp_path / "out" / "features.h5")
-    for name in store.names():
-        store.extend(name, store.read(name))
-    assert main(["extract", *arguments, *chosen]) == 0
-    with open_database(path) as database:
-        for image_id in (1, 2):
-            count = database.num_keypoints_for_image(image_id)
-            assert database.num_descriptors_for_image(image_id) == count
-        assert database.num_descriptors_for_image(1) == 2 * before

@@ -173,7 +173,7 @@ def test_frames_of_a_plane_turn_as_its_homography_does() -> None:
     assert (turn_cosines(carried, second[:, :, :2] @ np.diag([1.0, -1.0])) == -1.0).all()
 
 
-def write_pairs(path: Path, columns: int = 6) -> None:
+def write_pairs(path: Path) -> None:
     """Write images 1 to 4: a right pair (1, 2) and a wrong one (3, 4)."""
     pairs = [weak_pair(frames_agree=agree) for agree in (True, False)]
     with open_database(path) as database:
@@ -181,7 +181,7 @@ def write_pairs(path: Path, columns: int = 6) -> None:
         for image_id, lafs in enumerate((*pairs[0], *pairs[1]), 1):
             image = pycolmap.Image(name=f"{image_id}.png", image_id=image_id, camera_id=1)
             database.write_image(image, use_image_id=True)
-            database.write_keypoints(image_id, rows(lafs, columns))
+            database.write_keypoints(image_id, rows(lafs))
         same = np.stack([np.arange(len(pairs[0][0]))] * 2, axis=1)
         for pair in ((1, 2), (3, 4)):
             write_matches(database, *pair, same)

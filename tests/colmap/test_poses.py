@@ -11,7 +11,6 @@ import pytest
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import (
     Poses,
-    area_under_curve,
     correct_images,
     disagreeing_images,
     pair_errors,
@@ -89,12 +88,6 @@ def test_no_pairs(truth: Poses, num_images: int) -> None:
     assert scores.median_rotation_error_deg is None
     assert scores.median_position_error is None
     assert set(scores.auc.values()) == {0.0}
-
-
-def test_area_under_the_curve_is_that_of_the_steps() -> None:
-    """Of 5 pairs two are at 0 and 2 degrees: 1/5 from 0 to 2, 2/5 from 2 to 4."""
-    assert area_under_curve([2.0, 0.0, 7.0], 5, 4.0) == pytest.approx((0.2 * 2 + 0.4 * 2) / 4)
-    assert area_under_curve([], 0, 4.0) == 0
 
 
 def test_missing_images_count_as_failures(truth: Poses) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database, write_keypoints, write_matches
 from colmap_affrect.colmap.native_options import flat_values
+from colmap_affrect.colmap.poses import pair_errors
 from colmap_affrect.colmap.verification import (
     VerificationOptions,
     verification_differences,
@@ -111,19 +112,13 @@ def registered(model: pycolmap.Reconstruction) -> list[str]:
     return sorted(model.images[image_id].name for image_id in model.reg_image_ids())
 
 
-def rotation_errors_deg(
-    model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction
-) -> list[float]:
-    """Errors of the relative rotation of every two registered images."""
-    errors = []
-    for id1, id2 in combinations(sorted(model.reg_image_ids()), 2):
-        relative = [
-            scene.images[id2].cam_from_world().rotation
-            * scene.images[id1].cam_from_world().rotation.inverse()
-            for scene in (model, truth)
-        ]
-        errors.append(np.rad2deg((relative[0] * relative[1].inverse()).angle()))
-    return errors
+def max_rotation_error_deg(model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction) -> float:
+    """Largest error of the relative rotation of two registered images."""
+    poses = []
+    for scene in (model, truth):
+        found = {image.name: image.cam_from_world() for image in scene.images.values()}
+        poses.append({k: (v.rotation.matrix(), v.translation) for k, v in found.items()})
+    return max(degrees for degrees, _ in pair_errors(*poses).values())
 
 
 def test_synthetic_scene_through_our_writer_registers_all_images_in_place(
@@ -134,7 +129,7 @@ def test_synthetic_scene_through_our_writer_registers_all_images_in_place(
     (model,) = reconstruct(path)
     assert registered(model) == sorted(image.name for image in truth.images.values())
     assert model.num_points3D() >= 140
-    assert max(rotation_errors_deg(model, truth)) < ROTATION_ERROR_DEG
+    assert max_rotation_error_deg(model, truth) < ROTATION_ERROR_DEG
     assert model.compute_mean_reprojection_error() < 0.05
     # The principal point is half the size: a shift by half a pixel would show in the points.
     point = next(iter(model.points3D.values()))
@@ -155,7 +150,7 @@ def test_two_images_register_with_our_preset_and_not_with_colmaps_default(
     (model,) = reconstruct(path)
     assert registered(model) == sorted(image.name for image in truth.images.values())
     assert {point.track.length() for point in model.points3D.values()} == {2}
-    assert max(rotation_errors_deg(model, truth)) < 10 * ROTATION_ERROR_DEG
+    assert max_rotation_error_deg(model, truth) < 10 * ROTATION_ERROR_DEG
 
 
 def test_random_matches_among_true_ones_are_sorted_out(tmp_path: Path) -> None:

@@ -21,12 +21,9 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.images.reading import read_gray
-from colmap_affrect.interop.pycolmap_api import extract_features, match_exhaustive
+from colmap_affrect.interop.pycolmap_api import extract_features
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import Inputs, extract, extract_images, prepared_recipe
 
 FIRST, SECOND = NAMES[:2]
 
@@ -266,39 +263,6 @@ def test_changed_photograph_of_a_users_database_is_named(tmp_path: Path) -> None
         StaleStoreError, match=r"own\.db: since it was made, 1 changed \(a\.png\); use"
     ):
         extract_features(scene.file("own.db"), scene.photos, extraction_options=FAST[1])
-
-
-def test_photograph_of_another_size_than_its_camera_is_told_by_map(
-    tmp_path: Path, call: Call
-) -> None:
-    scene = Scene(tmp_path)
-    write_photographs(scene.photos, 2)
-    own = scene.file("own.db")
-    extract_features(own, scene.photos, extraction_options=FAST[1])
-    match_exhaustive(own)
-    write_image(scene.photos / SECOND, read_gray(scene.photos / SECOND)[:-8, :-16])
-    paths = ["--output-path", scene.out, "--image-path", scene.photos]
-    ended = call("map", "--from-database", own, *paths, "-q")
-    line = "1 photographs have another size than their cameras, such as b c.png: the database was"
-    assert line in ended.stdout
-    before = [path.read_bytes() for path in sorted(scene.out.rglob("*.bin"))]
-    own.write_bytes(own.read_bytes()[:-8192])
-    ended = call("map", "--from-database", own, *paths, "-q")
-    assert (ended.code, len(ended.stderr)) == (1, 1)
-    assert [path.read_bytes() for path in sorted(scene.out.rglob("*.bin"))] == before
-
-
-def test_escalation_refuses_photographs_that_have_changed(tmp_path: Path) -> None:
-    scene = Scene(tmp_path)
-    write_photographs(scene.photos, 2)
-    recipe, inputs = load_recipe("on-demand"), Inputs.of(scene.photos)
-    context = Context(Workspace(scene.out))
-    scene.out.mkdir()
-    extract(context, inputs, recipe)
-    scene.repaint(f"photos/{FIRST}")
-    extractor = prepared_recipe(context, recipe.extraction, [FIRST])
-    with pytest.raises(StaleStoreError, match=r"1 changed \(a.png\) since their features"):
-        list(extract_images(context, inputs, extractor, [(SECOND, 1), (FIRST, 1)]))
 
 
 @pytest.mark.parametrize("step", ["MatchStore.remove", "FeatureStore.remove"])

@@ -14,12 +14,11 @@ import numpy as np
 import PIL.Image
 import pytest
 from command import CAMERA, FAST, Ended, run_in_process_of_its_own
-from results import database_content, state
-from small_scene import IMAGE_SIZE, NAMES, photograph, write_photographs
-from synthetic import jpeg_with_orientation, write_image
+from results import state
+from small_scene import NAMES, photograph, write_photographs
+from synthetic import write_image
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import open_database
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, read_gray
 from colmap_affrect.project.stores import FeatureStore
 
@@ -148,27 +147,6 @@ def test_pixels_of_all_kinds_register(trio, run_images, tmp_path) -> None:
     ended = run_images(trio, *FAST, "--match-list-path", pairs)
     assert ended.code == 0, ended.stderr
     assert ended.report["unregistered"] == {}
-
-
-@pytest.mark.long
-def test_exif_orientation_is_not_applied(tmp_path, call) -> None:
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    for orientation in range(9):
-        data = jpeg_with_orientation(fifth_photograph(), orientation)
-        (photos / f"{orientation}.jpg").write_bytes(data)
-    with PIL.Image.open(photos / "6.jpg") as image:
-        assert image.getexif()[0x0112] == 6, "the EXIF bytes of this test are not understood"
-    ended = call("extract", "--image-path", photos, "--output-path", tmp_path / "out", *FAST)
-    assert (ended.code, ended.errors) == (0, [])
-    database = tmp_path / "out" / "database.db"
-    keypoints = database_content(database)["keypoints"]
-    assert len(keypoints) == 9
-    assert set(keypoints.values()) == {keypoints["1.jpg"]}
-    with open_database(database) as opened:
-        sizes = {(camera.width, camera.height) for camera in opened.read_all_cameras()}
-    assert sizes == {IMAGE_SIZE}
-    assert set(FeatureStore(tmp_path / "out" / "features.h5").image_sizes().values()) == sizes
 
 
 @pytest.mark.long
