@@ -25,25 +25,15 @@ def _require(condition: bool, message: str) -> None:
 
 @dataclass(frozen=True)
 class Photograph:
-    """An image as rectifiers and depth sources see it.
+    """An image as rectifiers and depth sources see it."""
 
-    Attributes:
-        gray: (H, W) uint8 at the size of processing, at most ``max_image_size_px``.
-        name: relative POSIX path below the image folder, the key of depth maps.
-        path: the file; None for an image that was never one.
-        camera_matrix: (3, 3) float64 pinhole intrinsics in pixel-centre px of ``gray``.
-        mask: (H, W) bool, where features may be; None means everywhere.
-        color: (H, W, 3) uint8 red, green, blue, for feature extractors that ask for it.
-        stretched: whether its contrast was low, and its tones have been stretched.
-    """
-
-    gray: GrayImage
-    name: str
-    path: Path | None
-    camera_matrix: Array
-    mask: Mask | None = None
-    color: ColorImage | None = None
-    stretched: bool = False
+    gray: GrayImage  # (H, W) uint8 at the size of processing, at most ``max_image_size_px``
+    name: str  # relative POSIX path below the image folder, the key of depth maps
+    path: Path | None  # the file; None for an image that was never one
+    camera_matrix: Array  # (3, 3) float64 pinhole intrinsics in pixel-centre px of ``gray``
+    mask: Mask | None = None  # (H, W) bool, where features may be; None: everywhere
+    color: ColorImage | None = None  # (H, W, 3) uint8, for extractors that ask for it
+    stretched: bool = False  # its contrast was low, and its tones have been stretched
 
     @property
     def size(self) -> tuple[int, int]:
@@ -53,32 +43,20 @@ class Photograph:
 
 @dataclass(frozen=True)
 class ShapeSamples:
-    """Affine shapes at points of an image.
+    """Affine shapes at points of an image."""
 
-    Attributes:
-        points: (N, 2) float64 pixel-centre px.
-        metrics: (N, 3) unit metrics (S11, S22, S12) of the *rectifying* maps.
-    """
-
-    points: Array
-    metrics: Floats
+    points: Array  # (N, 2) float64 pixel-centre px
+    metrics: Floats  # (N, 3) unit metrics (S11, S22, S12) of the *rectifying* maps
 
 
 @dataclass(frozen=True)
 class ShapeGrid:
-    """Affine shapes on a regular grid over an image; what every dense shape source returns.
+    """Affine shapes on a regular grid over an image; what every dense shape source returns."""
 
-    Attributes:
-        metrics: (R, C, 3) unit metrics (S11, S22, S12) of the *rectifying* maps.
-        textured: (R, C) bool, False where the image has no structure to read a shape from.
-        origin_px: centre of cell (0, 0) in x and in y, pixel-centre px.
-        step_px: distance of neighbouring cells in px.
-    """
-
-    metrics: Floats
-    textured: Mask
-    origin_px: float
-    step_px: int
+    metrics: Floats  # (R, C, 3) unit metrics (S11, S22, S12) of the *rectifying* maps
+    textured: Mask  # (R, C) bool, False where the image has no structure to read a shape from
+    origin_px: float  # centre of cell (0, 0) in x and in y, pixel-centre px
+    step_px: int  # distance of neighbouring cells in px
 
     def __post_init__(self) -> None:
         _require(
@@ -95,19 +73,14 @@ class ShapeGrid:
 
 @dataclass(frozen=True)
 class LocalFeatures:
-    """Local features of one image as full local affine frames.
+    """Local features of one image as full local affine frames."""
 
-    Attributes:
-        lafs: (N, 2, 3) float64 frames in image px; x = A u + c maps the unit circle to the
-            measurement ellipse (conventions, item 6); det A > 0.
-        responses: (N,) float32 detector responses, > 0.
-        descriptors: (N, D) float32 of unit length; D = 0 before they are described.
-        rectification_ids: (N,) int32, the warp each feature comes from; 0 is the image itself.
-    """
-
+    # (N, 2, 3) float64 frames in image px; x = A u + c maps the unit circle to the measurement
+    # ellipse (conventions, item 6); det A > 0
     lafs: Array
-    responses: Singles
-    descriptors: Singles
+    responses: Singles  # (N,) float32 detector responses, > 0
+    descriptors: Singles  # (N, D) float32 of unit length; D = 0 before they are described
+    # (N,) int32, the warp each feature comes from; 0 is the image itself
     rectification_ids: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
     def __post_init__(self) -> None:
@@ -177,26 +150,19 @@ def union(parts: list[LocalFeatures]) -> LocalFeatures:
 
 @dataclass(frozen=True)
 class Rectification:
-    """One rectifying warp and the part of the image it is meant for.
+    """One rectifying warp and the part of the image it is meant for."""
 
-    Attributes:
-        rectified_from_image: (3, 3) float64 map of pixel-centre coordinates; a homography
-            has a positive third coordinate all over the region.
-        canvas_size: (width, height) of the warp in px.
-        region: (h, w) bool mask of the part of the image; None means all of it.
-        tilt, tilt_angle_rad: class of the map in the space of tilts; of a homography, that of
-            its Jacobian at the middle of the region.
-        region_origin: (x, y) image pixel of the mask's first pixel.
-        segment_id: the segment of the image it belongs to, from 0; several warps may share one.
-    """
-
+    # (3, 3) float64 map of pixel-centre coordinates; a homography has a positive third coordinate
+    # all over the region
     rectified_from_image: Array
-    canvas_size: tuple[int, int]
-    region: Mask | None
+    canvas_size: tuple[int, int]  # (width, height) of the warp in px
+    region: Mask | None  # (h, w) bool mask of the part of the image; None: all of it
+    # class of the map in the space of tilts; of a homography, that of its Jacobian at the middle
+    # of the region
     tilt: float
     tilt_angle_rad: float
-    region_origin: tuple[int, int] = (0, 0)
-    segment_id: int = 0
+    region_origin: tuple[int, int] = (0, 0)  # (x, y) image pixel of the mask's first pixel
+    segment_id: int = 0  # the segment of the image, from 0; several warps may share one
 
     def in_region(self, points: Floats) -> Mask:
         """Tell which (N, 2) points, rounded to pixels of the image, belong to the region."""
@@ -233,22 +199,16 @@ def in_mask(mask: Mask, points: Floats, origin: tuple[int, int] = (0, 0)) -> Mas
 class RectificationPlan:
     """What to warp: data only, made by a rectifier, executed by ``rectifiers.execute``.
 
-    The image itself is always looked at and not listed. Warp k of ``items`` has the
+    The image itself always has features and is not listed. Warp k of ``items`` has the
     rectification id k + 1.
-
-    Attributes:
-        image_size: (width, height) in px.
-        items: the warps; may be empty.
-        original_region: (H, W) bool, where features of the image itself are kept; None
-            means everywhere.
-        replaces_original: a feature of the image itself gives way to one of a warp at the same
-            place and scale. For disjoint regions, each with the map that suits it best; where
-            several warps show the same place none of them is better than the image for sure.
     """
 
-    image_size: tuple[int, int]
-    items: tuple[Rectification, ...] = ()
+    image_size: tuple[int, int]  # (width, height) in px
+    items: tuple[Rectification, ...] = ()  # the warps
+    # (H, W) bool, where features of the image itself are kept; None: everywhere
     original_region: Mask | None = None
+    # a feature of a warp takes the place of one of the image itself at the same place and scale:
+    # for disjoint regions, each with the map that suits it best
     replaces_original: bool = False
 
     @property

@@ -1,15 +1,12 @@
-"""Options and exchangeable parts: what all of them have in common.
+"""What all options and all exchangeable parts have in common.
 
 Options are frozen pydantic models that refuse unknown names, values of another type and values out
 of range, in one line. A part is a class with its options class as attribute ``Options``; a
-:class:`Registry` finds it by the name in its options, here or, by an entry point, elsewhere.
+:class:`Registry` finds it by the name in its options.
 """
 
-import ast
 import difflib
 import hashlib
-import inspect
-import itertools
 import json
 import textwrap
 from collections.abc import Iterable, Mapping
@@ -38,7 +35,9 @@ def within(low: float, high: float) -> Any:
 class Options(BaseModel):
     """Base of all options."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
+    )
 
     def __init__(self, /, **values: Any) -> None:
         """Check the values; OptionError names the option."""
@@ -168,9 +167,7 @@ class Registry(Generic[Part]):
             named = {str(key): value for key, value in values.items()}
             return self.part(str(named.get("name", self.default))).Options(**named)
         except OptionError as error:
-            if not where:
-                raise
-            raise OptionError(f"{where}: {error}") from error
+            raise OptionError(f"{where}: {error}" if where else str(error)) from error
 
     def make(self, options: PartOptions, *given: Any) -> Part:
         """Build the part that options belong to; ``given`` is what else parts of this kind take."""
@@ -180,7 +177,6 @@ class Registry(Generic[Part]):
 
 def described_toml(options: Options, path: str = "") -> str:
     """Return options as TOML, under each what the text below it in its class says, as a comment."""
-    texts = _descriptions(type(options))
     lines, sections = [], []
     for name, value in options.to_mapping().items():
         inner = getattr(options, name)
@@ -192,26 +188,10 @@ def described_toml(options: Options, path: str = "") -> str:
         elif isinstance(value, dict):
             sections.append(tomli_w.dumps({name: value}) if value else "")
         else:
-            comment = textwrap.wrap(texts.get(name, "").replace("``", "'"), MAX_COMMENT)
+            text = type(options).model_fields[name].description or ""
+            comment = textwrap.wrap(text.replace("``", "'"), MAX_COMMENT)
             lines += [*(f"# {line}\n" for line in comment), tomli_w.dumps({name: value})]
     return "".join([*lines, *sections])
-
-
-def _descriptions(cls: type) -> dict[str, str]:
-    """Return the text below each field of a class and of those that it inherits from."""
-    found: dict[str, str] = {}
-    for base in reversed(cls.__mro__):
-        if not issubclass(base, Options):
-            continue
-        try:
-            source = textwrap.dedent(inspect.getsource(base))
-        except (OSError, TypeError):  # made at run time, or installed without its source
-            continue
-        (body,) = (node.body for node in ast.parse(source).body if isinstance(node, ast.ClassDef))
-        for field, text in itertools.pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                found[ast.unparse(field.target)] = " ".join(ast.literal_eval(text.value).split())
-    return found
 
 
 def digest_of(values: Any) -> str:

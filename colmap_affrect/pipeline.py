@@ -2,7 +2,6 @@
 
 import json
 import platform
-import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -35,15 +34,16 @@ from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.report.run_page import write_run_page
 from colmap_affrect.stages.cameras import choose_cameras
 from colmap_affrect.stages.context import Context, Resources
-from colmap_affrect.stages.copy import copy_verified, is_copy
+from colmap_affrect.stages.copy import copy_verified
 from colmap_affrect.stages.escalate import escalate, pair_levels
-from colmap_affrect.stages.extract import Inputs, extract, write_descriptors
+from colmap_affrect.stages.extract import extract, write_descriptors
 from colmap_affrect.stages.guide import (
     current,
     guide,
@@ -52,6 +52,7 @@ from colmap_affrect.stages.guide import (
     recorded_guiding,
     restore_exact,
 )
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.map import (
     advice,
     agreement,
@@ -282,7 +283,7 @@ def map_and_report(
         extend.refuse_discarding(workspace.path)
     before = existing_names(extend.model_path, image_names(workspace)) if extend else []
     reports, models = map_guided(context, mapper, extend, overwrite=overwrite)
-    names, copied = image_names(workspace), is_copy(workspace)
+    names, copied = image_names(workspace), workspace.is_copy
     verification = recorded_verification(workspace)
     missing, pair_inliers = unregistered(context, names, models), num_verified_inliers(workspace)
     cameras = read_camera_records(workspace.cameras)
@@ -334,7 +335,7 @@ def _says_the_same(path: Path, report: str) -> bool:
 
 def _require_photographs(context: Context) -> None:
     """Refuse to map photographs that are not where they were when they were extracted."""
-    if is_copy(context.workspace):
+    if context.workspace.is_copy:
         return
     inputs = Inputs.recorded(context.workspace)
     if not Path(inputs.image_path).is_dir():
@@ -361,7 +362,7 @@ def map_guided(
     if overwrite or not aside.exists():  # else a run has been killed in what follows
         report, models = map_images(context, mapper, extend, overwrite=overwrite)
         reports.append(report)
-        if extend or is_copy(context.workspace):
+        if extend or context.workspace.is_copy:
             return reports, models
         if not pairs_to_guide(context, images_in_need(context, sparse, min_num_tracks)):
             return reports, models
@@ -374,10 +375,10 @@ def map_guided(
         again, models = map_images(context, mapper)
         reports += [guided, again]
         if _are_better(context, models, aside):
-            shutil.rmtree(aside)
+            remove_own([aside])
             return reports, models
         restore_exact(context, new)
-        shutil.rmtree(sparse)
+        remove_own([sparse])
     aside.rename(sparse)
     (sparse / GUIDED_BEFORE).unlink()
     report, models = map_images(context, mapper)  # which reads them

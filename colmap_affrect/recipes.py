@@ -33,7 +33,7 @@ ImageSize = Annotated[int, within(16, 1_000_000)]
 
 
 class LevelOptions(Options):
-    """What pairs climb to; what is not given is as it is for all images."""
+    """A level of escalation; what is not given is as it is for all images."""
 
     rectifier: AnyRectifier = IdentityOptions()
     features: AnyFeatures | None = None
@@ -43,19 +43,19 @@ class LevelOptions(Options):
 
 @dataclass(frozen=True)
 class Level:
-    """One way to look at images and match them, all of it known."""
+    """Warps, features and matching of one level."""
 
     rectifier: RectifierOptions  # which warps
     features: FeatureOptions  # of the image and the warps
     max_image_size_px: int  # larger images are shrunk to this longer side
     matching: MatcherOptions | None  # how pairs are matched; None as the recipe says
-    # the lowest level with such features. It has those of the image itself, which are matched
-    # together with those of this level.
+    # the lowest level with such features: it has those of the image itself, which are matched
+    # together with those of this level
     base: int
 
     @property
     def name(self) -> str:
-        """What it is called in reports."""
+        """Name in reports."""
         return f"{self.rectifier.name} {self.features.name}" if self.base else self.rectifier.name
 
 
@@ -130,24 +130,24 @@ class ExtractionOptions(Options):
 
 
 class EscalateOptions(Options):
-    """Which pairs climb to the levels of ``escalation``: those of images that hang loosely."""
+    """Which pairs are escalated: those of weakly connected images."""
 
     strong_num_inliers: Annotated[int, within(0, 1_000_000)] = 100
-    """The pairs of an image climb while none of them has as many: an image that hangs on weak
-    pairs alone is verified but rarely registered."""
+    """The pairs of an image are escalated while none of them has as many: an image that only weak
+    pairs connect is verified but rarely registered."""
     min_num_tracks: Annotated[int, within(0, 1_000_000)] = 30
-    """The pairs of an image climb when fewer of its features are in tracks through three images or
-    more: mapping registers images by such features, and COLMAP wants 30 of them."""
+    """The pairs of an image are escalated when fewer of its features are in tracks through three
+    images or more: mapping registers images by such features, and COLMAP wants 30 of them."""
     min_num_consistent: Annotated[int, within(0, 1_000_000)] = 2
-    """A pair that is not verified climbs only when so many of its matches are confirmed by the
-    matches beside them: without it hardly any pair verifies at a higher level; 0 lets all climb."""
+    """A pair that is not verified is escalated only when so many of its matches are confirmed by
+    the matches beside them: else hardly any verifies at a higher level; 0: all are."""
     num_best_pairs: Annotated[int, within(0, 1_000_000)] = 2
-    """So many pairs of an image that no verified pairs connect to the others, those with the most
-    such matches, climb all the same."""
+    """So many pairs of an image that no verified pair connects to the others, those with the most
+    such matches, are escalated all the same."""
     num_blind_pairs: Annotated[int, within(0, 1_000_000)] = 10
-    """In the end so many pairs of an image that still hangs loosely have climbed to the first level
-    whose frames are not measured (ALIKED, DISK, XFeat), though nothing hints at a common surface:
-    where light or age differ, gradients do not."""
+    """In the end so many pairs of an image that is still weakly connected get the first level
+    whose frames are not measured (ALIKED, DISK, XFeat), without any hint at a common surface:
+    where light or age differ, gradients do."""
 
 
 class RecipeOptions(ExtractionOptions):
@@ -163,20 +163,10 @@ class RecipeOptions(ExtractionOptions):
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a recipe decides, resolved once.
+    """What a recipe decides, resolved once; the fields are its sections."""
 
-    Attributes:
-        name: its name, or the path it was read from.
-        summary: one line for people.
-        extraction: everything that decides the features of an image.
-        matching: the matcher.
-        escalate: which pairs climb.
-        guided: guided matching.
-        mapping: the mapper's ``name`` and options that differ from the preset.
-    """
-
-    name: str
-    summary: str = ""
+    name: str  # of the recipe, or the path that it was read from
+    summary: str = ""  # one line for people
     extraction: ExtractionOptions = field(default_factory=ExtractionOptions)
     matching: MatcherOptions = field(default_factory=NearestOptions)
     escalate: EscalateOptions = field(default_factory=EscalateOptions)
@@ -189,16 +179,14 @@ class Recipe:
         where = where or f"recipe {name}"
         options = dict(RecipeOptions.from_mapping(values, where))
         extraction = {key: options.pop(key) for key in ExtractionOptions.model_fields}
-        recipe = cls(name, extraction=ExtractionOptions(**extraction), **options)
-        try:
+        recipe, section = cls(name, extraction=ExtractionOptions(**extraction), **options), ""
+        try:  # refuse wrong options of the mapper now, not when mapping begins
             recipe.extraction.require_matching(recipe.matching)
-        except OptionError as error:
-            raise OptionError(f"{where}: {error}") from error
-        if recipe.mapping:
-            try:  # refuses wrong ones now, not when mapping begins
+            if recipe.mapping:
+                section = "mapping: "
                 recipe.mapper_options("sparse")
-            except OptionError as error:
-                raise OptionError(f"{where}: mapping: {error}") from error
+        except OptionError as error:
+            raise OptionError(f"{where}: {section}{error}") from error
         return recipe
 
     @property
@@ -218,10 +206,10 @@ class Recipe:
         }
 
     def mapper_options(self, preset: str, name: str = "", **values: Any) -> MapperOptions:
-        """Return the options of the mapper: those of a preset, of the recipe, and others given.
+        """Return the options of the mapper: of a preset, changed by the recipe, then by ``values``.
 
-        ``name`` is by default that of the recipe, or of the preset; ``values`` win over the
-        recipe's. Raises OptionError for an unknown mapper or option.
+        ``name`` is by default that of the recipe, or of the preset. OptionError for an unknown
+        mapper or option.
         """
         own = dict(self.mapping)
         recipes_name = str(own.pop("name", DEFAULT_MAPPERS.get(preset, MAPPERS.default)))
@@ -232,6 +220,7 @@ class Recipe:
         return options
 
 
+RENAMED = {"affnet-shapes-recommended": ["second-moment-shapes"]}  # recipes of older versions
 DEFAULT_MAPPERS = {"sparse": MAPPERS.default, "colmap": "incremental"}  # by preset
 
 
@@ -262,7 +251,7 @@ def _read(name: str) -> dict[str, Any]:
     except FileNotFoundError as error:
         if name.endswith(".toml"):
             raise OptionError(f"recipe {name}: no such file") from error
-        close = difflib.get_close_matches(name, recipe_names(), n=1)
+        close = RENAMED.get(name) or difflib.get_close_matches(name, recipe_names(), n=1)
         hint = f"did you mean '{close[0]}'? " if close else ""
         known = ", ".join(recipe_names())
         raise OptionError(f"unknown recipe '{name}': {hint}known are {known}") from error

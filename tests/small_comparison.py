@@ -12,14 +12,14 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.poses import AUC_THRESHOLDS_DEG, PoseScores
+from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, PoseScores
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.extract import Inputs
+from colmap_affrect.stages.inputs import Inputs
 
 NAMES = ("<img src=x onerror=alert(1)>.png", "a & b.png", "c.png", "d.png", "e.png", "f.png")
 IMAGE_SIZE = (160, 120)

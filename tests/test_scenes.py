@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from colmap_affrect.colmap.poses import pose_scores, read_poses
+from colmap_affrect.colmap.poses import read_poses
+from colmap_affrect.comparison.pose_scores import pose_scores
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.matchers.nearest import match_features, matchable

@@ -52,8 +52,9 @@ def run(options: argparse.Namespace) -> int:
 
 def extract(options: argparse.Namespace) -> int:
     from colmap_affrect.stages import extract as stage
+    from colmap_affrect.stages.inputs import Inputs
 
-    inputs = stage.Inputs.of(
+    inputs = Inputs.of(
         options.image_path,
         image_list_path=options.image_list_path,
         from_database=options.from_database,
@@ -134,8 +135,7 @@ def map(options: argparse.Namespace) -> int:
     from colmap_affrect.mappers.base import MAPPERS
     from colmap_affrect.pipeline import holds_vote, map_and_report, map_from_database
     from colmap_affrect.stages.cameras import choose_cameras
-    from colmap_affrect.stages.copy import is_copy
-    from colmap_affrect.stages.extract import Inputs
+    from colmap_affrect.stages.inputs import Inputs
 
     extend = given.extension(options)
     if options.from_database:
@@ -156,7 +156,7 @@ def map(options: argparse.Namespace) -> int:
         raise OptionError("--image-path: only with --from-database; else that of extract is used")
     with given.context(options) as context:
         mapper = MAPPERS.make(given.mapping(options, recorded=context.workspace.planned("map")))
-        is_others = is_copy(context.workspace) or bool(
+        is_others = context.workspace.is_copy or bool(
             Inputs.recorded(context.workspace).from_database
         )
         votes = holds_vote(options.focal_vote, mapper.options, is_others=is_others)

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from colmap_affrect.errors import OptionError, WorkspaceError
 from colmap_affrect.options import Options, suggestion
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.workspace import WEIGHTS, Workspace, placeless, without_digests
+from colmap_affrect.project.differences import WEIGHTS, placeless, without_digests
+from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap.verification import VerificationOptions
@@ -54,7 +55,7 @@ def _refuse_unknown(record: Mapping[str, Any], where: str) -> None:
     """Refuse sections, and options of extraction, that no run has recorded: typos of an editor."""
     from colmap_affrect.project.workspace import STAGES
     from colmap_affrect.recipes import ExtractionOptions
-    from colmap_affrect.stages.extract import Inputs
+    from colmap_affrect.stages.inputs import Inputs
 
     sections = {"format_version", "recipe", "begun", *STAGES}
     of_extract = {*Inputs.model_fields, *ExtractionOptions.model_fields, WEIGHTS}

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.colmap.model_records import camera_like
+from colmap_affrect.colmap.model_files import camera_like
 from colmap_affrect.colmap.tables import (
     DAMAGED,
     SENSOR_CAMERA,

@@ -20,7 +20,7 @@ from colmap_affrect.colmap.database import open_database, write_frame
 from colmap_affrect.colmap.tables import DAMAGED, columns_of, open_read_only
 from colmap_affrect.colmap.useless_keypoints import KINDS, leave_out_useless
 from colmap_affrect.errors import DatabaseError
-from colmap_affrect.project.workspace import remove_database
+from colmap_affrect.project.outputs import remove_database
 
 logger = logging.getLogger(__name__)
 

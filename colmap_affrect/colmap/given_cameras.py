@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import read_given_model
-from colmap_affrect.colmap.model_records import camera_like
+from colmap_affrect.colmap.model_files import camera_like, read_given_model
 from colmap_affrect.errors import OptionError
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.project.tables import read_lines, read_table

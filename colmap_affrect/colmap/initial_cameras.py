@@ -45,7 +45,7 @@ from colmap_affrect.images.exif import (
 )
 from colmap_affrect.images.headers import is_too_large
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.project.workspace import remove_database
+from colmap_affrect.project.outputs import remove_database
 
 logger = logging.getLogger(__name__)
 

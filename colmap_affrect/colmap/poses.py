@@ -1,13 +1,6 @@
-"""Camera poses of a model against ground truth, or against another model."""
+"""Camera poses of models, and how far relative poses are apart."""
 
-import itertools
-import math
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
-from typing import Any, Self
 
 import numpy as np
 
@@ -18,62 +11,6 @@ from colmap_affrect.geometry.arrays import Array
 
 Pose = tuple[Array, Array]  # cam_from_world: rotation matrix and translation
 Poses = dict[str, Pose]  # poses by image name
-PairErrors = Mapping[tuple[str, str], tuple[float, float]]
-"""By the sorted names of two images: the errors of their relative pose in degrees, of the rotation
-and of the direction of the translation."""
-
-AUC_THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0)
-MAX_CORRECT_ERROR_DEG = 5.0
-"""An image is registered correctly if its relative poses to at least half of the other registered
-images are off by at most this, in rotation and in translation direction."""
-MIN_IMAGES_TO_ALIGN = 3
-MAX_ALIGNMENT_ERROR = 0.05  # of the true extent; centres farther off do not decide alignment
-
-
-@dataclass(frozen=True)
-class PoseScores:
-    """A model against ground truth."""
-
-    correct_names: tuple[str, ...]  # images registered correctly (``MAX_CORRECT_ERROR_DEG``)
-    pair_errors_deg: PairErrors  # of every pair of registered images that have ground truth
-    num_pairs: int  # of all images with truth; those without errors count as failures
-    auc: Mapping[float, float]  # area under the curve up to a threshold, 0 to 1
-    # of camera centres after similarity alignment, in units of the ground truth; None with fewer
-    # than three images, or all on one line
-    median_position_error: float | None
-
-    @property
-    def median_rotation_error_deg(self) -> float | None:
-        """Of the pairs of registered images; None without pairs."""
-        return median(r for r, _ in self.pair_errors_deg.values()) if self.pair_errors_deg else None
-
-    @property
-    def median_direction_error_deg(self) -> float | None:
-        """Of the translations of the pairs of registered images; None without pairs."""
-        return median(d for _, d in self.pair_errors_deg.values()) if self.pair_errors_deg else None
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {
-            "correct_names": list(self.correct_names),
-            "num_pairs": self.num_pairs,
-            "auc": {f"{limit:g}": value for limit, value in self.auc.items()},
-            "median_rotation_error_deg": self.median_rotation_error_deg,
-            "median_direction_error_deg": self.median_direction_error_deg,
-            "median_position_error": self.median_position_error,
-            "pair_errors_deg": [[*pair, *errors] for pair, errors in self.pair_errors_deg.items()],
-        }
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build from :meth:`to_mapping`."""
-        return cls(
-            tuple(values["correct_names"]),
-            {(a, b): (rot, direction) for a, b, rot, direction in values["pair_errors_deg"]},
-            values["num_pairs"],
-            {float(limit): value for limit, value in values["auc"].items()},
-            values["median_position_error"],
-        )
 
 
 def read_poses(model_path: Path) -> Poses:
@@ -108,89 +45,3 @@ def pose_errors(estimated: Pose, truth: Pose) -> tuple[float, float]:
     cross = np.linalg.norm(np.cross(translation, true_translation))
     direction_error = np.degrees(np.arctan2(cross, translation @ true_translation))
     return float(rotation_error), float(direction_error)
-
-
-def pair_errors(estimated: Poses, truth: Poses) -> PairErrors:
-    """Compute the errors of the relative poses of all pairs of images that both have."""
-    names = sorted(estimated.keys() & truth.keys())
-    return {
-        (name1, name2): pose_errors(
-            relative_pose(estimated[name1], estimated[name2]),
-            relative_pose(truth[name1], truth[name2]),
-        )
-        for name1, name2 in itertools.combinations(names, 2)
-    }
-
-
-def correct_images(errors: PairErrors) -> tuple[str, ...]:
-    """Return the images whose relative poses to at least half of the others are right.
-
-    A pair is right if both of its errors are at most ``MAX_CORRECT_ERROR_DEG``; all are given.
-    """
-    right = (pair for pair, both in errors.items() if max(both) <= MAX_CORRECT_ERROR_DEG)
-    num_right = Counter(itertools.chain.from_iterable(right))
-    names = {name for pair in errors for name in pair}
-    return tuple(sorted(name for name in names if 2 * num_right[name] >= len(names) - 1))
-
-
-def area_under_curve(errors_deg: Iterable[float], num_pairs: int, threshold_deg: float) -> float:
-    """Integrate the share of pairs with at most an error over errors from 0 to a threshold.
-
-    The exact area under the steps, divided by the threshold: from 0 to 1. Of ``num_pairs`` those
-    without an error were not estimated, and are never below a threshold.
-    """
-    if not num_pairs:
-        return 0.0
-    return math.fsum(max(0.0, 1.0 - error / threshold_deg) for error in errors_deg) / num_pairs
-
-
-def position_errors(estimated: Poses, truth: Poses) -> dict[str, float]:
-    """Compute the distances of camera centres after the best similarity has aligned them.
-
-    Centres that are far off do not pull at the alignment. In units of the ground truth; empty with
-    fewer than three images, or centres on one line, which leaves the similarity open.
-    """
-    names = sorted(estimated.keys() & truth.keys())
-    if len(names) < MIN_IMAGES_TO_ALIGN:
-        return {}
-    centres, true_centres = (
-        np.array([-poses[name][0].T @ poses[name][1] for name in names])
-        for poses in (estimated, truth)
-    )
-    extent = float(np.linalg.norm(np.ptp(true_centres, axis=0)))
-    robust: Any = pycolmap.estimate_sim3d_robust(  # its stub says Sim3d, it is a dictionary
-        centres,
-        true_centres,
-        pycolmap.RANSACOptions(max_error=MAX_ALIGNMENT_ERROR * extent, random_seed=0),
-    )
-    aligned = robust["tgt_from_src"] if robust else pycolmap.estimate_sim3d(centres, true_centres)
-    if aligned is None:
-        return {}
-    moved = centres @ aligned.matrix()[:, :3].T + aligned.matrix()[:, 3]
-    return dict(zip(names, np.linalg.norm(moved - true_centres, axis=1).tolist(), strict=True))
-
-
-def pose_scores(estimated: Poses, truth: Poses, image_names: Sequence[str]) -> PoseScores:
-    """Measure the poses of registered images against ground truth, of the images given only."""
-    given = {name: pose for name, pose in truth.items() if name in set(image_names)}
-    errors = pair_errors(estimated, given)
-    largest = [max(both) for both in errors.values()]
-    num_pairs = math.comb(len(given), 2)
-    distances = list(position_errors(estimated, given).values())
-    return PoseScores(
-        correct_names=correct_images(errors),
-        pair_errors_deg=errors,
-        num_pairs=num_pairs,
-        auc={limit: area_under_curve(largest, num_pairs, limit) for limit in AUC_THRESHOLDS_DEG},
-        median_position_error=float(np.median(distances)) if distances else None,
-    )
-
-
-def disagreeing_images(poses: Poses, other: Poses) -> tuple[str, ...]:
-    """Return the images that two models have both, in poses that contradict each other.
-
-    An image agrees if its relative poses to at least half of the other common images do.
-    """
-    errors = pair_errors(poses, other)
-    agreeing = set(correct_images(errors))
-    return tuple(sorted({name for pair in errors for name in pair} - agreeing))

@@ -1,15 +1,13 @@
 """What a command left in a database, to tell what others have changed in it since.
 
-- ``database.db.parts``: digests of all rows, by image, camera and pair.
-- ``database.db.seal``: size and times of the file, while no command works with it. A database that
-  has them still is not read.
-- ``database.db.seal-open``: the same while a command works. ``open_database`` removes it when
-  anything is written, so a database without a seal was left by a process that was killed.
+``database.db.seal`` holds size and times of the file, and digests of all rows by image, camera and
+pair. A database that has these times still is not read. While a command works the seal is called
+``database.db.seal-open``: ``open_database`` removes it when anything is written, so a database
+without a seal was left by a process that was killed.
 """
 
 import hashlib
 import io
-import json
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +19,9 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap.database import working_seal
 from colmap_affrect.colmap.tables import open_read_only
-from colmap_affrect.errors import DatabaseError
+from colmap_affrect.errors import DAMAGE, DatabaseError
 from colmap_affrect.geometry.arrays import Indices
-from colmap_affrect.project.atomic_files import replace_bytes, replace_text
+from colmap_affrect.project.atomic_files import replace_bytes
 
 QUERIES = {
     "tables": "SELECT 0, user_version, (SELECT group_concat(sql) FROM (SELECT sql FROM "
@@ -44,6 +42,8 @@ QUERIES = {
 }
 """By part: the key of each of its rows, and what is digested."""
 
+UNREADABLE = (*DAMAGE, BadZipFile, EOFError)
+STAMP = "stamp"  # numbers and times of the files, beside the parts
 ROW = np.dtype([("key", "<i8"), ("digest", "<u8")])
 Parts = dict[str, NDArray[np.void]]
 
@@ -68,14 +68,14 @@ def seal_of(path: Path) -> Path:
     return path.with_name(path.name + ".seal")
 
 
-def parts_of(path: Path) -> Path:
-    """Return the file of digests."""
-    return path.with_name(path.name + ".parts")
+def has_seal(path: Path) -> bool:
+    """Tell whether a database was sealed when the last command that worked with it ended."""
+    return bool(_stamp_in(seal_of(path)))
 
 
 def is_untouched(path: Path) -> bool:
     """Tell whether a database is as it was when it was sealed."""
-    return _stamp(path) in map(_read_stamp, (seal_of(path), working_seal(path)))
+    return _stamp(path) in map(_stamp_in, (seal_of(path), working_seal(path)))
 
 
 def begin_work(path: Path) -> None:
@@ -88,7 +88,7 @@ def begin_work(path: Path) -> None:
 
 def keep_seal(path: Path) -> None:
     """Take a database that was read, and holds what was sealed, for one that nobody has touched."""
-    replace_text(working_seal(path), json.dumps(_stamp(path)))
+    _write(seal_of(path), _parts_in(seal_of(path)), _stamp(path))
 
 
 def remove_seal(path: Path) -> None:
@@ -102,20 +102,15 @@ def end_work(path: Path, *, reads: bool = True) -> None:
     if not path.exists():
         return
     working, stamp = working_seal(path), _stamp(path)
-    # Opening it through COLMAP changes the times, and another file is a new one.
-    is_same = parts_of(path).exists() and _read_stamp(working)[:2] == stamp[:2]
-    if not (is_same or reads):
-        return
-    if not is_same:
-        content = io.BytesIO()
-        parts: dict[str, Any] = read_parts(path)
-        np.savez(content, **parts)
-        replace_bytes(parts_of(path), content.getvalue())
-    if is_same and _read_stamp(working) == stamp:
+    known = _stamp_in(working)
+    if known == stamp:
         working.replace(seal_of(path))
         return
-    replace_text(seal_of(path), json.dumps(stamp))
-    working.unlink(missing_ok=True)
+    # Opening it through COLMAP changes the times, and another file is a new one.
+    parts = _parts_in(working) if known[:2] == stamp[:2] else {}
+    if parts or reads:
+        _write(seal_of(path), parts or read_parts(path), stamp)
+        working.unlink(missing_ok=True)
 
 
 def changes(path: Path) -> dict[str, Change]:
@@ -124,23 +119,18 @@ def changes(path: Path) -> dict[str, Change]:
     Raises DatabaseError where it cannot be read.
     """
     now, found = read_parts(path), dict[str, Change]()
-    if not seal_of(path).exists():
-        return found
-    with (
-        suppress(OSError, ValueError, KeyError, BadZipFile),
-        np.load(parts_of(path), allow_pickle=False) as before,
-    ):
-        for part, rows in now.items():
-            old = before[part]
-            _, at, there = np.intersect1d(old["key"], rows["key"], True, return_indices=True)
-            change = Change(
-                np.setdiff1d(rows["key"], old["key"]),
-                np.setdiff1d(old["key"], rows["key"]),
-                old["key"][at][old["digest"][at] != rows["digest"][there]],
-                len(old),
-            )
-            if len(change.keys):
-                found[part] = change
+    before = _parts_in(seal_of(path))
+    for part, rows in now.items() if before else ():
+        old = before[part]
+        _, at, there = np.intersect1d(old["key"], rows["key"], True, return_indices=True)
+        change = Change(
+            np.setdiff1d(rows["key"], old["key"]),
+            np.setdiff1d(old["key"], rows["key"]),
+            old["key"][at][old["digest"][at] != rows["digest"][there]],
+            len(old),
+        )
+        if len(change.keys):
+            found[part] = change
     return found
 
 
@@ -178,7 +168,21 @@ def _stamp(path: Path) -> list[int]:
     return found
 
 
-def _read_stamp(path: Path) -> list[int]:
-    with suppress(OSError, ValueError, TypeError):
-        return [int(number) for number in json.loads(path.read_text())]
+def _write(seal: Path, parts: Parts, stamp: list[int]) -> None:
+    content = io.BytesIO()
+    arrays: dict[str, Any] = {STAMP: np.array(stamp, np.int64), **parts}
+    np.savez(content, **arrays)
+    replace_bytes(seal, content.getvalue())
+
+
+def _stamp_in(seal: Path) -> list[int]:
+    """Return the stamp in a seal; empty where there is none, or it cannot be read."""
+    with suppress(*UNREADABLE), np.load(seal, allow_pickle=False) as arrays:
+        return [int(number) for number in arrays[STAMP]]
     return []
+
+
+def _parts_in(seal: Path) -> Parts:
+    with suppress(*UNREADABLE), np.load(seal, allow_pickle=False) as arrays:
+        return {part: arrays[part] for part in QUERIES}
+    return {}

@@ -6,7 +6,7 @@ Significance is of inliers, and of what their local affine frames say
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -264,14 +264,19 @@ def verify(
     options: VerificationOptions,
     extracted_px: ExtractedPx = None,
     advance: Callable[[int], None] | None = None,
+    pairs: Collection[tuple[int, int]] | None = None,
 ) -> None:
     """Estimate the two-view geometry of every matched pair that has none yet.
+
+    Of ``pairs`` of image ids only, if they are given, each with the lower id first.
 
     As ``pycolmap.geometric_verification``, but a geometry is written when it has been judged:
     whatever ends this, no pair is left that counts as verified and was not. ``advance`` is called
     with the number of pairs that are done.
     """
     todo = unverified_pairs(path)
+    if pairs is not None:
+        todo = todo[[tuple(pair) in pairs for pair in todo.tolist()]]
     if not len(todo):
         return
     require_database_space(path, len(todo))

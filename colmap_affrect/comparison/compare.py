@@ -19,11 +19,12 @@ from typing import Any, Self
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
-from colmap_affrect.colmap.poses import Poses, disagreeing_images, pose_scores, read_poses
+from colmap_affrect.colmap.poses import Poses, read_poses
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
 from colmap_affrect.comparison.methods import SIFT_COLMAP, Method, parse_methods, without_weights
 from colmap_affrect.comparison.page import write_page
+from colmap_affrect.comparison.pose_scores import disagreeing_images, pose_scores
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.tables import to_json
 from colmap_affrect.comparison.task import Layout, MethodTask
@@ -38,8 +39,9 @@ from colmap_affrect.pipeline import InputOptions, installed_versions
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import Contents
+from colmap_affrect.project.differences import first_difference
 from colmap_affrect.project.outputs import new_results, remove_own
-from colmap_affrect.project.workspace import Workspace, first_difference
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 
 DEFAULT_SEEDS = (0, 1, 2)

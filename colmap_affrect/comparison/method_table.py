@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
-from colmap_affrect.colmap.poses import AUC_THRESHOLDS_DEG, PoseScores
+from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, PoseScores
 from colmap_affrect.comparison.results import Comparison, MethodResult, Span
 from colmap_affrect.comparison.verdict import ranked
 from colmap_affrect.project.workspace import STAGES

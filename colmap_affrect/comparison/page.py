@@ -7,7 +7,6 @@ from math import log
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.colmap.poses import AUC_THRESHOLDS_DEG, MAX_CORRECT_ERROR_DEG
 from colmap_affrect.comparison.method_table import (
     Column,
     columns_of,
@@ -15,6 +14,7 @@ from colmap_affrect.comparison.method_table import (
     span_text,
     summary_rows,
 )
+from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, MAX_CORRECT_ERROR_DEG
 from colmap_affrect.comparison.results import Comparison, MethodResult
 from colmap_affrect.comparison.verdict import cautions, changes, headline, wrong_poses
 from colmap_affrect.errors import AffrectError

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, Field, PlainSerializer, TypeAdapter
 
-from colmap_affrect.colmap.poses import PoseScores
+from colmap_affrect.comparison.pose_scores import PoseScores
 from colmap_affrect.pairs.base import Pair
 
 PairCounts = Annotated[

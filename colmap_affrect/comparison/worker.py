@@ -56,8 +56,9 @@ from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import escalate, unmeasured_pairs
-from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import extracted_px, verify_matches

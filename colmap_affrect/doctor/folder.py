@@ -34,8 +34,8 @@ from colmap_affrect.project.contents import Contents, sha256_of
 from colmap_affrect.project.workspace import COPY_STAGES, INPUTS, STAGES, Workspace
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import Inputs, recorded_extraction
 from colmap_affrect.stages.guide import recorded_guiding
+from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.match import recorded_matching
 from colmap_affrect.stages.mend import edits_of
 from colmap_affrect.stages.pairs import without_deleted

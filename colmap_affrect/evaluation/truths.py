@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.poses import Pose, area_under_curve, pose_errors
+from colmap_affrect.colmap.poses import Pose, pose_errors
+from colmap_affrect.comparison.pose_scores import area_under_curve
 from colmap_affrect.conventions import colmap_from_pixel, is_inside
 from colmap_affrect.errors import EvaluationError
 from colmap_affrect.evaluation.data import PairResult, PairScore, ScoreOptions

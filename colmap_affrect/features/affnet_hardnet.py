@@ -1,10 +1,7 @@
 """Features ``affnet-hardnet``: a detector, AffNet, OriNet and a learned descriptor.
 
-The chain of the paper (Sec. 3): an upright patch round each keypoint gives its affine shape, the
-patch of that shape its orientation, the patch of both its descriptor. AffNet here drops the
-orientation it is given and keeps the area.
-
-Patches are sampled from a pyramid whose level has steps of 1 to 2 px.
+The chain of the paper (Sec. 3): an upright patch round each keypoint gives its affine shape (of the
+same area), the patch of that shape its orientation, the patch of both its descriptor.
 """
 
 from __future__ import annotations
@@ -30,14 +27,12 @@ if TYPE_CHECKING:
 MIN_DETECTABLE_PX = 32  # kornia finds nothing within 15 px of a border; Key.Net fails on less
 KEYNET_RADIUS_PX = 22.0  # of kornia's frames of Key.Net on the image itself
 
+MAX_TILT = 20.0  # more is degenerate; AffNet's shapes on photographs stay under 6 (Graffiti).
 MIN_RESPONSE = 1e-10
 """kornia fills up to the number asked for with frames of response 0 at the origin. Its Hessian
 finds rounding errors of 1e-13 in flat images; a blob of one gray level has 1e-6."""
-
-MAX_TILT = 20.0  # more is degenerate; AffNet's shapes on photographs stay under 6 (Graffiti).
-
 BATCH_MULTIPLE = 64
-"""Batches are filled up to multiples of this many patches: other sizes change the last bits of the
+"""Batches are padded to multiples of this many patches: other sizes change the last bits of the
 results on a CPU, so that an image alone would differ from one among others."""
 
 
@@ -163,7 +158,7 @@ class AffNetHardNet:
         shapes = np.tile(np.eye(2), (len(found), 1, 1))
         if self.affine_shapes is not None:
             upright = sample(_frames(shapes, half_widths_px, found.keypoints))
-            shapes = shapes_from_outputs(self._run(self.affine_shapes, upright))
+            shapes = _shapes_from_outputs(self._run(self.affine_shapes, upright))
         unturned = sample(_frames(shapes, half_widths_px, found.keypoints))
         # kornia's angles are of the opposite sense to those of our rotation().
         shapes = shapes @ rotation(-self._run(self.orinet, unturned).astype(np.float64))
@@ -193,7 +188,7 @@ def _sampler(
     """Return what samples (N, 1, 32, 32) patches of (N, 2, 3) frames, so many of each image."""
     import torch
 
-    from colmap_affrect.features.patches import PatchSampler
+    from colmap_affrect.features.networks import PatchSampler
 
     pairs = [pair for pair in zip(images, counts, strict=True) if pair[1]]
     samplers = [PatchSampler(_unit_range(image), device) for image, _ in pairs]
@@ -206,14 +201,10 @@ def _sampler(
     return sample
 
 
-def shapes_from_outputs(outputs: Floats) -> Array:
+def _shapes_from_outputs(outputs: Floats) -> Array:
     """Return (N, 2, 2) shapes of determinant 1 of (N, 3) outputs of AffNet, lower triangular.
 
-    They are not a number where the frame has no area.
-
-    >>> shapes_from_outputs(np.array([[0.0, 3.0, 3.0]]))[0]
-    array([[0.5, 0. ],
-           [1.5, 2. ]])
+    NaN where the frame has no area.
     """
     shapes = frames_from_affnet(outputs)
     areas = shapes[:, 0, 0] * shapes[:, 1, 1]

@@ -17,15 +17,10 @@ PATCH_SIZE_PX = 32  # side of the patches that all networks take
 
 @dataclass(frozen=True)
 class NetworkContext:
-    """What networks run with.
+    """What networks run with."""
 
-    Attributes:
-        weights: files by key, found beforehand (:mod:`colmap_affrect.features.weights`).
-        device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``.
-    """
-
-    weights: Mapping[str, Path] = field(default_factory=dict)
-    device: str = "cpu"
+    weights: Mapping[str, Path] = field(default_factory=dict)  # files by key, found beforehand
+    device: str = "cpu"  # or ``cuda``, ``cuda:1``, ``mps``
 
 
 class NetworkOptions(PartOptions):
@@ -61,23 +56,19 @@ class FeatureOptions(NetworkOptions):
 
 
 class FeatureExtractor(Protocol):
-    """Detection and description; called with its ``Options`` and a :class:`NetworkContext`.
+    """Detection and description; called with its ``Options`` and a :class:`NetworkContext`."""
 
-    Attributes:
-        descriptor_size: D, also of an image without features.
-    """
-
-    descriptor_size: int
+    descriptor_size: int  # D, also of an image without features
 
     def detect(self, view: View) -> LocalFeatures:
-        """Return features of one view, frames in its px; descriptors may be (N, 0) still."""
+        """Return features of one view, frames in its px; descriptors may still be (N, 0)."""
 
     def describe(
         self, images: Sequence[GrayImage], detected: Sequence[LocalFeatures]
     ) -> list[LocalFeatures]:
-        """Describe features that :meth:`detect` found, a list element for each image.
+        """Describe the features of :meth:`detect`, a list element for each image.
 
-        The result is the same for images together or one by one. Here they are described already.
+        Images together and one by one give the same. By default they are described already.
         """
         del images
         return list(detected)
@@ -119,8 +110,8 @@ SHAPES: Registry[ShapeSource] = Registry(
     kind="shape source",
     group="colmap_affrect.shapes",
     built_in={
-        "second-moment": "colmap_affrect.features.shapes.second_moment:SecondMoment",
-        "affnet": "colmap_affrect.features.shapes.affnet:AffNet",
+        "second-moment": "colmap_affrect.features.second_moment:SecondMoment",
+        "affnet": "colmap_affrect.features.affnet_shapes:AffNet",
     },
     default="second-moment",
 )

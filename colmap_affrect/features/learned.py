@@ -1,7 +1,7 @@
 """Features ``aliked``, ``disk`` and ``xfeat``: networks that detect and describe in one pass.
 
-They find a point and neither scale nor shape: all frames are upright circles of RADIUS_PX, which
-a warp makes ellipses in the image.
+They have points without scale or shape: all frames are upright circles of RADIUS_PX, which a warp
+makes ellipses in the image.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Networks with their weights, ready for inference; nothing here downloads anything.
+"""Networks with their weights, ready for inference, and the patches that they take.
 
-kornia builds the architectures. Its constructors download by default and load some files
-without checking them; here a network is built empty, and a file must have its parameters, all
-of them and no others, in their shapes.
+kornia builds the architectures, empty, and nothing is downloaded: a file must have the parameters
+of its network, all of them and no others, in their shapes.
 """
 
 import re
@@ -12,16 +11,21 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import numpy as np
 import torch
 from kornia import feature
 from kornia.feature.mkd import Whitening
 from torch import Tensor, nn
+from torch.nn.functional import affine_grid, grid_sample
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS
 from colmap_affrect.errors import DeviceError, OptionError
 from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict, unusable
+from colmap_affrect.geometry.affine import determinants
+from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
+from colmap_affrect.images.warping import halved
 from colmap_affrect.shown import such_as
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -30,9 +34,9 @@ DESCRIPTOR_SIZE = 128  # width of all descriptors
 
 
 def resolve_device(name: str) -> torch.device:
-    """Turn ``auto`` (CUDA if there is any, else the CPU), ``cpu``, ``cuda:1``, ``mps`` to a device.
+    """Return the device of ``auto`` (CUDA if there is any, else CPU), ``cpu``, ``cuda:1``, ``mps``.
 
-    Raises OptionError for another name, DeviceError when the device is not there.
+    OptionError for another name, DeviceError when the device is not there.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -99,7 +103,7 @@ def load_detector(name: str, count: int, weights: Mapping[str, Path], device: st
 
 
 def load_descriptor(name: str, path: Path, device: str) -> nn.Module:
-    """Build what makes (B, 128) rows of any length of (B, 1, 32, 32) patches in [0, 1]."""
+    """Build a network from (B, 1, 32, 32) patches in [0, 1] to (B, 128) rows of any length."""
     if name == "mkd":
         return _ready(_load_mkd(path), device)
     network: nn.Module = _loaded(DESCRIPTOR_NETWORKS[name](), path, name)
@@ -222,3 +226,61 @@ def _ready(network: Network, device: str) -> Network:
     if place.type == "cpu":
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network.to(place)
+
+
+PATCHES_AT_ONCE = 512  # sampled at once
+
+
+class PatchSampler:
+    """Patches of local affine frames, sampled from an (H, W) image and its halved versions.
+
+    They are those of ``kornia.feature.extract_patches_from_pyramid``, to rounding, in a quarter of
+    the time on a CPU: the pyramid is built once for all samplings, and positions are computed in
+    pieces that stay in the cache.
+    """
+
+    def __init__(self, image: Singles, device: torch.device) -> None:
+        levels = [image]
+        while min(levels[-1].shape) >= 2 * PATCH_SIZE_PX:
+            levels.append(halved(levels[-1]))
+        self.levels = [torch.from_numpy(level)[None, None].to(device) for level in levels]
+
+    def sample(self, lafs: Floats) -> Tensor:
+        """Return (N, 1, 32, 32) patches of (N, 2, 3) frames in px.
+
+        Pixel (i, j) of a patch is the image at c + A u, u = ((2 j + 1) / 32 - 1, (2 i + 1) / 32 -
+        1), bilinear, of the pyramid level whose pixels are as large as those of the patch or up to
+        half as large. Beyond the border the outermost pixels count. Frames that are not finite
+        give undefined patches.
+        """
+        image = self.levels[0]
+        if image.device.type == "mps":  # which has no sampling beyond the border
+            given = torch.from_numpy(lafs.astype(np.float32)).to(image.device)
+            return feature.extract_patches_from_pyramid(image, given[None], PATCH_SIZE_PX)[0]
+        frames = np.where(np.isfinite(lafs), lafs, 0.0)
+        numbers = self._level_numbers(frames[:, :, :2])
+        pixel = 2.0 / np.array(image.shape[:1:-1])
+        frames[:, :, 2] = (frames[:, :, 2] + HALF_PIXEL) * pixel - 1.0
+        frames[:, :, :2] *= pixel[:, None]
+        normalized = torch.from_numpy(frames.astype(np.float32)).to(image.device)
+        patches = image.new_empty((len(lafs), 1, PATCH_SIZE_PX, PATCH_SIZE_PX))
+        for number, level in enumerate(self.levels):
+            rows = np.flatnonzero(numbers == number)
+            for begin in range(0, len(rows), PATCHES_AT_ONCE):
+                part = torch.from_numpy(rows[begin : begin + PATCHES_AT_ONCE]).to(image.device)
+                patches[part] = _sampled(level, normalized[part])
+        return patches
+
+    def _level_numbers(self, matrices: Array) -> Indices:
+        """Return the (N,) levels to sample frames of (N, 2, 2) matrices from."""
+        steps_px = 2.0 * np.sqrt(np.abs(determinants(matrices))) / PATCH_SIZE_PX
+        numbers = np.floor(np.log2(np.maximum(steps_px, 1.0))).astype(np.int64)
+        return np.asarray(np.minimum(numbers, len(self.levels) - 1))
+
+
+def _sampled(level: Tensor, frames: Tensor) -> Tensor:
+    """Sample (N, 2, 3) frames in coordinates of -1...1 from border to border."""
+    size = [len(frames), 1, PATCH_SIZE_PX, PATCH_SIZE_PX]
+    positions = affine_grid(frames, size, align_corners=False).view(1, -1, PATCH_SIZE_PX, 2)
+    values = grid_sample(level, positions, padding_mode="border", align_corners=False)
+    return values.view(size)

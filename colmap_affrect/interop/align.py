@@ -18,11 +18,13 @@ from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.tables import read_table
 from colmap_affrect.project.workspace import Workspace
 
+# of positions across the line that fits them best, in units of the length along it; with less the
+# model can be turned about that line
 MIN_WIDTH = 0.01
-"""Of positions, across the line that fits them best, in units of the length along it: with less
-nothing tells how the model is turned about that line."""
 METRIC, ON_EARTH = ("x", "y", "z"), ("latitude", "longitude", "altitude")
-SHOWN = 12  # residuals that the summary lists, the largest first
+SHOWN = 12  # residuals in the summary, the largest first
+
+Places = dict[str, Array]  # (3,) by the name of a photograph or a marked point
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,82 +89,72 @@ def align(model_path: Path, output_path: Path, reference: Reference) -> Alignmen
     """
     if reference.distances and (reference.gps_database or reference.positions_path):
         raise OptionError("--distance: gives the scale alone; leave it out, or the positions")
-    model, place = read_given_model(model_path), None
+    model, origin = read_given_model(model_path), None
+    images = {image.name: image for image in map(model.image, model.reg_image_ids())}
+    old = {name: image.projection_center() for name, image in images.items()}
+    true, is_on_earth, marked = Places(), False, Places()
+    if reference.points_path:
+        marked, true = _marked_points(model, images, reference.points_path)
     if reference.distances:
-        new_from_old, residuals = _scale(model, reference)
+        new_from_old, residuals = _scale(old | marked, reference.distances)
     else:
-        names, old, new, place = _positions(model, reference)
-        new_from_old, residuals = _similarity(names, old, new)
+        if reference.points_path:
+            old = marked
+        elif reference.gps_database:
+            true, is_on_earth = _gps(reference.gps_database)
+        elif reference.positions_path:
+            true, is_on_earth = _table_of_positions(reference.positions_path)
+        else:
+            raise OptionError("give --gps, --positions, --points or --distance")
+        new_from_old, residuals, origin = _similarity(old, true, is_on_earth=is_on_earth)
     model.transform(new_from_old)
     photographs = Workspace.of_model(model_path).photographs()
-    with new_results(output_path, photographs=photographs, names=_images(model)) as (folder,):
+    with new_results(output_path, photographs=photographs, names=images) as (folder,):
         write_model(model, folder)
-        if place:
-            place.write(folder)
-    return Alignment(float(new_from_old.scale), residuals, place)
+        if origin:
+            origin.write(folder)
+    return Alignment(float(new_from_old.scale), residuals, origin)
 
 
-def _images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
-    images = (model.image(image_id) for image_id in model.reg_image_ids())
-    return {image.name: image for image in images}
+def _similarity(
+    old: Places, true: Places, *, is_on_earth: bool
+) -> tuple[pycolmap.Sim3d, dict[str, float], Georeference | None]:
+    """Return the similarity of least squares, its residuals, and the origin if on earth.
 
-
-def _centers(model: pycolmap.Reconstruction) -> dict[str, Array]:
-    return {name: image.projection_center() for name, image in _images(model).items()}
-
-
-def _positions(
-    model: pycolmap.Reconstruction, reference: Reference
-) -> tuple[list[str], Array, Array, Georeference | None]:
-    """Return names, places in the model and true places of what the reference knows."""
-    old, is_on_earth = _centers(model), False
-    if reference.points_path:
-        old, true = _marked_points(model, reference.points_path)
-    elif reference.gps_database:
-        true, is_on_earth = _gps(reference.gps_database)
-    elif reference.positions_path:
-        true, is_on_earth = _table_of_positions(reference.positions_path)
-    else:
-        raise OptionError("give --gps, --positions, --points or --distance")
+    Not ``pycolmap.align_reconstruction_to_locations``: it knows no marked points, and leaves out
+    positions that do not fit without saying which.
+    """
     names = sorted(old.keys() & true.keys())
     if len(names) < 3:
         raise OptionError(
             f"the true places of {len(names)} photographs or points of the model are known, and "
             f"3 are needed; known are those of {', '.join(sorted(true)[:3]) or 'none'}"
         )
-    places = np.array([true[name] for name in names])
-    origin = Georeference(*places.mean(axis=0).tolist()) if is_on_earth else None
+    before, after = (np.array([places[name] for name in names]) for places in (old, true))
+    origin = Georeference(*after.mean(axis=0).tolist()) if is_on_earth else None
     if origin:
-        places = origin.in_metres(places)
-    return names, np.array([old[name] for name in names]), places, origin
-
-
-def _similarity(
-    names: Sequence[str], old: Array, new: Array
-) -> tuple[pycolmap.Sim3d, dict[str, float]]:
-    for points in (old, new):
+        after = origin.in_metres(after)
+    for points in (before, after):
         along, across, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if across <= MIN_WIDTH * along:
             raise OptionError(
                 "the known places lie on one line, about which the model could be turned; give "
                 "others beside it, or --distance for the scale alone"
             )
-    found = pycolmap.estimate_sim3d(old, new)
-    if found is None:
+    new_from_old = pycolmap.estimate_sim3d(before, after)
+    if new_from_old is None:
         raise OptionError("the known places do not fit the model in any scale and rotation")
-    moved = np.array([found * point for point in old])
-    return found, dict(zip(names, np.linalg.norm(moved - new, axis=1).tolist(), strict=True))
+    moved = np.array([new_from_old * point for point in before])
+    residuals = np.linalg.norm(moved - after, axis=1).tolist()
+    return new_from_old, dict(zip(names, residuals, strict=True)), origin
 
 
 def _scale(
-    model: pycolmap.Reconstruction, reference: Reference
+    places: Places, distances: Sequence[tuple[str, str, float]]
 ) -> tuple[pycolmap.Sim3d, dict[str, float]]:
-    """Return the scale that fits distances best, by least squares of their shares."""
-    places = _centers(model)
-    if reference.points_path:
-        places |= _marked_points(model, reference.points_path)[0]
+    """Return the scale that fits distances best, by least squares of their logarithms."""
     lengths = {}
-    for first, second, length in reference.distances:
+    for first, second, length in distances:
         for name in (first, second):
             if name not in places:
                 raise OptionError(
@@ -177,81 +169,75 @@ def _scale(
     return pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)), residuals
 
 
-def _gps(path: Path) -> tuple[dict[str, Array], bool]:
-    """Return the positions of images on record in a database, and whether they are on earth."""
+def _gps(path: Path) -> tuple[Places, bool]:
+    """Return the pose priors of a database by image name, and whether they are on earth."""
     with open_copy(path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
         priors = [prior for prior in database.read_all_pose_priors() if prior.has_position()]
-    on_earth = pycolmap.PosePriorCoordinateSystem.WGS84
     systems = {prior.coordinate_system for prior in priors}
     if not priors:
         raise DatabaseError(f"{path}: no photograph has a position; give --positions FILE")
     if len(systems) > 1:
         raise DatabaseError(f"{path}: some positions are on earth, others are not")
-    found = {
+    true = {
         names[prior.corr_data_id.id]: np.array(prior.position).ravel()
         for prior in priors
         if prior.corr_data_id.id in names
     }
-    return found, on_earth in systems
+    return true, pycolmap.PosePriorCoordinateSystem.WGS84 in systems
 
 
-def _number(row: Mapping[str, str], column: str, where: str) -> float:
-    try:
-        value = float(row[column])
-    except (KeyError, ValueError) as error:
-        raise OptionError(f"{where}: {column} is missing, or no number") from error
-    if not np.isfinite(value):
-        raise OptionError(f"{where}: {column} is not finite")
-    return value
+def _numbers(row: Mapping[str, str], columns: Sequence[str], where: str) -> Array:
+    """Return the numbers of some columns of a row of a table."""
+    values = []
+    for column in columns:
+        try:
+            values.append(float(row[column]))
+        except (KeyError, ValueError) as error:
+            raise OptionError(f"{where}: {column} is missing, or no number") from error
+        if not np.isfinite(values[-1]):
+            raise OptionError(f"{where}: {column} is not finite")
+    return np.array(values)
 
 
-def _table_of_positions(path: Path) -> tuple[dict[str, Array], bool]:
-    where = f"--positions {path}"
-    rows = read_table(path, where, ("name", *METRIC, *ON_EARTH))
+def _table_of_positions(path: Path) -> tuple[Places, bool]:
+    """Return the positions of a table, and whether they are on earth."""
+    rows = read_table(path, f"--positions {path}", ("name", *METRIC, *ON_EARTH))
     is_on_earth = any("latitude" in row for _, row in rows)
-    columns = ON_EARTH if is_on_earth else METRIC
-    found = {}
+    true = Places()
     for place, row in rows:
-        if "name" not in row or row["name"] in found:
+        if "name" not in row or row["name"] in true:
             raise OptionError(f"{place}: has no name, or one that was there before")
-        found[row["name"]] = np.array([_number(row, column, place) for column in columns])
-    return found, is_on_earth
+        true[row["name"]] = _numbers(row, ON_EARTH if is_on_earth else METRIC, place)
+    return true, is_on_earth
 
 
 def _marked_points(
-    model: pycolmap.Reconstruction, path: Path
-) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return marked points by name, in the model and, of control points, where they are."""
-    where, images = f"--points {path}", _images(model)
-    seen: defaultdict[str, list[tuple[pycolmap.Image, Array]]] = defaultdict(list)
-    true = {}
+    model: pycolmap.Reconstruction, images: Mapping[str, pycolmap.Image], path: Path
+) -> tuple[Places, Places]:
+    """Return where marked points are in the model, and the true places of control points."""
+    where = f"--points {path}"
+    marks: defaultdict[str, list[tuple[pycolmap.Image, Array]]] = defaultdict(list)
+    true = Places()
     for place, row in read_table(path, where, ("point", "image", "px", "py", *METRIC), "point"):
         name = row.get("point", "")
         if not name:
             raise OptionError(f"{place}: names no point")
         if any(column in row for column in METRIC):
-            true[name] = np.array([_number(row, column, place) for column in METRIC])
+            true[name] = _numbers(row, METRIC, place)
         if row.get("image", "") in images:
-            mark = np.array([_number(row, "px", place), _number(row, "py", place)])
-            seen[name].append((images[row["image"]], mark))
-    found = {name: _triangulated(model, views) for name, views in seen.items() if len(views) > 1}
-    if not found:
+            marks[name].append((images[row["image"]], _numbers(row, ("px", "py"), place)))
+    views = {name: marked for name, marked in marks.items() if len(marked) > 1}
+    if not views:
         raise OptionError(f"{where}: no point is marked in two registered photographs")
-    for name, place_in_model in found.items():
-        if not len(place_in_model):
+    old = Places()
+    for name, marked in views.items():
+        flat = [model.cameras[image.camera_id].cam_from_img(mark) for image, mark in marked]
+        rays = np.column_stack([np.array(flat), np.ones(len(flat))])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        poses = [image.cam_from_world().matrix() for image, _ in marked]
+        point = pycolmap.triangulate_multi_view_point(poses, rays)
+        if point is None:
             raise OptionError(f"{where}: the rays of point {name} do not meet; look at its marks")
-    return found, true
-
-
-def _triangulated(
-    model: pycolmap.Reconstruction, views: Sequence[tuple[pycolmap.Image, Array]]
-) -> Array:
-    """Return where the rays through the marks of a point meet, nothing if they do not."""
-    cameras = [model.cameras[image.camera_id] for image, _ in views]
-    flat = [camera.cam_from_img(mark) for camera, (_, mark) in zip(cameras, views, strict=True)]
-    rays = np.column_stack([np.array(flat), np.ones(len(flat))])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    poses = [image.cam_from_world().matrix() for image, _ in views]
-    place = pycolmap.triangulate_multi_view_point(poses, rays)
-    return np.zeros(0) if place is None else np.asarray(place).ravel()
+        old[name] = np.asarray(point).ravel()
+    return old, true

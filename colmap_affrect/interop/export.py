@@ -1,8 +1,12 @@
-"""A COLMAP model for other programs: points, text, NVM, Bundler, flat photographs, tables."""
+"""A COLMAP model for other programs: points, text, NVM, Bundler, flat photographs, tables.
+
+PLY, text and undistorted photographs are pycolmap's own; of NVM and Bundler it has no writer.
+"""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +15,6 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.model_files import read_given_model
-from colmap_affrect.colmap.poses import model_poses
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.interop.georeference import Georeference
@@ -24,10 +27,10 @@ from colmap_affrect.project.workspace import Workspace
 DENSE = "dense"  # folder of undistorted photographs, as COLMAP's dense reconstruction has it
 NO_EXTRA = dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0.0)  # nerfstudio's distortion
 
-RADIAL_MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2}
-"""Camera models that Bundler's and NVM's radial terms can tell, and how many terms they have."""
+RADIAL_TERMS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2}
+"""Camera models that NVM and Bundler can hold, and how many radial terms each has."""
 
-NVM_TERMS, BUNDLER_TERMS = 1, 2
+NVM_TERMS, BUNDLER_TERMS = 1, 2  # radial terms that the formats have a place for
 
 FLIP_Y_Z = np.diag([1.0, -1.0, -1.0])  # from COLMAP's camera to that of OpenGL, Bundler, nerfstudio
 
@@ -45,16 +48,31 @@ class Source:
         images = (self.model.image(image_id) for image_id in self.model.reg_image_ids())
         return sorted(images, key=lambda image: str(image.name))
 
+    def radial(self, image: pycolmap.Image, num_terms: int, name: str) -> tuple[float, Array]:
+        """Return the focal length of an image and its radial terms, 0 if it lacks some."""
+        camera = self.model.cameras[image.camera_id]
+        known = RADIAL_TERMS.get(camera.model.name)
+        if known is None or known > num_terms:
+            raise OptionError(
+                f"{name}: cannot hold the camera of {image.name} ({camera.model.name}); export "
+                f"'undistorted' first, and then the model in its folder {DENSE}/sparse"
+            )
+        terms = np.zeros(num_terms)
+        terms[:known] = camera.params[len(camera.params) - known :]
+        return camera.mean_focal_length(), terms
+
     def tracks(self) -> Iterator[tuple[pycolmap.Point3D, list[tuple[int, int, Array]]]]:
-        """Yield points with, for each image that sees it: its place in images(), keypoint, x y."""
+        """Yield points with their tracks: place in images(), keypoint, its x y from the centre."""
         images = self.images()
         places = {image.image_id: place for place, image in enumerate(images)}
+        cameras = [self.model.cameras[image.camera_id] for image in images]
+        centers = [np.array([c.principal_point_x, c.principal_point_y]) for c in cameras]
         for _, point in sorted(self.model.points3D.items()):
             seen = []
             for element in point.track.elements:
-                place = places[element.image_id]
-                keypoint = images[place].points2D[element.point2D_idx].xy
-                seen.append((place, element.point2D_idx, keypoint))
+                place, keypoint = places[element.image_id], element.point2D_idx
+                xy = images[place].points2D[keypoint].xy - centers[place]
+                seen.append((place, keypoint, xy))
             yield point, seen
 
 
@@ -109,44 +127,26 @@ def _text(source: Source, folder: Path) -> Path:
     return path
 
 
-def _radial(
-    source: Source, image: pycolmap.Image, num_terms: int, name: str
-) -> tuple[float, Array, Array]:
-    """Return the focal length of an image, its radial terms, 0 if it lacks some, and its centre."""
-    camera = source.model.cameras[image.camera_id]
-    known = RADIAL_MODELS.get(camera.model.name)
-    if known is None or known > num_terms:
-        raise OptionError(
-            f"{name}: cannot hold the camera of {image.name} ({camera.model.name}); export "
-            f"'undistorted' first, and then the model in its folder {DENSE}/sparse"
-        )
-    terms = np.zeros(num_terms)
-    terms[:known] = camera.params[len(camera.params) - known :] if known else []
-    center = np.array([camera.principal_point_x, camera.principal_point_y])
-    return camera.mean_focal_length(), terms, center
-
-
 def _nvm(source: Source, folder: Path) -> Path:
     """Write VisualSFM's file: keypoints from the principal point, k with the other sign."""
     path, images = folder / "model.nvm", source.images()
-    lines, centers = ["NVM_V3", "", str(len(images))], []
+    lines = ["NVM_V3", "", str(len(images))]
     for image in images:
-        focal, terms, center = _radial(source, image, NVM_TERMS, "NVM")
+        focal, terms = source.radial(image, NVM_TERMS, "NVM")
         if any(character.isspace() for character in image.name):
             raise OptionError(f"NVM: cannot hold the name '{image.name}', which has a space")
-        centers.append(center)
         x, y, z, w = image.cam_from_world().rotation.quat
         values = [focal, w, x, y, z, *image.projection_center(), -terms[0], 0]
         lines.append(f"{image.name} {_numbers(values)}")
     lines += ["", str(source.model.num_points3D())]
-    for point, views in source.tracks():
-        unique = {view[0]: view for view in reversed(views)}  # one keypoint of each image
-        seen = [unique[place] for place in sorted(unique)]
-        keypoints = [
-            f"{place} {index} {_numbers(xy - centers[place])}" for place, index, xy in seen
+    for point, seen in source.tracks():
+        unique = {view[0]: view for view in reversed(seen)}  # one keypoint of each image
+        views = [
+            f"{place} {index} {_numbers(xy)}"
+            for place, index, xy in sorted(unique.values(), key=itemgetter(0))
         ]
         colour = " ".join(map(str, point.color))
-        lines.append(f"{_numbers(point.xyz)} {colour} {len(seen)} {' '.join(keypoints)}")
+        lines.append(f"{_numbers(point.xyz)} {colour} {len(views)} {' '.join(views)}")
     replace_text(path, "\n".join(lines) + "\n")
     return path
 
@@ -155,26 +155,20 @@ def _bundler(source: Source, folder: Path) -> Path:
     """Write Bundler's file, whose cameras look along -z, and the list of its photographs."""
     path, images = folder / "bundle.out", source.images()
     lines = ["# Bundle file v0.3", f"{len(images)} {source.model.num_points3D()}"]
-    centers = []
     for image in images:
-        focal, terms, center = _radial(source, image, BUNDLER_TERMS, "Bundler")
-        centers.append(center)
+        focal, terms = source.radial(image, BUNDLER_TERMS, "Bundler")
         matrix = FLIP_Y_Z @ image.cam_from_world().matrix()
-        lines.append(_numbers([focal, *terms]))
-        lines += [_numbers(row) for row in (*matrix[:, :3], matrix[:, 3])]
+        lines += map(_numbers, ([focal, *terms], *matrix[:, :3], matrix[:, 3]))
     for point, seen in source.tracks():
-        lines += [_numbers(point.xyz), " ".join(map(str, point.color))]
-        views = [
-            f"{place} {index} {_numbers((xy - centers[place]) * [1, -1])}"
-            for place, index, xy in seen
-        ]
-        lines.append(f"{len(views)} {' '.join(views)}")
+        views = [f"{place} {index} {_numbers(xy * [1, -1])}" for place, index, xy in seen]
+        colour = " ".join(map(str, point.color))
+        lines += [_numbers(point.xyz), colour, f"{len(views)} {' '.join(views)}"]
     replace_text(path, "\n".join(lines) + "\n")
     replace_text(folder / "bundle.list.txt", "".join(f"{image.name}\n" for image in images))
     return path
 
 
-def _numbers(values: Any) -> str:
+def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{float(value):.12g}" for value in values)
 
 
@@ -231,20 +225,19 @@ def _cameras(source: Source, folder: Path) -> Path:
     path, place = folder / "cameras.csv", Georeference.read(source.path)
     rows: list[dict[str, Any]] = []
     for image in source.images():
-        camera, pose = source.model.cameras[image.camera_id], image.cam_from_world()
-        qx, qy, qz, qw = pose.rotation.quat.tolist()
-        x, y, z = center = image.projection_center()
+        camera, center = source.model.cameras[image.camera_id], image.projection_center()
+        qx, qy, qz, qw = image.cam_from_world().rotation.quat.tolist()
         rows.append({
-            "name": image.name, "x": x, "y": y, "z": z, "qw": qw, "qx": qx, "qy": qy, "qz": qz,
+            "name": image.name, **dict(zip("xyz", center, strict=True)),
+            "qw": qw, "qx": qx, "qy": qy, "qz": qz,
             "num_points": image.num_points3D, "camera": image.camera_id,
             "camera_model": camera.model.name, "width": camera.width, "height": camera.height,
             "focal_px": camera.mean_focal_length(),
             "params": " ".join(f"{value:.9g}" for value in camera.params),
         })  # fmt: skip
         if place:
-            rows[-1] |= zip(
-                ("latitude", "longitude", "altitude_m"), place.on_earth(center), strict=True
-            )
+            on_earth = place.on_earth(center)
+            rows[-1] |= zip(("latitude", "longitude", "altitude_m"), on_earth, strict=True)
     replace_text(path, csv_text(rows))
     return path
 
@@ -258,12 +251,12 @@ def _geojson(source: Source, folder: Path) -> Path:
             "'colmap-affrect align' with --gps, or positions with latitude and longitude"
         )
     features = []
-    for name, (rotation, translation) in sorted(model_poses(source.model).items()):
-        latitude, longitude, altitude = place.on_earth(-rotation.T @ translation)
-        east, north, _ = rotation[2]
+    for image in source.images():
+        latitude, longitude, altitude = place.on_earth(image.projection_center())
+        east, north, _ = image.viewing_direction()
         heading = float(np.degrees(np.arctan2(east, north)) % 360.0)
         point = {"type": "Point", "coordinates": [longitude, latitude, altitude]}
-        about = {"name": name, "heading_deg": heading}
+        about = {"name": image.name, "heading_deg": heading}
         features.append({"type": "Feature", "geometry": point, "properties": about})
     content = {"type": "FeatureCollection", "features": features}
     replace_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")

@@ -1,4 +1,4 @@
-"""Where on earth a model is: beside COLMAP's files, which have no place for that."""
+"""Where on earth a model is: a file beside those of COLMAP, which have no place for it."""
 
 from dataclasses import astuple, dataclass
 from pathlib import Path

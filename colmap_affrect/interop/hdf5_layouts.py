@@ -17,9 +17,9 @@ These files are not trusted: links and data in other files are refused, and arra
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -27,29 +27,39 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.errors import OptionError, StoreError
+from colmap_affrect.errors import OptionError, StoreError, damage, reason
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.images.photographs import refuse_colliding_keys
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.project.atomic_files import require_space
+from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.outputs import leads_outside
 from colmap_affrect.project.stores import PairMatches, hloc_matches, pair_key
 from colmap_affrect.shown import such_as
 
 Datasets = dict[str, NDArray[Any]]
 
-LAYOUTS = ("hloc", "dim")
-
 MAX_VALUES = 1 << 28  # an array of more values is taken for damage, and not read
-
 MAX_NAMES_IN_MESSAGE = 10
-
 SPARE_BYTES = 8 << 20  # for HDF5's index, and for what it has not written yet
+KEYPOINTS, MATCHES = "/keypoints", "/matches0"
+MEND = "make it again with the program that wrote it"
 
-KEYPOINTS, HLOC_MATCHES = "/keypoints", "/matches0"
 
-UNREADABLE = (OSError, RuntimeError, KeyError, ValueError, TypeError, SystemError)
-"""What h5py raises for a damaged file."""
+@dataclass(frozen=True)
+class Layout:
+    """How a program names and stores what it knows of images and pairs."""
+
+    name: str
+    feature_key: Callable[[str], str]  # group of the features of an image
+    pair_part: Callable[[str], str]  # what stands for that group in the key of a pair
+    matches: str  # dataset in the group of a pair; empty where the key itself is a dataset
+    size_step: int  # 1 where image_size is (width, height), -1 where it is (height, width)
+
+
+LAYOUTS = {
+    "hloc": Layout("hloc", str, lambda key: key.replace("/", "-"), MATCHES, 1),
+    "dim": Layout("dim", lambda name: PurePosixPath(name).name, str, "", -1),
+}
 
 
 def listed(names: Iterable[str]) -> str:
@@ -72,20 +82,18 @@ class Source:
 
     def read(self, key: str, shape: tuple[int | None, ...], kinds: str = "fiu") -> NDArray[Any]:
         """Read numbers of some of numpy's kinds, of a shape in which None is any size."""
-        found = self.shapes[key]
-        same = [size in (expected, None) for size, expected in zip(shape, found, strict=False)]
-        if len(found) != len(shape) or not all(same):
+        stored = self.shapes[key]
+        same = [size in (expected, None) for size, expected in zip(shape, stored, strict=False)]
+        if len(stored) != len(shape) or not all(same):
             wanted = str(shape).replace("None", "N")
-            raise StoreError(f"{self.path}: {key} has shape {found}, expected {wanted}")
-        if np.prod([float(size) for size in found]) > MAX_VALUES:
-            raise StoreError(f"{self.path}: {key} of shape {found} is too large to be true")
-        with _reading(self.path):
-            kind = self.file[key].dtype.kind
-            values = np.asarray(self.file[key][()]) if kind in kinds else None
-        if values is None:
-            what = "numbers" if "f" in kinds else "integers"
-            raise StoreError(f"{self.path}: {key} does not hold {what}")
-        return values
+            raise StoreError(f"{self.path}: {key} has shape {stored}, expected {wanted}")
+        if np.prod([float(size) for size in stored]) > MAX_VALUES:
+            raise StoreError(f"{self.path}: {key} of shape {stored} is too large to be true")
+        with damage(self.path, MEND):
+            if self.file[key].dtype.kind in kinds:
+                return np.asarray(self.file[key][()])
+        what = "numbers" if "f" in kinds else "integers"
+        raise StoreError(f"{self.path}: {key} does not hold {what}")
 
 
 @contextmanager
@@ -95,17 +103,10 @@ def _opened(path: Path) -> Iterator[Source]:
         raise OptionError(f"{path}: no such file")
     try:
         file = h5py.File(path, "r")
-    except BlockingIOError as error:
-        raise StoreError(
-            f"{path}: another program is writing it; wait until it has ended"
-        ) from error
     except OSError as error:
-        if "already open for write" in str(error):
-            raise StoreError(
-                f"{path}: is being written, or its writer was killed; in the second case "
-                f"'h5clear --status {path.name}' mends it"
-            ) from error
-        raise StoreError(f"{path}: not an HDF5 file, or damaged ({_first_line(error)})") from error
+        raise StoreError(
+            f"{path}: not an HDF5 file, damaged, or still being written ({reason(error)})"
+        ) from error
     with file:
         yield Source(path, file, _shapes(path, file))
 
@@ -121,8 +122,11 @@ def _shapes(path: Path, file: h5py.File) -> dict[str, tuple[int, ...]]:
         elif isinstance(item, h5py.Dataset):
             shapes[key] = item.shape or ()
 
-    with _reading(path):
-        file.visititems_links(visit)
+    with damage(path, MEND):
+        try:
+            file.visititems_links(visit)
+        except SystemError as error:  # h5py's, for a name that is no UTF-8
+            raise ValueError(error) from error
     if outside:
         raise StoreError(
             f"{path}: soft and external links and data in other files are not followed: "
@@ -131,64 +135,13 @@ def _shapes(path: Path, file: h5py.File) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except UNREADABLE as error:
-        raise StoreError(f"{path}: damaged ({_first_line(error)})") from error
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-@dataclass(frozen=True)
-class Target:
-    """An HDF5 file that is being written."""
-
-    path: Path
-    file: Any
-
-    def write(self, key: str, datasets: Datasets) -> None:
-        """Add datasets to a group, if the disk has room: else HDF5 may end the process."""
-        require_space(self.path, sum(values.nbytes for values in datasets.values()) + SPARE_BYTES)
-        with _writing(self.path):
-            group = self.file.require_group(key)
-            for name, values in datasets.items():
-                group.create_dataset(name, data=values)
-
-
-@contextmanager
-def created(new: Path, path: Path) -> Iterator[Target]:
-    """Make a file in a temporary place, whose own name is told of when it cannot be written."""
-    require_space(path, SPARE_BYTES)
-    with _writing(path):
-        file = h5py.File(new, "w")
-    try:
-        yield Target(path, file)
-    finally:
-        with _writing(path):
-            file.close()
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        raise StoreError(
-            f"{path}: cannot be written ({_first_line(error)}); free space or give another name"
-        ) from error
-
-
 @dataclass(frozen=True)
 class ForeignFiles:
     """Features and matches of another program, by the names of photographs."""
 
     features: Source
     matches: Source
-    layout: str  # of both files, ``hloc`` or ``dim``
+    layout: Layout  # of both files
     keys: dict[str, str]  # of the features of each image that has some
     pairs: dict[Pair, str]  # key of the matches of each pair
     notes: list[str]  # which pairs were passed over
@@ -198,8 +151,7 @@ class ForeignFiles:
         key = f"{self.keys[name]}/image_size"
         if key not in self.features.shapes:
             return
-        stored = self.features.read(key, (2,))
-        stored = stored if self.layout == "hloc" else stored[::-1]
+        stored = self.features.read(key, (2,))[:: self.layout.size_step]
         size = tuple(stored.tolist())
         # deep-image-matching writes float16, which rounds sizes from 2049 px on.
         if not np.array_equal(stored, np.asarray(expected).astype(stored.dtype)):
@@ -210,12 +162,17 @@ class ForeignFiles:
                 "photographs"
             )
 
+    def keypoints_key(self, name: str) -> str:
+        """Return the dataset with the keypoints of an image, in its group or without one."""
+        key = self.keys[name]
+        return key + KEYPOINTS if key + KEYPOINTS in self.features.shapes else key
+
     def read_indices(self, pair: Pair, num_keypoints1: int) -> Indices:
         """Read the (M, 2) matches of a pair, the range of which is not checked here."""
-        key = self.pairs[pair]
-        if self.layout == "dim":
+        key = self.pairs[pair] + self.layout.matches
+        if not self.layout.matches:
             return self.matches.read(key, (None, 2), "iu").astype(np.int64)
-        column = self.matches.read(key + HLOC_MATCHES, (num_keypoints1,), "iu").astype(np.int64)
+        column = self.matches.read(key, (num_keypoints1,), "iu").astype(np.int64)
         rows = np.flatnonzero(column != -1)
         return np.stack([rows, column[rows]], axis=1)
 
@@ -228,26 +185,24 @@ def open_files(
     with _opened(features_path) as features, _opened(matches_path) as matches:
         if layout == "auto":  # a file without any matches is taken for hloc's
             columns = [k for k, s in matches.shapes.items() if len(s) == 1]
-            is_hloc = any(key.endswith(HLOC_MATCHES) for key in columns) or not matches.shapes
+            is_hloc = any(key.endswith(MATCHES) for key in columns) or not matches.shapes
             layout = "hloc" if is_hloc else "dim"
-        keys = _name_features(features, names, layout, image_path)
-        pairs, notes = _name_pairs(matches, keys, layout)
-        yield ForeignFiles(features, matches, layout, keys, pairs, notes)
+        chosen = LAYOUTS[layout]
+        keys = _name_features(features, names, chosen, image_path)
+        pairs, notes = _name_pairs(matches, keys, chosen)
+        yield ForeignFiles(features, matches, chosen, keys, pairs, notes)
 
 
 def _name_features(
-    source: Source, names: Sequence[str], layout: str, image_path: Path
+    source: Source, names: Sequence[str], layout: Layout, image_path: Path
 ) -> dict[str, str]:
     """Return the group with keypoints of each image, or the dataset of them at the top."""
     keys = [key.removesuffix(KEYPOINTS) for key in source.shapes if key.endswith(KEYPOINTS)]
     keys += [key for key in source.shapes if "/" not in key]
     if not keys:
         raise StoreError(f"{source.path}: holds no keypoints; is it a file of local features?")
-    known = {name: [name] for name in names}
-    if layout == "dim":
-        known |= _by_file_name(names)
-    unknown = sorted(set(keys) - known.keys())
-    if unknown:
+    known = {name: [name] for name in names} | _by_key(names, layout)
+    if unknown := sorted(set(keys) - known.keys()):
         raise StoreError(
             f"{source.path}: has features of images that are not in {image_path}: {listed(unknown)}"
         )
@@ -259,38 +214,34 @@ def _name_features(
         if name in key_of:
             raise StoreError(f"{source.path}: has features of {name} twice")
         key_of[name] = key
-    if layout == "hloc":
+    if layout.matches:
         refuse_colliding_keys(list(key_of))
     return key_of
 
 
 def _name_pairs(
-    source: Source, feature_keys: Mapping[str, str], layout: str
+    source: Source, feature_keys: Mapping[str, str], layout: Layout
 ) -> tuple[dict[Pair, str], list[str]]:
     """Return the key of each pair of images, and notes on pairs that were passed over."""
-    if layout == "hloc":
-        keys = [
-            key.removesuffix(HLOC_MATCHES) for key in source.shapes if key.endswith(HLOC_MATCHES)
-        ]
-        parts = {name.replace("/", "-"): name for name in feature_keys}
-    else:
-        keys, parts = list(source.shapes), {key: name for name, key in feature_keys.items()}
+    ending = layout.matches
+    keys = [key.removesuffix(ending) for key in source.shapes if key.endswith(ending)]
+    names = {layout.pair_part(key): name for name, key in feature_keys.items()}
     if source.shapes and not keys:
         raise StoreError(f"{source.path}: holds no 'matches0'; is it of another layout?")
     pairs: dict[Pair, str] = {}
     unknown, selves, again = [], [], []
     for key in sorted(keys, key=lambda key: ("/" not in key, key)):
-        found = _split_key(key, parts)
-        if len(found) > 1:
-            raise StoreError(f"{source.path}: {key} may be any of {listed(map(' + '.join, found))}")
-        if not found:
+        ways = _split_key(key, names)
+        if len(ways) > 1:
+            raise StoreError(f"{source.path}: {key} may be any of {listed(map(' + '.join, ways))}")
+        if not ways:
             unknown.append(key)
-        elif found[0][0] == found[0][1]:
+        elif ways[0][0] == ways[0][1]:
             selves.append(key)
-        elif found[0] in pairs or found[0][::-1] in pairs:
+        elif ways[0] in pairs or ways[0][::-1] in pairs:
             again.append(key)
         else:
-            pairs[found[0]] = key
+            pairs[ways[0]] = key
     if unknown:
         raise StoreError(
             f"{source.path}: has matches of images that have no features: {listed(unknown)}"
@@ -310,7 +261,14 @@ def _split_key(key: str, names: Mapping[str, str]) -> list[Pair]:
     return [(names[a], names[b]) for a, b in halves if a in names and b in names]
 
 
-def check_names(names: Sequence[str], layout: str) -> None:
+def _by_key(names: Iterable[str], layout: Layout) -> dict[str, list[str]]:
+    groups: defaultdict[str, list[str]] = defaultdict(list)
+    for name in names:
+        groups[layout.feature_key(name)].append(name)
+    return groups
+
+
+def check_names(names: Sequence[str], layout: Layout) -> None:
     """Refuse image names that the keys of a layout cannot hold or tell apart."""
     unsafe = [
         name
@@ -319,48 +277,54 @@ def check_names(names: Sequence[str], layout: str) -> None:
     ]
     if unsafe:
         raise StoreError(f"names that are no plain relative paths: {listed(unsafe)}")
-    if layout == "dim":
-        groups = _by_file_name(names).values()
-        same = [name for group in groups if len(group) > 1 for name in group]
-        if same:
-            raise StoreError(
-                f"deep-image-matching knows images by file name only, which these share: "
-                f"{listed(same)}; use --layout hloc"
-            )
-        return
-    refuse_colliding_keys(names)
-    folders = {str(parent) for name in names for parent in PurePosixPath(name).parents}
-    both = sorted(folders & set(names))
-    if both:
+    groups = _by_key(names, layout)
+    if same := [name for group in groups.values() if len(group) > 1 for name in group]:
+        raise StoreError(
+            f"deep-image-matching knows images by file name only, which these share: "
+            f"{listed(same)}; use --layout hloc"
+        )
+    if layout.matches:
+        refuse_colliding_keys(names)
+    folders = {str(parent) for key in groups for parent in PurePosixPath(key).parents}
+    if both := sorted(folders & groups.keys()):
         raise StoreError(f"{both[0]}: is an image and the folder of another; rename it")
 
 
-def _by_file_name(names: Iterable[str]) -> dict[str, list[str]]:
-    groups: defaultdict[str, list[str]] = defaultdict(list)
-    for name in names:
-        groups[feature_key(name, "dim")].append(name)
-    return groups
-
-
-def feature_key(name: str, layout: str) -> str:
-    """Return the group of the features of an image."""
-    return name if layout == "hloc" else PurePosixPath(name).name
-
-
-def keypoints_key(source: Source, key: str) -> str:
-    """Return the dataset of the keypoints of a group, or of one without groups."""
-    return f"{key}{KEYPOINTS}" if f"{key}{KEYPOINTS}" in source.shapes else key
-
-
-def match_datasets(pair: PairMatches, layout: str) -> tuple[str, Datasets]:
+def match_datasets(pair: PairMatches, layout: Layout) -> tuple[str, Datasets]:
     """Return the group of a pair and its datasets."""
-    if layout == "hloc":
+    if layout.matches:
         return pair_key(*pair.names), hloc_matches(pair)
-    first, second = (feature_key(name, layout) for name in pair.names)
+    first, second = map(layout.feature_key, pair.names)
     return first, {second: pair.indices}
 
 
-def one_match_per_keypoint(pair: PairMatches) -> PairMatches:
-    """Keep the first match of each keypoint of the first image: hloc's files have room for one."""
-    _, kept = np.unique(pair.indices[:, 0], return_index=True)
-    return replace(pair, indices=pair.indices[kept], scores=pair.scores[kept])
+@contextmanager
+def created(new: Path, path: Path) -> Iterator[Callable[[str, Datasets], None]]:
+    """Make a file in a temporary place; yield what adds datasets to one of its groups.
+
+    The disk must have room for them: else HDF5 may end the process. WorkspaceError names ``path``.
+    """
+    require_space(path, SPARE_BYTES)
+    with _writing(path):
+        file = h5py.File(new, "w")
+
+    def write(key: str, datasets: Datasets) -> None:
+        require_space(path, sum(values.nbytes for values in datasets.values()) + SPARE_BYTES)
+        with _writing(path):
+            group = file.require_group(key)
+            for name, values in datasets.items():
+                group.create_dataset(name, data=values)
+
+    try:
+        yield write
+    finally:
+        with _writing(path):
+            file.close()
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        raise cannot_write(path, error) from error

@@ -15,7 +15,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.checks import FATAL, refuse_unusable
 from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
-from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.colmap.verification import verify as verify_database
@@ -36,14 +35,9 @@ from colmap_affrect.stages import verify as verify_stage
 from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.escalate import escalate
-from colmap_affrect.stages.extract import (
-    Inputs,
-    extract,
-    recorded_extraction,
-    write_descriptors,
-    write_images_and_keypoints,
-)
+from colmap_affrect.stages.extract import extract, write_descriptors, write_images_and_keypoints
 from colmap_affrect.stages.guide import guide
+from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import add_pairs
@@ -251,44 +245,20 @@ def verify(
     pairs to verify, two names per line; all by default. With ``check_cameras`` all verified pairs
     vote on cameras whose focal length is no prior; those that they know become priors.
     """
-    path = Path(database_path)
+    path, pairs = Path(database_path), None
     verification = translate.verification_options(options, random_seed)
     refuse_unusable(path, FATAL | {"keypoints-not-finite"})
-    advance = _advance_unless_cancelled(cancellation_token)
-    advance(0)
-    if pairs_path is None:
-        verify_database(path, verification, advance=advance)
-    else:
-        pairs = read_pairs(Path(pairs_path), list(image_ids(path)))
-        _verify_pairs(path, pairs, verification, advance)
+    with _Cancellable(SILENT, cancellation_token).stage("verify", 0, "pairs") as advance:
+        if pairs_path is not None:
+            ids = image_ids(path)
+            listed = read_pairs(Path(pairs_path), list(ids))
+            pairs = {(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in listed}
+        verify_database(path, verification, advance=advance, pairs=pairs)
     if check_cameras:
         with temporary_folder(path.parent) as folder:
             records = folder / "cameras.json"
             record_cameras(path, records)
             hold_vote(path, records, verification, may_share=False)
-
-
-def _verify_pairs(
-    path: Path, pairs: Sequence[Pair], verification: VerificationOptions, advance: Advance
-) -> None:
-    """Verify in a copy that has the matches of these pairs only, and take over what is found."""
-    ids = image_ids(path)
-    wanted = {(min(pair), max(pair)) for pair in ((ids[one], ids[two]) for one, two in pairs)}
-    with temporary_folder(path.parent) as folder:
-        copy = folder / "database.db"
-        copy_database(path, copy)
-        with open_database(copy) as database:
-            for pair_id in database.read_num_matches()[0]:
-                pair = pycolmap.pair_id_to_image_pair(pair_id)
-                if pair not in wanted:
-                    database.delete_matches(*pair)
-        verify_database(copy, verification, advance=advance)
-        with open_database(copy) as verified, open_database(path) as database:
-            for pair in sorted(wanted):
-                known = database.exists_two_view_geometry(*pair)
-                if not known and verified.exists_two_view_geometry(*pair):
-                    geometry = verified.read_two_view_geometry(*pair)
-                    database.write_two_view_geometry(*pair, geometry)
 
 
 def _match(
@@ -356,27 +326,22 @@ class _Cancellable(Progress):
 
     def __init__(self, shown: Progress, token: Token) -> None:
         super().__init__()
-        self._shown, self._check = shown, _advance_unless_cancelled(token)
+        self._shown, self._token = shown, token
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        self._check(0)
+        self._check()
         with self._shown.stage(name, total, unit) as advance:
 
             def advance_or_end(count: int) -> None:
                 advance(count)
-                self._check(count)
+                self._check()
 
             yield advance_or_end
 
-
-def _advance_unless_cancelled(token: Token) -> Advance:
-    def advance(count: int) -> None:
-        del count
-        if token and token.is_cancelled:
+    def _check(self) -> None:
+        if self._token and self._token.is_cancelled:
             raise InterruptedError(CANCELLED)
-
-    return advance
 
 
 @contextmanager

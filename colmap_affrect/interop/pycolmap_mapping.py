@@ -82,7 +82,7 @@ def incremental_mapping(
 
 @dataclass
 class _Callbacks:
-    """pycolmap's callbacks, told of numbers of registered images."""
+    """Calls pycolmap's callbacks for numbers of newly registered images."""
 
     begun: Callable[[], None] | None
     following: Callable[[], None] | None
@@ -90,12 +90,12 @@ class _Callbacks:
     count: int = 0
 
     def show(self, number: int) -> None:
-        first = 0
-        if not self.count:
-            first = number if self.extends else min(number, 2)
+        is_first, rest = not self.count, number
+        self.count += number
+        if is_first:  # of a model that is extended, all images that it has
+            rest = 0 if self.extends else max(0, number - 2)
             if self.begun:
                 self.begun()
-        self.count += number
-        for _ in range(number - first):
-            if self.following:
+        if self.following:
+            for _ in range(rest):
                 self.following()

@@ -95,7 +95,7 @@ def changes(given: object, kind: type, argument: str) -> dict[str, Any]:
 
 
 def is_native(given: object, kind: type, own: type[Options]) -> bool:
-    """Tell pycolmap's options from ours: a dictionary is whose alone has one of its keys."""
+    """Tell whether options are pycolmap's: a dictionary is if it has a key that ours lack."""
     if not isinstance(given, Mapping):
         return isinstance(given, kind)
     names = {key.partition(".")[0] for key in flat_values(kind())}

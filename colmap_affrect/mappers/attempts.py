@@ -1,7 +1,6 @@
 """From a verified database to a folder of models, by any mapper."""
 
 import logging
-import shutil
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -35,6 +34,7 @@ from colmap_affrect.mappers.starts import (
     unknown_cameras,
 )
 from colmap_affrect.mappers.summaries import model_folders, read_summary, write_summary
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary
 
 logger = logging.getLogger(__name__)
@@ -79,8 +79,7 @@ def map_database(
     if task.extend:
         require_extends(mapper.options)
     partial = sparse_path.with_name(sparse_path.name + ".partial")
-    for old in (partial,) if task.extend else (partial, sparse_path):
-        shutil.rmtree(old, ignore_errors=True)
+    remove_own([partial] if task.extend else [partial, sparse_path])
     try:
         best = _best_attempt(mapper, task, sparse_path, partial, next_image)
         is_final = task.extend or mapper.options.is_complete
@@ -91,10 +90,10 @@ def map_database(
             write_model(model.reconstruction, partial / str(index))
             summaries.append(summarize(model, task, is_largest=index == 0))
             write_summary(summaries[-1], partial / str(index))
-        shutil.rmtree(sparse_path, ignore_errors=True)
+        remove_own([sparse_path])
         partial.rename(sparse_path)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_own([partial])
     return summaries
 
 
@@ -126,7 +125,7 @@ def _best_attempt(
             raw = partial / "raw"
             raw.mkdir(parents=True)
             found = attempts.next(partial / "started.db", raw, show)
-            shutil.rmtree(raw)
+            remove_own([raw])
             if not task.extend:  # whose images stay, whatever they are
                 found = _possible(found, kept)
             found = sorted(found, key=_size, reverse=True)

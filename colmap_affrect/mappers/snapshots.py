@@ -1,7 +1,6 @@
 """Snapshots of a long mapping, from which it goes on after it has been killed."""
 
 import logging
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,6 +12,7 @@ from colmap_affrect.errors import StoreError
 from colmap_affrect.mappers.base import MapperOptions, MappingTask
 from colmap_affrect.options import digest_of
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.outputs import remove_own
 
 logger = logging.getLogger(__name__)
 
@@ -48,16 +48,16 @@ def with_snapshots(
     digest = digest_of(made_from)
     record = folder / INPUTS
     if not (record.exists() and record.read_bytes() == digest.encode()):
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_own([folder])
         folder.mkdir(parents=True)
         replace_text(record, digest)
     try:
         yield replace(task, snapshot_path=folder)
     except BaseException:
         if not any(path.is_dir() for path in folder.iterdir()):
-            shutil.rmtree(folder, ignore_errors=True)
+            remove_own([folder])
         raise
-    shutil.rmtree(folder, ignore_errors=True)
+    remove_own([folder])
 
 
 def largest_snapshot(folder: Path) -> Path | None:
@@ -88,4 +88,4 @@ def drop_old_snapshots(folder: Path) -> None:
         if path != newest and (path / "frames.bin").exists()
     )
     for _, _, path in complete[: -(NUM_KEPT - 1)]:
-        shutil.rmtree(path, ignore_errors=True)
+        remove_own([path])

@@ -8,7 +8,7 @@ import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -20,7 +20,8 @@ from colmap_affrect.parallel.executor import unless_gpu_is_full
 
 logger = logging.getLogger(__name__)
 
-_SAID = threading.Lock()  # taken, and never given back, by the thread that says so
+_SAID = threading.Lock()  # taken, and never given back, by the thread that warns
+ROUNDING = np.float32(1e-6)  # similarities that near to 1 are equal: two copies have ratio 1
 
 Found = TypeVar("Found")
 
@@ -42,53 +43,38 @@ class MatcherOptions(NetworkOptions):
 
 @dataclass(frozen=True)
 class MatcherContext(NetworkContext):
-    """What a matcher works with.
+    """What a matcher works with."""
 
-    Attributes:
-        weights: files by key, found beforehand (:mod:`colmap_affrect.features.weights`).
-        device: as given, also ``auto``.
-        num_similarities: about how many pairs of features there will be to compare in all.
-    """
-
-    device: str = "auto"
-    num_similarities: float = 0
+    device: str = "auto"  # as given
+    num_similarities: float = 0  # about how many pairs of features will be compared in all
 
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """What a matcher is given of an image.
+    """What a matcher is given of an image."""
 
-    Attributes:
-        features: frames, scores (``responses``), descriptors and the warps they come from.
-        image_size: (width, height) of the stored image in px.
-        extractor: kind of the features, mostly the name of their extractor.
-    """
-
-    features: LocalFeatures
-    image_size: tuple[int, int]
-    extractor: str
+    features: LocalFeatures  # also of warps (``rectification_ids``)
+    image_size: tuple[int, int]  # (width, height) of the stored image in px
+    extractor: str  # kind of the features, mostly the name of their extractor
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Matches of two images before geometric verification.
+    """Matches of two images before geometric verification, one to one.
 
     Attributes:
-        indices: (M, 2) int64 features of image 1 and 2, strictly rising in column 0.
+        indices: (M, 2) int64 features of image 1 and 2, strictly rising in column 0, and no
+            feature twice in column 1: verification and tracks count on it.
         scores: (M,) float32 in [0, 1], larger is better.
     """
 
     indices: Indices
     scores: Singles
 
-
-ROUNDING = np.float32(1e-6)  # similarities that near to 1 are equal: two copies have ratio 1
-
-
-def distance_ratios(first: Singles, second: Singles) -> Singles:
-    """Return the ratios of distances of unit vectors with these similarities."""
-    distances = (np.maximum(1.0 - similarity, ROUNDING) for similarity in (first, second))
-    return np.asarray(np.sqrt(np.divide(*distances)))
+    @classmethod
+    def none(cls) -> Self:
+        """Return the result for images that have nothing in common."""
+        return cls(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
 
 
 class Matcher(Protocol):
@@ -101,7 +87,7 @@ class Matcher(Protocol):
         """
 
     def match(self, first: Any, second: Any) -> Matches:
-        """Match two prepared images. Either may have no features."""
+        """Match two prepared images one to one (:class:`Matches`). Either may have no features."""
 
 
 MATCHERS: Registry[Matcher] = Registry(
@@ -115,12 +101,18 @@ MATCHERS: Registry[Matcher] = Registry(
 )
 
 
-def unless_gpu_is_full_or_say(with_gpu: Callable[[], Found], without: Callable[[], Found]) -> Found:
-    """Return what is done on a GPU, or without it where its memory is full; say so once."""
+def distance_ratios(first: Singles, second: Singles) -> Singles:
+    """Return the ratios of distances of unit vectors with these similarities."""
+    distances = (np.maximum(1.0 - similarity, ROUNDING) for similarity in (first, second))
+    return np.asarray(np.sqrt(np.divide(*distances)))
 
-    def say_once_and_go_on() -> Found:
+
+def unless_gpu_is_full_or_say(with_gpu: Callable[[], Found], without: Callable[[], Found]) -> Found:
+    """Return what is done on a GPU, or without it where its memory is full; warn once."""
+
+    def warn_and_go_on() -> Found:
         if _SAID.acquire(blocking=False):
             logger.warning("the memory of the GPU is full; the CPU matches the rest")
         return without()
 
-    return unless_gpu_is_full(with_gpu, say_once_and_go_on)
+    return unless_gpu_is_full(with_gpu, warn_and_go_on)

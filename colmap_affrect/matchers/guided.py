@@ -1,13 +1,8 @@
 """Guided matching: the features of a pair once more, where its two-view geometry allows a match.
 
-Raw matching asks whether the nearest descriptor of the whole other image stands out. Of a pair
-whose geometry is known only the features near an epipolar line, or near the place that a
-homography gives, can match; among these few, many more stand out. Neighbouring pairs find the same
-features in this way, which makes tracks through three images.
-
-Every feature that the geometry allows is compared, and no other: features of image 1 are taken in
-groups whose epipolar lines (or places) lie close together, and a group is compared with those
-features of image 2 that any of its members may match.
+Only the features near an epipolar line, or near the place that a homography gives, are compared;
+among these few many more pass the ratio test, which gives more tracks through three images.
+Features of image 1 are compared in groups whose epipolar lines (or places) lie close together.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,16 +27,9 @@ from colmap_affrect.options import Options, within
 
 GROUP_ROWS = 48  # compared at once: more take longer in products, fewer in Python
 
-MIN_AGREEING = 0.5
-"""Of a right pair at least this share of the inliers has frames that agree with the geometry, and
-of a wrong one whose inliers are accidental far less; guiding would make such a pair look proven."""
-
-BANDS_BESIDE = 6.0
-MAX_ACCIDENTAL = 0.5
-"""Guided matches count where so many bands beside the geometry no more than this share of them is
-found: those are accidental. Where things repeat, and near the places of a homography that most of
-the scene does not lie on, they are as many."""
-
+MIN_AGREEING = 0.5  # share of inliers whose frames agree with the geometry, of a right pair
+BANDS_BESIDE = 6.0  # distance, in bands, of the geometry beside that counts accidental matches
+MAX_ACCIDENTAL = 0.5  # share of guided matches beside the geometry, above which none counts
 TINY = np.finfo(float).tiny
 ANGLE_ROUNDING = 1e-9  # far below any band, far above the error of angles in a pencil of lines
 BANDS_OF_HOMOGRAPHY = 2.0  # radius round the place of a homography: planes are never quite plane
@@ -106,10 +94,12 @@ class Guide(Protocol):
 
 
 class EpipolarGuide:
-    """Matches lie within a band around epipolar lines (Sampson's distance)."""
+    """Matches lie within a band around epipolar lines (Sampson's distance).
+
+    Both images are brought to unit size, which keeps angles around far epipoles apart.
+    """
 
     def __init__(self, fundamental: Array, points1: Array, points2: Array, band_px: float) -> None:
-        """Bring both images to unit size, which keeps angles around far epipoles apart."""
         self.model: EpipolarModel = EpipolarModel(fundamental, (points1, points2))
         self._band_px = band_px
         finite = [points[np.isfinite(points).all(axis=1)] for points in (points1, points2)]
@@ -286,12 +276,11 @@ def guided_matches(
 ) -> Indices:
     """Return the (M, 2) inliers of a pair and its guided matches, one to one, as (K, 2).
 
-    They rise by features of image 1. The inliers, which the geometry was estimated from, stay;
-    guided matches that disagree with one of them are left out, and all where the frames of the
-    inliers, or else of the guided matches, do not agree with the geometry (:data:`MIN_AGREEING`),
-    or where beside it there are too many as well (:data:`MAX_ACCIDENTAL`).
-    Frames are not asked where an image has none that could tell
-    (:attr:`GuidableImage.has_directions`); there nothing is found without inliers.
+    They rise by features of image 1. All inliers, which the geometry was estimated from, stay.
+    There are no others where the frames of the inliers (without any, of the guided matches) do not
+    agree with the geometry (:data:`MIN_AGREEING`), or where too many are found beside it
+    (:data:`MAX_ACCIDENTAL`). Frames without a direction (:attr:`GuidableImage.has_directions`) are
+    not compared; of these images there are no guided matches without inliers.
     """
     has_directions = first.has_directions and second.has_directions
     if not (has_directions or len(inliers)):

@@ -1,8 +1,8 @@
 """LightGlue (Lindenberger, Sarlin, Pollefeys, ICCV 2023), built by kornia.
 
-LightGlue reads where features are, so it takes the features of one view: the image, or one of its
-warps, in coordinates of their own. Of images with warps those pairs of views are matched whose
-descriptors have most nearest neighbours in common, which is cheap to see; what they find is united.
+LightGlue reads positions, so it takes the features of one view: the image, or one of its warps, in
+px of the view. Of images with warps the pairs of views with most mutual nearest neighbours are
+matched, and the matches united.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import LocalFeatures
@@ -47,10 +46,6 @@ TRAINING_SIZE_PX = 1024  # longer side in training, whose pixels scales of featu
 KORNIA_SIGMAS = 12.0  # radius of kornia's frames of DoG features, in units of sigma
 CHUNK_ROWS = 1 << 10  # features whose similarities are held at once, which bounds memory
 DUPLICATE_RADIUS_PX = 2.0  # of nearer matches of several views, at both ends, the best stays
-
-TrainedFor = Literal[
-    "aliked", "disk", "xfeat", "sift", "dog-affnet-hardnet", "keynet-affnet-hardnet"
-]
 
 
 @dataclass(frozen=True)
@@ -83,7 +78,9 @@ class LightGlueOptions(MatcherOptions):
     """LightGlue, and LighterGlue for XFeat; defaults are those of LightGlue's authors."""
 
     name: Literal["lightglue"] = "lightglue"
-    trained_for: TrainedFor = "aliked"
+    trained_for: Literal[
+        "aliked", "disk", "xfeat", "sift", "dog-affnet-hardnet", "keynet-affnet-hardnet"
+    ] = "aliked"
     """Features that the weights were trained for."""
     max_num_features: Annotated[int, within(1, 1_000_000)] = 2048
     """Most features of each view that are matched, those of the largest responses."""
@@ -103,11 +100,6 @@ class LightGlueOptions(MatcherOptions):
     def weights(self) -> tuple[str, ...]:
         """Key of the file of weights."""
         return (TRAININGS[self.trained_for].weights,)
-
-    @property
-    def kornia(self) -> str:
-        """Name of the configuration in kornia."""
-        return self.trained_for.replace("-", "_")
 
     def require_extractor(self, extractor: str) -> None:
         """Refuse features that the weights were not trained for."""
@@ -187,11 +179,10 @@ class LightGlue:
         lafs, size = features.lafs, np.asarray(image_size, np.float64)
         if features.rectification_ids[0]:
             lafs, size = frames_of_view(lafs, has_circles=self.training.has_circles)
-        values = network_inputs(lafs, size, max(image_size), self.options.kornia)
-        values["descriptors"] = features.descriptors
+        values = network_inputs(lafs, size, max(image_size), self.options.trained_for)
         inputs = {
             name: torch.from_numpy(np.ascontiguousarray(array, np.float32))[None]
-            for name, array in values.items()
+            for name, array in (values | {"descriptors": features.descriptors}).items()
         }
         moved = unless_gpu_is_full_or_say(
             lambda: {name: tensor.to(self._device) for name, tensor in inputs.items()},
@@ -206,15 +197,13 @@ class LightGlue:
         if limit and len(pairs) > limit:
             pairs = promising(first.views, second.views, limit)
         parts = [self._match_views(*pair) for pair in pairs]
-        if len(parts) == 1:
-            return parts[0]
-        return united(parts, first.keypoints, second.keypoints)
+        return parts[0] if len(parts) == 1 else united(parts, first.keypoints, second.keypoints)
 
     def _match_views(self, first: PreparedView, second: PreparedView) -> Matches:
         import torch
 
         if not len(first.rows) or not len(second.rows):
-            return NO_MATCHES
+            return Matches.none()
         pair = {"image0": first.inputs, "image1": second.inputs}
         rows, columns, scores = unless_gpu_is_full_or_say(
             lambda: self._run(self._network, pair, self._device),
@@ -246,19 +235,15 @@ class LightGlue:
         return load_network(self._path, self.options)
 
 
-NO_MATCHES = Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
-
-
 def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) -> torch.nn.Module:
-    """Build kornia's LightGlue with the parameters in a file; nothing is downloaded.
+    """Build kornia's LightGlue with the parameters in a file, all of them, else WeightsError.
 
-    With ``mixed`` precision kornia computes in 16 bits where that is safe. Raises WeightsError when
-    the file does not hold all parameters in their shapes.
+    With ``mixed`` precision kornia computes in 16 bits where that is safe.
     """
     from kornia.feature import LightGlue as Network
 
     configuration = {
-        **Network.features[options.kornia],
+        **Network.features[options.trained_for.replace("-", "_")],
         "weights": None,
         "depth_confidence": options.depth_confidence,
         "width_confidence": options.width_confidence,
@@ -279,7 +264,7 @@ def load_network(path: Path, options: LightGlueOptions, *, mixed: bool = False) 
 
 
 def renamed(name: str) -> str:
-    """Return kornia's name of a parameter, of files older than LightGlue's layers and XFeat's.
+    """Return kornia's name of a parameter in LightGlue's first files and in XFeat's.
 
     >>> renamed("matcher.self_attn.3.out_proj.bias")
     'transformers.3.self_attn.out_proj.bias'
@@ -291,9 +276,9 @@ def renamed(name: str) -> str:
 def frames_of_view(lafs: Array, *, has_circles: bool) -> tuple[Array, Array]:
     """Undo the warp of a view, whose frames were carried back into the image.
 
-    Circles became the map of the warp. Other frames have a common shape, which tells the map up to
-    a rotation; the one without is taken. The view is as large as its features reach. Returns the
-    (N, 2, 3) frames in px of the view, and its (width, height).
+    Circles became the linear part of the warp; of other frames the mean shape gives it up to a
+    rotation, of which none is assumed. The view is as large as its features reach. Returns (N, 2,
+    3) frames in px of the view, and its (width, height).
     """
     shapes = of_unit_area(lafs[:, :, :2])
     if has_circles:
@@ -309,25 +294,22 @@ def frames_of_view(lafs: Array, *, has_circles: bool) -> tuple[Array, Array]:
 
 
 def network_inputs(
-    lafs: Array, size: Array, longer_side_px: int, kornia: str
-) -> dict[str, NDArray[np.floating[Any]]]:
+    lafs: Array, size: Array, longer_side_px: int, trained_for: str
+) -> dict[str, Array]:
     """Return what the network reads of (N, 2, 3) frames in a view of (width, height).
 
-    Positions have their origin at the centre of the first pixel, as in training, and stay inside.
-    Scales are those of images of ``TRAINING_SIZE_PX``, of which only larger ones were shrunk;
-    orientations have the range and the sense of training: COLMAP's of SIFT, else kornia's.
+    Positions are pixel-centre px, as in training, and stay inside. Scales are those of images of
+    ``TRAINING_SIZE_PX``, of which only larger ones were shrunk; orientations have the range and
+    the sense of training: COLMAP's of SIFT, else kornia's.
     """
-    values: dict[str, NDArray[np.floating[Any]]] = {
-        "keypoints": np.clip(lafs[:, :, 2], 0.0, size),
-        "image_size": size,
-    }
-    if kornia == "keynet_affnet_hardnet":
+    values = {"keypoints": np.clip(lafs[:, :, 2], 0.0, size), "image_size": size}
+    if trained_for == "keynet-affnet-hardnet":
         values["lafs"] = lafs
-    if kornia not in ("sift", "dog_affnet_hardnet"):
+    if trained_for not in ("sift", "dog-affnet-hardnet"):
         return values
     sigmas = np.sqrt(determinants(lafs[:, :, :2])) / MEASUREMENT_SIGMAS
     sigmas = sigmas * min(1.0, TRAINING_SIZE_PX / longer_side_px)
-    if kornia == "sift":
+    if trained_for == "sift":
         return values | {"scales": sigmas, "oris": np.arctan2(lafs[:, 1, 0], lafs[:, 0, 0])}
     oris = np.arctan2(lafs[:, 0, 1], lafs[:, 0, 0]) % (2.0 * np.pi)
     return values | {"scales": KORNIA_SIGMAS * sigmas, "oris": oris}
@@ -363,7 +345,7 @@ def promising(
 def united(parts: list[Matches], keypoints1: Array, keypoints2: Array) -> Matches:
     """Unite matches of several pairs of views: one-to-one, and each place once, the best first."""
     if not sum(len(part.scores) for part in parts):
-        return NO_MATCHES
+        return Matches.none()
     indices = np.concatenate([part.indices for part in parts])
     scores = np.concatenate([part.scores for part in parts])
     order = np.argsort(-scores, kind="stable")

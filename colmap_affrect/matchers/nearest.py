@@ -2,9 +2,8 @@
 
 The second neighbour of the ratio test is the nearest descriptor that lies at least
 ``min_contrast_distance_px`` away from the first one (Mishkin, Matas, Perdoch, MODS, 2015):
-features of several warps at one location do not reject each other. Every distance is computed,
-in chunks of bounded memory; long lists coarsely at first, and exactly where that can decide
-(:mod:`colmap_affrect.matchers.nearest_8bit`).
+features of several warps at one location do not reject each other. All descriptors are compared,
+in chunks of bounded memory; many at first coarsely (:mod:`colmap_affrect.matchers.nearest_8bit`).
 """
 
 from dataclasses import dataclass, replace
@@ -28,6 +27,7 @@ from colmap_affrect.matchers.nearest_8bit import (
     MakeCoarse,
     ShortList,
     coarse_descriptors,
+    short_lists,
 )
 from colmap_affrect.options import within
 
@@ -57,8 +57,7 @@ class MatchableImage:
     descriptors: Singles  # (N, D) float32 rows of unit length
     keypoints: Floats  # (N, 2) pixel-centre px
     rivals: NeighborLists  # for each feature those too close to serve as its second neighbour
-    # the descriptors in few bits; None where that does not pay
-    coarse: CoarseDescriptors | None = None
+    coarse: CoarseDescriptors | None = None  # the descriptors in few bits, where that pays
 
     @property
     def nbytes(self) -> int:
@@ -86,10 +85,10 @@ class NearestNeighbors:
 
     def match(self, first: MatchableImage, second: MatchableImage) -> Matches:
         """Match two images."""
-        exact = [replace(image, coarse=None) for image in (first, second)]
+        exact1, exact2 = (replace(image, coarse=None) for image in (first, second))
         return unless_gpu_is_full_or_say(
             partial(match_features, first, second, self.options),
-            partial(match_features, exact[0], exact[1], self.options),
+            partial(match_features, exact1, exact2, self.options),
         )
 
 
@@ -101,12 +100,9 @@ def matchable(
 ) -> MatchableImage:
     """Prepare (N, D) unit descriptors at (N, 2) px; ``make_coarse`` is the same for all images."""
     descriptors = np.ascontiguousarray(descriptors, dtype=np.float32)
-    return MatchableImage(
-        descriptors,
-        keypoints,
-        neighbors_within(keypoints, options.min_contrast_distance_px),
-        make_coarse(descriptors) if make_coarse else None,
-    )
+    rivals = neighbors_within(keypoints, options.min_contrast_distance_px)
+    coarse = make_coarse(descriptors) if make_coarse else None
+    return MatchableImage(descriptors, keypoints, rivals, coarse)
 
 
 def match_features(
@@ -114,18 +110,17 @@ def match_features(
 ) -> Matches:
     """Match two images, with or without features; scores are 1 - the larger ratio of distances."""
     if not len(image1.descriptors) or not len(image2.descriptors):
-        return Matches(np.zeros((0, 2), np.int64), np.zeros(0, np.float32))
+        return Matches.none()
     everything = np.arange(len(image1.descriptors))
     forward, ratios = _nearest(image1, everything, image2, options.max_ratio)
     rows = np.flatnonzero(ratios < options.max_ratio)
     targets, back = np.unique(forward[rows], return_inverse=True)
     back_limit = options.max_ratio if options.ratio_both_ways else NO_LIMIT
     backward, back_ratios = _nearest(image2, targets, image1, back_limit)
-    mutual = backward[back] == rows
     worst = ratios[rows]
     if options.ratio_both_ways:
         worst = np.maximum(worst, back_ratios[back])
-    keep = mutual & (worst < options.max_ratio)
+    keep = (backward[back] == rows) & (worst < options.max_ratio)
     rows, columns, worst = rows[keep], targets[back][keep], worst[keep]
     order = np.argsort(worst, kind="stable")
     places = image1.keypoints[rows[order]], image2.keypoints[columns[order]]
@@ -140,16 +135,15 @@ def _nearest(
 
     They may be -1 and infinite where the ratio is ``max_ratio`` or larger.
     """
+    queries = image1.descriptors[rows]
     if image1.coarse is None or image2.coarse is None:
-        return _nearest_of_all(image1.descriptors[rows], image2)
-    short = image1.coarse.short_list(rows, image2.coarse, image2.rivals, max_ratio)
-    found, found_ratios, doubtful = _nearest_of_listed(image1.descriptors, image2, short)
-    again = short.rows[doubtful]
-    found[doubtful], found_ratios[doubtful] = _nearest_of_all(image1.descriptors[again], image2)
-    nearest = np.full(len(rows), -1)
+        return _nearest_of_all(queries, image2)
+    nearest, doubtful = np.full(len(rows), -1), np.zeros(len(rows), bool)
     ratios = np.full(len(rows), np.inf, np.float32)
-    places = np.searchsorted(rows, short.rows)
-    nearest[places], ratios[places] = found, found_ratios
+    for short in short_lists(image1.coarse, image2.coarse, rows, image2.rivals, max_ratio):
+        at = short.rows
+        nearest[at], ratios[at], doubtful[at] = _nearest_of_listed(queries, image2, short)
+    nearest[doubtful], ratios[doubtful] = _nearest_of_all(queries[doubtful], image2)
     return nearest, ratios
 
 
@@ -167,28 +161,18 @@ def _nearest_of_listed(
         candidates = image.descriptors[short.entry_columns[part]]
         similarity[part] = np.einsum("ij,ij->i", query, candidates)
     starts = np.searchsorted(short.entry_rows, np.arange(len(short.rows)))
-    if not len(starts):
-        return np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros(0, bool)
     first = np.maximum.reduceat(similarity, starts)
     highest = np.flatnonzero(similarity == first[short.entry_rows])
     _, lowest_column = np.unique(short.entry_rows[highest], return_index=True)
     nearest = short.entry_columns[highest[lowest_column]]
     rows, rivals = image.rivals.of(nearest)
-    without_rivals = similarity.copy()
-    without_rivals[_places(short, rows, rivals, len(image.descriptors))] = -1.0
-    second = np.maximum.reduceat(without_rivals, starts)
+    count = len(image.descriptors)
+    listed = short.entry_rows * count + short.entry_columns
+    similarity[np.isin(listed, rows * count + rivals)] = -1.0
     doubtful = short.doubtful.copy()
     doubtful[rows[rivals == short.runners_up[rows]]] = True
+    second = np.maximum.reduceat(similarity, starts)
     return nearest, distance_ratios(first, second), doubtful
-
-
-def _places(short: ShortList, rows: Indices, columns: Indices, count: int) -> Indices:
-    """Return the entries of a short list that are among some rows and columns of ``count``."""
-    listed = short.entry_rows * count + short.entry_columns
-    wanted = rows * count + columns
-    places = np.searchsorted(listed, wanted)
-    places[places == len(listed)] = 0
-    return np.asarray(places[listed[places] == wanted])
 
 
 def _nearest_of_all(queries: Singles, image: MatchableImage) -> tuple[Indices, Singles]:

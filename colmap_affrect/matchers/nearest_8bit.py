@@ -1,70 +1,176 @@
-"""Short lists for the ratio test, by similarities of descriptors in 8 or 16 bits.
+"""Short lists for the ratio test, by similarities of descriptors in 8 bits (CPU) or 16 bits (GPU).
 
-On photographs few features pass the test, and their neighbours stand out. Coarse similarities tell
-which features may pass and which may be their first and second neighbours; only those few are
-compared exactly. A GPU, or a processor with 8-bit products, computes coarse similarities in a
-fraction of the time. Their error is known, and six times its standard deviation is allowed for, so
-that the matches are those of exact similarities.
+Few features pass the test. Coarse similarities say which may, and which features may be their two
+nearest neighbours; only these are compared exactly. Six standard deviations of the rounding error
+are allowed for, so that matches are those of exact similarities. A run of ten photographs without
+8-bit products takes 1.7 times the processor time and 1.4 times as long (Sceaux, default recipe).
 
 torch is loaded here, when there is enough to match to pay for that.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, Protocol, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.geometry.arrays import Bools, Bytes, Floats, Indices, Singles
+from colmap_affrect.geometry.arrays import Bools, Bytes, Indices, Singles
 from colmap_affrect.geometry.neighbors import NeighborLists
 from colmap_affrect.parallel.executor import available_cores, one_openmp_thread
 
-MIN_SIMILARITIES_PER_CORE = 6e8  # with fewer than this, loading torch takes longer than it saves
-
-ERROR_SIGMAS = 6.0
-MAX_CODE, ZERO_CODE = 127, 128
-CODE_STEP = 1.0 / 250  # of 8-bit similarities; negative ones are 0, errors make some more than 1
-NUM_ROWS_8_BIT = 512  # rows of similarities computed at once, a multiple of ``SIZE_MULTIPLE``
+MIN_SIMILARITIES_PER_CORE = 6e8  # with fewer, loading torch takes longer than it saves
+ERROR_SIGMAS = 6.0  # of the rounding error, allowed for on each side
+MAX_CODE, ZERO_CODE = 127, 128  # largest signed code; code 0 as an unsigned one
+CODE_STEP = 1.0 / 250  # of 8-bit similarities: negative ones become 0, errors exceed 1 a little
 SIZE_MULTIPLE = 256
-"""Both factors of a product are filled up to a multiple of it: oneDNN prepares and keeps a program
+"""Both factors of a product are padded to a multiple of it: oneDNN prepares and keeps a program
 for every size, and many sizes take memory and time."""
 FOLD = 8  # similarities that share a maximum
-NO_HALF_SIMILARITY = -4.0
-NUM_ROWS_16_BIT = 4096
 HALF_ERROR = 2.0**-11  # standard deviation, rounded up, of similarities in 16 bits
+TAKEN_OUT = -4.0  # less than any similarity
 
 
 @dataclass(frozen=True)
 class ShortList:
     """Features that may pass the ratio test, and what may be their two nearest neighbours."""
 
-    rows: Indices  # (R,) int64 features of the first image that may pass, rising
+    rows: Indices  # (R,) int64 which of the features asked for may pass, rising
     runners_up: Indices  # (R,) int64 the second neighbour of each by coarse similarities
     doubtful: Bools  # (R,) bool those whose neighbours may not all be listed
     entry_rows: Indices  # (E,) int64 indices into ``rows``, rising
     entry_columns: Indices  # (E,) int64 features of the second image, rising in each row
 
 
-class CoarseDescriptors(Protocol):
-    """Descriptors of one image in few bits."""
+class FoldedSimilarities:
+    """(R, N) similarities as 8-bit codes; large ones are looked for among maxima of a few."""
+
+    def __init__(self, codes: Bytes) -> None:
+        # (R, FOLD, G): columns g, g + G, g + 2 G, ... are group g
+        self.groups = codes.reshape(len(codes), FOLD, -1)
+        self.maxima = self.groups.max(axis=1)
+
+    def largest(self) -> tuple[Indices, Indices]:
+        """Return the column of a largest similarity of each row, and its code."""
+        every, group = np.arange(len(self.maxima)), self.maxima.argmax(axis=1)
+        member = self.groups[every, :, group].argmax(axis=1)
+        return member * self.maxima.shape[1] + group, self.maxima[every, group].astype(np.int64)
+
+    def take_out(self, rows: Indices, columns: Indices) -> Bytes:
+        """Make some similarities 0; return what they were."""
+        member, group = np.divmod(columns, self.maxima.shape[1])
+        before = self.groups[rows, member, group]
+        self.groups[rows, member, group] = 0
+        self.maxima[rows, group] = self.groups[rows, :, group].max(axis=1)
+        return before
+
+    def at_least(self, rows: Indices, least: Singles) -> tuple[Indices, Indices]:
+        """Return where some rows reach a limit each: indices into ``rows``, and columns."""
+        codes = np.maximum(least, 1).astype(np.uint8)[:, None]
+        above = self.maxima[rows] >= codes
+        index, group = np.divmod(np.flatnonzero(above), above.shape[1])
+        found, member = np.nonzero(self.groups[rows[index], :, group] >= codes[index])
+        return index[found], member * self.maxima.shape[1] + group[found]
+
+
+class HalfSimilarities:
+    """(R, N) similarities in 16 bits on a GPU; methods as those of :class:`FoldedSimilarities`."""
+
+    def __init__(self, values: Any) -> None:
+        self.values = values
+
+    def _there(self, array: NDArray[Any]) -> Any:
+        import torch
+
+        return torch.from_numpy(array).to(self.values.device)
+
+    def largest(self) -> tuple[Indices, Singles]:  # noqa: D102
+        values, columns = self.values.max(dim=1)
+        return columns.cpu().numpy(), values.float().cpu().numpy()
+
+    def take_out(self, rows: Indices, columns: Indices) -> Singles:  # noqa: D102
+        places = self._there(rows), self._there(columns)
+        before = self.values[places].float().cpu().numpy()
+        self.values[places] = TAKEN_OUT
+        return np.asarray(before)
+
+    def at_least(self, rows: Indices, least: Singles) -> tuple[Indices, Indices]:  # noqa: D102
+        above = self.values[self._there(rows)] >= self._there(least.astype(np.float32))[:, None]
+        index, columns = (found.cpu().numpy() for found in above.nonzero(as_tuple=True))
+        return index, columns
+
+
+@dataclass(frozen=True)
+class EightBitDescriptors:
+    """Descriptors as signed 8-bit numbers, on the CPU."""
+
+    codes: NDArray[np.int8]  # (N, D) descriptors divided by ``step`` and rounded
+    packed: Any  # the same as the second factor of products
+    step: float  # the largest value over 127
+
+    num_rows: ClassVar[int] = 512  # compared at once, a multiple of ``SIZE_MULTIPLE``
+    unit: ClassVar[float] = CODE_STEP  # of similarities
+
+    @classmethod
+    def of(cls, descriptors: Singles) -> Self:
+        """Round (N, D) unit rows."""
+        step = max(float(np.abs(descriptors).max(initial=0.0)), 1e-6) / MAX_CODE
+        codes = np.rint(descriptors / step).astype(np.int8)
+        return cls(codes, _packed(codes), step)
 
     @property
     def nbytes(self) -> int:
         """Memory they take."""
+        return 2 * self.codes.nbytes
 
-    def short_list(
-        self, rows: Indices, other: Self, rivals: NeighborLists, max_ratio: float
-    ) -> ShortList:
-        """Compare some features (``rows``, rising) with all of another image of the same kind.
+    def margin(self, other: Self) -> float:
+        """Return the error of a similarity that is allowed for."""
+        # A rounding error is uniform: its standard deviation is a step over the root of 12.
+        return ERROR_SIGMAS * math.hypot(self.step, other.step, CODE_STEP) / math.sqrt(12)
 
-        ``rivals`` has for each feature of the other image those too close to be its second
-        neighbour, ``max_ratio`` limits the ratio of the distances to the first and the second one.
-        """
+    def similarities(self, rows: Indices, other: Self) -> FoldedSimilarities:
+        """Compare some features with all of another image."""
+        unit = self.step * other.step
+        return FoldedSimilarities(_similarity_codes(self.codes[rows], other.packed, unit))
 
 
+@dataclass(frozen=True)
+class HalfDescriptors:
+    """Descriptors as 16-bit floating point numbers, on a GPU."""
+
+    values: Any  # (N, D) tensor
+
+    num_rows: ClassVar[int] = 4096  # compared at once
+    unit: ClassVar[float] = 1.0  # of similarities
+
+    @classmethod
+    def of(cls, descriptors: Singles, device: str) -> Self:
+        """Copy (N, D) unit rows to a device."""
+        import torch
+
+        return cls(torch.from_numpy(descriptors).to(device, torch.float16))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory they take."""
+        return int(self.values.nbytes)
+
+    def margin(self, other: Self) -> float:
+        """Return the error of a similarity that is allowed for."""
+        del other
+        return ERROR_SIGMAS * HALF_ERROR
+
+    def similarities(self, rows: Indices, other: Self) -> HalfSimilarities:
+        """Compare some features with all of another image."""
+        import torch
+
+        chosen = self.values[torch.from_numpy(rows).to(self.values.device)]
+        return HalfSimilarities(chosen @ other.values.T)
+
+
+CoarseDescriptors = EightBitDescriptors | HalfDescriptors
 MakeCoarse = Callable[[Singles], CoarseDescriptors]  # makes coarse descriptors of (N, D) unit rows
 
 
@@ -85,142 +191,37 @@ def coarse_descriptors(num_similarities: float, device: str = "auto") -> MakeCoa
     return EightBitDescriptors.of if has_fast_8_bit_products() else None
 
 
-@dataclass(frozen=True)
-class EightBitDescriptors:
-    """Descriptors as signed 8-bit numbers, on the CPU."""
+def short_lists(
+    first: Any, second: Any, rows: Indices, rivals: NeighborLists, max_ratio: float
+) -> Iterator[ShortList]:
+    """Compare some features of one image (``rows``) with all of another, both of one class.
 
-    codes: NDArray[np.int8]  # (N, D) int8, the descriptors divided by ``step`` and rounded
-    packed: Any  # the same as the second factor of products, filled up with zeros
-    step: float  # the largest value over 127
-
-    @classmethod
-    def of(cls, descriptors: Singles) -> Self:
-        """Round (N, D) unit rows."""
-        step = max(float(np.abs(descriptors).max(initial=0.0)), 1e-6) / MAX_CODE
-        codes = np.rint(descriptors / step).astype(np.int8)
-        return cls(codes, _packed(codes), step)
-
-    @property
-    def nbytes(self) -> int:
-        """See :class:`CoarseDescriptors`."""
-        return 2 * self.codes.nbytes
-
-    def short_list(
-        self, rows: Indices, other: Self, rivals: NeighborLists, max_ratio: float
-    ) -> ShortList:
-        """See :class:`CoarseDescriptors`."""
-        import torch  # noqa: F401 - its threads can only be limited once they are there
-
-        # A rounding error is uniform: its standard deviation is a step over the root of 12.
-        margin = ERROR_SIGMAS * math.hypot(self.step, other.step, CODE_STEP) / math.sqrt(12)
-        width = math.ceil(2 * margin / CODE_STEP)
-        parts = []
-        with one_openmp_thread():
-            for begin in range(0, len(rows), NUM_ROWS_8_BIT):
-                chunk = rows[begin : begin + NUM_ROWS_8_BIT]
-                similarity = _Similarities.of(
-                    _similarity_codes(self.codes[chunk], other.packed, self.step * other.step)
-                )
-                best, first = similarity.largest()
-                of_best = rivals.of(best)
-                is_close = similarity.take_out(*of_best) >= first[of_best[0]] - width
-                runners_up, second = similarity.largest()
-                doubtful = _is_hidden(best, runners_up, of_best, is_close, rivals)
-                doubtful |= second <= width  # others may be below the smallest code
-                passing = _may_pass(CODE_STEP * first, CODE_STEP * second, max_ratio, margin)
-                may = np.flatnonzero(passing | doubtful)
-                near = similarity.at_least(may, np.maximum(second[may] - width, 1))
-                parts.append(
-                    _part(chunk[may], runners_up[may], doubtful[may], near, rivals.of(best[may]))
-                )
-        return _joined(parts)
-
-
-@dataclass(frozen=True)
-class _Similarities:
-    """Similarities of R features to N = ``FOLD`` G others, and the largest of every few.
-
-    Large ones are looked for among the maxima, which are fewer.
+    ``rivals`` has for each feature of the other image those too close to be its second neighbour,
+    ``max_ratio`` limits the ratio of the distances to the first and the second neighbour.
     """
-
-    groups: Bytes  # (R, FOLD, G) uint8; columns g, g + G, g + 2 G, ... are group g
-    maxima: Bytes  # (R, G) uint8 the largest of each group
-
-    @classmethod
-    def of(cls, codes: Bytes) -> Self:
-        """Group (R, N) similarities, N a multiple of ``FOLD``."""
-        groups = codes.reshape(len(codes), FOLD, -1)
-        return cls(groups, groups.max(axis=1))
-
-    def largest(self) -> tuple[Indices, Indices]:
-        """Return the column of a largest similarity of each row, and the similarity."""
-        every, group = np.arange(len(self.maxima)), self.maxima.argmax(axis=1)
-        member = self.groups[every, :, group].argmax(axis=1)
-        return member * self.maxima.shape[1] + group, self.maxima[every, group].astype(np.int64)
-
-    def take_out(self, rows: Indices, columns: Indices) -> Bytes:
-        """Make some similarities 0; return what they were."""
-        member, group = np.divmod(columns, self.maxima.shape[1])
-        before = self.groups[rows, member, group]
-        self.groups[rows, member, group] = 0
-        self.maxima[rows, group] = self.groups[rows, :, group].max(axis=1)
-        return before
-
-    def at_least(self, rows: Indices, least: Indices) -> tuple[Indices, Indices]:
-        """Return where some rows reach a limit each: indices into ``rows``, and columns."""
-        above = self.maxima[rows] >= least.astype(np.uint8)[:, None]
-        index, group = np.divmod(np.flatnonzero(above), above.shape[1])
-        found, member = np.nonzero(self.groups[rows[index], :, group] >= least[index, None])
-        return index[found], member * self.maxima.shape[1] + group[found]
-
-
-@dataclass(frozen=True)
-class HalfDescriptors:
-    """Descriptors as 16-bit floating point numbers, on a GPU."""
-
-    values: Any  # (N, D) tensor
-
-    @classmethod
-    def of(cls, descriptors: Singles, device: str) -> Self:
-        """Copy (N, D) unit rows to a device."""
-        import torch
-
-        return cls(torch.from_numpy(descriptors).to(device, torch.float16))
-
-    @property
-    def nbytes(self) -> int:
-        """See :class:`CoarseDescriptors`."""
-        return int(self.values.nbytes)
-
-    def short_list(
-        self, rows: Indices, other: Self, rivals: NeighborLists, max_ratio: float
-    ) -> ShortList:
-        """See :class:`CoarseDescriptors`."""
-        import torch
-
-        device = self.values.device
-        margin = ERROR_SIGMAS * HALF_ERROR
-        parts = []
-        for begin in range(0, len(rows), NUM_ROWS_16_BIT):
-            chunk = rows[begin : begin + NUM_ROWS_16_BIT]
-            similarity = self.values[torch.from_numpy(chunk).to(device)] @ other.values.T
-            first, best = (found.cpu().numpy() for found in similarity.max(dim=1))
-            of_best = rivals.of(best)
-            places = tuple(torch.from_numpy(indices).to(device) for indices in of_best)
-            is_close = similarity[places].float().cpu().numpy() >= first[of_best[0]] - 2 * margin
-            similarity[places] = NO_HALF_SIMILARITY
-            seconds, runners = similarity.max(dim=1)
-            second, runners_up = seconds.float().cpu().numpy(), runners.cpu().numpy()
-            doubtful = _is_hidden(best, runners_up, of_best, is_close, rivals)
-            passing = _may_pass(first.astype(np.float32), second, max_ratio, margin)
-            may = np.flatnonzero(passing | doubtful)
-            chosen = torch.from_numpy(may).to(device)
-            close = similarity[chosen] >= (seconds[chosen] - 2 * margin)[:, None]
-            near = tuple(found.cpu().numpy() for found in close.nonzero(as_tuple=True))
-            parts.append(
-                _part(chunk[may], runners_up[may], doubtful[may], near, rivals.of(best[may]))
-            )
-        return _joined(parts)
+    margin = first.margin(second)
+    width = 2.0 * margin / first.unit
+    for begin in range(0, len(rows), first.num_rows):
+        similarities = first.similarities(rows[begin : begin + first.num_rows], second)
+        best, highest = similarities.largest()
+        of_best = rivals.of(best)
+        is_close = similarities.take_out(*of_best) >= highest[of_best[0]] - width
+        runners_up, second_highest = similarities.largest()
+        doubtful = _is_hidden(best, runners_up, of_best, is_close, rivals)
+        doubtful |= second_highest <= width  # codes have no negative similarities
+        nearer, farther = first.unit * highest, first.unit * second_highest
+        # sqrt((1 - nearer) / (1 - farther)) may be below the limit
+        passing = 1.0 - nearer - margin < max_ratio**2 * (1.0 - farther + margin)
+        may = np.flatnonzero(passing | doubtful)
+        if not len(may):
+            continue
+        near = similarities.at_least(may, np.maximum(second_highest[may] - width, HALF_ERROR))
+        parts = zip(near, rivals.of(best[may]), strict=True)
+        entry_rows, columns = (np.concatenate(part) for part in parts)
+        entries = np.sort(entry_rows << 32 | columns)  # far faster than an order by two keys
+        yield ShortList(
+            begin + may, runners_up[may], doubtful[may], entries >> 32, entries & 0xFFFF_FFFF
+        )
 
 
 def _is_hidden(
@@ -232,8 +233,8 @@ def _is_hidden(
 ) -> Bools:
     """Tell where the second neighbour is not known, for each of R rows.
 
-    That is where a rival of the best may be nearer than it, and has the runner-up for a rival, of
-    which the best is none. What takes the place of the runner-up then may be far less similar.
+    A rival of the best may be nearer than it and have the runner-up for a rival, of which the best
+    is none. The second neighbour then may be far less similar than the runner-up.
     """
     rows, columns = (indices[is_close] for indices in of_best)
     is_other = columns != best[rows]
@@ -242,32 +243,6 @@ def _is_hidden(
     rows = rows[is_other][entries]
     hidden[rows[theirs == runners_up[rows]]] = True
     return hidden
-
-
-def _may_pass(first: Floats, second: Floats, max_ratio: float, margin: float) -> Bools:
-    """Tell where sqrt((1 - first) / (1 - second)) may be under a limit."""
-    return np.asarray(1.0 - first - margin < max_ratio**2 * (1.0 - second + margin))
-
-
-def _part(
-    rows: Indices,
-    runners_up: Indices,
-    doubtful: Bools,
-    near: tuple[Indices, ...],
-    of_best: tuple[Indices, Indices],
-) -> ShortList:
-    """Unite the entries near the second neighbour with the first one and its rivals, sorted."""
-    entry_rows, columns = (np.concatenate(both) for both in zip(near, of_best, strict=True))
-    entries = np.sort(entry_rows << 32 | columns)  # far faster than an order by two keys
-    return ShortList(rows, runners_up, doubtful, entries >> 32, entries & 0xFFFF_FFFF)
-
-
-def _joined(parts: list[ShortList]) -> ShortList:
-    begins = np.cumsum([0, *(len(part.rows) for part in parts)])
-    moved = (replace(p, entry_rows=p.entry_rows + b) for p, b in zip(parts, begins, strict=False))
-    none = np.zeros(0, np.int64)
-    every = [vars(ShortList(none, none, none.astype(bool), none, none)), *map(vars, moved)]
-    return ShortList(**{name: np.concatenate([part[name] for part in every]) for name in every[0]})
 
 
 def _packed(codes: NDArray[np.int8]) -> Any:
@@ -293,10 +268,11 @@ def _similarity_codes(codes: NDArray[np.int8], packed: Any, unit: float) -> Byte
     # Signed ones as the first factor are far slower.
     shifted = torch.from_numpy(_filled_up(codes).view(np.uint8) ^ ZERO_CODE)
     scale, zero = torch.tensor([unit]), torch.zeros(1, dtype=torch.int32)
-    product = torch.ops.onednn.qlinear_pointwise(
-        shifted, 1.0, ZERO_CODE, packed, scale, zero, None,
-        CODE_STEP, 0, torch.uint8, "none", [], "",
-    )  # fmt: skip
+    with one_openmp_thread():
+        product = torch.ops.onednn.qlinear_pointwise(
+            shifted, 1.0, ZERO_CODE, packed, scale, zero, None,
+            CODE_STEP, 0, torch.uint8, "none", [], "",
+        )  # fmt: skip
     return np.asarray(product.numpy()[: len(codes)])
 
 

@@ -61,7 +61,7 @@ def refuse_link(path: Path) -> None:
         )
 
 
-def folder_of(names: Collection[str], target: Path) -> Path | None:
+def photograph_folder_above(names: Collection[str], target: Path) -> Path | None:
     """Return the folder of a file to be written, or that above, if photographs lie there."""
     inner = [name for name in names if not leads_outside(name)]
     for folder in _resolved(target).parents[:2]:
@@ -122,7 +122,7 @@ def new_results(
                 f"{target}: lies beside the models of a run, which mapping removes; give another "
                 "name or folder"
             )
-        if place := photographs or folder_of(names, target):
+        if place := photographs or photograph_folder_above(names, target):
             refuse_photographs(target, place)
         if not replaces:
             _refuse_existing(target)
@@ -222,6 +222,17 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
         with suppress(OSError):  # of file systems without locks leftovers are not tidied up
             stack.enter_context(FileLock(Path(name) / LOCK))
         yield Path(name)
+
+
+def database_files(path: Path) -> list[Path]:
+    """Return a database of SQLite and the files that it may have beside it."""
+    return [path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", "-journal"))]
+
+
+def remove_database(path: Path) -> None:
+    """Remove a database and the files beside it, if they are there."""
+    for file in database_files(path):
+        file.unlink(missing_ok=True)
 
 
 def remove_own(paths: Iterable[Path]) -> None:

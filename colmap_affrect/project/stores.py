@@ -41,7 +41,7 @@ class PairMatches:
     level: int = 0  # of escalation, whose features were looked at together with those of level 0
 
 
-def _indexed(file: h5py.File) -> Entries:
+def _entries_of(file: h5py.File) -> Entries:
     found: Entries = {}
     for name, group in complete_groups(file):
         width, height = checked(group, "image_size").tolist()
@@ -69,7 +69,7 @@ class FeatureStore(GroupStore):
         if not self.path.exists():
             return {}
         with self._open("r") as file:
-            return entries(self.path, lambda: _indexed(file))
+            return entries(self.path, lambda: _entries_of(file))
 
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:

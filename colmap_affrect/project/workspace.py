@@ -16,11 +16,19 @@ from filelock import FileLock, Timeout
 
 from colmap_affrect import __version__
 from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError, damage
-from colmap_affrect.options import digest_of, flat, suggestion
+from colmap_affrect.options import digest_of, suggestion
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
+from colmap_affrect.project.differences import (
+    GIVEN,
+    LOCAL,
+    first_difference,
+    placeless,
+    without_digests,
+)
 from colmap_affrect.project.outputs import (
     LOCK,
     OF_SYSTEMS,
+    database_files,
     is_output_folder,
     refuse_link,
     remove_own,
@@ -28,14 +36,6 @@ from colmap_affrect.project.outputs import (
 
 logger = logging.getLogger(__name__)
 
-LOCAL = ("image_path", "image_list_path", "from_database", "cameras")  # not in digests of options
-PLACES = {
-    "image_path", "image_list_path", "from_database", "cameras.cameras_path", "masks.path",
-    "masks.camera_path", "depth.path", "match_list_path", "database",
-}  # fmt: skip
-"""Options that say where files are: other places are no other options, what the files hold counts
-(:mod:`colmap_affrect.project.contents`). But none at all is another option."""
-GIVEN = "given"  # what stands in the place of such an option when options are compared
 INPUTS = "inputs.sha256"  # in sparse/: digests of what it was made from
 FILES_OF_SPARSE = {INPUTS, "guided-before.json"}
 FILES_OF_MODEL = {
@@ -50,8 +50,7 @@ OWN_STEMS = {
 }  # fmt: skip
 """How names of files and folders begin that are written here."""
 
-SEAL_SUFFIXES = (".seal", ".seal-open", ".parts")  # of what tells whether others changed a database
-WEIGHTS = "weights"  # of a record: the digests of files, beside the options of a stage
+SEAL_SUFFIXES = (".seal", ".seal-open", ".parts")  # beside a database; the last of older versions
 FORMAT_VERSION = 6  # of ``config.toml``: counts up when a stage records other options than before
 
 
@@ -211,6 +210,11 @@ class Workspace:
         with damage(self.config, mend, WorkspaceError):
             _require_complete(record)
         return record
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether the folder holds a copy of another program's database."""
+        return "copy" in self.recorded().get("begun", [])
 
     def recipe(self) -> str:
         """Return the name of the recipe that the features were made with."""
@@ -391,41 +395,3 @@ def _require_complete(record: Mapping[str, Any]) -> None:
         raise ValueError("options of stages that have begun are missing")
     if not all(isinstance(each, str) for each in texts):
         raise ValueError("names are no texts")
-
-
-def database_files(path: Path) -> list[Path]:
-    """Return a database of SQLite and the files that it may have beside it."""
-    return [path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", "-journal"))]
-
-
-def remove_database(path: Path) -> None:
-    """Remove a database and the files beside it, if they are there."""
-    for file in database_files(path):
-        file.unlink(missing_ok=True)
-
-
-def placeless(options: Mapping[str, Any], there: str = "", prefix: str = "") -> dict[str, Any]:
-    """Return options without places of files; ``there`` stands where one is given."""
-    found = dict(options)
-    for key, value in options.items():
-        if isinstance(value, Mapping):
-            found[key] = placeless(value, there, f"{prefix}{key}.")
-        elif value and prefix + key in PLACES:
-            found[key] = there
-    return found
-
-
-def without_digests(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is on record for a stage without the digests of weights, which nobody gives."""
-    return {key: value for key, value in options.items() if key != WEIGHTS}
-
-
-def first_difference(known: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Say where options on record differ from those given now; empty if they do not."""
-    old, new = flat(known), flat(now)
-    # The name of a part first: with another one most other options differ too.
-    keys = sorted(old.keys() | new.keys(), key=lambda key: (key.rpartition(".")[2] != "name", key))
-    for key in keys:
-        if old.get(key) != new.get(key):
-            return f"{key}={old.get(key)!r}, and it is {new.get(key)!r} now"
-    return ""

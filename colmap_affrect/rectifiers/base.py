@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, SerializeAsAny
 from colmap_affrect.data import Photograph, RectificationPlan
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.base import SHAPES, ShapeOptions, ShapeSource
-from colmap_affrect.features.shapes.second_moment import SecondMomentOptions
+from colmap_affrect.features.second_moment import SecondMomentOptions
 from colmap_affrect.geometry.arrays import Floats
 from colmap_affrect.geometry.tilts import Cover, cover_shapes
 from colmap_affrect.images.depth import DepthSource

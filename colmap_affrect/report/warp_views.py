@@ -13,7 +13,8 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.pictures import Picture
 from colmap_affrect.report.regions import largest_warps, tinted, warp_colors
 from colmap_affrect.stages.context import Resources
-from colmap_affrect.stages.extract import Inputs, image_tasks, recorded_extraction
+from colmap_affrect.stages.extract import image_tasks
+from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.one_image import prepare
 
 MAP_SIZE_PX = 480

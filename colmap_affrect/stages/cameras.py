@@ -24,9 +24,8 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.copy import is_copy
 from colmap_affrect.stages.escalate import unmeasured_pairs
-from colmap_affrect.stages.extract import Inputs
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.verify import extracted_px, recorded_verification
 
 logger = logging.getLogger(__name__)
@@ -41,7 +40,7 @@ def choose_cameras(context: Context, *, may_share: bool = True) -> StageReport:
     start = time.perf_counter()
     workspace = context.workspace
     workspace.require("verify")
-    copied = is_copy(workspace)
+    copied = workspace.is_copy
     size_px = None if copied else extracted_px(context)
     is_new = needs_vote(read_camera_records(workspace.cameras))
     may_share = may_share and not copied and Inputs.recorded(workspace).cameras.mode == "auto"

@@ -4,27 +4,15 @@ Features hang on photographs, masks and depth maps; matches on the features of t
 the database and all that follows on all images, and on cameras that are given.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.stores import FeatureStore
-from colmap_affrect.project.workspace import Workspace, database_files
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.shown import such_as
 from colmap_affrect.stages.context import Context
-
-if TYPE_CHECKING:
-    from colmap_affrect.stages.extract import Inputs
-
-
-def source_files(path: Path) -> list[Path]:
-    """Return the files of a database, a table, or the folder of a model."""
-    files = path.iterdir() if path.is_dir() else database_files(path)
-    return sorted(file for file in files if file.is_file() and not file.name.endswith("-shm"))
+from colmap_affrect.stages.inputs import Inputs
 
 
 def refuse_other_photographs(
@@ -65,7 +53,7 @@ def forget_changed(
     gone = sorted(known.keys() - digests.keys()) if are_all else []
     cameras, before = contents.digest(inputs.camera_files), contents.recorded("cameras")
     other_cameras = ["cameras are given by other files"] if before not in ("", cameras) else []
-    lines = [*_told(changed, "changed"), *_told(gone, "gone"), *other_cameras]
+    lines = [*_counted(changed, "changed"), *_counted(gone, "gone"), *other_cameras]
     if lines:
         workspace.rewind(f"since it was made, {', '.join(lines)}")
         workspace.pairs.unlink(missing_ok=True)
@@ -80,14 +68,14 @@ def forget_changed(
     return {inputs.image_path: f"{', '.join(lines)}; all that hangs on them is made again"}
 
 
-def _told(names: Sequence[str], what: str) -> list[str]:
+def _counted(names: Sequence[str], what: str) -> list[str]:
     return [f"{len(names)} {what} ({such_as(names)})"] if names else []
 
 
 def refuse_changed(context: Context, digests: Mapping[str, str]) -> None:
     """Refuse to add to the features of photographs that have changed; StaleStoreError."""
     known = context.features.contents()
-    changed = _told([n for n in digests if known.get(n, "") not in ("", digests[n])], "changed")
+    changed = _counted([n for n in digests if known.get(n, "") not in ("", digests[n])], "changed")
     if changed:
         raise StaleStoreError(
             f"{context.workspace.features}: {changed[0]} since their features were extracted; run "

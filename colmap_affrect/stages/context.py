@@ -8,8 +8,9 @@ from colmap_affrect.errors import WeightsError
 from colmap_affrect.features.weights import digests, file_sha256
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.differences import WEIGHTS
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
-from colmap_affrect.project.workspace import WEIGHTS, Workspace
+from colmap_affrect.project.workspace import Workspace
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,9 @@ from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.shown import such_as
-from colmap_affrect.stages.changes import source_files
 from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.inputs import source_files
 
 logger = logging.getLogger(__name__)
 
@@ -85,8 +84,3 @@ def _other_sizes(database: Path, image_path: Path) -> dict[str, str]:
         return {}
     line = f"{len(odd)} photographs have another size than their cameras, such as {such_as(odd)}"
     return {str(image_path): f"{line}: the database was made from others"}
-
-
-def is_copy(workspace: Workspace) -> bool:
-    """Tell whether a folder holds the copy of another program's database."""
-    return "copy" in workspace.recorded().get("begun", [])

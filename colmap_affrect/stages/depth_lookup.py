@@ -16,7 +16,7 @@ from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.mappers.base import DepthLookup
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import Inputs, recorded_extraction
+from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 
 logger = logging.getLogger(__name__)
 

@@ -46,13 +46,12 @@ from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images, weakly_connected_images
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import (
-    Inputs,
     extract_images,
     prepared_recipe,
-    recorded_extraction,
     write_images_and_keypoints,
 )
 from colmap_affrect.stages.guide import restore_exact
+from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.match import (
     PAIRS_PER_WRITE,
     match_pairs,

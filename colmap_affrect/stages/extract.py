@@ -6,39 +6,29 @@ from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
-from colmap_affrect.colmap.database_copy import copy_without_features, read_names
-from colmap_affrect.colmap.given_cameras import read_given_cameras
-from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
+from colmap_affrect.colmap.database_copy import copy_without_features
+from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
-from colmap_affrect.images.photographs import (
-    CameraOptions,
-    MaskOptions,
-    Photographs,
-    checked_names,
-    left_out,
-    list_images,
-    not_named,
-    refuse_colliding_keys,
-)
+from colmap_affrect.images.photographs import checked_names, left_out, not_named
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.project.contents import Contents
+from colmap_affrect.project.differences import WEIGHTS
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.workspace import WEIGHTS, Workspace
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe
 from colmap_affrect.shown import one_line
 from colmap_affrect.stages.changes import (
     forget_changed,
     refuse_changed,
     refuse_other_photographs,
-    source_files,
 )
 from colmap_affrect.stages.context import Context, digests_to_record
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.one_image import (
     ExtractedImage,
     ImageExtractor,
@@ -48,110 +38,6 @@ from colmap_affrect.stages.one_image import (
 )
 
 logger = logging.getLogger(__name__)
-
-
-class Inputs(Options):
-    """Which photographs a run is about, and what is known of them."""
-
-    image_path: str
-    """Folder of the photographs."""
-    image_list_path: str = ""
-    """List of the photographs to use; all below the folder if empty."""
-    from_database: str = ""
-    """COLMAP database whose images, cameras, rigs, frames and pose priors are taken over; it stays
-    as it is."""
-    cameras: CameraOptions = CameraOptions()
-    """How images share cameras."""
-    masks: MaskOptions = MaskOptions()
-    """Where features may be; everywhere by default."""
-
-    @classmethod
-    def of(
-        cls,
-        image_path: Path,
-        *,
-        image_list_path: Path | None = None,
-        from_database: Path | None = None,
-        cameras: CameraOptions | None = None,
-        masks: MaskOptions | None = None,
-    ) -> Self:
-        """Build from paths, which are made absolute."""
-        return cls(
-            image_path=str(image_path.resolve()),
-            image_list_path=str(image_list_path.resolve()) if image_list_path else "",
-            from_database=str(from_database.resolve()) if from_database else "",
-            cameras=cameras or CameraOptions(),
-            masks=masks or MaskOptions(),
-        )
-
-    @classmethod
-    def recorded(cls, workspace: Workspace) -> Self:
-        """Return what the extract stage of a workspace was given."""
-        record = workspace.require("extract")
-        values = {key: value for key, value in record.items() if key in cls.model_fields}
-        return cls.from_mapping(values, str(workspace.config))
-
-    @property
-    def photographs(self) -> Photographs:
-        """The folder and the masks."""
-        return Photographs(Path(self.image_path), self.masks)
-
-    def names(self) -> list[str]:
-        """Return the images of the list, else of the database, else of the folder."""
-        folder, listed = Path(self.image_path), Path(self.image_list_path)
-        if not self.from_database:
-            return list_images(folder, listed if self.image_list_path else None)
-        known = read_names(Path(self.from_database))
-        if not self.image_list_path:
-            return checked_names(folder, known, self.from_database)
-        names = list_images(folder, listed)
-        unknown = sorted(set(names) - set(known))
-        if unknown:
-            raise ImageError(f"{listed}: lists {unknown[0]}, which {self.from_database} has not")
-        return names
-
-    def files(self, name: str, options: ExtractionOptions) -> list[Path]:
-        """Return the files that the features of an image depend on."""
-        files = self.photographs.files(name)
-        if options.uses_depth:
-            depth = options.depth.file(name)
-            files += [*([depth] if depth else []), *self.camera_files]
-        return files
-
-    @property
-    def camera_files(self) -> list[Path]:
-        """The files that cameras and images of the database are taken from."""
-        given = [Path(path) for path in (self.from_database, self.cameras.cameras_path) if path]
-        return [file for path in given for file in source_files(path)]
-
-    def check(self) -> None:
-        """Refuse cameras and masks that cannot be used; OptionError names the option."""
-        self.photographs.check()
-        read_given_cameras(self.cameras)
-        if self.from_database and self.cameras != CameraOptions():
-            raise OptionError(
-                f"the cameras of {self.from_database} are used; leave out camera mode, model and "
-                "parameters, and other options of cameras"
-            )
-
-    def check_names(self, names: Sequence[str]) -> None:
-        """Refuse photographs with the same key in hloc's files, or that cannot share cameras."""
-        refuse_colliding_keys(names)
-        if not self.from_database:
-            self.initial_cameras.check(names)
-
-    @property
-    def initial_cameras(self) -> InitialCameras:
-        """What decides on cameras."""
-        return InitialCameras(Path(self.image_path), self.cameras)
-
-
-def recorded_extraction(workspace: Workspace) -> ExtractionOptions:
-    """Return the options that the features of a workspace were made with."""
-    record = workspace.require("extract")
-    names = ExtractionOptions.model_fields
-    options = {key: value for key, value in record.items() if key in names}
-    return ExtractionOptions.from_mapping(options, str(workspace.config))
 
 
 def extract(

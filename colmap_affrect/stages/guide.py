@@ -26,7 +26,7 @@ from colmap_affrect.project.stores import GuidedPair
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.climbing import weakly_connected_images
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import recorded_extraction
+from colmap_affrect.stages.inputs import recorded_extraction
 from colmap_affrect.stages.match import PAIRS_PER_WRITE
 from colmap_affrect.stages.one_guided_pair import GuidedMatcher, GuidedTask, guided_task
 from colmap_affrect.stages.stationary import StationaryFilter

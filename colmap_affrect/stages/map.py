@@ -6,7 +6,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from shutil import rmtree
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
@@ -25,11 +24,11 @@ from colmap_affrect.mappers.starts import holding
 from colmap_affrect.mappers.summaries import made_from, model_folders, read_summary, refuse_edited
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import INPUTS, Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.copy import is_copy
 from colmap_affrect.stages.depth_lookup import depth_lookup
 from colmap_affrect.stages.escalate import (
     first_level_database,
@@ -37,8 +36,8 @@ from colmap_affrect.stages.escalate import (
     measured_keypoints,
     reject,
 )
-from colmap_affrect.stages.extract import Inputs, recorded_extraction
 from colmap_affrect.stages.guide import guided_matches
+from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import recorded_verification
 
@@ -85,7 +84,7 @@ def map_images(
     with context.progress.stage("map", num_images, "images") as advance:
         models, num_rejected = _map(context, mapper, task, advance)
     is_large = _num_registered(models) >= LARGE_MODEL
-    if not is_copy(workspace) and not is_large and _rank(models) < (True, num_images):
+    if not workspace.is_copy and not is_large and _rank(models) < (True, num_images):
         models = _or_first_level(context, mapper, task, models)
     warnings = {}
     if num_rejected:
@@ -111,7 +110,7 @@ def map_images(
 def _task(context: Context, existing: ExistingModel | None) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
     workspace = context.workspace
-    copied = is_copy(workspace)
+    copied = workspace.is_copy
     return MappingTask(
         workspace.database,
         image_path_of(workspace),
@@ -133,13 +132,13 @@ def _inputs(workspace: Workspace, extend: Extension | None) -> str:
 
 def image_path_of(workspace: Workspace) -> Path | None:
     """Return the folder of the photographs, None where another program's database names none."""
-    path = workspace.require("copy" if is_copy(workspace) else "extract")["image_path"]
+    path = workspace.require("copy" if workspace.is_copy else "extract")["image_path"]
     return Path(path) if path else None
 
 
 def image_names(workspace: Workspace) -> list[str]:
     """Return the names of the images of a run, or of the database that was copied."""
-    if is_copy(workspace):
+    if workspace.is_copy:
         return sorted(colmap_database.image_ids(workspace.database))
     return Inputs.recorded(workspace).names()
 
@@ -161,7 +160,7 @@ def _or_first_level(
         if _rank(firsts) <= _rank(models):
             return models
         logger.info("the model of the pairs before they climbed is better and is kept")
-        rmtree(context.workspace.sparse)
+        remove_own([context.workspace.sparse])
         sparse.rename(context.workspace.sparse)
     return firsts
 
@@ -178,7 +177,7 @@ def _map(
     were rejected.
     """
     workspace, sparse = context.workspace, context.workspace.sparse
-    if task.extend or is_copy(workspace):
+    if task.extend or workspace.is_copy:
         return map_database(mapper, task, sparse, advance), 0
     with measured_database(context) as found:
         if not found:
@@ -201,7 +200,7 @@ def _map(
         held = holding(task, model, models[0], path.with_name("held.db"))
         others = map_database(mapper, held, every, _ignore)
         if _rank(others) >= _rank(models):
-            rmtree(sparse)
+            remove_own([sparse])
             every.rename(sparse)
             return others, len(rejected)
     return models, len(rejected)
@@ -239,7 +238,7 @@ def num_verified_inliers(workspace: Workspace) -> dict[Pair, int]:
 
 def _min_num_inliers(workspace: Workspace) -> int:
     """Return how many inliers a verified pair has; another program had its own threshold."""
-    return 1 if is_copy(workspace) else recorded_verification(workspace).min_num_inliers
+    return 1 if workspace.is_copy else recorded_verification(workspace).min_num_inliers
 
 
 def unregistered(
@@ -298,20 +297,20 @@ def advice(
     if not missing and not is_doubtful:
         return ()
     is_inconsistent = bool(models and (models[0].doubts or models[0].num_contradicted))
-    recipes = [] if is_copy(workspace) else _other_recipes(context)
+    recipes = [] if workspace.is_copy else _other_recipes(context)
     texts = []
     if any(record.is_contradicted for record in read_camera_records(workspace.cameras).values()):
         texts.append("run again without the given focal lengths, or with others: pairs contradict "
                      "them")  # fmt: skip
     if missing:
         texts += recipes
-    has_cameras = is_copy(workspace) or Inputs.recorded(workspace).from_database
+    has_cameras = workspace.is_copy or Inputs.recorded(workspace).from_database
     if models and (models[0].rival_focals_px or models[0].loose) and not has_cameras:
         texts.append(
             "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
             "several focal lengths fit"
         )
-    if is_copy(workspace):
+    if workspace.is_copy:
         texts.append("run --from-database, with --image-path, makes new features for its images")
     else:
         cameras = colmap_database.all_cameras(workspace.database)

@@ -14,11 +14,13 @@ from colmap_affrect.features.weights import resolve
 from colmap_affrect.matchers.base import MATCHERS, MatcherContext, MatcherOptions
 from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.project.contents import sha256_of
+from colmap_affrect.project.differences import WEIGHTS
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
-from colmap_affrect.project.workspace import WEIGHTS, Workspace
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context, digests_to_record
-from colmap_affrect.stages.extract import recorded_extraction, write_images_and_keypoints
+from colmap_affrect.stages.extract import write_images_and_keypoints
+from colmap_affrect.stages.inputs import recorded_extraction
 from colmap_affrect.stages.one_pair import Matching, iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.stationary import StationaryFilter

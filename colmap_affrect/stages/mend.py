@@ -22,21 +22,22 @@ from colmap_affrect.colmap.seal import (
     begin_work,
     changes,
     end_work,
+    has_seal,
     is_untouched,
     keep_seal,
     remove_seal,
-    seal_of,
 )
 from colmap_affrect.colmap.tables import Tables, delete_rows, open_read_only, read_tables
 from colmap_affrect.colmap.useless_keypoints import KINDS
 from colmap_affrect.errors import AffrectError, DatabaseError
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.project.workspace import Workspace, database_files
+from colmap_affrect.project.outputs import database_files
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.shown import such_as
 from colmap_affrect.stages.cameras import choose_cameras
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.copy import copy_verified, is_copy
+from colmap_affrect.stages.copy import copy_verified
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import write_matches
@@ -116,7 +117,7 @@ def _edits(found: dict[str, Change], tables: Tables) -> Edits:
     lost = ["its tables are others"] * ("tables" in found)
     for part, what in (("images", tables.names), ("cameras", {})):
         if part in found:
-            lost.append(_told(part, found[part], what))
+            lost.append(_changed_rows(part, found[part], what))
     pairs = [found[part] for part in ("matches", "geometries") if part in found]
     if any(0 < change.num_before == len(change.gone) for change in pairs):
         lost.append("all pairs are gone")
@@ -143,7 +144,7 @@ def _counted(count: int, what: str) -> str:
     return f"{count} {what}{'s' * (count != 1)}"
 
 
-def _told(part: str, change: Change, names: dict[int, str]) -> str:
+def _changed_rows(part: str, change: Change, names: dict[int, str]) -> str:
     parts = [(change.changed, "changed"), (change.added, "added"), (change.gone, "gone")]
     texts = [
         f"{len(keys)} {what}"
@@ -187,11 +188,11 @@ def mend(context: Context, *, follows: bool) -> None:
     begun = workspace.recorded().get("begun", [])
     if not begun or not (path.exists() or "verify" in begun):
         return
-    found, is_copied = edits_of(path), is_copy(workspace)
-    if found and not str(found) and not (is_copied or seal_of(path).exists()):
+    found, is_copied = edits_of(path), workspace.is_copy
+    if found and not str(found) and not (is_copied or has_seal(path)):
         found = Edits(_unlike_features(context))
     if not (found and str(found)):
-        if found and seal_of(path).exists():
+        if found and has_seal(path):
             keep_seal(path)
         return
     if not is_copied:
@@ -250,7 +251,7 @@ def _without_others(context: Context, found: Edits) -> Edits:
 
 def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows: bool) -> None:
     workspace, record = context.workspace, context.workspace.recorded()
-    original = Path(record["copy"]["database"]) if is_copy(workspace) else None
+    original = Path(record["copy"]["database"]) if workspace.is_copy else None
     if original and not original.exists():
         raise DatabaseError(
             f"{workspace.database}: was changed since the last run ({found}), and {original} is "

@@ -20,7 +20,8 @@ from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import Inputs, write_images_and_keypoints
+from colmap_affrect.stages.extract import write_images_and_keypoints
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 
 logger = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import recorded_extraction
+from colmap_affrect.stages.inputs import recorded_extraction
 from colmap_affrect.stages.match import write_matches
 from colmap_affrect.stages.pairs import listed_pairs
 

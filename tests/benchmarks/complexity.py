@@ -71,7 +71,7 @@ def main() -> None:
     """Print the table: means over images, medians over rounds."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument(
-        "--methods", nargs="+", default=["default", "affnet-shapes-recommended"],
+        "--methods", nargs="+", default=["default", "second-moment-shapes"],
         help="[LABEL=]RECIPE[:KEY=VALUE[,...]]",
     )  # fmt: skip
     parser.add_argument("--image-path", type=Path, required=True, help="folder of images")

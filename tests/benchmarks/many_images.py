@@ -21,7 +21,8 @@ from pathlib import Path
 from machine import describe_machine, table
 from street import FOCAL_LENGTH_PX, IMAGE_SIZE, take_photographs, view_of
 
-from colmap_affrect.colmap.poses import pose_scores, read_poses
+from colmap_affrect.colmap.poses import read_poses
+from colmap_affrect.comparison.pose_scores import pose_scores
 
 INTERVAL_S = 0.1
 PROGRESS = re.compile(r"^([\w ()-]+): \d+/\d+ \w+")

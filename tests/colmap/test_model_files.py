@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import shutil
 from pathlib import Path
@@ -9,8 +10,13 @@ from pathlib import Path
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.model_files import read_given_model, registered_names
-from colmap_affrect.colmap.model_records import RECORDS
+from colmap_affrect.colmap.model_files import (
+    RECORDS,
+    SUMMARY,
+    file_digests,
+    read_given_model,
+    registered_names,
+)
 from colmap_affrect.errors import StoreError
 
 
@@ -76,37 +82,44 @@ def test_damaged_models_are_an_error_or_can_be_used(model_path: Path, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("name", "offset", "what"),
+    ("name", "offset", "content", "what"),
     [
-        ("cameras.bin", 16, "a camera is of no size"),
-        ("rigs.bin", 20, "a rig has a camera that is not there"),
-        ("frames.bin", 12, "a frame has a rig that is not there"),
-        ("images.bin", 8, "a frame has an image that is not there"),
+        ("cameras.bin", 16, bytes(8), r"cameras\.bin: damaged \(a camera is of no size"),
+        ("cameras.bin", 12, b"\xff", r"cameras\.bin: damaged \(a camera is of no model"),
+        ("rigs.bin", 20, bytes(4), r"0: damaged \(.*Camera 0 from rig 1 not found"),
+        ("frames.bin", 12, bytes(4), r"0: damaged \(Rig with ID 0 does not exist"),
+        ("frames.bin", 16, bytes(32), r"frames\.bin: damaged \(a pose without rotation"),
+        ("images.bin", 8, bytes(4), r"damaged \("),
+        ("points3D.bin", 16, b"\xff" * 8, r"points3D\.bin: damaged \(points that are not finite"),
     ],
 )
-def test_what_files_say_of_each_other_must_be_so(
-    model_path: Path, name: str, offset: int, what: str
+def test_values_and_references_that_cannot_be_are_damage(
+    model_path: Path, name: str, offset: int, content: bytes, what: str
 ) -> None:
-    path = model_path / name
-    data = bytearray(path.read_bytes())
-    data[offset : offset + 4] = bytes(4)
-    path.write_bytes(data)
-    with pytest.raises(StoreError, match=what):
+    data = bytearray((model_path / name).read_bytes())
+    data[offset : offset + len(content)] = content
+    (model_path / name).write_bytes(data)
+    with pytest.raises(StoreError, match=what) as error:
         read_given_model(model_path)
+    assert "\n" not in str(error.value)
 
 
-def test_tracks_and_keypoints_see_each_other(
-    model: pycolmap.Reconstruction, tmp_path: Path
+@pytest.mark.parametrize("is_ours", [False, True])
+def test_tracks_and_keypoints_name_each_other(
+    model: pycolmap.Reconstruction, tmp_path: Path, is_ours: bool
 ) -> None:
     model.write(tmp_path)
+    if is_ours:
+        content = {"model": file_digests(tmp_path)}
+        (tmp_path / SUMMARY).write_text(json.dumps(content))
+        read_given_model(tmp_path)
     changed = pycolmap.Reconstruction(tmp_path)
     changed.delete_point3D(min(changed.points3D))
-    for name, of in ("images.bin", changed), ("points3D.bin", model):
-        (tmp_path / name).unlink()
-        (other := tmp_path / "other").mkdir(exist_ok=True)
-        of.write(other)
-        shutil.copy(other / name, tmp_path)
-    with pytest.raises(
-        StoreError, match=r"points3D\.bin: damaged \(a track has a keypoint that sees"
-    ):
+    (other := tmp_path / "other").mkdir()
+    changed.write(other)
+    shutil.copy(other / "images.bin", tmp_path)
+    what = (
+        r"images\.bin: is not as it was written" if is_ours else r"points3D\.bin: damaged \(a track"
+    )
+    with pytest.raises(StoreError, match=what):
         read_given_model(tmp_path)

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database, write_keypoints, write_matches
 from colmap_affrect.colmap.native_options import flat_values
-from colmap_affrect.colmap.poses import pair_errors
 from colmap_affrect.colmap.verification import (
     VerificationOptions,
     verification_differences,
     verified_pairs,
     verify,
 )
+from colmap_affrect.comparison.pose_scores import pair_errors
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS, pixel_from_colmap
 from colmap_affrect.errors import OptionError
 from colmap_affrect.mappers.base import MAPPERS

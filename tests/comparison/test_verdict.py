@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from colmap_affrect.colmap.poses import PoseScores
 from colmap_affrect.comparison import verdict as rules
+from colmap_affrect.comparison.pose_scores import PoseScores
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.verdict import Change, verdict
 

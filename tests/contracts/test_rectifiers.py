@@ -8,7 +8,7 @@ from contracts.rectifier_contract import RectifierContract
 from numpy.typing import NDArray
 
 from colmap_affrect.data import Photograph
-from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
+from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.rectifiers.base import (
     RECTIFIERS,
     Rectifier,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from contracts.rectifier_contract import IMAGES
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from random_weights import write_random_weights
 
 from colmap_affrect.features.base import SHAPES, NetworkContext, ShapeSource
@@ -67,10 +67,3 @@ def test_flat_images_have_no_texture_and_no_samples(source: ShapeSource) -> None
     assert not grid.textured.any()
     assert_allclose(grid.metrics, np.broadcast_to([1.0, 1.0, 0.0], grid.metrics.shape))
     assert len(source.samples(image).points) == 0
-
-
-@every_source
-def test_shapes_are_the_same_every_time(source: ShapeSource) -> None:
-    image = IMAGES["textured"]
-    assert_array_equal(source.grid(image).metrics, source.grid(image).metrics)
-    assert_array_equal(source.samples(image).points, source.samples(image).points)

@@ -6,12 +6,11 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from contracts.rectifier_contract import RectifierContract, photograph_of
+from contracts.rectifier_contract import photograph_of
 from synthetic import texture
 
 from colmap_affrect.errors import OptionError
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.rectifiers.base import RECTIFIERS, Rectifier, RectifierInputs
 from colmap_affrect.stages.one_image import prepare
 
 MODULE = """
@@ -52,13 +51,6 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         "[colmap_affrect.rectifiers]\nskew = skew_affrect:Skew\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-
-
-@pytest.mark.usefixtures("installed")
-class TestSkew(RectifierContract):
-    def make(self) -> Rectifier:
-        options = load_recipe("default", ["rectifier.name=skew"]).extraction.rectifier
-        return RECTIFIERS.make(options, RectifierInputs())
 
 
 @pytest.mark.usefixtures("installed")

@@ -32,9 +32,6 @@ CHAIN = 1e-3
 """Three networks in a row, each on patches sampled through what the one before it said; their
 layers are folded here and not in kornia, which rounds differently."""
 
-BATCHES = 1e-5
-"""The same numbers in batches of another size; on some processors the sums are ordered by it."""
-
 ANGLE_DEG = 4.0
 """The histogram of gradients has bins of 10 degrees and a parabola through three."""
 
@@ -64,22 +61,6 @@ def circles(centers: object, sigmas_px: object) -> LocalFeatures:
     responses = np.linspace(1.0, 0.5, len(points), dtype=np.float32)
     ids = np.arange(len(points), dtype=np.int32)
     return LocalFeatures(lafs, responses, np.zeros((len(points), 0), np.float32), ids)
-
-
-class Constant(nn.Module):
-    """A network that answers the same row for each patch and remembers the patches."""
-
-    def __init__(self, row: object) -> None:
-        super().__init__()
-        self.row = torch.as_tensor(row, dtype=torch.float32)
-        self.seen: list[torch.Tensor] = []
-
-    def forward(self, patches: torch.Tensor) -> torch.Tensor:
-        self.seen.append(patches.clone())
-        return self.row.expand(len(patches), *self.row.shape)
-
-    def patches(self, count: int) -> np.ndarray:
-        return torch.cat(self.seen)[:count, 0].numpy()
 
 
 def describe_one(
@@ -192,55 +173,7 @@ def test_describe_leaves_out_degenerate_shapes(
     assert_allclose(described.keypoints, detected.keypoints[described.rectification_ids])
 
 
-@pytest.mark.parametrize("row", [np.zeros(128), np.full(128, np.nan), np.full(128, np.inf)])
-def test_describe_leaves_out_descriptors_of_nothing(
-    weights: dict[str, Path], image: GrayImage, row: np.ndarray
-) -> None:
-    profile = make(weights)
-    profile.descriptor = Constant(row)
-    described = describe_one(profile, image, circles([[60.0, 50.0]], [2.0]))
-    assert described.descriptors.shape == (0, profile.descriptor_size)
-
-
-def test_without_affine_shape_frames_are_similarities_and_affnet_is_not_needed(
-    weights: dict[str, Path], image: GrayImage
-) -> None:
-    needed = {key: weights[key] for key in ("orinet", "tfeat")}
-    profile = make(needed, affine_shape=False)
-    described = describe_one(profile, image, profile.detect((image, None)))
-    shapes = described.lafs[:, :, :2] / described.scales[:, None, None]
-    assert_allclose(
-        shapes @ shapes.transpose(0, 2, 1), np.tile(np.eye(2), (len(shapes), 1, 1)), atol=1e-9
-    )
-
-
 # Batches.
-
-
-@pytest.mark.parametrize("batch_size", [5, 1000])
-def test_describe_does_not_depend_on_the_batch_size(
-    weights: dict[str, Path], image: GrayImage, batch_size: int
-) -> None:
-    profile = make(weights, max_num_features=12)
-    detected = profile.detect((image, None))
-    expected = describe_one(profile, image, detected)
-    actual = describe_one(make(weights, batch_size=batch_size), image, detected)
-    assert_allclose(actual.descriptors, expected.descriptors, rtol=0, atol=BATCHES)
-
-
-@pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
-def test_describe_in_half_precision_is_near(
-    weights: dict[str, Path], image: GrayImage, dtype: str
-) -> None:
-    detected = make(weights, max_num_features=60).detect((image, None))
-    full = describe_one(make(weights), image, detected)
-    half = describe_one(make(weights, dtype=dtype), image, detected)
-    assert half.descriptors.dtype == np.float32
-    assert len(half) == len(full)
-    similarities = (full.descriptors * half.descriptors).sum(axis=1)
-    # bfloat16 has 8 bits: angles and shapes are off by up to 1 %.
-    assert np.median(similarities) > 0.99
-    assert not np.array_equal(full.descriptors, half.descriptors)
 
 
 # Odd images.

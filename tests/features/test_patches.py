@@ -9,8 +9,8 @@ from kornia.feature import extract_patches_from_pyramid
 from numpy.testing import assert_allclose
 from synthetic import texture
 
-from colmap_affrect.features import patches
-from colmap_affrect.features.patches import PatchSampler
+from colmap_affrect.features import networks as patches
+from colmap_affrect.features.networks import PatchSampler
 from colmap_affrect.geometry.affine import rotation
 
 

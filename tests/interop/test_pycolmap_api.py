@@ -23,7 +23,6 @@ from colmap_affrect.errors import (
     StaleStoreError,
 )
 from colmap_affrect.images.reading import read_gray
-from colmap_affrect.matchers import nearest
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.verify import recorded_verification
@@ -61,24 +60,6 @@ def keypoints(path: Path) -> dict[str, Any]:
 
 
 @pytest.mark.long
-def test_the_documented_example_of_pycolmap_registers_the_scene(
-    photos: Path, tmp_path: Path
-) -> None:
-    # pycolmap's example pipeline, with its name replaced in the two calls that make features.
-    output_path = tmp_path / "out"
-    output_path.mkdir()
-    database_path = output_path / "database.db"
-
-    colmap_affrect.extract_features(database_path, photos)
-    colmap_affrect.match_exhaustive(database_path)
-    maps = pycolmap.incremental_mapping(database_path, photos, output_path)
-    maps[0].write(output_path)
-
-    assert {image.name for image in maps[0].images.values()} == set(NAMES)
-    assert pycolmap.Reconstruction(output_path).num_reg_images() == len(NAMES)
-
-
-@pytest.mark.long
 def test_database_is_that_of_a_run(photos: Path, tmp_path: Path) -> None:
     colmap_affrect.extract_features(str(tmp_path / "a.db"), str(photos))
     colmap_affrect.match_exhaustive(str(tmp_path / "a.db"))
@@ -113,20 +94,6 @@ def test_images_and_pairs_are_added_call_by_call(photos: Path, tmp_path: Path) -
     assert verify.num_done == 5
 
 
-def test_what_pycolmap_imported_before_is_kept(photos: Path, tmp_path: Path) -> None:
-    path = tmp_path / "a.db"
-    with open_database(path):
-        pass
-    options = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params="301,302,161,122")
-    pycolmap.import_images(path, photos, pycolmap.CameraMode.SINGLE, NAMES[::-1], options)
-    ids = image_ids(path)
-    colmap_affrect.extract_features(path, photos)
-    assert image_ids(path) == ids
-    with open_database(path) as database:
-        (camera,) = database.read_all_cameras()
-        assert camera.params.tolist() == [301, 302, 161, 122]
-
-
 def test_reader_options_and_camera_mode_are_those_of_pycolmap(photos: Path, tmp_path: Path) -> None:
     options = dict(camera_model="PINHOLE", camera_params="301,302,161,122")
     colmap_affrect.extract_features(
@@ -141,6 +108,18 @@ def test_reader_options_and_camera_mode_are_those_of_pycolmap(photos: Path, tmp_
     with open_database(tmp_path / "b.db") as database:
         (camera,) = database.read_all_cameras()
         assert camera.focal_length == 2.0 * 320
+    path = tmp_path / "c.db"  # with images that pycolmap has imported before
+    with open_database(path):
+        pass
+    native = pycolmap.ImageReaderOptions(**options)
+    pycolmap.import_images(path, photos, pycolmap.CameraMode.SINGLE, NAMES[::-1], native)
+    ids = image_ids(path)
+    colmap_affrect.extract_features(path, photos, NAMES[:1])
+    assert image_ids(path) == ids
+    with open_database(path) as database:
+        assert [camera.params.tolist() for camera in database.read_all_cameras()] == [
+            [301, 302, 161, 122]
+        ]
 
 
 @pytest.mark.long
@@ -168,43 +147,24 @@ def test_features_are_replaced_in_a_new_database_and_the_old_one_stays(
         np.testing.assert_allclose(points[:, :2], store.read(name).keypoints + 0.5, atol=1e-4)
 
 
-def test_features_of_another_program_are_never_replaced_in_place(photos: Path, sift: Path) -> None:
-    before = keypoints(sift)
+def test_a_database_of_another_program_and_other_photographs_are_refused(
+    photos: Path, sift: Path, tmp_path: Path
+) -> None:
+    before, extract = keypoints(sift), colmap_affrect.extract_features
     with pytest.raises(DatabaseError, match=r"has other features of a\.png.*from_database"):
-        colmap_affrect.extract_features(sift, photos)
-    after = keypoints(sift)
-    for name in NAMES:
-        np.testing.assert_array_equal(before[name], after[name])
-
-
-def test_images_of_another_size_than_their_camera_are_reported(
-    photos: Path, sift: Path, tmp_path: Path
-) -> None:
-    folder = tmp_path / "photos"
-    write_photographs(folder)
-    write_image(folder / "b c.png", read_gray(photos / "b c.png")[:200, :310])
-    report = colmap_affrect.extract_features(tmp_path / "new.db", folder, from_database=sift)
-    assert report.num_done == 3
-    assert report.failures.keys() == {"b c.png"}
-    assert "is 310 x 200 px, and its camera in the database 320 x 240" in report.failures["b c.png"]
-
-
-def test_image_of_the_database_that_is_not_there_is_named(sift: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "photos"
-    write_photographs(folder, 2)
-    with pytest.raises(
-        AffrectError, match=r"old\.db: lists side/d\.png and 1 more, which is not in "
-    ):
-        colmap_affrect.extract_features(tmp_path / "new.db", folder, from_database=sift)
-
-
-def test_cameras_of_the_database_and_camera_options_exclude_each_other(
-    photos: Path, sift: Path, tmp_path: Path
-) -> None:
+        extract(sift, photos)
     with pytest.raises(OptionError, match="leave out camera mode"):
-        colmap_affrect.extract_features(
-            tmp_path / "new.db", photos, camera_mode="single", from_database=sift
-        )
+        extract(tmp_path / "a.db", photos, camera_mode="single", from_database=sift)
+    write_photographs(tmp_path / "few", 2)
+    with pytest.raises(AffrectError, match=r"lists side/d\.png and 1 more, which is not in "):
+        extract(tmp_path / "b.db", tmp_path / "few", from_database=sift)
+    write_photographs(tmp_path / "cut")
+    write_image(tmp_path / "cut/b c.png", read_gray(photos / "b c.png")[:200, :310])
+    report = extract(tmp_path / "c.db", tmp_path / "cut", from_database=sift)
+    assert (report.num_done, *report.failures) == (3, "b c.png")
+    assert "is 310 x 200 px, and its camera in the database 320 x 240" in report.failures["b c.png"]
+    for name, points in keypoints(sift).items():
+        np.testing.assert_array_equal(points, before[name])
 
 
 def test_masks_of_the_reader_options_are_used(photos: Path, tmp_path: Path) -> None:
@@ -230,23 +190,12 @@ def test_masks_of_the_reader_options_are_used(photos: Path, tmp_path: Path) -> N
             {"extraction_options": {"sift": {"upright": True}}},
             "sift.upright=True cannot be carried",
         ),
-        ({"extraction_options": {"sift": {"uprigt": 1}}}, "did you mean 'sift.upright'"),
         ({"extraction_options": {"max_image_size_px": "big"}}, "expected int"),
-        (
-            {
-                "extraction_options": pycolmap.FeatureExtractionOptions(
-                    type=pycolmap.FeatureExtractorType.ALIKED_N32
-                )
-            },
-            "extraction_options: type=ALIKED_N32 cannot be carried over",
-        ),
         ({"extraction_options": pycolmap.Camera()}, "Camera does not apply here"),
         ({"extraction_options": "defualt"}, "did you mean 'default'"),
         ({"reader_options": {"camera_modell": "PINHOLE"}}, "did you mean 'camera_model'"),
         ({"camera_mode": "two"}, "mode='two' is not one of"),
         ({"image_names": ["a.png", "../x.png"]}, r"lists \.\./x\.png"),
-        ({"device": "cuda:77"}, "cuda:77"),
-        ({"from_database": "missing.db"}, "no such file"),
         ({"from_database": "missing.db", "image_names": ["a.png"]}, "missing.db: no such file"),
         ({"image_path": "nowhere", "image_names": ["a.png"]}, "nowhere: no such folder"),
         (
@@ -273,6 +222,8 @@ def test_options_of_verification_come_from_pycolmap_or_a_dictionary(
     colmap_affrect.match_exhaustive(path, verification_options=pycolmaps)
     recorded = recorded_verification(Workspace.beside(path))
     assert (recorded.min_num_inliers, recorded.max_error_px) == (31, 2.5)
+    with pytest.raises(StaleStoreError, match="random_seed=0, and it is 3 now"):
+        colmap_affrect.match_exhaustive(path, verification_options=pycolmaps, random_seed=3)
     with pytest.raises(StaleStoreError, match=r"max_error_px=2\.5, and it is 3\.0 now; use a new"):
         colmap_affrect.match_exhaustive(path)
     with pytest.raises(OptionError, match="multiple_models=True cannot be carried over"):
@@ -281,57 +232,15 @@ def test_options_of_verification_come_from_pycolmap_or_a_dictionary(
         )
     with pytest.raises(OptionError, match="unknown option 'max_err'"):
         colmap_affrect.match_exhaustive(path, verification_options={"max_err": 1})
-    with pytest.raises(PairListError, match="give match_list_path"):
-        colmap_affrect.match_image_pairs(path)
-
-
-def test_seed_of_the_options_counts_unless_another_is_given(photos: Path, tmp_path: Path) -> None:
-    path = tmp_path / "a.db"
-    colmap_affrect.extract_features(path, photos, NAMES[:2], extraction_options={})
-    colmap_affrect.match_exhaustive(path, verification_options={"random_seed": 5})
-    assert recorded_verification(Workspace.beside(path)).random_seed == 5
-    with pytest.raises(StaleStoreError, match="random_seed=5, and it is 3 now"):
-        colmap_affrect.match_exhaustive(
-            path, verification_options={"random_seed": 5}, random_seed=3
-        )
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+    for options, message in (
         ({"max_ratio": 3.0}, "^matching_options: max_ratio=3.0 is outside .0.1, 1.$"),
         ({"max_rato": 0.8}, "^matching_options: unknown option 'max_rato'"),
         (3, "^matching_options: int does not apply here; give colmap_affrect.NearestOptions or"),
-    ],
-)
-def test_wrong_options_of_matching_name_the_argument(
-    photos: Path, tmp_path: Path, options: Any, message: str
-) -> None:
-    colmap_affrect.extract_features(tmp_path / "a.db", photos, NAMES[:2])
-    with pytest.raises(OptionError, match=message):
-        colmap_affrect.match_exhaustive(tmp_path / "a.db", options)
-
-
-def test_sections_of_a_recipe_are_kept_for_later_calls(photos: Path, tmp_path: Path) -> None:
-    path = tmp_path / "a.db"
-    sections = {"rectifier": "identity", "matching": {"max_ratio": 0.8}}
-    colmap_affrect.extract_features(path, photos, NAMES[:2], extraction_options=sections)
-    colmap_affrect.match_exhaustive(path)
-    assert Workspace.beside(path).require("match")["max_ratio"] == 0.8
-
-
-def test_device_reaches_matching(
-    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    devices: list[str] = []
-    monkeypatch.setattr(nearest, "coarse_descriptors", lambda _, device: devices.append(device))
-    listed = tmp_path / "pairs.txt"
-    listed.write_text(f"{NAMES[0]} {NAMES[1]}\n")
-    path = tmp_path / "a.db"
-    colmap_affrect.extract_features(path, photos, NAMES[:3])
-    colmap_affrect.match_image_pairs(path, None, {"match_list_path": listed}, device="cpu")
-    colmap_affrect.match_exhaustive(path, device=pycolmap.Device.cpu)
-    assert devices == ["cpu", "cpu"]
+    ):
+        with pytest.raises(OptionError, match=message):
+            colmap_affrect.match_exhaustive(path, options)
+    with pytest.raises(PairListError, match="give match_list_path"):
+        colmap_affrect.match_image_pairs(path)
 
 
 def test_recipe_that_escalates_climbs(photos: Path, tmp_path: Path) -> None:
@@ -340,16 +249,6 @@ def test_recipe_that_escalates_climbs(photos: Path, tmp_path: Path) -> None:
     )
     reports = colmap_affrect.match_exhaustive(tmp_path / "a.db")
     assert [report.name for report in reports] == ["match", "verify", "escalate"]
-
-
-def test_verify_refuses_matches_that_would_end_the_process(photos: Path, tmp_path: Path) -> None:
-    path = tmp_path / "a.db"
-    pycolmap.extract_features(path, photos)
-    with open_database(path) as database:
-        count = database.num_keypoints_for_image(2)
-        database.write_matches(1, 2, np.array([[0, 0], [1, count]], np.uint32))
-    with pytest.raises(DatabaseError, match="matches of keypoints that do not exist"):
-        colmap_affrect.verify(path)
 
 
 def test_verify_works_on_a_database_of_colmap(photos: Path, tmp_path: Path) -> None:

@@ -34,7 +34,6 @@ from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.match import recorded_matching
 
 COARSE = {"rectifier": "identity", "max_image_size_px": 320}
 
@@ -165,16 +164,6 @@ def test_options_are_translated() -> None:
     assert nested == usual.changed(random_seed=7, max_error_px=2.5, scale_max_error=False)
     with pytest.raises(OptionError, match=r"ransac\.max_eror'.*did you mean 'ransac\.max_error'"):
         verification_options({"ransac": {"max_eror": 2}}, None)
-
-
-@pytest.mark.long
-def test_dictionary_without_a_matcher_changes_that_on_record(extracted: Path) -> None:
-    config = Workspace.beside(extracted).config
-    text = config.read_text(encoding="utf-8")
-    config.write_text(text.replace("ratio_both_ways = true", "ratio_both_ways = false"))
-    colmap_affrect.match_exhaustive(extracted, {"max_ratio": 0.7})
-    options = recorded_matching(Workspace.beside(extracted))
-    assert options == NearestOptions(max_ratio=0.7, ratio_both_ways=False)
 
 
 def test_what_matching_options_ask_for_is_done(extracted: Path) -> None:

@@ -16,7 +16,6 @@ from colmap_affrect.matchers.guided import (
     Guide,
     GuidedOptions,
     HomographyGuide,
-    frame_angles_deg,
     guided_matches,
     nearest_allowed,
 )
@@ -90,14 +89,6 @@ def test_bands_are_those_of_sampsons_distance() -> None:
     assert_array_equal(allowed.ravel(), errors <= 7.0)
 
 
-def test_only_few_features_are_compared() -> None:
-    first, second = random_images(5, (4000, 4000))
-    guide = EpipolarGuide(fundamental((1, 0.2, 0.1)), first.points, second.points, 1.0)
-    num_compared = sum(len(rows) * len(columns) for rows, columns in guide.groups())
-    assert num_compared < 0.06 * 4000**2
-    assert sum(len(rows) for rows, _ in guide.groups()) == 4000
-
-
 def test_homography_misses_nothing() -> None:
     first, second = random_images(6, (900, 2000))
     guide = HomographyGuide(HOMOGRAPHY, first.points, second.points, 10.0)
@@ -119,17 +110,6 @@ def test_points_without_a_place_match_nothing() -> None:
         assert len(found)
         assert np.isfinite(first.points[found[:, 0]]).all()
         assert np.isfinite(second.points[found[:, 1]]).all()
-
-
-def test_without_features() -> None:
-    first, second = random_images(3)
-    none = GuidableImage(np.zeros((0, 8), np.float32), np.zeros((0, 2)))
-    for one, other in ((first, none), (none, second), (none, none)):
-        for guide in (
-            EpipolarGuide(fundamental((1, 0.2, 0.1)), one.points, other.points, 3.0),
-            HomographyGuide(HOMOGRAPHY, one.points, other.points, 3.0),
-        ):
-            assert nearest_allowed(one, other, guide, OPTIONS).shape == (0, 2)
 
 
 def plane_pair(wrong: int = 0) -> tuple[GuidableImage, GuidableImage, list[Guide]]:
@@ -176,17 +156,6 @@ def test_frames_that_turn_otherwise_match_nothing(kind: int) -> None:
     assert len(guided_matches(first, second, guides[kind], free, inliers)) == 200
     without = [replace(image, shapes=None) for image in (first, second)]
     assert len(guided_matches(*without, guides[kind], OPTIONS, inliers)) == 200
-
-
-def test_directions_may_all_be_turned() -> None:
-    first, second, _ = plane_pair()
-    guide = EpipolarGuide(-fundamental((1, 0.2, 0.1)), first.points, second.points, 1e4)
-    every = np.stack([np.arange(200)] * 2, axis=1)
-    angles = frame_angles_deg(guide, (first.shapes, second.shapes), every, every)
-    opposite = EpipolarGuide(fundamental((1, 0.2, 0.1)), first.points, second.points, 1e4)
-    np.testing.assert_allclose(
-        angles, frame_angles_deg(opposite, (first.shapes, second.shapes), every, every), atol=1e-6
-    )
 
 
 def test_pair_whose_frames_contradict_its_geometry_keeps_what_it_has() -> None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from colmap_affrect.matchers import nearest
 from colmap_affrect.matchers.base import Matches
 from colmap_affrect.matchers.nearest import NearestOptions, match_features, matchable
 
@@ -120,33 +118,6 @@ def test_match_features_equals_plain_loops(
     actual = run(first, second, options)
     assert actual.indices.tolist() == [[row, target] for row, target, _ in expected]
     assert_allclose(actual.scores, [1 - ratio for *_, ratio in expected], atol=RATIO_ERROR)
-
-
-@pytest.mark.parametrize("count1", [0, 1, 7])
-@pytest.mark.parametrize("count2", [0, 1])
-def test_match_features_of_empty_or_single_features_has_the_layout_of_matches(
-    count1: int, count2: int
-) -> None:
-    first = (unit_rows(np.random.default_rng(0).random((count1, 8)) + 1), np.zeros((count1, 2)))
-    second = (np.eye(8, dtype=np.float32)[:count2], np.zeros((count2, 2)))
-    matches = run(first, second, NearestOptions())
-    assert matches.indices.shape == (len(matches.scores), 2)
-    assert matches.indices.dtype == np.int64
-    assert matches.scores.dtype == np.float32
-    assert len(matches.indices) <= min(count1, count2)
-
-
-@pytest.mark.parametrize("chunk_elements", [1, 50, 333, 10_000])
-def test_match_features_gives_the_same_result_in_chunks_of_any_size(
-    monkeypatch: pytest.MonkeyPatch, chunk_elements: int
-) -> None:
-    first, second = two_views(5, 137, 90, 150.0, 0.08)
-    whole = run(first, second, NearestOptions(max_ratio=0.95))
-    assert len(whole.indices) > 20
-    monkeypatch.setattr(nearest, "CHUNK_ELEMENTS", chunk_elements)
-    chunked = run(first, second, NearestOptions(max_ratio=0.95))
-    np.testing.assert_array_equal(chunked.indices, whole.indices)
-    assert_allclose(chunked.scores, whole.scores, atol=RATIO_ERROR)
 
 
 def spread(count: int) -> NDArray[np.float64]:

@@ -10,14 +10,11 @@ from numpy.typing import NDArray
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import DeviceError
-from colmap_affrect.geometry.neighbors import neighbors_within
-from colmap_affrect.matchers import nearest
 from colmap_affrect.matchers import nearest_8bit as coarse
 from colmap_affrect.matchers.base import ImageFeatures, MatcherContext
 from colmap_affrect.matchers.nearest import (
     NearestNeighbors,
     NearestOptions,
-    _nearest_of_listed,
     match_features,
     matchable,
 )
@@ -25,7 +22,6 @@ from colmap_affrect.matchers.nearest_8bit import (
     EightBitDescriptors,
     HalfDescriptors,
     MakeCoarse,
-    ShortList,
     coarse_descriptors,
     has_fast_8_bit_products,
 )
@@ -88,51 +84,6 @@ def test_matches_are_those_of_exact_similarities(
     np.testing.assert_allclose(found.scores, exact.scores, atol=1e-4)
 
 
-def test_short_list_has_few_rows_and_few_entries(kind: MakeCoarse) -> None:
-    first, second = (kind(descriptors) for descriptors, _ in crowded_views(4, 1.0, signed=False))
-    rivals = neighbors_within(crowded_views(4, 1.0, signed=False)[1][1], 10.0)
-    short = first.short_list(np.arange(350), second, rivals, 0.85)
-    assert len(short.rows) < 300
-    assert len(short.entry_rows) < 0.05 * len(short.rows) * 450
-    part = first.short_list(np.arange(100, 140), second, rivals, 0.85)
-    inside = (short.rows >= 100) & (short.rows < 140)
-    np.testing.assert_array_equal(part.rows, short.rows[inside])
-    np.testing.assert_array_equal(part.runners_up, short.runners_up[inside])
-
-
-def test_lists_of_several_chunks_are_those_of_one(
-    kind: MakeCoarse, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    options = NearestOptions()
-    views = crowded_views(5, 0.5, signed=False)
-    whole = match_features(*(matchable(*view, options, kind) for view in views), options)
-    monkeypatch.setattr(coarse, "NUM_ROWS_8_BIT", 33)
-    monkeypatch.setattr(coarse, "NUM_ROWS_16_BIT", 47)
-    monkeypatch.setattr(nearest, "CHUNK_ROWS", 101)
-    parts = match_features(*(matchable(*view, options, kind) for view in views), options)
-    np.testing.assert_array_equal(parts.indices, whole.indices)
-
-
-def test_nearest_whose_rival_is_the_coarse_runner_up_is_doubtful() -> None:
-    # Of the queries' nearest, 1 and 3, the first has the runner-up 2 at the same place.
-    others = np.eye(4, dtype=np.float32)
-    image = matchable(others, np.array([(0, 0), (50, 0), (52, 0), (99, 0)]), NearestOptions())
-    queries = unit_rows(np.array([(0.2, 1.0, 0.4, 0.3), (0.3, 0.0, 0.2, 1.0)]))
-    short = ShortList(
-        np.array([0, 1]),
-        np.array([2, 0]),
-        np.array([False, False]),
-        np.array([0, 0, 0, 1, 1]),
-        np.array([1, 2, 3, 0, 3]),
-    )
-    found, ratios, doubtful = _nearest_of_listed(queries, image, short)
-    assert found.tolist() == [1, 3]
-    assert doubtful.tolist() == [True, False]
-    cosines = (queries[0, 1], queries[0, 3]), (queries[1, 3], queries[1, 0])
-    expected = [np.sqrt((1 - first) / (1 - second)) for first, second in cosines]
-    np.testing.assert_allclose(ratios, expected, rtol=1e-6)
-
-
 def test_ambiguous_copies_do_not_hide_a_match(kind: MakeCoarse) -> None:
     # The query is nearest to feature 0 or 1, copies of each other. Feature 2, a bit less similar,
     # is a rival of 1 only: with 1 as the nearest the ratio is small, with 0 it is near 1.
@@ -161,14 +112,6 @@ def test_few_features(kind: MakeCoarse, counts: tuple[int, int]) -> None:
     found = match_features(*(matchable(*view, options, kind) for view in views), options)
     exact = match_features(*(matchable(*view, options) for view in views), options)
     np.testing.assert_array_equal(found.indices, exact.indices)
-
-
-def test_memory_of_all_arrays_is_counted(kind: MakeCoarse) -> None:
-    rows, places = np.eye(128, dtype=np.float32)[:5], 100.0 * np.arange(10).reshape(5, 2)
-    exact = matchable(rows, places, NearestOptions())
-    assert exact.nbytes == 5 * 128 * 4 + 5 * 2 * 8 + 6 * 8 + 5 * 8
-    coarse_bytes = matchable(rows, places, NearestOptions(), kind).nbytes - exact.nbytes
-    assert coarse_bytes == 5 * 128 * 2
 
 
 def test_coarse_descriptors_are_made_where_they_pay(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,20 +160,3 @@ def test_product_of_the_library_is_that_of_numbers() -> None:
     expected = similarity_codes(codes[:20], codes[10:], unit)
     np.testing.assert_array_less(np.abs(found[:, :27].astype(int) - expected), 2)
     assert not found[:, 27:].any()
-
-
-def test_products_that_saturate_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    def saturating(
-        codes1: NDArray[np.int8], codes2: NDArray[np.int8], unit: float
-    ) -> NDArray[np.uint8]:
-        products = np.clip(codes1.astype(np.int32) @ codes2.astype(np.int32).T, -(2**15), 2**15)
-        return np.clip(np.rint(unit / coarse.CODE_STEP * products), 0, 255).astype(np.uint8)
-
-    def missing(*_: object) -> NDArray[np.uint8]:
-        raise AttributeError("'_OpNamespace' 'onednn' object has no attribute 'qlinear_pointwise'")
-
-    monkeypatch.setattr("torch.backends.cpu.get_cpu_capability", lambda: "AVX512")
-    monkeypatch.setattr(coarse, "_packed", lambda codes: codes)
-    for product, expected in ((similarity_codes, True), (saturating, False), (missing, False)):
-        monkeypatch.setattr(coarse, "_similarity_codes", product)
-        assert has_fast_8_bit_products.__wrapped__() is expected

@@ -140,7 +140,7 @@ IN_TEMPORARY_FOLDERS = {
     ("align.py", "align"), ("pycolmap_mapping.py", "incremental_mapping"),
     ("export.py", "_points"), ("export.py", "_nerfstudio"), ("export.py", "_text"),
     ("hdf5_layouts.py", "created"),
-    ("inspection.py", "inspect_image"), ("sheet.py", "figure_page"), ("conversion.py", "_convert"),
+    ("inspection.py", "inspect_image"), ("sheet.py", "draw_sheet"), ("conversion.py", "_convert"),
     ("compare.py", "_make_shared"), ("worker.py", "_run_seed"), ("worker.py", "_seed_result"),
     ("datasets.py", "read_views"),
 }  # fmt: skip

@@ -379,3 +379,12 @@ def test_complete_groups_are_readable_after_a_kill_at_any_time(
     written = 3 + len([line for line in printed if line.isdigit()])
     # The last one may be complete before it is printed.
     assert_holds_images(store, written, written + 1)
+
+
+def test_file_that_somebody_else_has_written_is_read_again(store: FeatureStore) -> None:
+    store.write("a.png", some_features(2), (8, 6))
+    assert store.num_keypoints() == {"a.png": 2}
+    other = FeatureStore(store.path.with_name("other.h5"))
+    other.write("b.png", some_features(3), (8, 6))
+    other.path.replace(store.path)
+    assert store.num_keypoints() == {"b.png": 3}

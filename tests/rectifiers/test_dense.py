@@ -11,7 +11,7 @@ from strategies import tilt_distance
 from synthetic import texture
 
 from colmap_affrect.data import Mask, Rectification, RectificationPlan, ShapeGrid
-from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
+from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.geometry.affine import rectifying_affine
 from colmap_affrect.geometry.tilts import (
     metrics_from_tilts,

@@ -23,7 +23,7 @@ from colmap_affrect.data import (
     View,
 )
 from colmap_affrect.errors import DepthError, ImageError
-from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
+from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.geometry.affine import (
     fit_canvas,
     image_corners,

@@ -21,8 +21,8 @@ from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import Inputs
 from colmap_affrect.stages.extract import extract as extract_stage
+from colmap_affrect.stages.inputs import Inputs
 
 
 @pytest.mark.long

@@ -11,7 +11,8 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.depth_lookup import depth_lookup
-from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.extract import extract
+from colmap_affrect.stages.inputs import Inputs
 
 
 def extracted(tmp_path: Path, name: str, settings: list[str]) -> Context:

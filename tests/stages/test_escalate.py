@@ -30,7 +30,8 @@ from colmap_affrect.stages import map as map_stage
 from colmap_affrect.stages.climbing import weakly_connected_images
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, recorded_escalation
-from colmap_affrect.stages.extract import Inputs, extract, recorded_extraction
+from colmap_affrect.stages.extract import extract
+from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import extracted_px, verify_matches

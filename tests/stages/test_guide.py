@@ -28,7 +28,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import guide as stage
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import (
     current,
     exact_inliers,
@@ -37,6 +37,7 @@ from colmap_affrect.stages.guide import (
     guided_matches,
     restore_exact,
 )
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.map import agreement, map_images
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs

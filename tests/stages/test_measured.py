@@ -37,7 +37,8 @@ from colmap_affrect.stages.escalate import (
     measured_database,
     reject,
 )
-from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.extract import extract
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import verified_inliers, verify_matches

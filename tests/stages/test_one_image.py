@@ -28,7 +28,8 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, load_recipe
 from colmap_affrect.stages import one_image
 from colmap_affrect.stages.context import Context, Resources, digests_to_record
-from colmap_affrect.stages.extract import Inputs, extract
+from colmap_affrect.stages.extract import extract
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.one_image import num_images_at_once, prepare
 
 WIDTH, HEIGHT = 480, 360

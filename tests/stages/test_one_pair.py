@@ -17,7 +17,7 @@ from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.matchers import base, nearest
 from colmap_affrect.matchers.nearest import NearestOptions
-from colmap_affrect.matchers.nearest_8bit import MakeCoarse, ShortList
+from colmap_affrect.matchers.nearest_8bit import MakeCoarse
 from colmap_affrect.pairs.lists import exhaustive_pairs
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.stages import one_pair
@@ -74,7 +74,7 @@ class OnFullGpu:
 
     nbytes = 0
 
-    def short_list(self, *_: object) -> ShortList:
+    def margin(self, *_: object) -> float:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
 
 

@@ -172,8 +172,7 @@ class AffNet:
         """Return the (N, 3) outputs of the network on the patches of (N, 2, 3) frames."""
         import torch
 
-        from colmap_affrect.features.networks import standardized
-        from colmap_affrect.features.patches import PatchSampler
+        from colmap_affrect.features.networks import PatchSampler, standardized
 
         wide = lafs.copy()
         wide[:, :, :2] *= PATCH_SIGMAS / MEASUREMENT_SIGMAS

@@ -5,12 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from strategies import Array
 from synthetic import texture
 
 from colmap_affrect.data import GrayImage, ShapeGrid
-from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
+from colmap_affrect.features.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.geometry.affine import rotation
 from colmap_affrect.geometry.shapes import STEP_PX
 from colmap_affrect.geometry.tilts import cosh_distances, tilts_from_metrics, unit_metrics
@@ -119,40 +119,3 @@ def test_textured_blocks_lie_round_the_texture() -> None:
     rows, columns = np.nonzero(grid.textured)
     middle = np.array([columns.mean(), rows.mean()]) * grid.step_px + grid.origin_px
     assert_allclose(middle, [217.5, 55.5], atol=2.0)
-
-
-@pytest.mark.parametrize(
-    ("size", "cells"),
-    [((1, 1), (1, 1)), ((50, 1), (13, 1)), ((1, 6), (1, 2)), ((33, 18), (9, 5)), ((8, 4), (2, 1))],
-)
-def test_second_moment_shapes_have_one_cell_per_started_block(
-    size: tuple[int, int], cells: tuple[int, int]
-) -> None:
-    rng = np.random.default_rng(2)
-    image = rng.integers(0, 256, size[::-1]).astype(np.uint8)
-    grid = SOURCE.grid(image)
-    assert grid.textured.shape == cells[::-1]
-    assert grid.metrics.shape == (*cells[::-1], 3)
-    assert (grid.origin_px, grid.step_px) == (1.5, 4)
-    s11, s22, s12 = np.moveaxis(grid.metrics, -1, 0)
-    assert_allclose(s11 * s22 - s12**2, 1.0, rtol=1e-6)
-
-
-def test_second_moment_shapes_of_stripes_stay_finite_and_of_unit_area() -> None:
-    stripes = np.tile(np.repeat([30, 220], 6).astype(np.uint8), (120, 10))
-    grid = SOURCE.grid(stripes)
-    s11, s22, s12 = np.moveaxis(grid.metrics, -1, 0)
-    assert np.isfinite(grid.metrics).all()
-    assert_allclose(s11 * s22 - s12**2, 1.0, rtol=1e-6)
-    # Gradients along x only: x is to be stretched, without limit but that of the code.
-    assert (tilts_from_metrics(grid.metrics)[0] > 10.0).all()
-
-
-def test_samples_are_the_textured_blocks_with_their_centers() -> None:
-    image = np.full((161, 318), 128, np.uint8)
-    image[:, :160] = texture((160, 161), seed=5)
-    grid, samples = SOURCE.grid(image), SOURCE.samples(image)
-    assert 0 < np.count_nonzero(grid.textured) < grid.textured.size
-    columns, rows = ((samples.points - grid.origin_px) / grid.step_px).astype(int).T
-    assert_array_equal(np.stack([rows, columns], axis=1), np.argwhere(grid.textured))
-    assert_array_equal(samples.metrics, grid.metrics[rows, columns])

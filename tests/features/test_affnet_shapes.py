@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -17,16 +16,13 @@ from strategies import Array
 from synthetic import texture
 from torch import nn
 
-from colmap_affrect.data import GrayImage, LocalFeatures, ShapeGrid
+from colmap_affrect.data import GrayImage, LocalFeatures
+from colmap_affrect.features import affnet_shapes as affnet
+from colmap_affrect.features.affnet_shapes import AffNet, AffNetOptions
 from colmap_affrect.features.base import NetworkContext
-from colmap_affrect.features.shapes import affnet
-from colmap_affrect.features.shapes.affnet import AffNet, AffNetOptions
-from colmap_affrect.features.shapes.second_moment import SecondMoment, SecondMomentOptions
 from colmap_affrect.geometry.shapes import log_metrics, metrics_from_log
 from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 from colmap_affrect.images.reading import shrink_to
-
-SHARED = Path(__file__).resolve().parents[4] / "shared"
 
 SINGLE = 2e-4
 """Metrics of tilts up to about 20 through a network in single precision, with the folded batch
@@ -135,12 +131,6 @@ def reflected(values: Array) -> Array:
     return np.pad(values, ((14, 14 + -height % 4), (14, 14 + -width % 4)), mode="reflect")
 
 
-def log_tilts(metrics1: Array, metrics2: Array) -> Array:
-    """Log transition tilts between (..., 3) unit metrics."""
-    (a11, a22, a12), (b11, b22, b12) = np.moveaxis(metrics1, -1, 0), np.moveaxis(metrics2, -1, 0)
-    return np.arccosh(np.maximum((a11 * b22 + a22 * b11 - 2 * a12 * b12) / 2, 1.0))
-
-
 @pytest.fixture(scope="module")
 def image() -> GrayImage:
     """An image whose brightness and contrast vary, of odd size."""
@@ -216,18 +206,6 @@ def test_strips_equal_the_whole(
     assert_allclose(affnet_source.grid(image).metrics, whole.metrics, atol=SINGLE, rtol=SINGLE)
 
 
-def test_grid_of_several_sizes_is_the_log_euclidean_mean(image: GrayImage) -> None:
-    network = random_network()
-    singles = [
-        log_metrics(source(network, scales=(scale,), min_deviation=0.0).grid(image).metrics)
-        for scale in (1.0, 0.5)
-    ]
-    both = source(network, scales=(1.0, 0.5), min_deviation=0.0).grid(image)
-    expected = metrics_from_log(np.mean(singles, axis=0))
-    assert_allclose(both.metrics, expected, atol=SINGLE, rtol=SINGLE)
-    assert log_tilts(metrics_from_log(singles[0]), metrics_from_log(singles[1])).mean() > 0.05
-
-
 def test_shapes_of_a_smaller_size_are_interpolated_between_the_centers_of_its_blocks(
     image: GrayImage,
 ) -> None:
@@ -246,16 +224,6 @@ def test_shapes_of_a_smaller_size_are_interpolated_between_the_centers_of_its_bl
             logs,
         )
     assert_allclose(full.metrics, metrics_from_log(logs), atol=SINGLE, rtol=SINGLE)
-
-
-def test_sizes_smaller_than_a_patch_are_left_out(image: GrayImage) -> None:
-    network = random_network()
-    expected = source(network, scales=(1.0, 0.5), min_deviation=0.0).grid(image)
-    # A quarter of 117 x 83 px is 29 x 21 px.
-    actual = source(network, scales=(1.0, 0.5, 0.25), min_deviation=0.0).grid(image)
-    assert_array_equal(actual.metrics, expected.metrics)
-    largest = source(network, scales=(0.25,), min_deviation=0.0).grid(image)
-    assert np.isfinite(largest.metrics).all()
 
 
 def test_textured_blocks_are_those_whose_surroundings_deviate() -> None:
@@ -292,84 +260,3 @@ def test_samples_are_the_network_on_patches_of_12_sigma(image: GrayImage) -> Non
     assert_array_equal(samples.points, keypoints.keypoints)
     # The patches are sampled at pixels, up to rounding.
     assert_allclose(samples.metrics, expected, atol=1e-3, rtol=1e-3)
-
-
-def test_samples_are_those_of_the_strongest_keypoints(
-    image: GrayImage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rng = np.random.default_rng(4)
-    keypoints = circles([tuple(point) for point in rng.uniform(20, 60, (7, 2))], [1.7] * 7)
-    shuffled = keypoints.select(rng.permutation(7))
-    network = random_network()
-    monkeypatch.setattr(affnet, "BATCH_SIZE", 2)
-    every = source(network, lambda _: keypoints).samples(image)
-    few = source(network, lambda _: shuffled, max_num_keypoints=4).samples(image)
-    assert len(every.points) == 7
-    assert_array_equal(few.points, every.points[:4])
-    assert_allclose(few.metrics, every.metrics[:4], atol=SINGLE, rtol=SINGLE)
-
-
-def test_samples_leave_out_singular_shapes(image: GrayImage) -> None:
-    network = random_network()
-    # Only a patch with contrast reaches the last layer with anything but its bias.
-    network.features[-3].bias.data[:] = -30.0
-    for keypoints in (circles([(50.0, 40.0), (30.0, 30.0)], [2.0, 3.0]), circles([], [])):
-        samples = source(network, lambda _, found=keypoints: found).samples(image)
-        assert samples.points.shape == (0, 2)
-        assert samples.metrics.shape == (0, 3)
-
-
-needs_shared = pytest.mark.skipif(
-    not (SHARED / "weights" / "AffNet.pth").is_file(),
-    reason="the weights and photographs of ../shared are not here",
-)
-
-
-@pytest.fixture(scope="module")
-def published() -> LAFAffNetShapeEstimator:
-    """AffNet with its published weights."""
-    network = LAFAffNetShapeEstimator(pretrained=False, preserve_orientation=False)
-    path = SHARED / "weights" / "AffNet.pth"
-    network.load_state_dict(torch.load(path, "cpu", weights_only=True)["state_dict"])
-    return network.eval()
-
-
-def graffiti(number: int) -> GrayImage:
-    path = SHARED / "pairs" / "oxford_graf" / f"graf_{number}.png"
-    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
-
-
-def residual_tilts(grid1: ShapeGrid, grid2: ShapeGrid, homography: Array) -> Array:
-    """Transition tilts between the shapes of image 1 and those of image 2 brought back to it."""
-    rows, columns = np.indices(grid1.textured.shape)
-    points = np.stack([columns.ravel(), rows.ravel()], 1) * grid1.step_px + grid1.origin_px
-    mapped = points @ homography[:, :2].T + homography[:, 2]
-    target = mapped[:, :2] / mapped[:, 2:]
-    cells = np.rint((target - grid2.origin_px) / grid2.step_px).astype(int)[:, ::-1]
-    seen = ((cells >= 0) & (cells < grid2.textured.shape)).all(axis=1) & grid1.textured.ravel()
-    cells, target, third = cells[seen], target[seen], mapped[seen, 2, None, None]
-    jacobians = (homography[None, :2, :2] - target[:, :, None] * homography[None, 2:, :2]) / third
-    s11, s22, s12 = grid2.metrics[cells[:, 0], cells[:, 1]].T
-    metrics = np.stack([np.stack([s11, s12], -1), np.stack([s12, s22], -1)], -2)
-    # With S = M^T M of the map M that rectifies image 2, M J rectifies image 1.
-    brought = unit_metrics(np.swapaxes(np.linalg.cholesky(metrics), 1, 2) @ jacobians)
-    return np.exp(log_tilts(grid1.metrics.reshape(-1, 3)[seen], brought))
-
-
-@pytest.mark.shared
-@needs_shared
-def test_dense_shapes_agree_with_the_homography_between_two_photographs(
-    published: LAFAffNetShapeEstimator,
-) -> None:
-    images = graffiti(1), graffiti(4)
-    homography = np.loadtxt(SHARED / "pairs" / "oxford_graf" / "H_graf_1_4.txt")
-    shares = {}
-    for name, shapes in {
-        "default": source(published),
-        "paper": source(published, paper=True),
-        "second-moment": SecondMoment(SecondMomentOptions()),
-    }.items():
-        residuals = residual_tilts(shapes.grid(images[0]), shapes.grid(images[1]), homography)
-        shares[name] = np.mean(residuals < 1.7)
-    assert shares["default"] > 0.75
-    assert shares["default"] > shares["paper"] > shares["second-moment"]

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.poses import (
-    Poses,
+from colmap_affrect.colmap.poses import Poses, read_poses
+from colmap_affrect.comparison.pose_scores import (
     correct_images,
     disagreeing_images,
     pair_errors,
     pose_scores,
     position_errors,
-    read_poses,
 )
 from colmap_affrect.errors import ComparisonError
 

@@ -1,1 +1,0 @@
-"""Affine shapes of an image."""
