@@ -207,6 +207,7 @@ def test_pipeline_options_leave_given_intrinsics_alone_if_asked_to(
 NATIVE = {
     "sparse": pycolmap.IncrementalPipelineOptions,
     "incremental": pycolmap.IncrementalPipelineOptions,
+    "estimate": pycolmap.IncrementalPipelineOptions,
     "global": pycolmap.GlobalPipelineOptions,
 }
 

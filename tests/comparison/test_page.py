@@ -1,9 +1,12 @@
+"""The page of a comparison, number by number, and its recording for a viewer."""
+
 from __future__ import annotations
 
 import base64
 import json
 import re
 import struct
+import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,13 +18,14 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.comparison.method_table import columns_of
-from colmap_affrect.comparison.page import cards_of, choose_pairs, plot_pairs, write_page
+from colmap_affrect.comparison.page import choose_pairs, plot_pairs, write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.verdict import verdict
+from colmap_affrect.comparison.viewer import log_comparison
+from colmap_affrect.errors import ComparisonError
 from colmap_affrect.report.match_plots import PLOT_HEIGHT
 from colmap_affrect.report.pictures import Picture
-from colmap_affrect.report.view_graph import GRAPH_SIZE, differing_edge_paths, lay_out
+from colmap_affrect.report.view_graph import differing_edge_paths, lay_out
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 
@@ -161,42 +165,6 @@ def test_marks_say_what_each_method_does_with_a_photograph(page: Page) -> None:
     assert {group: groups.count(group) for group in set(groups)} == expected
 
 
-def test_of_methods_that_contradict_each_other_the_odd_one_is_marked(
-    comparison: Comparison,
-) -> None:
-    name, (sift, _, default) = NAMES[0], comparison.methods
-    odd = replace(default, name="odd", disagreements={"sift": (name,), "default": (name,)})
-    others = [replace(each, disagreements={"odd": (name,)}) for each in (sift, default)]
-
-    assert uncertain(comparison, odd, *others) == []  # ground truth calls all of them right
-    odd, *others = map(without_truth, (odd, *others))
-    assert uncertain(comparison, odd, *others) == [(name, "odd")]
-    two = replace(odd, disagreements={"sift": (name,)}), others[0]
-    assert sorted(uncertain(comparison, *two)) == [(name, "odd"), (name, "sift")]
-
-
-def test_photographs_that_their_method_doubts_are_marked(comparison: Comparison) -> None:
-    method = without_truth(comparison.methods[2])
-    loose = [replace(seed, doubtful={NAMES[1]: "any focal length fits"}) for seed in method.seeds]
-    assert uncertain(comparison, replace(method, seeds=tuple(loose))) == [(NAMES[1], "default")]
-    flat = [replace(seed, doubts=("no parallax",)) for seed in method.seeds]
-    names = [name for name, _ in uncertain(comparison, replace(method, seeds=tuple(flat)))]
-    assert names == [name for name in NAMES if name in method.usually_registered]
-    assert len(names) > 1
-
-
-def without_truth(method: MethodResult) -> MethodResult:
-    """The same, measured against nothing."""
-    return replace(method, seeds=tuple(replace(seed, scores=None) for seed in method.seeds))
-
-
-def uncertain(comparison: Comparison, *methods: MethodResult) -> list[tuple[str, str]]:
-    """Photographs and methods that the contact sheet marks so."""
-    compared = replace(comparison, methods=methods)
-    cards = cards_of(columns_of(compared), compared)
-    return [(c.name, mark.column.name) for c in cards for mark in c.marks if mark.is_uncertain]
-
-
 def test_names_of_images_are_never_markup(page: Page) -> None:
     assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
     assert "x" not in page.values("img", "src")
@@ -248,15 +216,6 @@ def test_matrices_of_the_script_have_the_inliers(page: Page, comparison: Compari
         np.testing.assert_array_equal(counts, expected)
 
 
-def test_more_photographs_than_fit_into_a_matrix_have_the_table_only(
-    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("colmap_affrect.report.view_graph.MAX_NUM_IN_MATRIX", len(NAMES) - 1)
-    html = write_page(comparison, tmp_path).read_text(encoding="utf-8")
-    assert "data-matrix=" not in html
-    assert "Table of verified pairs" in html
-
-
 def test_models_are_drawn_in_one_frame(page: Page) -> None:
     default, sift = page.data["views"]
     assert [len(view["cameras"]) for view in (sift, default)] == [4, 5]
@@ -295,24 +254,6 @@ def test_matches_lie_where_the_features_are(comparison: Comparison, folder: Path
     assert after.num_from_warps == len(expected_warped) > 0 < len(expected_plain)
 
 
-def test_warps_of_the_method_that_rectifies_are_shown(page: Page) -> None:
-    alts = page.values("img", "alt")
-    assert sum(alt.startswith("Warp of tilt") for alt in alts) >= 3
-    assert sum(alt.endswith("with its regions in colour") for alt in alts) == 3
-
-
-def test_layout_keeps_thumbnails_apart_and_inside() -> None:
-    names = [f"{number}.jpg" for number in range(12)]
-    pairs = {(names[i], names[i + 1]): 100 for i in range(8)}  # the last three are alone
-    layout = lay_out(names, [pairs])
-    half = layout.node_size / 2
-    assert layout.centers.min() >= half - 1e-6
-    assert (layout.centers <= np.array(GRAPH_SIZE) - half + 1e-6).all()
-    rows, columns = np.triu_indices(12, 1)
-    gaps = np.abs(layout.centers[rows] - layout.centers[columns]).max(axis=1)
-    assert gaps.min() > 0.9 * layout.node_size
-
-
 def test_what_is_missing_is_said_in_its_place(tmp_path: Path) -> None:
     (tmp_path / "photographs").mkdir()
     write_image(tmp_path / "photographs" / "a.png", texture((64, 48), 0))
@@ -335,19 +276,6 @@ def test_what_is_missing_is_said_in_its_place(tmp_path: Path) -> None:
     assert "No method finished" in page.text
 
 
-def test_bars_of_wrong_poses_are_explained_where_there_are_any(
-    page: Page, comparison: Comparison, tmp_path: Path
-) -> None:
-    explanation = "The orange rest of a bar"
-    assert explanation not in page.text
-    sift = comparison.finished[0]
-    seeds = [
-        replace(s, scores=s.scores and replace(s.scores, correct_names=())) for s in sift.seeds
-    ]
-    wrong = replace(comparison, methods=(replace(sift, seeds=tuple(seeds)),))
-    assert explanation in write_page(wrong, tmp_path).read_text(encoding="utf-8")
-
-
 def test_lost_models_and_databases_are_said_in_their_place(
     comparison: Comparison, tmp_path: Path
 ) -> None:
@@ -357,9 +285,18 @@ def test_lost_models_and_databases_are_said_in_their_place(
     assert page.number("registered", "sift") == 4
 
 
-@pytest.mark.long
-def test_page_of_200_photographs_is_below_15_mb(large_page_path: Path) -> None:
-    page = Page(large_page_path.read_text(encoding="utf-8"))
-    assert 2_000_000 < large_page_path.stat().st_size < 15_000_000
-    assert len(page.values("img", "src")) == 200
-    assert page.data["views"][4]["count"] > 5000
+def test_recording_has_cameras_and_points_of_all_methods(tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    path = log_comparison(make_comparison(tmp_path), tmp_path)
+    content = path.read_bytes()
+    for entity in (b"/sift/points", b"/default/points", b"/default/cameras/e.png"):
+        assert entity in content.replace(b"\\", b"")
+    assert b"/sift/cameras/e.png" not in content.replace(b"\\", b"")
+
+
+def test_without_rerun_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(ComparisonError, match=r"colmap-affrect\[viewer\]"):
+        log_comparison(make_comparison(tmp_path), tmp_path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -93,23 +92,3 @@ def test_page_fits_and_is_readable(browser: Browser, scheme: str, width: int) ->
     assert_fits_and_is_readable(browser, scheme, width)
     ground = browser.run("return getComputedStyle(document.body).backgroundColor")
     assert (ground == "rgb(255, 255, 255)") == (scheme == "light")
-
-
-def test_models_are_printed(browser: Browser) -> None:
-    browser.command("Emulation.setEmulatedMedia", media="print")
-    shown = "return document.querySelector(arguments[0]).getClientRects().length"
-    try:
-        assert browser.run(shown, "canvas") == 1
-        assert browser.run(shown, "nav") == 0
-    finally:
-        browser.command("Emulation.setEmulatedMedia", media="")
-
-
-def test_page_of_200_photographs_opens_in_3_seconds(
-    running: Browser, large_page_path: Path
-) -> None:
-    start = time.monotonic()
-    running.open(large_page_path)
-    until_drawn(running)
-    assert time.monotonic() - start < 3.0
-    assert running.log() == []
