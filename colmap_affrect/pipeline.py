@@ -1,11 +1,9 @@
 """From a folder of photographs to a COLMAP model: the stages one after the other."""
 
 import json
-import platform
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
@@ -36,6 +34,7 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
+from colmap_affrect.project.versions import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.report.run_page import write_run_page
@@ -70,11 +69,6 @@ from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed
 from colmap_affrect.stages.verify import recorded_verification, verify_matches
 
 FocalVote = Literal["auto", "always", "never"]
-
-REPORTED_PACKAGES = (
-    "colmap-affrect", "pycolmap", "pyceres", "opencv-python-headless", "numpy", "h5py", "torch",
-    "kornia",
-)  # fmt: skip
 
 
 def holds_vote(focal_vote: FocalVote, mapping: MapperOptions, *, is_others: bool) -> bool:
@@ -396,14 +390,3 @@ def _are_better(context: Context, models: Sequence[ModelSummary], aside: Path) -
         tell_more = bool(loose_names(old)) and not loose_names(models[0])
     least = (MIN_SHARE_OF_RIVAL if tell_more else 1.0) * agreement(context, aside)
     return agreement(context, context.workspace.sparse) > least
-
-
-def installed_versions() -> dict[str, str]:
-    """Return the versions of what a result depends on."""
-    versions = {"python": platform.python_version()}
-    for package in REPORTED_PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            versions[package] = "not installed as a package"
-    return versions

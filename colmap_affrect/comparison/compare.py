@@ -9,7 +9,7 @@ import json
 import pickle
 import signal
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,7 +18,7 @@ from typing import Any, Self
 
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.database_copy import copy_without_features
-from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images, record_cameras
+from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.colmap.poses import Poses, read_poses
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
@@ -35,12 +35,13 @@ from colmap_affrect.options import Options
 from colmap_affrect.pairs.base import Pair, PairOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.parallel.subprocesses import child
-from colmap_affrect.pipeline import InputOptions, installed_versions
+from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import Contents
 from colmap_affrect.project.differences import first_difference
 from colmap_affrect.project.outputs import new_results, remove_own
+from colmap_affrect.project.versions import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 
@@ -85,17 +86,17 @@ def compare(
     Workspace(output_path).require_own(image_path)
     plan = _Plan.checked(image_path, Layout(output_path), options)
     tasks = plan.tasks()
-    todo = [item.method.recipe for item in tasks if overwrite or not _finished(item)]
+    todo = [item.method.recipe for item in tasks if overwrite or not item.finished()]
     keys = {key for recipe in todo if recipe for key in recipe.weights}
     resolve(sorted(keys), options.resources.weights_path, progress=progress)
     with Workspace(output_path).locked():
         unreadable = _share(plan, overwrite=overwrite)
         for task in tasks:
-            _begin(task, overwrite=overwrite)
+            task.begin(overwrite=overwrite)
         results = []
         for number, task in enumerate(tasks, 1):
             title = f"method {number} of {len(tasks)}, {task.method.label}"
-            result = _finished(task) or _run(task, progress, title)
+            result = task.finished() or _run(task, progress, title)
             results.append(replace(result, failures={**unreadable, **result.failures}))
         comparison = Comparison(
             image_names=tuple(plan.names),
@@ -113,10 +114,7 @@ def compare(
 
 @dataclass(frozen=True)
 class _Plan:
-    """A comparison whose options have been checked.
-
-    ``not_compared`` says which learned methods lack their weights, and how these are had.
-    """
+    """A comparison whose options have been checked."""
 
     image_path: Path
     layout: Layout
@@ -125,7 +123,7 @@ class _Plan:
     names: list[str]
     pairs: list[Pair]
     truth: Poses | None
-    not_compared: str = ""
+    not_compared: str  # learned methods without their weights, and how these are had
 
     @classmethod
     def checked(cls, image_path: Path, layout: Layout, options: CompareOptions) -> Self:
@@ -160,10 +158,17 @@ class _Plan:
         absent = f"{', '.join(lacking)}: {hint}" if lacking else ""
         return cls(image_path, layout, options, methods, names, pairs, truth, absent)
 
+    @cached_property
     def inputs(self) -> dict[str, Any]:
-        options = self.options
+        """What all methods begin with, for the record; digests stand for the files."""
+        options, contents = self.options, Contents(Workspace(self.layout.path).contents)
+        given = options.inputs(self.image_path)
+        files = {name: given.photographs.files(name) for name in self.names}
+        files[""] = given.camera_files
+        digests = {name: contents.digest(paths)[:NUM_DIGITS] for name, paths in files.items()}
+        contents.save()
         return {
-            "photographs": self._contents(),
+            "photographs": digests,
             "images": _fingerprint(self.names),
             "pairs": _fingerprint([f"{first}\n{second}" for first, second in self.pairs]),
             "camera": {**options.cameras.to_mapping(), "focal_vote": options.holds_vote},
@@ -172,39 +177,31 @@ class _Plan:
             "mapping": _without_seed(options.mapping),
         }
 
-    def _contents(self) -> dict[str, str]:
-        """Return what the files of each image hold, and those that cameras are taken from."""
-        inputs = self.options.inputs(self.image_path)
-        files = {name: inputs.photographs.files(name) for name in self.names}
-        files[""] = inputs.camera_files
-        return {name: self.contents.digest(paths)[:NUM_DIGITS] for name, paths in files.items()}
-
-    @cached_property
-    def contents(self) -> Contents:
-        return Contents(Workspace(self.layout.path).contents)
-
     def settings(self) -> dict[str, Any]:
-        inputs = self.inputs()
+        """Return the settings of all methods, for people."""
         keys = ("image_list_path", "from_database", "ground_truth_path")
         paths: dict[str, Path | None] = {key: getattr(self.options, key) for key in keys}
         return {
-            "camera": inputs["camera"],
+            "camera": self.inputs["camera"],
             "masks": self.options.masks.to_mapping(),
             **{key: str(path.resolve()) if path else "" for key, path in paths.items()},
             "match_list_path": self.options.pairs.match_list_path,
             "not_compared": self.not_compared,
             "preset": self.options.mapping.preset_name,
-            "verification": inputs["verification"],
-            "mapping": inputs["mapping"],
+            "verification": self.inputs["verification"],
+            "mapping": self.inputs["mapping"],
         }
 
     def tasks(self) -> list[MethodTask]:
+        """Return what is to be done for each method."""
         options = self.options
-        ours = options.verification, options.mapping, options.holds_vote
         mapper = MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset("colmap")
         colmaps = VerificationOptions.preset("colmap"), mapper, False
-        return [
-            MethodTask(
+        ours = options.verification, options.mapping, options.holds_vote
+        tasks = []
+        for method in self.methods:
+            verification, mapping, focal_vote = colmaps if method.label == SIFT_COLMAP else ours
+            task = MethodTask(
                 method=method,
                 output_path=self.layout.path.resolve(),
                 image_path=self.image_path.resolve(),
@@ -216,11 +213,8 @@ class _Plan:
                 seeds=tuple(options.seeds),
                 resources=options.resources,
             )
-            for method in self.methods
-            for verification, mapping, focal_vote in (
-                colmaps if method.label == SIFT_COLMAP else ours,
-            )
-        ]
+            tasks.append(task)
+        return tasks
 
 
 def _without_seed(options: Options) -> dict[str, Any]:
@@ -252,10 +246,10 @@ def _share(plan: _Plan, *, overwrite: bool) -> dict[str, str]:
     Returns the images that COLMAP does not take, with the reason. Raises StaleStoreError when the
     lists were made for something else.
     """
-    layout, inputs = plan.layout, plan.inputs()
+    layout = plan.layout
     if layout.inputs.exists():
         known = json.loads(layout.inputs.read_text(encoding="utf-8"))
-        if difference := first_difference(known, inputs):
+        if difference := first_difference(known, plan.inputs):
             if not overwrite:
                 raise StaleStoreError(
                     f"{layout.path}: methods were compared there with {difference}; use "
@@ -268,24 +262,22 @@ def _share(plan: _Plan, *, overwrite: bool) -> dict[str, str]:
             "left as it is, use another --output-path"
         )
     if not layout.shared.exists():
-        _make_shared(plan, inputs)
-    plan.contents.save()
+        _make_shared(plan)
     reason = f"COLMAP cannot read it, or does not take it (camera mode {plan.options.cameras.mode})"
     return dict.fromkeys(sorted(set(plan.names) - set(layout.image_names())), reason)
 
 
-def _make_shared(plan: _Plan, inputs: Mapping[str, Any]) -> None:
+def _make_shared(plan: _Plan) -> None:
     """Make the shared folder, which appears as a whole."""
     with new_results(plan.layout.shared) as (folder,):
-        new = Layout(folder.parent)
+        new, options = Layout(folder.parent), plan.options
         folder.mkdir()
-        if plan.options.from_database:
-            copy_without_features(plan.options.from_database, new.database)
+        if options.from_database:
+            copy_without_features(options.from_database, new.database)
         else:
-            cameras = plan.options.cameras
-            import_images(new.database, plan.image_path, plan.names, cameras)
-            initial = InitialCameras(plan.image_path, cameras)
-            record_cameras(new.database, new.cameras, initial)
+            import_images(new.database, plan.image_path, plan.names, options.cameras)
+            cameras = options.inputs(plan.image_path).initial_cameras
+            record_cameras(new.database, new.cameras, cameras)
         taken = image_ids(new.database)
         names = [name for name in plan.names if name in taken]
         pairs = [pair for pair in plan.pairs if set(pair) <= taken.keys()]
@@ -296,34 +288,7 @@ def _make_shared(plan: _Plan, inputs: Mapping[str, Any]) -> None:
             )
         replace_text(new.images, "".join(f"{name}\n" for name in names))
         write_pairs(new.pairs, pairs)
-        replace_text(new.inputs, json.dumps(inputs, indent=1))
-
-
-def _begin(task: MethodTask, *, overwrite: bool) -> None:
-    """Refuse a folder in which a method of this name has finished with other options."""
-    if overwrite:
-        remove_own([task.folder])
-    if task.result.exists():
-        content = json.loads(task.result.read_text(encoding="utf-8"))
-        known, now = content["result"]["options"], json.loads(json.dumps(task.options))
-        if task.method.climbs:
-            known["seed"], now["seed"] = content["seeds"][0], task.seeds[0]
-        if difference := first_difference(known, now):
-            raise StaleStoreError(
-                f"{task.folder}: {task.method.label} was run there with {difference}; use "
-                "--overwrite to redo the methods that are named, another name (NAME=RECIPE), or "
-                "another --output-path"
-            )
-    Workspace(task.folder).begin()
-
-
-def _finished(task: MethodTask) -> MethodResult | None:
-    """Return the result of a method that has been run with the same seeds."""
-    if task.result.exists():
-        content = json.loads(task.result.read_text(encoding="utf-8"))
-        if content["seeds"] == list(task.seeds):
-            return MethodResult.from_mapping(task.method.label, content["result"])
-    return None
+        replace_text(new.inputs, json.dumps(plan.inputs, indent=1))
 
 
 def _run(task: MethodTask, progress: Progress, title: str) -> MethodResult:
@@ -338,54 +303,52 @@ def _run(task: MethodTask, progress: Progress, title: str) -> MethodResult:
         for line in process.stdout or ():
             event = json.loads(line)
             if "stage" in event:
+                stage.close()
                 name, total = f"{title}: {event['stage']}", event["total"]
                 advance = stage.enter_context(progress.stage(name, total, event["unit"]))
             elif "advance" in event:
                 advance(event["advance"])
-            elif "end" in event:
-                stage.close()
             else:
                 failed = event["failed"]
-    if process.returncode and not failed:
-        failed = f"its process ended {_ending(process.returncode)}; {log_path} may say why"
-    result = None if failed else _finished(task)
+    if code := process.returncode:
+        ending = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+        memory = " (perhaps for want of memory)" if code == -signal.SIGKILL else ""
+        failed = failed or f"its process ended {ending}{memory}; {log_path} may say why"
+    result = None if failed else task.finished()
     return result or MethodResult(
         task.method.label, summary=task.method.summary, folder=task.shown_folder, failed=failed
     )
 
 
-def _ending(code: int) -> str:
-    """Say how a process ended by its exit code."""
-    if code == -signal.SIGKILL:
-        return "by SIGKILL (perhaps for want of memory)"
-    return f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-
-
 def _measured(results: Sequence[MethodResult], plan: _Plan) -> tuple[MethodResult, ...]:
     """Add what needs the models: scores against ground truth, and where models contradict."""
-    folder, truth = plan.layout.path, plan.truth
 
     def poses_of(seed: SeedResult) -> Poses:
-        return read_poses(folder / seed.model_path) if seed.model_path else {}
+        return read_poses(plan.layout.path / seed.model_path) if seed.model_path else {}
+
+    def scored(seed: SeedResult, poses: Poses) -> SeedResult:
+        truth = plan.truth
+        return (
+            seed if truth is None else replace(seed, scores=pose_scores(poses, truth, plan.names))
+        )
 
     all_poses = {result.name: [poses_of(seed) for seed in result.seeds] for result in results}
     measured = []
     for result in results:
-        seeds, (first, *later) = result.seeds, all_poses[result.name] or [{}]
-        if truth is not None:
-            found = zip(seeds, all_poses[result.name], strict=True)
-            seeds = tuple(replace(s, scores=pose_scores(p, truth, plan.names)) for s, p in found)
-        unstable = {image for poses in later for image in disagreeing_images(first, poses)}
+        poses = all_poses[result.name]
+        first, *later = poses or [{}]
         others = {
-            name: disagreeing_images(first, poses[0])
-            for name, poses in all_poses.items()
-            if poses and name != result.name
+            name: disagreeing_images(first, other[0])
+            for name, other in all_poses.items()
+            if other and name != result.name
         }
         measured.append(
             replace(
                 result,
-                seeds=seeds,
-                unstable_names=tuple(sorted(unstable)),
+                seeds=tuple(map(scored, result.seeds, poses)),
+                unstable_names=tuple(
+                    sorted({image for other in later for image in disagreeing_images(first, other)})
+                ),
                 disagreements={other: images for other, images in others.items() if images},
             )
         )

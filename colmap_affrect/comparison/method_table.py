@@ -63,19 +63,83 @@ class Row:
 
 
 Better = Callable[[Iterable[float]], float] | None  # which of the means is best, if any
+Figure = tuple[str, str, int, Better, Callable[[MethodResult], Span | None]]
+"""Key and title of a line, decimals, what is best, and the value of a method."""
 
 
 def summary_rows(columns: Sequence[Column], comparison: Comparison) -> list[Row]:
     """Return the table of methods, without the lines that say nothing of any of them."""
     methods = [column.method for column in columns]
-    rows = [*_model_rows(methods, comparison), *_score_rows(methods), *_cost_rows(methods)]
+    rows = [_row(figure, methods) for figure in _figures(comparison, methods)]
+    splits = [_splits(method) for method in methods]
+    rows.insert(2, Row("models", "Images in each model", splits, (False,) * len(splits)))
     return [row for row in rows if any(cell != NOTHING for cell in row.cells)]
 
 
-def _row(
-    key: str, title: str, spans: Sequence[Span | None], digits: int = 1, better: Better = None
-) -> Row:
+def _figures(comparison: Comparison, methods: Sequence[MethodResult]) -> list[Figure]:
+    given = len(comparison.image_names)
+
+    def measured(key: str, title: str, digits: int = 1, better: Better = None) -> Figure:
+        return key, title, digits, better, lambda method: method.span(key)
+
+    def scored(
+        key: str, title: str, digits: int, better: Better, value: Callable[[PoseScores], Any]
+    ) -> Figure:
+        def span(method: MethodResult) -> Span | None:
+            values = [value(seed.scores) for seed in method.seeds if seed.scores is not None]
+            return _span(number for number in values if number is not None)
+
+        return key, title, digits, better, span
+
+    def area(limit: float) -> Figure:
+        title = f"AUC of relative poses at {limit:g}°"
+        return scored(f"auc_{limit:g}", title, 3, max, lambda scores: scores.auc[limit])
+
+    def median(key: str, title: str, digits: int) -> Figure:
+        return scored(key, f"Median {title}", digits, min, lambda scores: getattr(scores, key))
+
+    def seconds(stage: str) -> Figure:
+        def span(method: MethodResult) -> Span | None:
+            return _span(s for name, s in method.stage_seconds.items() if name == stage)
+
+        return f"{stage}_s", f"Seconds to {stage}", 1, min, span
+
+    def keypoints(method: MethodResult) -> Span | None:
+        return _span([fmean(method.num_keypoints.values())] if method.num_keypoints else [])
+
+    def memory_mb(method: MethodResult) -> Span:
+        return Span.of([method.peak_memory_bytes / BYTES_PER_MB])
+
+    stages = {stage for method in methods for stage in method.stage_seconds}
+    return [
+        measured("registered", f"Registered, of {given}", better=max),
+        ("correct", f"Registered correctly, of {given}", 1, max, lambda method: method.correct),
+        measured("verified_pairs", f"Verified pairs, of {comparison.num_pairs:,}"),
+        measured("points3D", "3D points", 0, max),
+        measured("mean_track_length", "Images per 3D point", 2),
+        ("num_keypoints", "Keypoints per image", 0, None, keypoints),
+        measured("inliers", "Inliers in all pairs", 0),
+        measured("mean_observations", "3D points seen by an image", 0),
+        measured("mean_reprojection_error_px", "Reprojection error, px", 2),
+        *map(area, AUC_THRESHOLDS_DEG),
+        median("median_rotation_error_deg", "rotation error, °", 2),
+        median("median_direction_error_deg", "error of translation direction, °", 2),
+        median("median_position_error", "position error, units of the ground truth", 4),
+        *map(seconds, sorted(stages, key=STAGES.index)),
+        ("total_s", "Seconds in all", 1, min, lambda method: Span.of([method.total_s])),
+        ("peak_memory_bytes", "Peak memory, MB", 0, min, memory_mb),
+    ]
+
+
+def _span(values: Iterable[float]) -> Span | None:
+    known = list(values)
+    return Span.of(known) if known else None
+
+
+def _row(figure: Figure, methods: Sequence[MethodResult]) -> Row:
     """Write means and, in brackets, ranges with as many decimals in all cells as any needs."""
+    key, title, digits, better, value = figure
+    spans = [value(method) for method in methods]
     known = [span for span in spans if span]
     means = {round(span.mean, digits) for span in known}
     best = better(means) if better and len(means) > 1 else None
@@ -91,81 +155,11 @@ def digits_of(values: Iterable[float], digits: int) -> int:
     return 0 if all(value == round(value) for value in values) else digits
 
 
-def _model_rows(methods: Sequence[MethodResult], comparison: Comparison) -> list[Row]:
-    given = len(comparison.image_names)
-
-    def measured(key: str, title: str, digits: int = 1, better: Better = None) -> Row:
-        return _row(key, title, [method.span(key) for method in methods], digits, better)
-
-    keypoints = [method.num_keypoints.values() for method in methods]
-    means = [Span.of([fmean(counts)]) if counts else None for counts in keypoints]
-    correct = [method.correct for method in methods]
-    splits = [_splits(method) for method in methods]
-    return [
-        measured("registered", f"Registered, of {given}", better=max),
-        _row("correct", f"Registered correctly, of {given}", correct, better=max),
-        Row("models", "Images in each model", splits, (False,) * len(splits)),
-        measured("verified_pairs", f"Verified pairs, of {comparison.num_pairs:,}"),
-        measured("points3D", "3D points", 0, max),
-        measured("mean_track_length", "Images per 3D point", 2),
-        _row("num_keypoints", "Keypoints per image", means, 0),
-        measured("inliers", "Inliers in all pairs", 0),
-        measured("mean_observations", "3D points seen by an image", 0),
-        measured("mean_reprojection_error_px", "Reprojection error, px", 2),
-    ]
-
-
-def _score_rows(methods: Sequence[MethodResult]) -> list[Row]:
-    def scored(
-        key: str, title: str, digits: int, better: Better, value: Callable[[PoseScores], Any]
-    ) -> Row:
-        spans = []
-        for method in methods:
-            values = [value(seed.scores) for seed in method.seeds if seed.scores is not None]
-            known = [number for number in values if number is not None]
-            spans.append(Span.of(known) if known else None)
-        return _row(key, title, spans, digits, better)
-
-    def area(limit: float) -> Row:
-        title = f"AUC of relative poses at {limit:g}°"
-        return scored(f"auc_{limit:g}", title, 3, max, lambda scores: scores.auc[limit])
-
-    def median(key: str, title: str, digits: int) -> Row:
-        return scored(key, f"Median {title}", digits, min, lambda scores: getattr(scores, key))
-
-    return [
-        *map(area, AUC_THRESHOLDS_DEG),
-        median("median_rotation_error_deg", "rotation error, °", 2),
-        median("median_direction_error_deg", "error of translation direction, °", 2),
-        median("median_position_error", "position error, units of the ground truth", 4),
-    ]
-
-
-def _cost_rows(methods: Sequence[MethodResult]) -> list[Row]:
-    def costs(key: str, title: str, digits: int, values: Iterable[float | None]) -> Row:
-        spans = [Span.of([value]) if value is not None else None for value in values]
-        return _row(key, title, spans, digits, min)
-
-    seconds = [method.stage_seconds for method in methods]
-    stages = sorted({stage for known in seconds for stage in known}, key=STAGES.index)
-    memory = [method.peak_memory_bytes / BYTES_PER_MB for method in methods]
-    return [
-        *(
-            costs(f"{s}_s", f"Seconds to {s}", 1, [known.get(s) for known in seconds])
-            for s in stages
-        ),
-        costs("total_s", "Seconds in all", 1, [method.total_s for method in methods]),
-        costs("peak_memory_bytes", "Peak memory, MB", 0, memory),
-    ]
-
-
 def span_text(span: Span | None, digits: int = 1, digits_of_ends: int = 0) -> str:
     """Write a mean, and the range where its ends differ as they are written.
 
     >>> span_text(Span.of([7, 8])), span_text(Span.of([8, 8])), span_text(None)
     ('7.5 (7-8)', '8.0', '-')
-    >>> span_text(Span.of([2.891, 2.893]), 2, 2)
-    '2.89'
     """
     if span is None:
         return NOTHING

@@ -59,7 +59,7 @@ def write_page(
         if method.folder and rectifies(Workspace(output_path / method.folder))
     ]
     chosen = choose_pairs(methods, rectifying)
-    of_pairs = list(dict.fromkeys(name for item in chosen for name in item.names))
+    of_pairs = list(dict.fromkeys(name for pair in chosen for name in pair))
     pair_pictures = photograph_pictures(folder, sorted(of_pairs), MATCH_PICTURE_PX)
     rows = pair_rows(methods)
     content = {
@@ -117,6 +117,10 @@ def _graphs_and_models(
     kinds = [{card.name: card.marks[number].kind for card in cards} for number in range(len(views))]
     used = {kind for of_view in kinds for kind in of_view.values()}
     first, later = graphs[:1], graphs[1:]
+    notes = [f"{len(graph)} verified pairs" for graph in graphs]
+    for number, graph in enumerate(later, 1):
+        sides = {"new": graph.keys() - graphs[0].keys(), "lost": graphs[0].keys() - graph.keys()}
+        notes[number] += "".join(f", {len(pairs)} {what}" for what, pairs in sides.items() if pairs)
     return {
         "cards": cards,
         "layout": layout,
@@ -124,9 +128,7 @@ def _graphs_and_models(
             *(view_graph.edge_paths(names, layout, graph) for graph in first),
             *(view_graph.differing_edge_paths(names, layout, graph, *first) for graph in later),
         ],
-        "edge_notes": [
-            f"{len(graph)} verified pairs{_difference(graph, graphs[0])}" for graph in graphs
-        ],
+        "edge_notes": notes,
         "views": views,
         "kinds": {kind: text for kind, text in KINDS.items() if kind in used},
         "script_data": {
@@ -136,11 +138,6 @@ def _graphs_and_models(
             ],
         },
     }
-
-
-def _difference(graph: Mapping[Pair, int], first: Mapping[Pair, int]) -> str:
-    counts = {"new": len(graph.keys() - first.keys()), "lost": len(first.keys() - graph.keys())}
-    return "".join(f", {count} {what}" for what, count in counts.items() if count)
 
 
 def _warps(
@@ -155,21 +152,18 @@ def _warps(
     It is the method with most registered images of those that rectify; its photographs are
     those of the pairs that are drawn.
     """
-    content: dict[str, Any] = {"warped_method": "", "warped": [], "warped_error": ""}
     methods = [method for method in comparison.finished if method.name in rectifying]
     if not methods:
-        return content
+        return {"warped_method": "", "warped": [], "warped_error": ""}
     best = max(methods, key=lambda method: method.registered.mean)
-    content["warped_method"] = best.name
     names = dict.fromkeys([*of_pairs, *comparison.image_names])
-    readable = [name for name in names if name in best.num_keypoints]
+    shown = [name for name in names if name in best.num_keypoints][:MAX_NUM_WARPED_PHOTOGRAPHS]
+    warped, why = [], ""
     try:
-        workspace = Workspace(output_path / best.folder)
-        shown = readable[:MAX_NUM_WARPED_PHOTOGRAPHS]
-        content["warped"] = warped_photographs(workspace, shown, resources)
+        warped = warped_photographs(Workspace(output_path / best.folder), shown, resources)
     except AffrectError as error:
-        content["warped_error"] = str(error)
-    return content
+        why = str(error)
+    return {"warped_method": best.name, "warped": warped, "warped_error": why}
 
 
 FILTERS = {
@@ -311,75 +305,57 @@ def pair_rows(methods: Sequence[MethodResult]) -> list[tuple[Pair, list[int]]]:
     return sorted(rows, key=lambda row: -contrast(row[1]))
 
 
-@dataclass(frozen=True)
-class ChosenPair:
-    """A pair to draw, and two methods: of fewer inliers, or without rectification, and of more."""
-
-    names: Pair
-    before: MethodResult
-    after: MethodResult
-
-    @property
-    def difference(self) -> float:
-        """How much the two methods differ."""
-        methods = (self.before, self.after)
-        return contrast([method.pair_inliers.get(self.names, 0) for method in methods])
-
-
-def choose_pairs(methods: Sequence[MethodResult], rectifying: Collection[str]) -> list[ChosenPair]:
+def choose_pairs(
+    methods: Sequence[MethodResult], rectifying: Collection[str]
+) -> dict[Pair, tuple[MethodResult, MethodResult]]:
     """Return the pairs with the largest differences, each image in at most two of them.
 
-    Where some methods warp photographs (``rectifying``) and others do not, the best of the one kind
-    is compared with the best of the other; else the best method with the worst.
+    Each has two methods: the best of those that warp photographs (``rectifying``) is the second,
+    and the best of the others the first; where there is one kind only, the best and the worst.
     """
     warped = [method for method in methods if method.name in rectifying]
     plain = [method for method in methods if method.name not in rectifying]
+    chosen = {}
+    for pair, counts in pair_rows(methods):
+        inliers = dict(zip([method.name for method in methods], counts, strict=True))
 
-    def chosen(pair: Pair) -> ChosenPair:
-        def key(method: MethodResult) -> int:
-            return method.pair_inliers.get(pair, 0)
+        def key(method: MethodResult, inliers: Mapping[str, int] = inliers) -> int:
+            return inliers[method.name]
 
         if warped and plain:
-            return ChosenPair(pair, max(plain, key=key), max(warped, key=key))
-        return ChosenPair(pair, min(methods, key=key), max(methods, key=key))
-
-    pairs = sorted({pair for method in methods for pair in method.pair_inliers})
+            both = max(plain, key=key), max(warped, key=key)
+        else:
+            both = min(methods, key=key), max(methods, key=key)
+        chosen[pair] = contrast(list(map(key, both))), both
     uses: Counter[str] = Counter()
-    found: list[ChosenPair] = []
-    for item in sorted(map(chosen, pairs), key=lambda item: -item.difference):
-        fits = all(uses[name] < MAX_PAIRS_OF_IMAGE for name in item.names)
-        if fits and item.difference > 0 and len(found) < MAX_NUM_PAIRS:
-            found.append(item)
-            uses.update(item.names)
+    found: dict[Pair, tuple[MethodResult, MethodResult]] = {}
+    for pair, (difference, both) in sorted(chosen.items(), key=lambda item: (-item[1][0], item[0])):
+        fits = all(uses[name] < MAX_PAIRS_OF_IMAGE for name in pair)
+        if fits and difference > 0 and len(found) < MAX_NUM_PAIRS:
+            found[pair] = both
+            uses.update(pair)
     return found
 
 
-@dataclass(frozen=True)
-class PairPlots:
-    """Two photographs side by side, and what the methods before and after found, by name."""
-
-    shown: SideBySide
-    plots: Mapping[str, MatchPlot]
-
-
 def plot_pairs(
-    chosen: Sequence[ChosenPair], pictures: Mapping[str, Picture], output_path: Path
-) -> list[PairPlots]:
-    """Draw the inliers of pairs whose photographs are among the pictures."""
-    drawable = [item for item in chosen if pictures.keys() >= set(item.names)]
-    sides = {item.names: SideBySide.of(item.names, pictures) for item in drawable}
-    names_of = {item.names: (item.before.name, item.after.name) for item in drawable}
-    methods = {method.name: method for item in drawable for method in (item.before, item.after)}
+    chosen: Mapping[Pair, tuple[MethodResult, MethodResult]],
+    pictures: Mapping[str, Picture],
+    output_path: Path,
+) -> list[dict[str, Any]]:
+    """Draw pairs whose photographs are among the pictures: ``shown``, ``plots`` by method."""
+    sides = {p: SideBySide.of(p, pictures) for p in chosen if pictures.keys() >= set(p)}
+    names = {pair: [method.name for method in chosen[pair]] for pair in sides}
+    methods = {method.name: method for pair in sides for method in chosen[pair]}
     drawn: dict[str, dict[Pair, MatchPlot]] = {}
     for name, method in methods.items():
         workspace = Workspace(output_path / method.folder)
         drawn[name] = plot_inliers(
-            [side for pair, side in sides.items() if name in names_of[pair]],
+            [side for pair, side in sides.items() if name in names[pair]],
             method.pair_inliers,
             workspace.path / f"seed-{method.seeds[0].seed}" / "database.db",
             workspace.features,
         )
     return [
-        PairPlots(side, {name: drawn[name][pair] for name in names_of[pair]})
+        {"shown": side, "plots": {name: drawn[name][pair] for name in names[pair]}}
         for pair, side in sides.items()
     ]

@@ -56,35 +56,24 @@ class Span:
 
 @dataclass(frozen=True)
 class SeedResult:
-    """Verification and mapping of one method with one seed.
-
-    Attributes:
-        model_names: image names of each model, largest model first; empty if there is none.
-        model_path: largest model, relative to the folder of the comparison; empty if none.
-        num_points3D: of the largest model, as the next three.
-        mean_track_length: images per point.
-        mean_observations: observed points per registered image.
-        num_observations: observed points of each image of the largest model.
-        pair_inliers: verified pairs and their numbers of inliers.
-        scores: against ground truth; None where there is none.
-        wall_s: seconds of ``verify`` and ``map``.
-        doubtful: images of the largest model that cannot be trusted, with the reason.
-        doubts: reasons to doubt the largest model as a whole.
-    """
+    """Verification and mapping of one method with one seed."""
 
     seed: int
+    # image names of each model, the largest model first
     model_names: Annotated[tuple[tuple[str, ...], ...], Field(alias="models")]
-    model_path: str
-    num_points3D: Annotated[int, Field(alias="points3D")]
-    mean_track_length: float
-    mean_observations: float
+    model_path: str  # the largest model, relative to the folder of the comparison; empty if none
+    num_points3D: Annotated[
+        int, Field(alias="points3D")
+    ]  # of the largest model, as all that follow
+    mean_track_length: float  # images per point
+    mean_observations: float  # observed points per registered image
     mean_reprojection_error_px: float
-    num_observations: Mapping[str, int]
-    pair_inliers: PairCounts
-    scores: Scores
-    wall_s: Mapping[str, float]
-    doubtful: Mapping[str, str] = field(default_factory=dict)
-    doubts: tuple[str, ...] = ()
+    num_observations: Mapping[str, int]  # observed points of each image
+    pair_inliers: PairCounts  # of the verified pairs, whatever the model
+    scores: Scores  # against ground truth; None where there is none
+    wall_s: Mapping[str, float]  # seconds of ``verify`` and ``map``
+    doubtful: Mapping[str, str] = field(default_factory=dict)  # images that cannot be trusted: why
+    doubts: tuple[str, ...] = ()  # reasons to doubt the model as a whole
 
     @property
     def registered_names(self) -> tuple[str, ...]:
@@ -107,11 +96,6 @@ class SeedResult:
         measures = {key: measure(self) for key, measure in MEASURES.items()}
         return {"seed": self.seed, **measures, **_plain(self)}
 
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build from :meth:`to_mapping`."""
-        return TypeAdapter(cls).validate_python(values)
-
 
 MEASURES: dict[str, Callable[[SeedResult], float]] = {
     "registered": lambda seed: len(seed.registered_names),
@@ -126,43 +110,30 @@ MEASURES: dict[str, Callable[[SeedResult], float]] = {
 }
 """Numbers of every seed, by their names in JSON."""
 
-MEASURES_OF_MODEL = {
-    "points3D", "mean_track_length", "mean_observations", "mean_reprojection_error_px",
-}  # fmt: skip
+OF_MODEL = {"points3D", "mean_track_length", "mean_observations", "mean_reprojection_error_px"}
 """Of these, what a seed without a model has none of."""
 
 
 @dataclass(frozen=True)
 class MethodResult:
-    """One method on all images.
+    """One method on all images."""
 
-    Attributes:
-        name: ``sift``, ``sift-affine-dsp`` or the name of a recipe.
-        failed: why it failed as a whole; empty if it did not.
-        wall_s: seconds of ``extract``, ``match`` and, for recipes that climb, ``escalate``.
-        unstable_names: images whose poses contradict each other from seed to seed.
-        disagreements: by the name of another method, the images that both register with the
-            first seed in poses that contradict each other.
-        num_keypoints: by image name; images that could not be read are missing.
-        raw_matches: number of matches before verification of each pair.
-        failures: images that could not be used, with the reason.
-        folder: its results, relative to the folder of the comparison.
-        seeds: one result per seed, in the order asked for; empty if the method failed.
-    """
-
-    name: str
+    name: str  # label of the method
     _: KW_ONLY
-    failed: str = ""
-    wall_s: Mapping[str, float] = field(default_factory=dict)
+    failed: str = ""  # why it failed as a whole; empty if it did not
+    wall_s: Mapping[str, float] = field(default_factory=dict)  # of stages before all seeds
     peak_memory_bytes: int = 0
+    # images whose poses contradict each other from seed to seed
     unstable_names: tuple[str, ...] = ()
+    # by another method, images that both register with the first seed in contradicting poses
     disagreements: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    num_keypoints: Mapping[str, int] = field(default_factory=dict)
-    raw_matches: PairCounts = field(default_factory=dict)
+    num_keypoints: Mapping[str, int] = field(default_factory=dict)  # of images that could be read
+    raw_matches: PairCounts = field(default_factory=dict)  # before verification
     summary: str = ""
-    failures: Mapping[str, str] = field(default_factory=dict)
+    failures: Mapping[str, str] = field(default_factory=dict)  # images that cannot be used: why
     options: Mapping[str, Any] = field(default_factory=dict)
-    folder: str = ""
+    folder: str = ""  # of its results, relative to the folder of the comparison
+    # in the order asked for; empty if the method failed
     seeds: tuple[Annotated[SeedResult, PlainSerializer(SeedResult.to_mapping)], ...] = ()
 
     @property
@@ -200,8 +171,8 @@ class MethodResult:
     def usually_doubted(self) -> dict[str, str]:
         """Images that cannot be trusted in more than half of the seeds, with a reason."""
         seeds = [seed.reasons_to_doubt for seed in self.seeds]
-        found = in_most([list(reasons) for reasons in seeds])
-        return {name: next(r[name] for r in seeds if name in r) for name in sorted(found)}
+        names = in_most([list(reasons) for reasons in seeds])
+        return {name: next(r[name] for r in seeds if name in r) for name in sorted(names)}
 
     @property
     def stage_seconds(self) -> dict[str, float]:
@@ -217,31 +188,28 @@ class MethodResult:
 
     def span(self, measure: str) -> Span | None:
         """Return one of ``MEASURES`` over the seeds; those of models None without any."""
-        seeds = [s for s in self.seeds if s.model_names or measure not in MEASURES_OF_MODEL]
+        seeds = [s for s in self.seeds if s.model_names or measure not in OF_MODEL]
         return Span.of(MEASURES[measure](seed) for seed in seeds) if seeds else None
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON, spans first; without seeds where the method failed."""
         values = _plain(self)
-        del values["name"]
         if self.failed:
             return {key: values[key] for key in ("failed", *KEPT_OF_FAILED)}
-        del values["failed"]
         return {
             **{key: asdict(span) if (span := self.span(key)) else None for key in MEASURES},
             "correct": asdict(self.correct) if self.correct else None,
             "registered_names": {str(s.seed): list(s.registered_names) for s in self.seeds},
             "wall_s": self.stage_seconds,
             "total_s": self.total_s,
-            **{key: value for key, value in values.items() if key != "wall_s"},
+            **{key: values[key] for key in values if key not in {"name", "failed", "wall_s"}},
         }
 
     @classmethod
     def from_mapping(cls, name: str, values: Mapping[str, Any]) -> Self:
         """Build from :meth:`to_mapping`."""
-        of_seeds = {stage for seed in values.get("seeds", ()) for stage in seed["wall_s"]}
-        seconds = values.get("wall_s", {})
-        wall_s = {stage: seconds[stage] for stage in seconds if stage not in of_seeds}
+        of_seeds = {stage for seed in values["seeds"] for stage in seed["wall_s"]}
+        wall_s = {stage: s for stage, s in values["wall_s"].items() if stage not in of_seeds}
         return TypeAdapter(cls).validate_python({**values, "name": name, "wall_s": wall_s})
 
 
@@ -261,20 +229,14 @@ def in_most(names_of_seeds: Sequence[Sequence[str]]) -> frozenset[str]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Several methods on one set of photographs.
+    """Several methods on one set of photographs."""
 
-    Attributes:
-        image_names: all images given, sorted.
-        num_pairs: pairs that were to be matched.
-        settings: cameras, masks, pair list, preset and mapper that all methods had.
-    """
-
-    image_names: tuple[str, ...]
+    image_names: tuple[str, ...]  # all images given, sorted
     image_path: str
     methods: tuple[MethodResult, ...]
     seeds: tuple[int, ...]
-    num_pairs: int
-    settings: Mapping[str, Any]
+    num_pairs: int  # that were to be matched
+    settings: Mapping[str, Any]  # cameras, masks, pair list, preset and mapper of all methods
     versions: Mapping[str, str]
 
     @property
@@ -290,10 +252,11 @@ class Comparison:
     @property
     def only_registered_by(self) -> dict[str, str]:
         """Image name to the one method that usually registers it."""
-        usual = {method.name: method.usually_registered for method in self.finished}
-        counts = Counter(name for names in usual.values() for name in names)
-        found = {name: method for method, names in usual.items() for name in names}
-        return {name: found[name] for name in self.image_names if counts[name] == 1}
+        by_image: dict[str, list[str]] = {name: [] for name in self.image_names}
+        for method in self.finished:
+            for name in method.usually_registered:
+                by_image[name].append(method.name)
+        return {name: methods[0] for name, methods in by_image.items() if len(methods) == 1}
 
     @property
     def registered_by_none(self) -> tuple[str, ...]:
@@ -304,7 +267,7 @@ class Comparison:
     @property
     def has_ground_truth(self) -> bool:
         """Whether models were measured against ground truth."""
-        return any(seed.scores for method in self.finished for seed in method.seeds)
+        return any(method.correct for method in self.finished)
 
     @property
     def names_with_truth(self) -> frozenset[str]:
@@ -319,10 +282,7 @@ class Comparison:
             "only_registered_by": self.only_registered_by,
             "registered_by_none": list(self.registered_by_none),
             "methods": {method.name: method.to_mapping() for method in self.methods},
-            "seeds": list(self.seeds),
-            "image_path": self.image_path,
-            "image_names": list(self.image_names),
-            "num_pairs": self.num_pairs,
+            **{k: getattr(self, k) for k in ("seeds", "image_path", "image_names", "num_pairs")},
             "settings": dict(self.settings),
             "versions": dict(self.versions),
         }

@@ -5,15 +5,21 @@ images and pairs. ``methods/NAME/`` is a workspace with the features and raw mat
 and ``methods/NAME/seed-K/`` has the two-view geometries and models of one seed.
 """
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP, Method
+from colmap_affrect.comparison.results import MethodResult
 from colmap_affrect.comparison.sift import describe_options
+from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.images.photographs import MaskOptions
 from colmap_affrect.mappers.base import MapperOptions
+from colmap_affrect.project.differences import first_difference
+from colmap_affrect.project.outputs import remove_own
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Resources
 
 
@@ -79,3 +85,28 @@ class MethodTask:
         if recipe is None:
             return describe_options(affine=self.method.label == SIFT_AFFINE_DSP)
         return recipe.to_mapping()
+
+    def finished(self) -> MethodResult | None:
+        """Return the result of the method if it has been run with the same seeds."""
+        if self.result.exists():
+            content = json.loads(self.result.read_text(encoding="utf-8"))
+            if content["seeds"] == list(self.seeds):
+                return MethodResult.from_mapping(self.method.label, content["result"])
+        return None
+
+    def begin(self, *, overwrite: bool) -> None:
+        """Make the folder; StaleStoreError where the method has finished with other options."""
+        if overwrite:
+            remove_own([self.folder])
+        if self.result.exists():
+            content = json.loads(self.result.read_text(encoding="utf-8"))
+            known, now = content["result"]["options"], json.loads(json.dumps(self.options))
+            if self.method.climbs:
+                known["seed"], now["seed"] = content["seeds"][0], self.seeds[0]
+            if difference := first_difference(known, now):
+                raise StaleStoreError(
+                    f"{self.folder}: {self.method.label} was run there with {difference}; use "
+                    "--overwrite to redo the methods that are named, another name (NAME=RECIPE), "
+                    "or another --output-path"
+                )
+        Workspace(self.folder).begin()

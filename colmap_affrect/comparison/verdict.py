@@ -1,4 +1,4 @@
-"""What a comparison means, in plain words: one small rule per function.
+"""What a comparison means, in plain words.
 
 Gains are counted in photographs registered, or registered correctly where there is ground truth.
 """
@@ -6,8 +6,6 @@ Gains are counted in photographs registered, or registered correctly where there
 import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Self
 
 from colmap_affrect.comparison.results import Comparison, MethodResult, Span, in_most
 
@@ -25,16 +23,31 @@ MIN_WHOLE_SECONDS = 10
 
 def verdict(comparison: Comparison) -> tuple[str, ...]:
     """Return the paragraphs, the most important one first."""
-    return (*headline(comparison), *changes(comparison), *cautions(comparison))
+    return (headline(comparison), *changes(comparison), *cautions(comparison))
 
 
 def cautions(comparison: Comparison) -> tuple[str, ...]:
     """Return what follows on gains and losses: what is missing, wrong or doubtful."""
-    rules = (
-        seeds_disagree, wrong_poses, registered_by_none, failures, doubts, unstable_poses,
-        contradictions, not_compared,
-    )  # fmt: skip
-    return tuple(text for rule in rules for text in rule(comparison))
+    finished = comparison.finished
+    truth, often = comparison.has_ground_truth, " in most seeds" * (len(comparison.seeds) > 1)
+    counts = [(method.name, _count(method)) for method in finished]
+    ranges = [f"{name} {n.min:g} to {n.max:g}" for name, n in counts if n.min != n.max]
+    missing = comparison.registered_by_none if finished else ()
+    absent = comparison.settings.get("not_compared")
+    verb = "registered correctly" if truth else "registered"
+    texts = [
+        ranges and f"Seeds disagree: photographs {verb} depend on chance, {'; '.join(ranges)}.",
+        *wrong_poses(comparison),
+        missing and f"Registered by no method{often}: {_listed(missing)}.",
+        *(f"{method.name} failed: {method.failed}" for method in comparison.methods
+          if method.failed),
+        *_doubts(comparison),
+        *(f"Doubtful: in {method.name} the poses of {_listed(method.unstable_names)} contradict "
+          "each other from seed to seed." for method in finished if method.unstable_names),
+        *_contradictions(comparison),
+        absent and f"Not compared for want of weights: {absent}",
+    ]  # fmt: skip
+    return tuple(text for text in texts if text)
 
 
 def ranked(methods: Iterable[MethodResult]) -> list[MethodResult]:
@@ -42,40 +55,14 @@ def ranked(methods: Iterable[MethodResult]) -> list[MethodResult]:
     return sorted(methods, key=lambda method: (-_count(method).mean, method.total_s))
 
 
-def not_compared(comparison: Comparison) -> list[str]:
-    """Say which learned methods could be compared too, and how their weights are had."""
-    absent = comparison.settings.get("not_compared")
-    return [f"Not compared for want of weights: {absent}"] if absent else []
+def is_gain(method: MethodResult, reference: MethodResult) -> bool:
+    """Tell whether a method registers more photographs than another, or as many more often."""
+    more = len(method.usually_correct) - len(reference.usually_correct)
+    return more > 0 or (more == 0 and _mean_gain(method, reference) >= MIN_MEAN_GAIN)
 
 
-@dataclass(frozen=True)
-class Change:
-    """What one method does better or worse than another.
-
-    Attributes:
-        gained: images that it usually registers and the other does not, sorted.
-        mean: more images on average over the seeds.
-        time_ratio: of their total times; 0 where the other one took none.
-    """
-
-    gained: tuple[str, ...]
-    lost: tuple[str, ...]
-    mean: float
-    time_ratio: float
-
-    @classmethod
-    def between(cls, method: MethodResult, reference: MethodResult) -> Self:
-        """Compare a method with a reference; both have finished."""
-        ours, others = method.usually_correct, reference.usually_correct
-        ratio = method.total_s / reference.total_s if reference.total_s else 0.0
-        mean = _count(method).mean - _count(reference).mean
-        return cls(tuple(sorted(ours - others)), tuple(sorted(others - ours)), mean, ratio)
-
-    @property
-    def is_gain(self) -> bool:
-        """Whether more photographs are registered, or the same ones more often."""
-        more = len(self.gained) - len(self.lost)
-        return more > 0 or (more == 0 and self.mean >= MIN_MEAN_GAIN)
+def _mean_gain(method: MethodResult, reference: MethodResult) -> float:
+    return _count(method).mean - _count(reference).mean
 
 
 def reference_of(comparison: Comparison) -> MethodResult | None:
@@ -84,61 +71,47 @@ def reference_of(comparison: Comparison) -> MethodResult | None:
     return next((finished[name] for name in REFERENCES if name in finished), None)
 
 
-def is_unrectified(method: MethodResult) -> bool:
-    """Tell whether a method is a recipe that warps nothing."""
-    rectifier = method.options.get("rectifier", {})
-    return rectifier.get("name") == "identity" and not method.options.get("escalation")
-
-
 def is_rectified(method: MethodResult) -> bool:
     """Tell whether a method is a recipe that warps photographs."""
-    return "rectifier" in method.options and not is_unrectified(method)
+    options = method.options
+    is_plain = options.get("rectifier", {}).get("name") == "identity"
+    return "rectifier" in options and not (is_plain and not options.get("escalation"))
 
 
-def headline(comparison: Comparison) -> list[str]:
+def headline(comparison: Comparison) -> str:
     """Say first of all whether anything was gained."""
     finished, total = comparison.finished, len(comparison.image_names)
     if not finished:
-        return ["No method finished."]
-    best = ranked(finished)[0]
+        return "No method finished."
+    best, reference = ranked(finished)[0], reference_of(comparison)
     most = max(method.registered.max for method in finished)
     if most < MIN_IMAGES <= total:
-        return [
+        return (
             f"Nothing was reconstructed: no method registers more than {most:g} of the {total} "
             "photographs."
-        ]
+        )
     registers = "correctly registers" if comparison.has_ground_truth else "registers"
-    reference = reference_of(comparison)
-    best_of_total = f"{_number(_count(best))} of {total}"
+    gain = f"{best.name} {registers} {_number(_count(best))} of {total} photographs"
     if reference is None:
-        return [
-            f"{best.name} {registers} {best_of_total} photographs, no method more. COLMAP's SIFT "
-            "was not run, so nothing can be said about a gain."
-        ]
+        return (
+            f"{gain}, no method more. COLMAP's SIFT was not run, so nothing can be said about a "
+            "gain."
+        )
     if len(finished) == 1:
-        return [f"{best.name} {registers} {best_of_total} photographs; no other method finished."]
-    num_of_reference = _number(_count(reference))
-    if not Change.between(best, reference).is_gain:
-        return [
+        return f"{gain}; no other method finished."
+    others = _number(_count(reference))
+    if not is_gain(best, reference):
+        return (
             f"No benefit on this set: no method {registers} more photographs than "
-            f"{reference.name}, which {registers} {num_of_reference} of {total}."
-        ]
-    gain = f"{best.name} {registers} {best_of_total} photographs, {reference.name} "
-    return [f"{gain}{num_of_reference}.{_without_rectification(comparison, best)}"]
-
-
-def _without_rectification(comparison: Comparison, best: MethodResult) -> str:
+            f"{reference.name}, which {registers} {others} of {total}."
+        )
+    gain += f", {reference.name} {others}."
     if not is_rectified(best):
-        return " Rectification is not needed for that."
-    as_good = [
-        method.name
-        for method in comparison.finished
-        if not is_rectified(method) and not Change.between(best, method).is_gain
-    ]
-    if not as_good:
-        return ""
+        return f"{gain} Rectification is not needed for that."
+    as_good = [m.name for m in finished if not is_rectified(m) and not is_gain(best, m)]
     verb = "does" if len(as_good) == 1 else "do"
-    return f" {_listed(as_good)} {verb} as well without rectification."
+    without = f" {_listed(as_good)} {verb} as well without rectification." if as_good else ""
+    return f"{gain}{without}"
 
 
 def changes(comparison: Comparison) -> list[str]:
@@ -147,42 +120,29 @@ def changes(comparison: Comparison) -> list[str]:
     Rectified methods are set against our own features without warps too.
     """
     finished, reference = comparison.finished, reference_of(comparison)
-    rectified, plain = filter(is_rectified, finished), filter(is_unrectified, finished)
     pairs = [(method, reference) for method in finished if reference and method is not reference]
-    pairs += [(method, other) for other, method in itertools.product(plain, rectified)]
+    recipes = [method for method in finished if "rectifier" in method.options]
+    plain = [method for method in recipes if not is_rectified(method)]
+    pairs += [(m, other) for other, m in itertools.product(plain, recipes) if is_rectified(m)]
     return [_change_text(*pair) for pair in pairs]
 
 
 def _change_text(method: MethodResult, reference: MethodResult) -> str:
-    change = Change.between(method, reference)
-    parts = []
-    if change.gained:
-        parts.append(f"gains {_listed(change.gained)}")
-    if change.lost:
-        parts.append(f"loses {_listed(change.lost)}")
+    ours, others = method.usually_correct, reference.usually_correct
+    named = {"gains": sorted(ours - others), "loses": sorted(others - ours)}
+    parts = [f"{verb} {_listed(names)}" for verb, names in named.items() if names]
     if not parts:
-        parts.append("the same photographs" if method.usually_correct else "none more")
-        if abs(change.mean) >= MIN_MEAN_GAIN:
-            parts.append(f"{abs(change.mean):.1f} {'more' if change.mean > 0 else 'fewer'} on "
-                         "average over the seeds")  # fmt: skip
-    times = f"{_seconds(method.total_s)} s against {_seconds(reference.total_s)} s"
-    ratio = f"{change.time_ratio:.1f}"
-    speed = "about the same time" if ratio == "1.0" else f"{ratio} times the time"
-    cost = f", in {speed} ({times})" if change.time_ratio else ""
-    return f"{method.name} against {reference.name}: {', '.join(parts)}{cost}."
-
-
-def seeds_disagree(comparison: Comparison) -> list[str]:
-    """Say which methods register more or fewer photographs with another seed."""
-    ranges = [
-        f"{method.name} {_count(method).min:g} to {_count(method).max:g}"
-        for method in comparison.finished
-        if _count(method).min != _count(method).max
-    ]
-    if not ranges:
-        return []
-    verb = "registered correctly" if comparison.has_ground_truth else "registered"
-    return [f"Seeds disagree: photographs {verb} depend on chance, {'; '.join(ranges)}."]
+        mean = _mean_gain(method, reference)
+        parts.append("the same photographs" if ours else "none more")
+        if abs(mean) >= MIN_MEAN_GAIN:
+            more = "more" if mean > 0 else "fewer"
+            parts.append(f"{abs(mean):.1f} {more} on average over the seeds")
+    if reference.total_s:
+        ratio = f"{method.total_s / reference.total_s:.1f}"
+        speed = "about the same time" if ratio == "1.0" else f"{ratio} times the time"
+        times = f"{_seconds(method.total_s)} s against {_seconds(reference.total_s)} s"
+        parts.append(f"in {speed} ({times})")
+    return f"{method.name} against {reference.name}: {', '.join(parts)}."
 
 
 def wrong_poses(comparison: Comparison) -> list[str]:
@@ -195,22 +155,7 @@ def wrong_poses(comparison: Comparison) -> list[str]:
     ]
 
 
-def registered_by_none(comparison: Comparison) -> list[str]:
-    """Name the photographs that nothing registers."""
-    missing = comparison.registered_by_none
-    if not missing or not comparison.finished:
-        return []
-    often = " in most seeds" if len(comparison.seeds) > 1 else ""
-    return [f"Registered by no method{often}: {_listed(missing)}."]
-
-
-def failures(comparison: Comparison) -> list[str]:
-    """Name the methods that failed, with the reason."""
-    return [f"{method.name} failed: {method.failed}" for method in comparison.methods
-            if method.failed]  # fmt: skip
-
-
-def doubts(comparison: Comparison) -> list[str]:
+def _doubts(comparison: Comparison) -> list[str]:
     """Name what cannot be trusted in the models of most seeds, whatever ground truth says.
 
     Methods in which the same is doubtful are named together.
@@ -235,17 +180,7 @@ def _doubts_of(method: MethodResult) -> list[str]:
     ]
 
 
-def unstable_poses(comparison: Comparison) -> list[str]:
-    """Doubt poses that differ between the seeds."""
-    return [
-        f"Doubtful: in {method.name} the poses of {_listed(method.unstable_names)} contradict "
-        "each other from seed to seed."
-        for method in comparison.finished
-        if method.unstable_names
-    ]
-
-
-def contradictions(comparison: Comparison) -> list[str]:
+def _contradictions(comparison: Comparison) -> list[str]:
     """Doubt poses that differ between methods; the method with most contradictions comes first.
 
     Where ground truth knows the pose, it says who is right.

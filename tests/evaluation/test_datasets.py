@@ -18,10 +18,12 @@ from small_scene import FOCAL_PX
 
 from colmap_affrect.colmap.poses import relative_pose
 from colmap_affrect.errors import EvaluationError
+from colmap_affrect.evaluation import datasets
 from colmap_affrect.evaluation.data import Dataset
-from colmap_affrect.evaluation.datasets import load_evd, load_imc, load_pairs, load_svp
+from colmap_affrect.evaluation.datasets import load_evd, load_imc, load_pairs, load_svp, stem
 
 SCRIPT = Path(__file__).parents[2] / "recipes" / "own-evaluation-set" / "imc_from_model.py"
+SVP_SAMPLE = Path(__file__).parents[3] / "shared" / "pairs" / "svp_sample"
 Entry = dict[str, Any]
 INTRINSICS = [[FOCAL_PX, 0, 159.5], [0, FOCAL_PX, 119.5], [0, 0, 1]]
 """Of the photographs of the small scene, in pixel-centre px."""
@@ -117,6 +119,7 @@ def test_pairs_without_an_image_or_pose_are_left_out_and_named(svp: Path) -> Non
 
 @pytest.mark.parametrize(("file", "old", "new"), [
     ("cameras.txt", "SIMPLE_RADIAL", "ROUND"),
+    ("cameras.txt", "300.0", "nan"),
     ("images.txt", "1 0.99", "1 2.99"),
 ])  # fmt: skip
 def test_unusable_cameras_and_poses_are_refused(svp: Path, file: str, old: str, new: str) -> None:
@@ -139,6 +142,20 @@ def test_category_is_that_of_the_poses_and_bad_lines_are_refused(svp: Path) -> N
         load_svp(svp)
 
 
+@pytest.mark.shared
+@pytest.mark.skipif(not SVP_SAMPLE.is_dir(), reason="the sample is not here")
+def test_difficulties_of_the_real_list_are_those_of_the_real_poses() -> None:
+    scene = SVP_SAMPLE / "scene1"
+    views = datasets.read_views(scene / "0")
+    lines = (scene / "scene1_image_pairs.txt").read_text().splitlines()
+    listed = [line.split() for line in lines if line.strip() and line[0] != "#"]
+    found = [datasets.difficulty(views[stem(a)][1], views[stem(b)][1]) for a, b, _ in listed]
+    assert found == [int(tens) for *_, tens in listed]
+    assert [pair.name for pair in load_svp(SVP_SAMPLE).pairs] == [
+        "scene1/frame_0000001535_4.jpg scene1/frame_0000000305_1.jpg"
+    ]
+
+
 @pytest.fixture
 def imc(tmp_path: Path) -> Path:
     return scenes.write_imc(tmp_path / "set" / "garden")
@@ -155,9 +172,32 @@ def test_imc_scene_or_folder_of_scenes_is_read(imc: Path, path: str) -> None:
     require_pose(dataset.pairs[0].truth, 0, 3)
 
 
+def test_list_from_zero_may_be_there_and_others_must_be(imc: Path) -> None:
+    folder = imc / "set_100" / "new-vis-pairs"
+    np.save(folder / "keys-th-0.0.npy", np.array(["a-b", "a-d", "b-c"]))
+    assert list(categories(load_imc(imc)).values()) == ["0.0", "0.1", "0.2"]
+    np.save(folder / "keys-th-0.9.npy", np.array(["a-d", None], dtype=object))
+    with pytest.raises(EvaluationError, match=r"keys-th-0\.9\.npy: cannot be read \(Object arrays"):
+        load_imc(imc)
+
+
+def test_names_with_dashes_and_pairs_of_unknown_images(imc: Path) -> None:
+    root = imc / "set_100"
+    for name in scenes.NAMES:
+        (root / "images" / f"{name}.png").rename(root / "images" / f"x-{name}.png")
+        path = root / "calibration" / f"calibration_{name}.h5"
+        path.rename(path.with_name(f"calibration_x-{name}.h5"))
+    scenes.write_lists(imc, {1: ["x-a-x-d", "x-a-e"], 2: []})
+    dataset = load_imc(imc)
+    assert categories(dataset) == {"garden/x-a.png garden/x-d.png": "0.1"}
+    assert dataset.notes[0].startswith("garden: 1 of 2 listed pairs are left out")
+
+
 @pytest.mark.parametrize(("changes", "fault"), [
     ({"K": np.diag([np.nan, 300, 1])}, "K is empty or has values that are not finite"),
     ({"K": np.diag([300.0, 300, 1])}, r"K is not \[\[fx, 0, cx\]"),
+    ({"T": None}, "cannot be read"),
+    ({"R": 2 * pose(0)[0]}, "R is not orthonormal"),
     ({"R": pose(0)[0] * [1, 1, -1]}, "or a reflection"),
 ])  # fmt: skip
 def test_unusable_calibration_is_refused(imc: Path, changes: Entry, fault: str) -> None:
@@ -261,6 +301,7 @@ def test_poses_and_points_in_pixels_of_both_origins(
 
 @pytest.mark.parametrize(("changes", "problem"), [
     ({"homography": [[1, 2], [3, 4]]}, r"has shape \(2, 2\)"),
+    ({"relative_pose": posed(rotation=(2 * np.eye(3)).tolist())}, "not orthonormal"),
     ({"relative_pose": posed(centre=[0, 0, 0])}, "relative_pose needs"),
     ({"correspondences": "../points.txt"}, "must be a file in the folder"),
 ])  # fmt: skip
@@ -277,13 +318,15 @@ SAME = '{"image1": "a.png", "image2": "b.png", "homography": "h.txt"}'
 
 
 @pytest.mark.parametrize(("content", "message"), [
-    ("{", "cannot be read"),
-    ('{"pairs": [{"image1": "a.png"}]}', "image2 is missing"),
+    ("[]", "cannot be read"),
+    ('{"pairs": [1]}', r"pairs\[0\]: expected options, got 1"),
+    ('{"pairs": [], "pixel_origin": "left"}', r"cannot be read \(KeyError\('left'\)\)"),
     (
         '{"pairs": [{"image1": "../a.png", "image2": "b.png", "homography": []}]}',
         "must be path",
     ),
     ('{"pairs": [{"image1": "a", "image2": "b"}]}', "needs homography, correspondences or"),
+    ('{"pairs": [{"image1": "a", "image2": "b", "truth": 1}]}', "unknown option 'truth'"),
     (f'{{"pairs": [{SAME}, {SAME}]}}', "two pairs are called 'a b'"),
 ])  # fmt: skip
 def test_bad_list_is_one_line(content: str, message: str, tmp_path: Path) -> None:

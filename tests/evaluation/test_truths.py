@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,10 +18,10 @@ from colmap_affrect.evaluation.truths import (
     TrueHomography,
     TruePose,
     columns_by_kind,
+    homography_columns,
     pose_columns,
     recalls,
     symmetric_epipolar_distances,
-    transfer_errors,
 )
 
 TRUTH = np.array([[0.9, 0.2, 30.0], [-0.1, 1.1, -20.0], [3e-4, -1e-4, 1.0]])
@@ -41,14 +42,16 @@ def error_px(estimate: np.ndarray | None) -> float:
     return TrueHomography(TRUTH, SIZE1, SIZE2).error_px(estimate)
 
 
-def test_transfer_error_of_one_match_by_hand() -> None:
-    points1 = np.array([[100.0, 50.0]])
-    exact = np.array([(90 + 10 + 30) / 1.025, (-10 + 55 - 20) / 1.025])
-    errors = transfer_errors(TRUTH, points1, exact[None] + [3.0, 4.0])
-    np.testing.assert_allclose(errors, [5.0], atol=ROUNDING_PX)
-    points = np.array([[200.0, 40.0], [100.0, 7.0]])
-    errors = transfer_errors(BEHIND, points, np.array([[-200.0, -40.0], [0.0, 0.0]]))
-    assert np.isinf(errors).all()
+@pytest.mark.parametrize(("truth", "size2", "first", "last"), [
+    (shift(-100.0, 40.0), SIZE2, (100, 0), (316, 196)),
+    (shift(0.0, 100.0), SIZE2, (0, 0), (236, 156)),
+    (BEHIND, (10_000, 10_000), (0, 0), (96, 196)),
+])  # fmt: skip
+def test_visible_points_land_in_image_2(truth: Any, size2: Any, first: Any, last: Any) -> None:
+    points = TrueHomography(truth, SIZE1, size2).visible
+    np.testing.assert_array_equal(points.min(axis=0), first)
+    np.testing.assert_array_equal(points.max(axis=0), last)
+    assert len(points) == np.prod((np.array(last) - first) // 4 + 1)
 
 
 def test_error_agrees_with_all_visible_pixels_carried_there_and_back() -> None:
@@ -67,6 +70,14 @@ def test_error_agrees_with_all_visible_pixels_carried_there_and_back() -> None:
     assert error_px(-2.0 * TRUTH) == pytest.approx(0, abs=ROUNDING_PX)
     horizon = TRUTH + np.array([[0, 0, 0], [0, 0, 0], [-0.01, 0, 0]])  # within the image
     assert error_px(horizon) == error_px(None) == math.inf
+
+
+def test_counts_are_of_both_estimators() -> None:
+    errors = ((0.5, {"magsac_error": 4.0}), (3.0, {"magsac_error": 2.9}), (math.inf, {}))
+    results = [PairResult(error, 9, 9, details, name="p") for error, details in errors]
+    counts = homography_columns(results)
+    assert list(counts.values()) == [1, 1, 1, 2, 2, 2, 0, 0, 1, 2, 2, 2]
+    assert list(counts)[2:7:4] == ["< 3 px", "MAGSAC: < 1 px"]
 
 
 def homography_score(points1: np.ndarray, points2: np.ndarray) -> PairScore:
@@ -126,12 +137,13 @@ def test_exact_matches_give_the_pose() -> None:
     assert (score.num_inliers, score.num_correct, score.details["gc_num_inliers"]) == (60, 60, 60)
 
 
-def test_wrong_true_rotation_is_the_rotation_error() -> None:
+@pytest.mark.parametrize("degrees", [3.0, 77.0])
+def test_wrong_true_rotation_is_the_rotation_error(degrees: float) -> None:
     # The second camera is turned about its own centre: the direction in its frame turns along.
-    wrong = turn((0, 0, 1), 77.0)
+    wrong = turn((0, 0, 1), degrees)
     score = pose_score(matches(60), (wrong @ POSE2[0], wrong @ POSE2[1]))
-    assert score.error == pytest.approx(77.0, abs=1e-4)
-    assert not score.solved
+    assert score.error == pytest.approx(degrees, abs=1e-4)
+    assert score.solved == (degrees < 5.0)
 
 
 def test_wrong_true_position_is_the_direction_error() -> None:
@@ -154,6 +166,15 @@ def test_threshold_is_in_pixels_of_the_mean_focal_length() -> None:
     )
     assert few < 150
     assert many > 280
+
+
+def test_points_that_give_no_pose() -> None:
+    for count in (0, 5):
+        score = pose_score(matches(count))
+        assert (score.error, score.num_inliers, score.solved) == (math.inf, 0, 0.0)
+    points1, points2 = matches(60)
+    points1[3] = np.nan
+    assert pose_score((points1, points2)).num_inliers == 59
 
 
 def pose_result(category: str, error: float, direction_error: float) -> PairResult:
