@@ -341,14 +341,6 @@ def rename_image(base: Path, name: str) -> None:
     (base / "list.txt").write_text(f"{name}\nb c.png\nside/č.png\nside/d.png\n", encoding="utf-8")
 
 
-def num_registered(model_path: Path) -> int:
-    """Count the images of a model that was written a moment ago."""
-    try:
-        return pycolmap.Reconstruction(model_path).num_reg_images()
-    except (ValueError, IndexError, RuntimeError) as error:
-        raise AssertionError(f"{model_path.name}: a model that cannot be read: {error}") from error
-
-
 def assert_whole(label: str, out: Path) -> None:
     """A command that ended well has all of its results inside of its folder."""
     found = tree(out)
@@ -359,9 +351,10 @@ def assert_whole(label: str, out: Path) -> None:
     assert any(value[0] != "folder" for value in found.values()), "nothing was written"
     if "undistorted" in label or "nerfstudio" in label:
         pictures = [path for path in (out / "dense" / "images").rglob("*") if path.is_file()]
-        assert (len(pictures), num_registered(out / "dense" / "sparse")) == (4, 4)
+        model = pycolmap.Reconstruction(out / "dense" / "sparse")
+        assert (len(pictures), model.num_reg_images()) == (4, 4)
     if "text" in label:
-        assert num_registered(out / "text") == 4
+        assert pycolmap.Reconstruction(out / "text").num_reg_images() == 4
 
 
 # Output folders before an export; each function returns what may be changed then.
@@ -395,19 +388,11 @@ def hard_link(out: Path, result: str) -> list[Path]:
     return [out]
 
 
-def a_file(out: Path, _: str) -> list[Path]:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_bytes(b"mine")
-    return []
-
-
 TRAPS = {
     "dangling link": linked("../new.png"),
     "link to a photograph": linked("photos/a.png"),
     "link to a folder": linked("../photos"),
-    "link to the photographs": linked("photos"),
     "link to nothing beside the photographs": linked("photos/new"),
     "output folder is a link to the photographs": linked_folder,
-    "output folder is a file": a_file,
     "hard link to a photograph": hard_link,
 }

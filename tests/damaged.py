@@ -94,58 +94,26 @@ def damage(
 
 STATEMENTS = (
     "UPDATE images SET camera_id = 999 WHERE image_id = {id}",
-    "UPDATE images SET name = '' WHERE image_id = {id}",
     "UPDATE images SET name = x'ff00fe' WHERE image_id = {id}",
-    "UPDATE images SET name = 'renamed.png' WHERE image_id = {id}",
     "DELETE FROM images WHERE image_id = {id}",
     "INSERT INTO images (name, camera_id) VALUES ('more.png', 1)",
-    "UPDATE keypoints SET rows = 100000 WHERE image_id = {id}",
     "UPDATE keypoints SET rows = -1 WHERE image_id = {id}",
     "UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = {id}",
     "UPDATE keypoints SET data = substr(data, 1, 101) WHERE image_id = {id}",
-    "UPDATE keypoints SET data = NULL WHERE image_id = {id}",
     "DELETE FROM keypoints WHERE image_id = {id}",
-    "UPDATE matches SET rows = 100000",
     "UPDATE matches SET data = x'ffffffffffffffff', rows = 1",
     "UPDATE two_view_geometries SET config = 77",
-    "UPDATE two_view_geometries SET qvec = zeroblob(32)",
     "UPDATE two_view_geometries SET data = x'ffffffffffffffff', rows = 1",
-    "DELETE FROM two_view_geometries",
     "UPDATE cameras SET width = 100",
     "UPDATE cameras SET params = x'00'",
     "UPDATE frames SET rig_id = 99",
-    "DELETE FROM rigs",
     "DELETE FROM cameras",
     "DROP TABLE frame_data",
-    "DROP TABLE two_view_geometries",
     "ALTER TABLE images RENAME COLUMN camera_id TO camera",
     "CREATE TRIGGER nosy AFTER INSERT ON matches BEGIN DELETE FROM images; END",
     "PRAGMA user_version = 2147483647",
 )
 """What nobody means to do to the rows of a database; ``{id}`` is one of the images."""
-
-MEANT = (
-    "DELETE FROM two_view_geometries WHERE pair_id = (SELECT min(pair_id) FROM matches)",
-    "DELETE FROM matches WHERE pair_id = (SELECT min(pair_id) FROM matches)",
-    "INSERT INTO pose_priors SELECT 1, data_id, sensor_id, sensor_type, "
-    "x'000000000000F03F000000000000F03F000000000000F03F', NULL, NULL, 1 FROM frame_data LIMIT 1",
-    "UPDATE cameras SET params = "
-    "x'00000000008072400000000000C0724000000000000064400000000000005E40' WHERE camera_id = 1",
-)
-"""Edits that a user may mean; the second takes the matches of a pair and leaves its geometry."""
-
-PROBES = (
-    "SELECT image_id, name, camera_id FROM images ORDER BY name",
-    "SELECT * FROM cameras ORDER BY camera_id",
-    "SELECT count(*), total(length(data)), total(rows) FROM keypoints",
-    "SELECT pair_id, rows FROM matches ORDER BY pair_id",
-    "SELECT pair_id, rows, config FROM two_view_geometries ORDER BY pair_id",
-    "SELECT * FROM pose_priors",
-    "SELECT * FROM frames ORDER BY frame_id",
-    "SELECT count(*) FROM rigs",
-    "SELECT type, name FROM sqlite_master ORDER BY type, name",
-    "PRAGMA user_version",
-)
 
 
 Statement = str | tuple[str, list[object]]
@@ -160,9 +128,3 @@ def execute(path: Path, *statements: Statement) -> None:
             query, values = (statement, []) if isinstance(statement, str) else statement
             connection.execute(query, values)
         connection.commit()
-
-
-def rows(path: Path) -> dict[str, list[Any]]:
-    """What a database answers to the probes."""
-    with closing(sqlite3.connect(path)) as connection:
-        return {probe: connection.execute(probe).fetchall() for probe in PROBES}

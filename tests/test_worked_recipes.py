@@ -12,7 +12,6 @@ import pytest
 from small_scene import write_photographs
 
 from colmap_affrect.images.masks import read_mask
-from colmap_affrect.recipes import recipe_folder, recipe_names
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -55,11 +54,6 @@ def test_masks_leave_out_borders_and_captions(tmp_path: Path) -> None:
     expected[12 : 240 - 48, 12 : 320 - 12] = True
     for name in names:
         np.testing.assert_array_equal(read_mask(tmp_path / "masks" / f"{name}.png"), expected)
-
-
-def test_worked_recipes_are_no_recipes_of_the_command_line() -> None:
-    assert recipe_folder() == RECIPES
-    assert not {"cluster", "historical-photographs", "replace-sift"} & set(recipe_names())
 
 
 @pytest.mark.parametrize(

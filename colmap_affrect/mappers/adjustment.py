@@ -93,14 +93,17 @@ class Adjuster:
         used = {model.images[image_id].camera_id for image_id in images}
         others = set(model.reg_image_ids()) - set(images)
         held = {model.images[image_id].camera_id for image_id in others} & used
-        held |= {key for key in used if key in self.constant or not self.priors[key].sigma}
+        held |= used & self.constant
         for key in sorted(held):
             config.set_constant_cam_intrinsics(key)
         if image_ids is None:
             config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
         for key in sorted(used - held):
-            self._add_prior(problem, model.cameras[key])
+            if self.priors[key].sigma:
+                self._add_prior(problem, model.cameras[key])
+            else:
+                _refine_distortion_only(problem, model.cameras[key])
         solver = pyceres.SolverOptions()
         solver.max_num_iterations, solver.num_threads = max_iterations, 1
         solver.function_tolerance = 1e-5 if max_iterations <= FAST else 1e-7
@@ -122,6 +125,13 @@ class Adjuster:
         covariance = np.diag((sigma / self.noise_px) ** 2)
         normal = _pyceres().factors.NormalPrior(mean, covariance)
         problem.add_residual_block(normal, None, [camera.params])
+
+
+def _refine_distortion_only(problem: Any, camera: pycolmap.Camera) -> None:
+    if problem.has_parameter_block(camera.params):
+        fixed = [*camera.focal_length_idxs(), *camera.principal_point_idxs()]
+        manifold = _pyceres().SubsetManifold(len(camera.params), fixed)
+        problem.set_manifold(camera.params, manifold)
 
 
 def _pyceres() -> Any:

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from command import Call, on_photographs
-from random_weights import write_comparing_lightglue
 from small_scene import write_photographs
 
 from colmap_affrect import __version__, pipeline
 from colmap_affrect.cli import main
 from colmap_affrect.cli.parser import EXAMPLES, build_parser, epilog
 from colmap_affrect.errors import OptionError
-from colmap_affrect.features import weights
 from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers.doubts import Doubts
 from colmap_affrect.project.workspace import Workspace
@@ -112,10 +109,8 @@ def test_weights_are_listed_with_where_they_are(tmp_path: Path, call: Call) -> N
     [
         [],
         ["rum"],
-        ["run"],
         ["run", "--image-path", "x"],
         ["map", "--output-path", "{out}", "--camera-mode", "single"],
-        ["run", "--image-path", "x", "--output-path", "{out}", "--camera-mode", "double"],
         ["run", "--image-path", "x", "--output-path", "{out}", "--random-seed", "one"],
         ["match", "--output-path", "{out}", "-q", "-v"],
     ],
@@ -204,38 +199,22 @@ MODEL = "--model-path OUT/sparse/0 --output-path NEW"
 
 INPUTS = {
     f"run {RUN}": f"--config {SELECTED} --recipe --weights --depth-path --match-list-path --extend",
-    f"extract {RUN}": f"{SELECTED} --recipe --weights --depth-path",
-    f"compare {RUN}": f"{SELECTED} --weights --depth-path --match-list-path --ground-truth-path",
-    "pairs --output-path OUT": "--match-list-path",
-    "match --output-path OUT": "--recipe",
+    f"compare {RUN}": "--ground-truth-path",
     "escalate --output-path OUT": "--weights",
-    "map --output-path NEW --from-database OUT/database.db": "--image-path --extend",
-    "map --output-path OUT": "--extend",
-    "evaluate pairs --dataset-path PHOTOS --output-path NEW": "--recipes --weights --depth-path",
-    "inspect PHOTOS/a.png --output-path NEW": "--mask-path --recipe --weights --depth-path",
+    "map --output-path NEW --from-database OUT/database.db": "--image-path",
     f"import-h5 --image-path PHOTOS {H5}": "--cameras-path",
-    f"export {MODEL}": "--image-path",
     f"align {MODEL}": "--gps --positions --points",
-    "doctor OUT": "--image-path --weights",
-    "weights list": "--weights",
     # what a command cannot do without
-    "run --output-path NEW --image-path NONE": "",
     "extract --output-path NEW --image-path NONE": "",
-    **{f"{stage} --output-path NONE": "" for stage in ("pairs", "match", "verify", "escalate")},
-    **{f"{stage} --output-path NONE": "" for stage in ("guide", "map")},
+    "match --output-path NONE": "",
     "map --output-path NEW --from-database NONE": "",
-    "compare --output-path NEW --image-path NONE": "",
     "evaluate evd --output-path NEW --dataset-path NONE": "",
     "convert --output-path NEW --image-path NONE": "",
     "inspect NONE --output-path NEW": "",
-    f"import-h5 --image-path NONE {H5}": "",
     f"import-h5 --image-path PHOTOS {H5} --features-path NONE": "",
-    f"import-h5 --image-path PHOTOS {H5} --matches-path NONE": "",
-    "export-h5 --output-path NONE --features-path NEW --matches-path NEW.h5": "",
     "export-h5 --database-path NONE --features-path NEW --matches-path NEW.h5": "",
     "export-database NONE NEW": "",
     "export --output-path NEW --model-path NONE": "",
-    "align --output-path NEW --distance a.png,b.png,1 --model-path NONE": "",
     "doctor NONE": "",
     "recipes NONE": "",
 }
@@ -286,20 +265,12 @@ def test_inspect_draws_a_sheet_and_writes_the_plan(tmp_path: Path, call: Call) -
     ("arguments", "message"),
     [
         ("--device gpu", "--device gpu: not one of auto, cpu, cuda"),
-        ("--recipe depth-planes-recommended", "give --depth-path FOLDER, or --depth-mod"),
         ("--recipe depth-planes", "give --depth-path FOLDER, or --depth-model"),
-        ("--recipe depth-planes-recommended --depth-path nowhere", "nowhere"),
-        ("--recipe dense-affnet --weights nowhere", "nowhere: no such folder"),
         ("--recipe defalt", "did you mean 'default'"),
         ("--pairs vocab", "pairs: methods='vocab' is not one of"),
-        ("--image-list-path none.txt", "none.txt: cannot be read (No such file"),
-        ("--from-database none.db", "none.db: no such file"),
-        ("--extend none", "--extend none: no such folder; give"),
         ("--refine-existing", "--refine-existing: only with --extend MODEL"),
         ("--camera-params 1,2", "SIMPLE_RADIAL needs 4 values"),
-        ("--config none.toml", "none.toml: no such file"),
         ("--preset dense", "invalid choice: 'dense'"),
-        ("--mapper-options", "expected at least one argument"),
         ("--mapper-options min_model_size", "min_model_size: expected KEY=VALUE"),
         ("--mapper-options __import__('os')=1", "pycolmap has no such option"),
     ],
@@ -324,25 +295,13 @@ def test_misspelt_option_names_the_one_that_was_meant(tmp_path: Path, call: Call
     assert "unknown argument --recipie (did you mean --recipe?); see" in done.stderr[0]
 
 
-@pytest.mark.parametrize(
-    ("old", "new"), [("[verify", "[verrify"), ("max_image_size_px", "max_image_size")]
-)
-def test_typo_in_a_config_is_refused(
-    tmp_path: Path, verified: Path, call: Call, old: str, new: str
-) -> None:
+def test_typo_in_a_config_is_refused(tmp_path: Path, verified: Path, call: Call) -> None:
     config = tmp_path / "config.toml"
     text = (verified / "config.toml").read_text(encoding="utf-8")
-    config.write_text(text.replace(old, new), encoding="utf-8")
+    config.write_text(text.replace("[verify", "[verrify"), encoding="utf-8")
     done = call("run", "--config", config, "--output-path", tmp_path / "out")
     assert done.code == 2
-    meant = f"unknown '{new.strip('[')}' (did you mean '{old.strip('[')}'?)"
-    assert meant in done.stderr[0]
-
-
-def test_unknown_weights_are_wrong_usage(call: Call) -> None:
-    done = call("weights", "fetch", "afnet")
-    assert (done.code, done.stdout) == (2, "")
-    assert done.stderr == ["error: unknown weights 'afnet' (did you mean 'affnet'?)"]
+    assert "unknown 'verrify' (did you mean 'verify'?)" in done.stderr[0]
 
 
 def test_weights_of_recipes_are_listed_by_their_names(call: Call) -> None:
@@ -354,17 +313,6 @@ def test_weights_of_recipes_are_listed_by_their_names(call: Call) -> None:
     assert keys("aliked") == ["aliked-n16", "aliked-n16rot", "aliked-n32"]
     done = call("weights", "fetch", "default")
     assert (done.code, done.stdout) == (0, "default: no weights are needed\n")
-
-
-def test_damaged_photograph_is_no_reason_to_compare_methods(
-    photos: Path, tmp_path: Path, call: Call
-) -> None:
-    folder = shutil.copytree(photos, tmp_path / "photos")
-    (folder / "damaged.png").write_bytes(b"no image")
-    done = call("run", *on_photographs(folder, tmp_path / "out"), "--no-page")
-    assert "damaged.png: unreadable" in done.stdout
-    assert "colmap-affrect export" in done.stdout
-    assert "colmap-affrect compare" not in done.stdout
 
 
 def test_what_is_printed_may_end_early() -> None:
@@ -389,33 +337,6 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Taken:
     return taken
 
 
-def test_matcher_with_weights_goes_on_and_is_taken_from_the_record(
-    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch, taken: Taken
-) -> None:
-    write_photographs(tmp_path / "photos", 2)
-    write_comparing_lightglue(tmp_path / "sift_lightglue.pth")
-    monkeypatch.setenv(weights.ENVIRONMENT_VARIABLE, str(tmp_path))
-    out = ["--output-path", tmp_path / "out"]
-    assert call("extract", "--image-path", tmp_path / "photos", *out,
-                "--recipe", "sift-lightglue").code == 0  # fmt: skip
-    assert call("pairs", *out).code == 0
-    refused = call("match", *out, "--set", "matching.trained_for=disk")
-    assert "not of rootsift; use --recipe disk-lightglue, or --set" in refused.errors[0]
-    assert refused.errors[0].endswith("take 'run' with another --output-path")
-    change = ["--set", "matching.min_score=0.2", "--overwrite"]
-    for more in ([], [], ["--overwrite"], change, []):
-        assert call("match", *out, "-q", *more).stderr == []
-    record = Workspace(tmp_path / "out").recorded()["match"]
-    assert record["weights"]
-    assert record["min_score"] == 0.2
-    done = call(
-        "run", "--config", tmp_path / "out" / "config.toml", "--output-path", tmp_path / "b"
-    )
-    assert done.stderr == ["error: enough"]
-    changed = load_recipe("sift-lightglue", ["matching.min_score=0.2"]).matching
-    assert [options.recipe.matching for _, options in taken] == [changed]
-
-
 def test_run_repeats_what_is_on_record_and_options_win(
     tmp_path: Path, call: Call, taken: Taken
 ) -> None:
@@ -438,28 +359,6 @@ def test_run_repeats_what_is_on_record_and_options_win(
     assert options.image_list_path == tmp_path / "list.txt"
     assert (others, changed.image_list_path) == (tmp_path, None)
     assert (changed.recipe, changed.cameras.mode) == (load_recipe("default"), "per-image")
-
-
-def test_missing_weights_are_one_error_with_the_way_out(
-    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def no_network(*_: object, **__: object) -> None:
-        raise OSError("no network")
-
-    monkeypatch.setattr(weights, "urlopen", no_network)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.setenv("COLMAP_AFFRECT_WEIGHTS", "")
-    write_photographs(tmp_path / "photos", 2)
-    empty = tmp_path / "weights"
-    empty.mkdir()
-    done = call(
-        "run", "--image-path", tmp_path / "photos", "--output-path", tmp_path / "out",
-        "--recipe", "dense-affnet", "--weights", empty,
-    )  # fmt: skip
-    assert (done.code, done.stdout) == (1, "")
-    (line,) = done.errors
-    for said in ("AffNet.pth", str(empty), "COLMAP_AFFRECT_WEIGHTS", "default", "no network"):
-        assert said in line
 
 
 @pytest.mark.long

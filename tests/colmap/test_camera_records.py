@@ -56,8 +56,3 @@ def test_only_cameras_with_a_story_are_named_and_not_all() -> None:
     assert line == "c.jpg, d, e and 1 more: focal length 500 to 700 px, pairs: 40 pairs agree"
     lines = notable_lines([replace(VOTED, why=str(index)) for index in range(9)])
     assert (len(lines), lines[-1]) == (6, "and 4 more, see report.json")
-
-
-def test_intrinsics_are_fixed_when_nothing_is_left_to_refine() -> None:
-    assert not replace(FROM_EXIF, given=("focal", "principal-point")).is_fixed
-    assert replace(FROM_EXIF, given=("focal", "distortion")).is_fixed

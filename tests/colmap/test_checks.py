@@ -14,7 +14,6 @@ from colmap_affrect.colmap.checks import check_database, check_image_files
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.tables import pair_images
 from colmap_affrect.errors import DatabaseError
-from colmap_affrect.project.outputs import leads_outside
 
 NAMES = ["a.png", "b c.png", "side/č.png"]
 NUM_KEYPOINTS = [5, 7, 9]
@@ -90,20 +89,12 @@ def test_healthy_database_has_no_problem(database_path: Path) -> None:
     assert tables.summary() == ("3 images, 1 camera, 21 keypoints, 3 matched and 3 verified pairs")
 
 
-WITHOUT_PAIRS = [
-    ("UPDATE two_view_geometries SET rows = 0, data = NULL", []),
-    ("UPDATE matches SET rows = 0, data = NULL", []),
-]
-
 BROKEN: list[tuple[str, list[Statement], list[str]]] = [
     ("no-camera", ["UPDATE images SET camera_id = 9 WHERE image_id = 2"], ["b c.png"]),
     ("no-prior-focal", ["UPDATE cameras SET prior_focal_length = 0"], ["camera 1 (90 x 60)"]),
     ("no-frame", ["DELETE FROM frame_data WHERE data_id = 3"], ["side/č.png"]),
-    ("no-frame", ["UPDATE frame_data SET sensor_type = 1 WHERE data_id = 3"], ["side/č.png"]),
     ("bad-name", ["UPDATE images SET name = x'61FF' WHERE image_id = 1"], ["image 1: 'a\ufffd'"]),
-    ("bad-name", ["UPDATE images SET name = '' WHERE image_id = 1"], ["image 1: ''"]),
     ("unsafe-name", ["UPDATE images SET name = 'x/../../y' WHERE image_id = 1"], ["x/../../y"]),
-    ("unsafe-name", ["UPDATE images SET name = '/etc/x' WHERE image_id = 1"], ["/etc/x"]),
     (
         "no-keypoints",
         [
@@ -125,12 +116,11 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
     ),
     (
         "keypoint-data",
-        ["UPDATE keypoints SET rows = -1 WHERE image_id = 2", *WITHOUT_PAIRS],
-        ["b c.png"],
-    ),
-    (
-        "keypoint-data",
-        ["UPDATE keypoints SET rows = 0 WHERE image_id = 2", *WITHOUT_PAIRS],
+        [
+            "UPDATE two_view_geometries SET rows = 0, data = NULL",
+            "UPDATE matches SET rows = 0, data = NULL",
+            "UPDATE keypoints SET rows = -1 WHERE image_id = 2",
+        ],
         ["b c.png"],
     ),
     ("camera-model", ["UPDATE cameras SET model = 12345"], ["camera 1: model 12345"]),
@@ -145,13 +135,7 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
         ["camera 1: 9000 px, 1e+02"],
     ),
     ("camera-params", ["UPDATE cameras SET params = substr(params, 1, 24)"], ["camera 1"]),
-    (
-        "camera-params",
-        [("UPDATE cameras SET params = ?", [np.full(4, np.nan).tobytes()])],
-        ["camera 1"],
-    ),
     ("frame-links", ["UPDATE frames SET rig_id = 7 WHERE frame_id = 2"], ["row 2 of frames, rigs"]),
-    ("frame-links", ["UPDATE rigs SET ref_sensor_id = 5"], ["rig 1, cameras"]),
     (
         "matrix-data",
         [
@@ -160,34 +144,15 @@ BROKEN: list[tuple[str, list[Statement], list[str]]] = [
         ],
         [f"F of pair_id {pair_id(1, 2)}"],
     ),
-    (
-        "matrix-data",
-        ["INSERT INTO pose_priors VALUES (1, 1, 1, 0, x'00', NULL, NULL, 0)"],
-        ["position of rowid 1"],
-    ),
-    ("keypoint-data", ["UPDATE keypoints SET data = NULL WHERE image_id = 2"], ["b c.png"]),
     ("keypoint-data", ["UPDATE keypoints SET data = 'text' WHERE image_id = 2"], ["b c.png"]),
     ("keypoints-not-finite", [changed_keypoint(6, 1, np.nan)], ["b c.png"]),
-    ("keypoints-not-finite", [changed_keypoint(6, 0, np.inf)], ["b c.png"]),
-    ("keypoints-not-finite", [changed_keypoint(6, 0, -1e30)], ["b c.png"]),
     ("keypoints-outside", [changed_keypoint(3, 0, 91.5)], ["b c.png"]),
-    ("keypoints-outside", [changed_keypoint(3, 1, 61.5)], ["b c.png"]),
     ("keypoints-outside", [changed_keypoint(3, 1, -1.5)], ["b c.png"]),
     ("no-matches", ["DELETE FROM matches", "DELETE FROM two_view_geometries"], []),
     (
         "match-data",
         [f"UPDATE matches SET rows = 3 WHERE pair_id = {pair_id(1, 3)}"],
         ["a.png - side/č.png (raw matches)"],
-    ),
-    (
-        "match-data",
-        [replace_data("two_view_geometries", pair_id(1, 3), np.ones((1, 3), np.uint32))],
-        ["a.png - side/č.png (inliers)"],
-    ),
-    (
-        "match-range",
-        [replace_data("matches", pair_id(1, 2), np.array([[5, 0]], np.uint32))],
-        ["a.png - b c.png (raw matches)"],
     ),
     (
         "match-range",
@@ -229,10 +194,8 @@ def test_what_is_broken_is_found_and_nothing_else(
     "statement",
     [
         "DELETE FROM frames",  # none has one: as in databases of old
-        "DELETE FROM descriptors",
         changed_keypoint(0, 0, 90.5),  # within the tolerance
         replace_data("keypoints", 2, np.full((7, 4), 3, np.float32)),
-        replace_data("keypoints", 2, np.full((7, 2), 3, np.float32)),
         replace_data("matches", pair_id(1, 2), np.array([[4, 6]], np.uint32)),  # the last ones
         f"UPDATE two_view_geometries SET rows = 0, data = NULL, config = 0 "
         f"WHERE pair_id = {pair_id(1, 2)}",  # tried without success
@@ -277,17 +240,9 @@ def test_files_that_are_missing_unreadable_or_of_another_size_are_found(
     }
 
 
-@pytest.mark.parametrize(("first", "second"), [(1, 2), (7, 2**31 - 2), (2**31 - 3, 2**31 - 2)])
+@pytest.mark.parametrize(("first", "second"), [(1, 2), (2**31 - 3, 2**31 - 2)])
 def test_pair_ids_are_those_of_colmap(first: int, second: int) -> None:
     assert pair_images(pair_id(first, second)) == (first, second)
-
-
-@pytest.mark.parametrize(
-    ("name", "unsafe"),
-    [("a/b.png", False), ("a..b/c.png", False), ("../a.png", True), ("a\\..\\b.png", True)],
-)
-def test_unsafe_names_lead_out_of_the_folder(name: str, unsafe: bool) -> None:
-    assert leads_outside(name) == unsafe
 
 
 def test_damaged_file_is_a_database_error_or_problems(tmp_path: Path, database_path: Path) -> None:
@@ -295,7 +250,7 @@ def test_damaged_file_is_a_database_error_or_problems(tmp_path: Path, database_p
     data = database_path.read_bytes()
     rng = random.Random(7)
     errors = []
-    for number in range(90):
+    for number in range(30):
         changed = bytearray(data)
         for _ in range(rng.choice([1, 10, 100])):
             changed[rng.randrange(len(changed))] = rng.randrange(256)
@@ -305,7 +260,7 @@ def test_damaged_file_is_a_database_error_or_problems(tmp_path: Path, database_p
             check_database(path)
         except DatabaseError as error:
             errors.append(str(error).startswith(f"{path}: damaged ("))
-    assert len(errors) > 40
+    assert len(errors) > 10
     assert all(errors)
 
 

@@ -16,7 +16,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
     colmap_keypoints,
     image_ids,
-    lack_matches,
     open_database,
     write_keypoints,
     write_matches,
@@ -82,27 +81,6 @@ def test_import_images_adds_what_is_new_and_names_what_colmap_cannot_read(
         assert (database.num_images(), database.num_frames()) == (4, 4)
 
 
-@pytest.mark.parametrize("mode", ["single", "per-folder", "per-image"])
-@pytest.mark.parametrize("first", [["a.png"], ["b.png", "wing/a.png"]])
-def test_images_that_come_later_share_the_cameras_of_those_that_are_there(
-    tmp_path: Path, image_folder: Path, mode: str, first: list[str]
-) -> None:
-    names = NAMES[:2] + NAMES[3:]
-    write_image(image_folder / "wing" / "a.png", texture((90, 60), 9))
-    names.append("wing/a.png")
-    sharing = []
-    for path, parts in (("once.db", [names]), ("later.db", [first, names])):
-        for part in parts:
-            assert (
-                import_images(tmp_path / path, image_folder, part, CameraOptions(mode=mode)) == []
-            )
-        with open_database(tmp_path / path) as database:
-            cameras = {image.name: image.camera_id for image in database.read_all_images()}
-        sharing.append({(a, b) for a in cameras for b in cameras if cameras[a] == cameras[b]})
-    assert sharing[0] == sharing[1]
-    assert len(sharing[0]) == {"single": 16, "per-folder": 8, "per-image": 4}[mode]
-
-
 def test_new_database_appears_with_all_images_or_not_at_all(
     tmp_path: Path, image_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,13 +96,6 @@ def test_new_database_appears_with_all_images_or_not_at_all(
     assert sorted(file.name for file in tmp_path.glob("database.db*")) == ["database.db"]
 
 
-def test_image_ids_of_a_file_that_is_no_database_is_a_database_error(tmp_path: Path) -> None:
-    path = tmp_path / "not a database.db"
-    path.write_bytes(b"something else, long enough to have a header of its own" * 10)
-    with pytest.raises(DatabaseError, match=r"not a database\.db"):
-        image_ids(path)
-
-
 def test_colmap_keypoints_move_by_half_a_pixel_and_divide_shapes_by_six() -> None:
     laf = np.array([[[12.0, -6.0, 10.0], [3.0, 18.0, 20.0]]])
     keypoints = colmap_keypoints(laf)
@@ -132,7 +103,7 @@ def test_colmap_keypoints_move_by_half_a_pixel_and_divide_shapes_by_six() -> Non
     assert_allclose(keypoints, [[10.5, 20.5, 2.0, -1.0, 0.5, 3.0]])
 
 
-@pytest.mark.parametrize("count", [0, 1, 40_000])
+@pytest.mark.parametrize("count", [0, 40_000])
 def test_write_keypoints_writes_any_number_of_frames(database_path: Path, count: int) -> None:
     lafs = some_frames(count)
     with open_database(database_path) as database:
@@ -144,7 +115,7 @@ def test_write_keypoints_writes_any_number_of_frames(database_path: Path, count:
         )
 
 
-def test_write_keypoints_keeps_those_that_it_finds_and_refuses_another_number(
+def test_keypoints_that_are_there_stay_unless_escalation_has_extended_them(
     database_path: Path,
 ) -> None:
     with open_database(database_path) as database:
@@ -153,21 +124,13 @@ def test_write_keypoints_keeps_those_that_it_finds_and_refuses_another_number(
         with pytest.raises(DatabaseError, match=r"5 keypoints .* 9"):
             write_keypoints(database, 1, some_frames(9))
         np.testing.assert_array_equal(database.read_keypoints(1), colmap_keypoints(some_frames(5)))
-
-
-def test_write_keypoints_writes_anew_what_escalation_has_extended(database_path: Path) -> None:
-    with open_database(database_path) as database:
-        write_keypoints(database, 1, some_frames(5))
         write_keypoints(database, 1, some_frames(9), level_ends=[5, 9])
         np.testing.assert_array_equal(database.read_keypoints(1), colmap_keypoints(some_frames(9)))
 
 
-@pytest.mark.parametrize(("place", "value"), [((1, 0, 2), np.nan), ((2, 1, 0), np.inf)])
-def test_write_keypoints_refuses_values_that_are_not_finite(
-    database_path: Path, place: tuple[int, int, int], value: float
-) -> None:
+def test_write_keypoints_refuses_values_that_are_not_finite(database_path: Path) -> None:
     lafs = some_frames(4)
-    lafs[place] = value
+    lafs[1, 0, 2] = np.nan
     with open_database(database_path) as database:
         with pytest.raises(DatabaseError, match="finite"):
             write_keypoints(database, 3, lafs)
@@ -211,13 +174,10 @@ def matchable_path(database_path: Path) -> Path:
     return database_path
 
 
-@pytest.mark.parametrize("dtype", [np.int64, np.uint16])
-def test_write_matches_round_trips_in_the_order_of_the_pair(
-    matchable_path: Path, dtype: type
-) -> None:
+def test_write_matches_round_trips_in_the_order_of_the_pair(matchable_path: Path) -> None:
     # Also above the range of signed integers of 16 bits.
     for pair, matches in (((2, 1), [[4, 1], [0, 3]]), ((4, 2), [[39_999, 6], [32_768, 0]])):
-        indices = np.array(matches, dtype)
+        indices = np.array(matches, np.uint16)
         with open_database(matchable_path) as database:
             write_matches(database, *pair, indices)
             np.testing.assert_array_equal(database.read_matches(*pair), indices)
@@ -240,27 +200,19 @@ def test_write_matches_leaves_a_row_of_no_matches_and_keeps_those_it_finds(
     ("pair", "matches"),
     [
         ((1, 2), np.array([[0.0, 1.0]])),
-        ((1, 2), np.array([[3.7, 2.2]], np.float32)),
-        ((1, 2), np.array([[True, False]])),
         ((1, 2), np.array([[0, 1, 2]])),
-        ((1, 2), np.array([0, 1])),
         ((1, 2), np.array([[-1, 0]])),
-        ((1, 2), np.array([[5, 0]])),
         ((1, 2), np.array([[0, 7]])),
         ((2, 1), np.array([[0, 5]])),
         ((1, 3), np.array([[0, 0]])),
         ((4, 2), np.array([[40_000, 1]])),
-        ((4, 2), np.array([[40_000, 1]], np.uint16).astype(np.int16)),
-        ((1, 2), np.array([[4_294_967_295, 0]], np.uint32)),
         ((1, 2), np.array([[1 << 32, 0]])),
         ((1, 1), np.array([[0, 1]])),
         ((1, 99), np.array([[0, 1]])),
     ],
     ids=[
-        "float64", "float32", "bool", "three columns", "one dimension", "negative",
-        "first out of range", "second out of range", "out of range in reversed pair",
-        "image without keypoints", "one past the end", "wrapped to 16 bits",
-        "-1 as uint32", "33 bits", "same image", "unknown image",
+        "float64", "three columns", "negative", "out of range", "out of range in reversed pair",
+        "image without keypoints", "one past the end", "33 bits", "same image", "unknown image",
     ],
 )  # fmt: skip
 def test_write_matches_refuses_what_would_crash_colmap(
@@ -284,13 +236,3 @@ def test_database_that_cannot_be_made_on_a_full_disk_says_so(
         WorkspaceError, match=r"any\.db: cannot be written \(No space left on device"
     ):
         image_ids(tmp_path / "any.db")
-
-
-def test_pairs_without_a_row_of_matches_are_those_that_lack_them(database_path: Path) -> None:
-    with open_database(database_path) as database:
-        for image_id in (1, 2, 3):
-            write_keypoints(database, image_id, some_frames(3))
-        write_matches(database, 1, 2, np.zeros((0, 2), np.int64))
-        write_matches(database, 1, 3, np.array([[0, 1]]))
-        pairs = np.array([[2, 1], [1, 3], [3, 2], [0, 2]])
-        assert lack_matches(database, pairs).tolist() == [False, False, True, False]

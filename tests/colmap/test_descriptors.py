@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from small_scene import write_photographs
 
 import colmap_affrect
-from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import (
     colmap_descriptors,
@@ -85,14 +84,6 @@ def test_signed_descriptors_of_networks_are_matched_too(tmp_path: Path) -> None:
     assert len(expected & found) >= 0.95 * len(expected)
 
 
-def test_rows_have_the_length_that_colmap_expects() -> None:
-    rng = np.random.default_rng(0)
-    for rows in (rng.normal(size=(40, 128)), rng.exponential(size=(40, 128))):
-        encoded = colmap_descriptors(rows / np.linalg.norm(rows, axis=1, keepdims=True))
-        lengths = np.linalg.norm(encoded.astype(float), axis=1)
-        np.testing.assert_allclose(lengths, 512.0, atol=4.0)
-
-
 def test_positive_descriptors_keep_their_values_and_none_or_zero_are_no_trouble() -> None:
     row = np.full((1, 128), np.sqrt((1.0 - 0.26) / 125))
     row[0, :3] = 0.3, 0.4, 0.1
@@ -104,23 +95,3 @@ def test_positive_descriptors_keep_their_values_and_none_or_zero_are_no_trouble(
 def test_descriptors_of_another_size_are_refused() -> None:
     with pytest.raises(DatabaseError, match=r"64 elements.*leave out --database-descriptors"):
         colmap_descriptors(np.ones((3, 64)))
-
-
-def test_descriptors_are_written_anew_after_an_escalation(tmp_path: Path) -> None:
-    write_photographs(tmp_path / "photos", 2)
-    arguments = ["--image-path", str(tmp_path / "photos"), "--output-path", str(tmp_path / "out")]
-    chosen = ["--recipe", "on-demand", "--database-descriptors", "-q"]
-    assert main(["extract", *arguments, *chosen]) == 0
-    path = tmp_path / "out" / "database.db"
-    with open_database(path) as database:
-        before = database.num_descriptors_for_image(1)
-        assert before == database.num_keypoints_for_image(1)
-    store = FeatureStore(tmp_path / "out" / "features.h5")
-    for name in store.names():
-        store.extend(name, store.read(name))
-    assert main(["extract", *arguments, *chosen]) == 0
-    with open_database(path) as database:
-        for image_id in (1, 2):
-            count = database.num_keypoints_for_image(image_id)
-            assert database.num_descriptors_for_image(image_id) == count
-        assert database.num_descriptors_for_image(1) == 2 * before

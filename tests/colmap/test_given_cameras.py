@@ -52,33 +52,21 @@ def test_table_gives_as_much_as_is_known(tmp_path: Path) -> None:
     ("lines", "message"),
     [
         (["name,focal_cm", "a,3"], "plates.csv: unknown column 'focal_cm' .did you mean 'focal_"),
-        (["focal_px", "3"], "must have the column 'name'"),
         ([], "must have the column 'name'"),
-        (["name,cx,cx", "a,3,4"], "must have the column 'name', and each once"),
         (["name,focal_px", "a,3", "a,4"], "line 3: a is there twice"),
-        (["name,focal_px", ",3"], "line 2: has no name"),
         (
             ["name,focal_px", "a,3,4"],
             "line 2: has 3 cells and the first line 2; values with commas",
         ),
         (["name,focal_px", "a,long"], "line 2: focal_px long: not numbers"),
-        (["name,focal_px", "a,35mm"], "line 2: focal_px 35mm: not numbers"),
-        (["name,focal_px", "a,-3"], "line 2: focal_px -3: not a positive number"),
         (["name,focal_px", "a,0"], "line 2: focal_px 0: not a positive number"),
-        (["name,focal_px", "a,1 2"], "line 2: focal_px 1 2: not a positive number"),
-        (["name,focal_px", "a,nan"], "line 2: focal_px nan: has a number that is not finite"),
         (["name,focal_px", "a,1e999"], "not finite"),
         (["name,focal_mm", "a,50"], "line 2: focal_mm needs sensor_width_mm or plate_width_mm"),
-        (["name,plate_width_mm", "a,50"], "line 2: focal_mm needs"),
         (["name,focal_px,focal_mm", "a,5,5"], "line 2: focal_px and focal_mm say the same twice"),
-        (["name,focal_mm,sensor_width_mm,plate_width_mm", "a,5,5,5"], "sensor_width_mm and plate"),
-        (["name,params,cx,cy", "a,1 2 3 4,1,1"], "line 2: params and cx say the same twice"),
         (["name,cx", "a," + "5" * 200_000], "line 2: field larger than field limit"),
         (["name,cx", "a,5"], "line 2: give both cx and cy, or none"),
-        (["name,cx,cy", "a,1 2,3"], "line 2: cx and cy must be one number each"),
         (["name,model", "a,PINHOL"], "line 2: model PINHOL: not one of SIMPLE_PINHOLE"),
         (["name,model,params", "a,PINHOLE,1 2 3"], r"line 2: params: PINHOLE needs 4 values \(fx"),
-        (["name,params", "a,-1 2 3 0"], "line 2: params: a focal length of -1 px cannot be"),
         (
             ["name,focal_px,camera", "a,3,X", "b,,Y", "c,4,X"],
             "line 4: says something else of camera 'X' than line 2; give them two labels",
@@ -96,15 +84,10 @@ def test_wrong_tables_are_one_clear_line(tmp_path: Path, lines: list[str], messa
     ("options", "message"),
     [
         ({"focal_length_px": -1.0}, "outside"),
-        ({"focal_length_px": float("nan")}, "focal_length_px"),
         ({"params": "900,450,300,0", "focal_length_px": 5.0}, "--camera-params: has focal length"),
-        ({"params": "900,450,300,0", "principal_point": "1,2"}, "leave out --focal-length-px"),
         ({"model": "PINHOL"}, "--camera-model PINHOL: not one of"),
-        ({"model": "PINHOLE", "params": "1,2,3"}, r"params: PINHOLE needs 4 values .*, not 3"),
         ({"params": "0,450,300,0"}, "--camera-params: a focal length of 0 px cannot be"),
-        ({"params": "inf,450,300,0"}, "--camera-params inf,450,300,0: has a number that is not"),
         ({"principal_point": "1"}, "--principal-point 1: give cx,cy, two numbers"),
-        ({"principal_point": "a,b"}, "--principal-point a,b: not numbers"),
         ({"cameras_path": "nowhere.csv"}, "--cameras-path nowhere.csv: cannot be read .No such"),
     ],
 )
@@ -149,10 +132,7 @@ def test_cameras_of_a_binary_model_are_read(tmp_path: Path) -> None:
     ("cameras", "images", "message"),
     [
         ("7 PINHOLE 90 x 1 2 3 4\n", IMAGES, "cameras.txt, line 1: not CAMERA_ID MODEL WIDTH"),
-        ("7 PIN 90 60 1 2 3 4\n", IMAGES, "line 1 PIN: not one of"),
-        ("7 PINHOLE 90 60 1 2 3\n", IMAGES, "line 1: PINHOLE needs 4 values"),
         (CAMERAS, IMAGES.replace(" 9 b", " 8 b"), "images.txt, line 2: not an image of a camera"),
-        (CAMERAS, "1 2 3\n", "images.txt, line 1: not an image"),
         (CAMERAS, None, "images.txt: cannot be read"),
     ],
 )
@@ -165,11 +145,6 @@ def test_wrong_models_are_one_clear_line(
     with pytest.raises(OptionError, match=message) as error:
         given(tmp_path)
     assert "\n" not in str(error.value)
-
-
-def test_folder_without_a_model_is_one_clear_line(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="not a COLMAP model"):
-        given(tmp_path)
 
 
 def test_damaged_binary_model_is_one_clear_line(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from colmap_affrect.colmap.verification import (
     VerificationOptions,
     estimate_geometry,
     max_error_px,
-    telling_shapes,
     two_view_options,
     verified_pairs,
     verify,
@@ -146,6 +144,7 @@ def test_homography_is_judged_where_epipolar_lines_are_not_significant(frames_ag
 def test_database_without_shapes_needs_more_inliers() -> None:
     frames = weak_pair(frames_agree=True)
     assert num_inliers(frames, min_significance=5.0) > 0
+    assert num_inliers(frames, columns=4, min_significance=5.0) > 0
     assert num_inliers(frames, columns=2, min_significance=5.0) == 0
     upright = [lafs.copy() for lafs in frames]
     for lafs in upright:
@@ -153,24 +152,6 @@ def test_database_without_shapes_needs_more_inliers() -> None:
     assert num_inliers((upright[0], upright[1]), min_significance=5.0) == 0
     many = tuple(np.concatenate(two) for two in zip(frames, frames, strict=True))
     assert num_inliers((many[0], many[1]), columns=2, min_significance=5.0) > 0
-
-
-def test_shapes_that_are_all_alike_tell_nothing() -> None:
-    lafs, _ = frames_of([HOMOGRAPHY], 9, 4)
-    assert telling_shapes(rows(lafs, 2)) is None
-    for columns in (4, 6):
-        assert telling_shapes(rows(lafs, columns)) is not None
-    lafs[:, :, :2] = np.linspace(1, 9, 9)[:, None, None] * rotation(0.3)
-    assert telling_shapes(rows(lafs)) is None
-
-
-def test_shapes_that_are_those_of_views_tell_nothing() -> None:
-    lafs, _ = frames_of([HOMOGRAPHY], 90, 4)
-    views = np.array([np.eye(2), [[1.5, 0.4], [0.0, 0.6]], [[0.5, 0.0], [-0.8, 2.0]]])
-    lafs[:, :, :2] = 12.0 * views[np.arange(90) % 3]
-    assert telling_shapes(rows(lafs)) is None
-    lafs[:, :, :2] = lafs[:, :, :2] @ rotation(np.linspace(0, 3, 90))
-    assert telling_shapes(rows(lafs)) is not None
 
 
 def test_frames_of_a_plane_turn_as_its_homography_does() -> None:
@@ -183,7 +164,7 @@ def test_frames_of_a_plane_turn_as_its_homography_does() -> None:
     assert (turn_cosines(carried, second[:, :, :2] @ np.diag([1.0, -1.0])) == -1.0).all()
 
 
-def write_pairs(path: Path, columns: int = 6) -> None:
+def write_pairs(path: Path) -> None:
     """Write images 1 to 4: a right pair (1, 2) and a wrong one (3, 4)."""
     pairs = [weak_pair(frames_agree=agree) for agree in (True, False)]
     with open_database(path) as database:
@@ -191,7 +172,7 @@ def write_pairs(path: Path, columns: int = 6) -> None:
         for image_id, lafs in enumerate((*pairs[0], *pairs[1]), 1):
             image = pycolmap.Image(name=f"{image_id}.png", image_id=image_id, camera_id=1)
             database.write_image(image, use_image_id=True)
-            database.write_keypoints(image_id, rows(lafs, columns))
+            database.write_keypoints(image_id, rows(lafs))
         same = np.stack([np.arange(len(pairs[0][0]))] * 2, axis=1)
         for pair in ((1, 2), (3, 4)):
             write_matches(database, *pair, same)
@@ -265,25 +246,6 @@ def test_preset_colmap_writes_what_pycolmap_does(tmp_path: Path) -> None:
         assert ours.config == theirs.config
         np.testing.assert_array_equal(ours.inlier_matches, theirs.inlier_matches)
         np.testing.assert_array_equal(ours.E, theirs.E)
-
-
-def test_missing_shapes_are_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    for columns in (2, 6):
-        write_pairs(tmp_path / f"{columns}.db", columns)
-    with caplog.at_level(logging.WARNING):
-        verify(tmp_path / "6.db", VerificationOptions(max_num_trials=100))
-        assert not caplog.messages
-        verify(tmp_path / "2.db", VerificationOptions.preset("colmap", max_num_trials=100))
-        assert not caplog.messages
-    for _ in range(2):  # as a vote on cameras does
-        with open_database(tmp_path / "2.db") as database:
-            database.clear_two_view_geometries()
-        with caplog.at_level(logging.INFO):
-            verify(tmp_path / "2.db", VerificationOptions(max_num_trials=100))
-    assert [message.split(": ")[1] for message in caplog.messages] == [
-        "keypoints have no shapes; pairs need more inliers to count as verified, and sides that "
-        "look alike are not told apart"
-    ]
 
 
 def test_threshold_grows_with_photographs_that_were_shrunk() -> None:

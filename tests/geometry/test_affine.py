@@ -57,14 +57,6 @@ def test_transform_frames_carries_warp_frame_to_image_by_inverse_on_the_left() -
     assert_allclose(actual, expected, atol=ROUNDING)
 
 
-@given(homographies(), homographies(), frames())
-def test_transform_frames_by_two_homographies_equals_their_product(
-    first: Array, second: Array, lafs: Array
-) -> None:
-    stepwise = transform_frames(second, transform_frames(first, lafs))
-    assert_allclose(stepwise, transform_frames(second @ first, lafs), rtol=1e-6, atol=1e-6)
-
-
 @given(homographies(), frames())
 def test_transform_frames_by_homography_has_the_jacobian_of_finite_differences(
     homography: Array, lafs: Array

@@ -1,12 +1,23 @@
-"""Matches that confirm each other are counted, wrong ones and copies of one place are not."""
+"""Neighbours, matches that confirm each other, and significance of their numbers."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import Array
 
-from colmap_affrect.geometry import consistency
 from colmap_affrect.geometry.consistency import num_consistent_matches
+from colmap_affrect.geometry.neighbors import neighbors_within
+from colmap_affrect.geometry.significance import (
+    log10_bayes_factor,
+    log10_choose,
+    log10_false_alarms,
+    shuffled,
+)
 
 SIZE = np.array([1200.0, 700.0])
 MAP = np.array([[2.6, 0.9, 40.0], [-0.4, 1.2, 310.0]])  # neither its transpose nor its inverse
@@ -59,9 +70,62 @@ def test_copies_of_one_place_are_no_neighbours() -> None:
     assert num_consistent_matches(first, carried(first)) == 0
 
 
-def test_many_matches_are_compared_block_by_block(monkeypatch: pytest.MonkeyPatch) -> None:
-    first = random_frames(70, 5)
-    second = np.concatenate([carried(first[:50]), random_frames(20, 6)])
-    whole = num_consistent_matches(first, second)
-    monkeypatch.setattr(consistency, "ROWS_AT_ONCE", 9)
-    assert num_consistent_matches(first, second) == whole > 40
+@pytest.mark.parametrize("num", [2, 3, 50, 9001])
+def test_matches_paired_anew_are_no_matches(num: int) -> None:
+    first, second = shuffled(num)
+    assert len(first) == len(second) >= min(num * (num - 1), 4000 - num)
+    assert (first != second).all()
+    assert set(first) == set(second) == set(range(num))
+    assert len(set(zip(first.tolist(), second.tolist(), strict=True))) == len(first)
+
+
+def test_false_alarms_are_those_of_the_formula() -> None:
+    assert log10_choose(9, 4) == pytest.approx(math.log10(126))
+    expected = math.log10((40 - 7) * math.comb(40, 12) * math.comb(12, 7) * 0.02**5)
+    assert log10_false_alarms(40, 12, 7, 0.02) == pytest.approx(expected)
+    assert log10_false_alarms(40, 7, 7, 0.02) == math.inf
+
+
+def test_factor_is_fair_under_chance() -> None:
+    # Its mean over what chance brings is 1: it may be multiplied with the false alarms.
+    counts = np.arange(13)
+    chances = np.array([math.comb(12, n) * 0.3**n * 0.7 ** (12 - n) for n in counts])
+    factors = np.array([10 ** log10_bayes_factor(12, n, 0.3) for n in counts])
+    assert chances @ factors == pytest.approx(1.0)
+
+
+# Eighths are exact in binary, so points at exactly the radius are no matter of rounding.
+coordinates = st.integers(-400, 400).map(lambda eighths: eighths / 8)
+point_sets = st.lists(st.tuples(coordinates, coordinates), max_size=60).map(
+    lambda points: np.array(points, dtype=float).reshape(-1, 2)
+)
+radii = st.sampled_from([0.125, 0.625, 1.25, 5.0, 12.5, 200.0])
+
+
+def all_neighbors(points: Array, radius: float) -> list[list[int]]:
+    """Neighbours by comparing every pair."""
+    squares = ((points[:, None] - points[None]) ** 2).sum(axis=2)
+    return [np.flatnonzero(row <= radius**2).tolist() for row in squares]
+
+
+@given(point_sets, radii)
+def test_neighbors_within_equals_all_distances(points: Array, radius: float) -> None:
+    lists = neighbors_within(points, radius)
+    assert lists.starts.shape == (len(points) + 1,)
+    actual = [
+        sorted(lists.indices[begin:end].tolist())
+        for begin, end in zip(lists.starts[:-1], lists.starts[1:], strict=True)
+    ]
+    assert actual == all_neighbors(points, radius)
+
+
+@given(point_sets.filter(len), st.data())
+def test_of_lists_the_neighbors_of_the_points_asked_for_in_order(
+    points: Array, data: st.DataObject
+) -> None:
+    asked = np.array(data.draw(st.lists(st.integers(0, len(points) - 1), max_size=10)), dtype=int)
+    rows, neighbors = neighbors_within(points, 5.0).of(asked)
+    expected = all_neighbors(points, 5.0)
+    assert (np.diff(rows) >= 0).all()
+    for position, point in enumerate(asked):
+        assert sorted(neighbors[rows == position].tolist()) == expected[point]

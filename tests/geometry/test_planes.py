@@ -12,14 +12,12 @@ from strategies import Array
 
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.planes import (
-    WINDOW_SIGMA_PX,
     PlaneClusters,
     cluster_normals,
     fronto_parallel_homography,
     normals_from_depth,
     orthogonalized,
     shrink_depth,
-    spiral_points,
     viewing_cosines,
 )
 
@@ -67,29 +65,6 @@ def test_normals_are_right_up_to_a_depth_discontinuity() -> None:
     assert np.isnan(errors).mean() < 0.002
 
 
-def test_normals_are_unknown_where_a_plane_has_no_hold() -> None:
-    depth = plane_depth([0.3, 0.2, -0.9])
-    depth[:, 40:] = np.nan
-    depth[10, 60] = 2.0  # alone
-    depth[30, 50:80] = 2.0  # a row of pixels
-    known = np.isfinite(normals_from_depth(depth, CAMERA)).all(axis=2)
-    assert known[:, :40].all()
-    assert not known[:, 40:].any()
-
-
-def test_normals_are_weighted_least_squares_fits_of_inverse_depth() -> None:
-    rng = np.random.default_rng(3)
-    depth = plane_depth([0.4, -0.3, -0.8]) * (1.0 + 1e-3 * rng.standard_normal((70, 90)))
-    row, column = 41, 57
-    rows, columns = np.mgrid[row - 2 : row + 3, column - 2 : column + 3]
-    weights = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / (2 * WINDOW_SIGMA_PX**2))
-    directions = rays(CAMERA, np.arange(90), np.arange(70))[rows, columns].reshape(-1, 3)
-    root = np.sqrt(weights).reshape(-1, 1)  # weights enter the normal equations linearly
-    fitted, *_ = np.linalg.lstsq(root * directions, root[:, 0] / depth[rows, columns].ravel())
-    normal = normals_from_depth(depth, CAMERA)[row, column]
-    assert_allclose(normal, -unit(fitted), atol=1e-9)
-
-
 def test_shrink_depth_keeps_planes_exact_and_says_where_pixels_went() -> None:
     normal = unit([0.5, -0.4, -0.8])
     shrunk, shrunk_from_depth = shrink_depth(plane_depth(normal), 31)
@@ -98,32 +73,6 @@ def test_shrink_depth_keeps_planes_exact_and_says_where_pixels_went() -> None:
     assert_allclose(project(shrunk_from_depth, middles), [[0, 0], [28, 22]], atol=1e-12)
     normals = normals_from_depth(shrunk, shrunk_from_depth @ CAMERA)
     assert angles_deg(normals, normal).max() < EXACT_DEG
-
-
-def test_shrink_depth_leaves_small_maps_and_spreads_the_unknown() -> None:
-    depth = plane_depth([0.1, 0.2, -1.0])
-    same, identity = shrink_depth(depth, 90)
-    assert_allclose(same, depth)
-    assert_allclose(identity, np.eye(3))
-    depth[5, 7] = np.nan
-    shrunk, _ = shrink_depth(depth, 45)
-    assert np.argwhere(np.isnan(shrunk)).tolist() == [[2, 3]]
-
-
-@pytest.mark.parametrize("num_points", [10, 300, 500, 2000])
-def test_spiral_points_cover_the_sphere_evenly(num_points: int) -> None:
-    points = spiral_points(num_points)
-    assert points.shape == (num_points, 3)
-    assert_allclose(np.linalg.norm(points, axis=1), 1.0)
-    assert_allclose(points[:, 2].mean(), 0.0, atol=1e-12)
-    # In units of the side of a square with a point's share of the sphere.
-    share = np.sqrt(4.0 * np.pi / num_points)
-    cosines = points @ points.T - 3.0 * np.eye(num_points)
-    spacing = np.arccos(cosines.max(axis=1)) / share
-    assert spacing.min() > 0.7
-    assert spacing.max() < 1.3
-    anywhere = unit(np.random.default_rng(1).standard_normal((3000, 3)))
-    assert np.arccos((anywhere @ points.T).max(axis=1)).max() / share < 1.1
 
 
 def scattered(center: Array, count: int, spread_deg: float, rng: np.random.Generator) -> Array:
@@ -166,24 +115,6 @@ def test_cluster_normals_finds_planes_by_falling_size() -> None:
     assert clusters.labels.dtype == np.int32
 
 
-@pytest.mark.parametrize("limit", [1, 2, 3, 9])
-def test_cluster_normals_obeys_the_limit_on_planes(limit: int) -> None:
-    assert len(clustered(three_planes()[0], max_num_planes=limit).normals) == min(limit, 3)
-
-
-def test_cluster_normals_lets_the_rest_vote_again_after_each_choice() -> None:
-    # Candidates may be close: without a second vote a bin that is 20 degrees from the first
-    # plane, and still holds it, would win over the second plane.
-    rng = np.random.default_rng(2)
-    planes = unit([[0.0, 0.0, -1.0], [1.0, 0.0, -0.2]])
-    normals = np.concatenate(
-        [scattered(planes[0], 600, 4.0, rng), scattered(planes[1], 400, 4.0, rng)]
-    )
-    clusters = clustered(normals[None], min_separation_rad=np.deg2rad(20.0))
-    assert len(clusters.normals) == 2
-    assert angles_deg(clusters.normals, planes).max() < 1.0
-
-
 def test_cluster_normals_takes_opposite_normals_as_one_plane_only_if_told() -> None:
     rng = np.random.default_rng(8)
     right = unit([1.0, 0.1, -0.1])
@@ -207,14 +138,6 @@ def test_orthogonalized_normals_are_the_nearest_orthogonal_ones(count: int) -> N
         turned, _ = np.linalg.qr(np.eye(3) + 0.02 * rng.standard_normal((3, 3)))
         turned *= np.sign(np.diag(turned))
         assert ((result @ turned - skewed) ** 2).sum() >= cost - 1e-12
-
-
-def test_orthogonalized_keeps_both_sides_of_a_street_opposite() -> None:
-    street = unit([[1.0, 0.02, -0.1], [0.0, -1.0, -0.1], [-1.0, 0.05, -0.05], [0.0, 0.1, -1.0]])
-    result = orthogonalized(street)
-    assert_allclose(result[2], -result[0])
-    assert_allclose(result[[0, 1, 3]] @ result[[0, 1, 3]].T, np.eye(3), atol=1e-12)
-    assert angles_deg(result, street).max() < 6.0
 
 
 @given(visible_normals(), st.floats(0.0, np.pi), st.tuples(st.floats(0, 89), st.floats(0, 69)))

@@ -51,7 +51,7 @@ def source(path, **options):
 # --- files: formats and places
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, ">f4", np.int32, np.uint16])
+@pytest.mark.parametrize("dtype", [np.float16, ">f4", np.int32])
 @pytest.mark.parametrize("suffix", [".npy", ".npz"])
 def test_arrays_round_trip(tmp_path, suffix, dtype):
     values = np.asfortranarray(asymmetric_map().astype(dtype))
@@ -68,12 +68,6 @@ def test_png_of_sixteen_bits_counts_steps_and_zero_is_unknown(tmp_path):
     depth = source(tmp_path, png_scale=0.002).depth(photograph())
     expected = np.where(steps == 0, np.nan, 0.002 * steps)
     assert_allclose(depth, expected, rtol=FLOAT32_RTOL)
-
-
-def test_tiff_of_floating_point_numbers_is_taken_as_it_is(tmp_path):
-    values = asymmetric_map().astype(np.float32)
-    write_map(tmp_path / "a.tif", values)
-    assert_array_equal(source(tmp_path, png_scale=7.0).depth(photograph()), values)
 
 
 def test_the_only_map_of_a_file_is_taken_or_the_one_named_depth(tmp_path):
@@ -120,7 +114,7 @@ def test_values_that_are_no_depth_are_unknown_and_raise_no_warning(tmp_path):
 # --- files: kinds
 
 
-@pytest.mark.parametrize(("scale_x", "scale_y"), [(1, 1), (0.5, 0.5), (2.0, 2.0), (1.0, 25 / 24)])
+@pytest.mark.parametrize(("scale_x", "scale_y"), [(1, 1), (0.5, 0.5), (1.0, 25 / 24)])
 def test_distances_along_rays_become_depths_along_the_axis(tmp_path, scale_x, scale_y):
     # Written out: pixel centres of a resized image, p' = s (p + 1/2) - 1/2.
     camera = np.array(
@@ -160,12 +154,6 @@ def test_missing_map_names_the_places_looked_at(tmp_path):
         source(tmp_path).depth(photograph(""))
 
 
-def test_png_of_eight_bits_is_refused_as_a_preview(tmp_path):
-    write_map(tmp_path / "a.png", np.full((4, 6), 9, np.uint8))
-    with pytest.raises(DepthError, match=r"a\.png: depth map of a\.jpg: 8 bits are a preview"):
-        source(tmp_path).depth(photograph())
-
-
 @pytest.mark.parametrize("suffix", [".npy", ".npz", ".png", ".tif"])
 def test_file_of_another_format_or_with_pickled_objects_is_unreadable(tmp_path, suffix):
     pickled = tmp_path / "pickled.npy"
@@ -180,10 +168,8 @@ def test_file_of_another_format_or_with_pickled_objects_is_unreadable(tmp_path, 
     "values",
     [
         np.ones((1, 4, 6)),
-        np.float64(2.0),
         np.ones((0, 6)),
         np.ones((4, 6), complex),
-        np.full((4, 6), "1.0"),
     ],
 )
 def test_array_that_is_no_map_of_numbers_is_refused(tmp_path, values):
@@ -202,7 +188,7 @@ def test_map_far_larger_than_the_photograph_is_refused_by_its_header(tmp_path, s
     assert source(tmp_path).depth(photograph(path=stored)).shape == (1800, 2700)
 
 
-@pytest.mark.parametrize("size", [(4, 6), (6, 6), (12, 7)])
+@pytest.mark.parametrize("size", [(4, 6), (12, 7)])
 def test_map_of_another_aspect_is_refused_unless_networks_round_so(tmp_path, size):
     write_map(tmp_path / "a.npy", asymmetric_map(size))
     with pytest.raises(DepthError, match=rf"is {size[0]} x {size[1]} px, the photograph 12 x 8"):
@@ -210,14 +196,6 @@ def test_map_of_another_aspect_is_refused_unless_networks_round_so(tmp_path, siz
     for rounded in ((6, 4), (120, 80), (352, 224), (64, 42)):
         write_map(tmp_path / "a.npy", asymmetric_map(rounded))
         assert source(tmp_path).depth(photograph()).shape == rounded[::-1]
-
-
-@pytest.mark.parametrize("value", [0.0, np.nan])
-@pytest.mark.parametrize("kind", ["z", "ray", "inverse"])
-def test_map_without_depths_is_refused(tmp_path, kind, value):
-    write_map(tmp_path / "a.npy", np.full((4, 6), value))
-    with pytest.raises(DepthError, match=r"a\.npy: depth map of a\.jpg: 0 % of the values are dep"):
-        source(tmp_path, kind=kind).depth(photograph())
 
 
 def test_require_some_needs_a_map_of_one_image(tmp_path):
@@ -241,9 +219,8 @@ def world_points(depth, camera_matrix, pose):
     return (points - translation) @ rotation
 
 
-@pytest.mark.parametrize("number", [1, 5, 9])
-def test_paving_of_the_courtyard_is_the_plane_z_0_of_the_world(number):
-    name = f"court_{number}.jpg"
+def test_paving_of_the_courtyard_is_the_plane_z_0_of_the_world():
+    name = "court_5.jpg"
     image = courtyard_photograph(name)
     pose = read_poses(COURTYARD / "ground_truth")[name]
     options = {"path": COURTYARD / "depth", "png_scale": PNG_METRES}

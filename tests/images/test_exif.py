@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import pytest
 from photographs_with_exif import BODY, LENS_50, write_photograph
-from PIL import ExifTags, TiffImagePlugin
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.images.exif import CameraTags, ExifFocal, exif_focal, read_camera_tags
+from colmap_affrect.images.exif import CameraTags, exif_focal, read_camera_tags
 
 MM50 = {**BODY, "FocalLength": 50.0}
 
@@ -30,7 +27,6 @@ def tags_of(path: Path, size: tuple[int, int], tags: dict[str, Any]) -> CameraTa
     [
         {**BODY, "FocalLengthIn35mmFilm": 28},
         {**MM50, "FocalPlaneXResolution": 3 / 0.7, "FocalPlaneResolutionUnit": 4},
-        {**MM50, "FocalPlaneXResolution": 90.0, "FocalPlaneResolutionUnit": 2},
         {
             "Make": "A", "FocalLength": 6.1, "FocalPlaneXResolution": 312.5,
             "FocalPlaneResolutionUnit": 3,
@@ -92,14 +88,10 @@ def tags(size: tuple[int, int], **values: Any) -> CameraTags:
         # Two against one, where the resolution is one of the two.
         (tags((4368, 2912), equivalent_mm=85.0, px_per_mm=(122, 122)), 36.0, 6100.0, True),
         (tags((4368, 2912), equivalent_mm=50.0, px_per_mm=(122, 122)), 24.0, 6066.0, False),
-        # Fewer pixels than there are, which shrinking does not explain.
-        (tags((4368, 2912), equivalent_mm=85.0, px_per_mm=(122, 122)), None, None, False),
         # Only one of two can be.
         (tags((400, 300), equivalent_mm=28.0, px_per_mm=(122, 122)), None, 323.6, False),
-        (tags((4368, 2912), equivalent_mm=5.0, px_per_mm=(122, 122)), None, 6100.0, True),
         # Pixels that are not square, and a zoom that focal lengths in mm do not know.
         (tags((4368, 2912), px_per_mm=(122, 61)), None, None, False),
-        (tags((4368, 2912), px_per_mm=(122, None)), None, 6100.0, False),
         (tags((4368, 2912), px_per_mm=(122, 122), zoom=2.0), None, None, False),
         (tags((4368, 2912)), 35.8, 6100.6, False),
     ],
@@ -116,34 +108,7 @@ def test_statements_that_contradict_each_other(
     assert found.is_rescaled == is_rescaled
 
 
-@pytest.mark.parametrize(
-    "value",
-    [0, -50, Fraction(1, 2**31), TiffImagePlugin.IFDRational(1, 0), float("nan"), float("inf"),
-        -0.0, 4e9],
-)  # fmt: skip
-@pytest.mark.parametrize(
-    "name",
-    ["FocalLength", "FocalLengthIn35mmFilm", "FocalPlaneXResolution", "FocalPlaneYResolution",
-        "FocalPlaneResolutionUnit", "ExifImageWidth", "ExifImageHeight", "DigitalZoomRatio"],
-)  # fmt: skip
-def test_absurd_numbers_never_raise_and_give_no_absurd_focal_length(value: Any, name: str) -> None:
-    from colmap_affrect.images.exif import _camera_tags
-
-    values = {ExifTags.Base[key]: item for key, item in LENS_50.items()}
-    found = exif_focal(_camera_tags((4368, 2912), {**values, ExifTags.Base[name]: value}))
-    assert found.focal_px is None or 0.3 * 4368 <= found.focal_px <= 6 * 4368
-
-
-@pytest.mark.parametrize("value", ["50 mm", b"\xff\xfe", "", "\ud800", (1, 2), None, [], 10**400])
-def test_text_in_the_place_of_numbers_is_named(value: Any) -> None:
-    from colmap_affrect.images.exif import _camera_tags
-
-    found = _camera_tags((400, 300), {ExifTags.Base.FocalLength: value})
-    assert found.focal_mm is None
-    assert exif_focal(found) == ExifFocal(None, why="EXIF has an absurd FocalLength")
-
-
-@pytest.mark.parametrize("num_bytes", range(0, 300, 7))
+@pytest.mark.parametrize("num_bytes", range(0, 300, 29))
 def test_damaged_headers_never_raise(tmp_path: Path, num_bytes: int) -> None:
     path = tmp_path / "a.jpg"
     write_photograph(path, (90, 60), LENS_50)
@@ -154,9 +119,3 @@ def test_damaged_headers_never_raise(tmp_path: Path, num_bytes: int) -> None:
     found = read_camera_tags(path)
     if found:
         exif_focal(found)
-
-
-def test_a_pipe_has_no_header_and_is_not_waited_for(tmp_path: Path) -> None:
-    path = tmp_path / "pipe.jpg"
-    os.mkfifo(path)
-    assert read_camera_tags(path) is None

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import os
 import re
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import PIL.ExifTags
 import PIL.Image
 import pytest
 from command import Call
 from small_scene import IMAGE_SIZE, photograph
-from synthetic import texture, write_image
+from synthetic import png_of_size, texture, write_image
 
 import colmap_affrect
 from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.data import Mask
-from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.errors import ImageError
 from colmap_affrect.features.sift import SiftOptions
 from colmap_affrect.images.masks import read_mask, shrink_mask
 from colmap_affrect.images.photographs import MaskOptions, Photographs, list_images
@@ -70,15 +67,6 @@ def test_features_of_the_image_and_of_all_warps_keep_to_the_mask(photo_path: Pat
     assert (inside.rectification_ids > 0).sum() > 0.8 * len(inside)
 
 
-def test_mask_of_a_shrunk_image_is_exact_in_its_own_pixels(photo_path: Path) -> None:
-    mask = diagonal_mask()
-    options = ExtractionOptions(rectifier=AsiftOptions(), max_image_size_px=131)
-    features = prepare(options).extract_file(photo_path, mask=mask).features
-    columns, rows = np.rint(features.keypoints).astype(int).T
-    assert len(features) > 100
-    assert mask[rows, columns].all()
-
-
 def test_shrunk_mask_keeps_its_place() -> None:
     mask = np.zeros((90, 120), bool)
     mask[30:, 20:60] = True
@@ -87,20 +75,10 @@ def test_shrunk_mask_keeps_its_place() -> None:
     np.testing.assert_array_equal(shrink_mask(mask, (40, 30)), expected)
 
 
-@pytest.mark.parametrize("white", [1, 77, 255])
+@pytest.mark.parametrize("white", [1, 255])
 def test_only_black_is_left_out(tmp_path: Path, white: int) -> None:
     write_mask(tmp_path / "m.png", diagonal_mask((40, 90)), white)
     np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), diagonal_mask((40, 90)))
-
-
-def test_colour_and_16_bit_masks_are_read(tmp_path: Path) -> None:
-    mask = diagonal_mask((50, 80))
-    colour = np.zeros((*mask.shape, 4), np.uint8)
-    colour[..., 1], colour[..., 3] = mask * 200, 255
-    cv2.imwrite(str(tmp_path / "rgba.png"), colour)
-    cv2.imwrite(str(tmp_path / "deep.png"), mask.astype(np.uint16))
-    for name in ("rgba.png", "deep.png"):
-        np.testing.assert_array_equal(read_mask(tmp_path / name), mask)
 
 
 @pytest.mark.parametrize("mask_name", ["wing/a b.jpg.png", "wing/a b.png"])
@@ -138,18 +116,15 @@ def test_mask_and_camera_mask_both_count(tmp_path: Path) -> None:
         Photographs(tmp_path, masks).mask("x.jpg")
 
 
-HUGE_PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(
-    ">IIBBBBBI", 32_000, 31_000, 8, 0, 0, 0, 0, 0
-)
-"""Only a header: whoever reads on finds it damaged."""
-
-
 @pytest.mark.parametrize(
     ("prepare_mask", "message"),
     [
         (lambda path: path.write_bytes(b""), "not a readable image"),
         (lambda path: write_mask(path, diagonal_mask((300, 240))), "320 x 240 px and its mask 300"),
-        (lambda path: path.write_bytes(HUGE_PNG), "320 x 240 px and its mask 32000 x 31000 px"),
+        (
+            lambda path: path.write_bytes(png_of_size(32_000, 31_000)),
+            "320 x 240 px and its mask 32000 x 31000 px",
+        ),
     ],
 )
 def test_image_with_a_wrong_mask_is_reported_and_the_others_go_on(
@@ -189,15 +164,6 @@ def test_photographs_without_a_mask_are_used_whole_and_named(
     store = FeatureStore(tmp_path / "out" / "features.h5")
     assert len(store.read("a b.png")) > 100
     assert len(store.read("good.png")) == 0
-
-
-def test_missing_folder_of_masks_is_one_clear_line(tmp_path: Path) -> None:
-    masks = MaskOptions(path=str(tmp_path / "nowhere"))
-    with pytest.raises(OptionError, match=r"--mask-path .*nowhere: no such folder"):
-        Photographs(tmp_path, masks).check()
-    masks = MaskOptions(camera_path=str(tmp_path / "nothing.png"))
-    with pytest.raises(OptionError, match=r"--camera-mask-path .*nothing\.png: no such file"):
-        Photographs(tmp_path, masks).check()
 
 
 def test_gps_position_and_focal_length_of_exif_are_taken_over(tmp_path: Path) -> None:
@@ -251,16 +217,7 @@ def test_list_images_takes_those_of_a_list(tmp_path: Path) -> None:
     assert list_images(tmp_path, listed) == ["b c.png", "deep/č.png"]
 
 
-def test_list_images_leaves_out_a_name_that_is_not_utf8(tmp_path: Path) -> None:
-    Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.png")).write_bytes(b"")
-    with pytest.raises(
-        ImageError, match=r"names: 1 left out, such as \\udcff.png: the name is"
-    ) as error:
-        list_images(tmp_path)
-    str(error.value).encode("utf-8")
-
-
-@pytest.mark.parametrize("line", ["d.png", "../photos/a.png", "{folder}/a.png", "# a.png", ""])
+@pytest.mark.parametrize("line", ["d.png", "../photos/a.png", ""])
 def test_list_images_refuses_a_list_of_what_is_not_there(tmp_path: Path, line: str) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()

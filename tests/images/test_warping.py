@@ -92,7 +92,7 @@ def amplitude(image: GrayImage, plan: Rectification) -> float:
     return float(np.sqrt(2) * warp(image, plan).ravel()[inside].std())
 
 
-@pytest.mark.parametrize("angle_rad", [0.0, 0.7, np.pi / 2, 2.2])
+@pytest.mark.parametrize("angle_rad", [0.0, 0.7])
 @pytest.mark.parametrize("tilt", [3.15, 6.22])
 def test_warp_suppresses_what_the_compressed_axis_cannot_show(
     tilt: float, angle_rad: float
@@ -105,16 +105,6 @@ def test_warp_suppresses_what_the_compressed_axis_cannot_show(
     assert amplitude(too_fine, plan) < 8.0
     coarse = grating(compressed, 24.0)
     assert amplitude(coarse, plan) > 80.0
-
-
-def test_warp_mask_of_a_whole_image_marks_where_the_warp_shows_it() -> None:
-    plan = rectification(3.0, 0.5)
-    everywhere = replace(plan, region=None)
-    np.testing.assert_array_equal(warp_mask(everywhere, SIZE), warp_mask(plan, SIZE))
-    sources = project(plan.image_from_rectified, canvas_points(plan).reshape(-1, 2))
-    shown = ((sources > -0.4) & (sources < np.array(SIZE) - 0.6)).all(axis=1)
-    assert (warp_mask(everywhere, SIZE).ravel()[shown] == 255).all()
-    assert shown.mean() < 0.9
 
 
 def perspective(
@@ -180,50 +170,6 @@ def test_warp_by_a_homography_of_a_coordinate_ramp_shows_image_from_rectified(
     fitted, *_ = np.linalg.lstsq(design, errors, rcond=None)
     assert abs(fitted[0]) < RAMP_ERROR_PX
     assert np.abs(design @ fitted).max() < PERSPECTIVE_RAMP_ERROR_PX
-
-
-def test_warp_by_a_homography_shows_frontal_detail_and_suppresses_what_it_cannot_show() -> None:
-    # The left end of the warp magnifies, its right end compresses by three and more.
-    size = (900, 300)
-    homography = np.array([[1.0, 0, 0], [0, 1.0, 0], [0.002, 0, 1.0]])
-    plan = perspective(homography, 1.2, size)
-    rows, columns = np.indices(size[::-1])
-    image = np.rint(128 + 100 * np.sin(2 * np.pi * (0.95 * columns + 0.3 * rows) / 5.0))
-    shown = warp(image.astype(np.uint8), plan).astype(float)
-    points = canvas_points(plan)
-    sources = project(plan.image_from_rectified, points.reshape(-1, 2))
-    inside = ((sources > 12) & (sources < np.array(size) - 13)).all(axis=1)
-    spans = jacobian_spans(plan, points.reshape(-1, 2)).max(axis=1)
-    magnified = inside & (spans < 1.0)
-    compressed = inside & (spans > 3.2)  # 5 px of the image are less than 2 of the warp
-    assert np.count_nonzero(magnified) > 3000
-    assert np.count_nonzero(compressed) > 3000
-    assert np.sqrt(2) * shown.ravel()[magnified].std() > 75.0
-    assert np.sqrt(2) * shown.ravel()[compressed].std() < 8.0
-
-
-def test_warp_by_a_homography_close_to_affine_is_the_affine_warp() -> None:
-    image = texture(SIZE, seed=5, finest_sigma_px=2.0)
-    for tilt, angle_rad in [(1.0, 0.0), (1.0, 0.6), (3.2, 0.0), (2.5, np.pi / 2)]:
-        plan = rectification(tilt, angle_rad)
-        matrix = plan.rectified_from_image.copy()
-        matrix[2, 0] = 1e-12
-        almost = replace(plan, rectified_from_image=matrix)
-        assert not almost.is_affine
-        # Equal but for OpenCV's coordinates in steps of 1/32 px, and but for the rim of the
-        # canvas, which one of them blurs with what lies beyond and the other with its mirror.
-        inner = (slice(3, -3), slice(None))
-        assert_allclose(warp(image, almost)[inner].astype(int), warp(image, plan)[inner], atol=4)
-        np.testing.assert_array_equal(warp_mask(almost, SIZE), warp_mask(plan, SIZE))
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (3, 2)])
-def test_warps_of_tiny_flat_images_are_flat_and_of_the_planned_size(size: tuple[int, int]) -> None:
-    matrix = np.array([[3.0, 0.2, 4.0], [0.1, 2.5, 4.0], [1e-3, 2e-3, 1.0]])
-    for plan in (rectification(4.0, 0.8, size), Rectification(matrix, (150, 140), None, 1.0, 0.0)):
-        shown = warp(np.full(size[::-1], 90, np.uint8), plan)
-        assert shown.shape == warp_mask(plan, size).shape == plan.canvas_size[::-1]
-        assert np.unique(shown).tolist() == [90]
 
 
 @pytest.mark.parametrize("is_affine", [True, False])

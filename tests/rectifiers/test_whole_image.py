@@ -25,8 +25,6 @@ from colmap_affrect.rectifiers.whole_image import (
     AffNetShapesOptions,
     Asift,
     AsiftOptions,
-    Identity,
-    IdentityOptions,
 )
 
 SIZE = (163, 117)
@@ -36,13 +34,6 @@ def fixed_shapes(classes: list[tuple[float, float]], counts: list[int]) -> Fixed
     """Shapes of given classes (tilt, angle), so many of each."""
     rows = np.repeat([(5.0, 5.0, *of_class) for of_class in classes], counts, axis=0)
     return FixedShapes(rows)
-
-
-def test_identity_plans_nothing() -> None:
-    assert (
-        Identity(IdentityOptions(), RectifierInputs()).plan(photograph_of(texture(SIZE, 1))).items
-        == ()
-    )
 
 
 def test_asift_has_the_61_maps_of_the_paper_and_their_area() -> None:

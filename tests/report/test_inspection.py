@@ -31,8 +31,7 @@ from colmap_affrect.geometry.affine import (
     project,
     rectifying_affine,
 )
-from colmap_affrect.geometry.tilts import asift_covering
-from colmap_affrect.recipes import ExtractionOptions, LevelOptions
+from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.base import (
     RECTIFIERS,
     RectifierInputs,
@@ -43,7 +42,6 @@ from colmap_affrect.rectifiers.depth_planes import DepthPlanesOptions
 from colmap_affrect.rectifiers.whole_image import (
     AsiftOptions,
     IdentityOptions,
-    plan_whole_image,
 )
 from colmap_affrect.report.inspection import inspect_image
 from colmap_affrect.report.regions import (
@@ -51,7 +49,6 @@ from colmap_affrect.report.regions import (
     circle_origin,
     region_middle,
     tinted,
-    warp_colors,
 )
 from colmap_affrect.report.sheet import DPI, WIDTH_INCHES, printable
 from colmap_affrect.stages.one_image import ImageExtractor
@@ -61,21 +58,18 @@ SHAPES = RectifierInputs(SecondMoment(SecondMomentOptions()))
 
 
 class GridFeatures:
-    """A feature extractor that finds a feature every ``step_px``, wherever the mask is set."""
+    """A feature extractor that finds a feature every 20 px, wherever the mask is set."""
 
     descriptor_size = 3
-
-    def __init__(self, step_px: int = 20, radius_px: float = 12.0, first_px: int = 10) -> None:
-        self.step_px, self.radius_px, self.first_px = step_px, radius_px, first_px
 
     def detect(self, view: View) -> LocalFeatures:
         image, mask = view
         is_found = np.ones(image.shape, bool) if mask is None else mask > 0
         grid = np.zeros_like(is_found)
-        grid[self.first_px :: self.step_px, self.first_px :: self.step_px] = True
+        grid[10::20, 10::20] = True
         points = np.argwhere(grid & is_found)[:, ::-1].astype(float)
         count = len(points)
-        lafs = lafs_from_keypoints(points, np.full(count, self.radius_px), np.zeros(count))
+        lafs = lafs_from_keypoints(points, np.full(count, 12.0), np.zeros(count))
         responses = np.linspace(1, 2, count).astype(np.float32)
         return LocalFeatures(lafs, responses, np.zeros((count, 3), np.float32))
 
@@ -84,9 +78,6 @@ class GridFeatures:
     ) -> list[LocalFeatures]:
         assert len(images) == len(detected)
         return list(detected)
-
-
-NO_FEATURES = GridFeatures(first_px=10_000)
 
 
 class Planned:
@@ -120,24 +111,13 @@ def homography_warp(segment: int) -> Rectification:
     return Rectification(homography, (180, 160), region, 1.4, 0.25, (180, 90), segment)
 
 
-def extractor_of(
-    *plans: RectificationPlan, extractor: GridFeatures | None = None, **options: Any
-) -> ImageExtractor:
-    """Extractor whose levels have these plans."""
-    levels = [AsiftOptions() if plan.items else IdentityOptions() for plan in plans]
-    return ImageExtractor(
-        ExtractionOptions(
-            rectifier=levels[0],
-            escalation=tuple(LevelOptions(rectifier=item) for item in levels[1:]),
-            **options,
-        ),
-        (extractor or GridFeatures(),) * len(plans),
-        tuple(Planned(plan) for plan in plans),
-    )
-
-
 def extractor_with(options: RectifierOptions, rectifier: Any) -> ImageExtractor:
     return ImageExtractor(ExtractionOptions(rectifier=options), (GridFeatures(),), (rectifier,))
+
+
+def extractor_of(plan: RectificationPlan) -> ImageExtractor:
+    options = AsiftOptions() if plan.items else IdentityOptions()
+    return extractor_with(options, Planned(plan))
 
 
 @pytest.fixture
@@ -204,31 +184,6 @@ def test_json_describes_a_known_plan(tmp_path: Path, photo: Path) -> None:
     assert str(plan_path) in shown
 
 
-def test_sizes_are_those_of_processing(tmp_path: Path, photo: Path) -> None:
-    plan = RectificationPlan((150, 100), (affine_warp(2.0, 0.3, (10, 5, 60, 40)),))
-    inspect_image(extractor_of(plan, max_image_size_px=150), photo, tmp_path / "out")
-    data = json.loads((tmp_path / "out" / "photo-plan.json").read_text(encoding="utf-8"))
-    assert (data["stored_size"], data["levels"][0]["size"]) == ([300, 200], [150, 100])
-    assert data["levels"][0]["warps"][0]["region"]["share"] == pytest.approx(2400 / 15_000)
-
-
-@pytest.mark.long
-def test_each_level_has_a_sheet_and_an_entry(tmp_path: Path, photo: Path) -> None:
-    warps = (affine_warp(2.0, 0.3, (30, 20, 80, 60)),)
-    extractor = extractor_of(RectificationPlan(SIZE), RectificationPlan(SIZE, warps))
-    levels, _ = inspect(extractor, photo, tmp_path / "all")
-    assert sorted(path.name for path in (tmp_path / "all").iterdir()) == [
-        "photo-inspection-level-1.png",
-        "photo-inspection.png",
-        "photo-plan.json",
-        "run.log",
-    ]
-    assert [level["level"] for level in levels] == [0, 1]
-    escalated = levels[1]
-    assert escalated["original"] == {"features_found": 0, "features_kept": 0}
-    assert escalated["totals"]["keypoints"] == escalated["warps"][0]["features_kept"] > 0
-
-
 def test_missing_depth_is_a_warning_as_in_extraction(tmp_path: Path, photo: Path) -> None:
     (level,), _ = inspect(extractor_with(DepthPlanesOptions(), Planned()), photo, tmp_path / "out")
     assert level["warning"].startswith("not rectified: photo.png: no depth map")
@@ -246,31 +201,7 @@ def test_unreadable_image_is_refused_before_anything_is_written(tmp_path: Path) 
 # --- Sheets
 
 
-PLANS = {
-    "no warps": RectificationPlan(SIZE),
-    "homography": RectificationPlan(SIZE, (homography_warp(0),)),
-    "61 warps": plan_whole_image(
-        SIZE, np.concatenate([[[1.2, 0.7]], asift_covering()]), AsiftOptions(area_preserving=False)
-    ),
-}
-
-
-@pytest.mark.parametrize(
-    ("kind", "extractor"),
-    [
-        ("no warps", GridFeatures()),
-        ("homography", GridFeatures()),
-        ("homography", NO_FEATURES),
-        pytest.param("61 warps", GridFeatures(), marks=pytest.mark.long),
-    ],
-)
-def test_sheet_of_plan(kind: str, extractor: GridFeatures, tmp_path: Path, photo: Path) -> None:
-    (level,), _ = inspect(extractor_of(PLANS[kind], extractor=extractor), photo, tmp_path / "out")
-    assert (level["totals"]["keypoints"] == 0) == (extractor is NO_FEATURES)
-    assert len(level["warps"]) == len(PLANS[kind].items)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (20, 31), (600, 33)])
+@pytest.mark.parametrize("size", [(1, 1), (600, 33)])
 def test_sheet_of_small_and_flat_images(size: tuple[int, int], tmp_path: Path) -> None:
     path = write_image(tmp_path / "flat.png", np.full(size[::-1], 90, np.uint8))
     options = DenseShapesOptions()
@@ -280,7 +211,7 @@ def test_sheet_of_small_and_flat_images(size: tuple[int, int], tmp_path: Path) -
 def test_names_of_every_kind_are_written_and_drawn(tmp_path: Path) -> None:
     path = tmp_path / "a $x^{$ ü 漢字.png"
     write_image(path, texture(SIZE, 3))
-    inspect(extractor_of(PLANS["no warps"]), path, tmp_path / "Ausgabe ä")
+    inspect(extractor_of(RectificationPlan(SIZE)), path, tmp_path / "Ausgabe ä")
     assert (tmp_path / "Ausgabe ä" / "a $x^{$ ü 漢字-inspection.png").exists()
     assert printable("a ü Ж 漢") == "a ü Ж \N{REPLACEMENT CHARACTER}"
 
@@ -302,26 +233,6 @@ def test_ellipse_of_a_warp_becomes_a_circle(item: Rectification) -> None:
     x, y = (ellipse - middle).T
     area = np.abs(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2
     assert area == pytest.approx(np.pi * radius_px**2, rel=0.02)  # of a polygon of 24 sides
-
-
-def test_middle_of_a_bent_region_is_in_it() -> None:
-    region = np.ones((41, 31), bool)
-    region[:30, 5:] = False  # an L, whose centre of mass is outside
-    column, row = region_middle(region, (100, 50)).astype(int) - (100, 50)
-    assert region[row, column]
-
-
-def test_warps_of_a_segment_and_of_a_class_have_one_color() -> None:
-    regional = [affine_warp(tilt, 0.3, (9, 9, 20, 20), segment) for tilt, segment in
-                [(2.0, 5), (3.0, 5), (2.0, 1)]]  # fmt: skip
-    first, second, third = warp_colors(RectificationPlan(SIZE, tuple(regional)))
-    assert first == second != third
-    classes = np.array([[2.0, 0.3], [2.0, 0.4], [2.0, 0.3]])
-    first, second, third = warp_colors(plan_whole_image(SIZE, classes, AsiftOptions()))
-    assert first == third != second
-    many = warp_colors(PLANS["61 warps"])
-    assert len(many) == 61
-    assert len(set(many)) > 20
 
 
 def test_region_is_tinted_where_it_lies(tmp_path: Path) -> None:

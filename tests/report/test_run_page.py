@@ -12,7 +12,6 @@ from small_run import NAMES, make_run_page, small_report
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.report import view_graph
 from colmap_affrect.report.run_page import write_run_page
 
 
@@ -90,12 +89,3 @@ def test_a_run_without_anything_says_so(tmp_path: Path) -> None:
     ):
         assert text in html
     assert html.count("no picture</span>") == 6
-
-
-def test_hundreds_of_photographs_are_on_a_circle_without_a_large_matrix() -> None:
-    names = [f"{number}.jpg" for number in range(1200)]
-    layout = view_graph.lay_out(names, [{(names[0], names[1]): 50}])
-    middle = np.array(view_graph.GRAPH_SIZE) / 2
-    from_middle = (layout.centers - middle) / (middle - layout.node_size / 2)
-    np.testing.assert_allclose(np.linalg.norm(from_middle, axis=1), 1.0, atol=1e-6)
-    assert view_graph.matrix(names, {(names[0], names[1]): 50}) == ""

@@ -12,7 +12,6 @@ from small_scene import IMAGE_SIZE, photograph, write_photographs
 from synthetic import write_image
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.images.photographs import CameraOptions, list_images
@@ -36,12 +35,9 @@ def test_unreadable_image_is_reported_and_the_run_goes_on(
     assert code == 1
     assert stderr[-1] == "error: could not read 1 of the images: broken.jpg"
     assert sum(line.startswith("error:") for line in stderr) == 1
-    assert any("broken.jpg: not a readable image" in line for line in stderr[:-1])
-    assert "registered  3 of 4 images" in stdout
     assert "not broken.jpg: unreadable" in stdout
     report = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
     assert report["unregistered"] == {"broken.jpg": "unreadable"}
-    assert report["advice"] == []
     assert report["status"] == "partial"
     code, _, stderr = call(*arguments, "--max-failures", 1)
     assert code == 0
@@ -75,7 +71,6 @@ def test_blank_image_has_no_features_and_the_run_goes_on(
     assert report["images_registered"] == 3
     assert (report["num_pairs"], report["num_verified_pairs"]) == (6, 3)
     assert FeatureStore(tmp_path / "out" / "features.h5").num_keypoints()["blank.png"] == 0
-    assert any("blank.png: no features" in line for line in stderr)
 
 
 def test_one_image_ends_without_a_model(tmp_path: Path, call: Call) -> None:
@@ -90,18 +85,6 @@ def test_one_image_ends_without_a_model(tmp_path: Path, call: Call) -> None:
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert (report["status"], report["num_models"], report["num_pairs"]) == ("no_model", 0, 0)
     assert report["unregistered"] == {"a.png": "no verified pair"}
-    assert len(report["advice"]) == 1  # no recipe would help
-    assert "compare" not in stdout
-
-
-def test_images_without_overlap_end_without_a_model(tmp_path: Path, call: Call) -> None:
-    rng = np.random.default_rng(0)
-    for name in ("a.png", "b.png"):
-        write_image(tmp_path / name, rng.integers(0, 256, (120, 160), dtype=np.uint8))
-    code, _, stderr = call("run", "--image-path", tmp_path, "--output-path", tmp_path / "o", "-q")
-    assert code == 3
-    why = "no model was found: no pair of images is verified"
-    assert stderr == [f"error: {why}; see {tmp_path / 'o' / 'report.html'}"]
 
 
 def test_bad_input_is_one_clear_line_and_writes_no_results(
@@ -126,67 +109,29 @@ def test_bad_input_is_one_clear_line_and_writes_no_results(
         assert not (tmp_path / "out").exists()
 
 
-def test_images_of_different_sizes_cannot_share_a_camera(
-    trio: Path, tmp_path: Path, call: Call
-) -> None:
-    write_image(trio / "side" / "z.png", photograph((0.0, 0.0, 0.0), 0.0)[:, :300])
-    out = tmp_path / "out"
-    arguments = ["extract", "--image-path", trio, "--output-path", out]
-    code, _, stderr = call(*arguments, "--camera-mode", "per-folder")
-    assert (code, len(stderr)) == (2, 1)
-    assert stderr[0].startswith("error: --camera-mode per-folder: side/")
-    assert "320 x 240 px" in stderr[0]
-    assert "300 x 240 px" in stderr[0]
-    assert not Workspace(out).config.exists()
-    # The same folder works with another mode, without --overwrite.
-    code, _, stderr = call(*arguments, "--recipe", "unrectified-rootsift")
-    assert code == 0, stderr
-    assert len(image_ids(Workspace(out).database)) == 4
-
-
-def test_folders_of_different_sizes_work_with_a_camera_per_folder(
-    trio: Path, tmp_path: Path, call: Call
-) -> None:
-    (trio / "other").mkdir()
-    write_image(trio / "other" / "z.png", photograph((0.0, 0.0, 0.0), 0.0)[:, :300])
-    code, _, stderr = call(
-        "extract", "--image-path", trio, "--output-path", tmp_path / "out",
-        "--camera-mode", "per-folder", "--recipe", "unrectified-rootsift",
-    )  # fmt: skip
-    assert code == 0, stderr
-    with open_database(tmp_path / "out" / "database.db") as database:
-        widths = sorted(camera.width for camera in database.read_all_cameras())
-    assert widths == [300, 320, 320]
-
-
-@pytest.mark.parametrize("overwrite", [[], ["--overwrite"]])
 def test_database_of_another_program_is_refused_and_left_as_it_is(
-    trio: Path, tmp_path: Path, call: Call, overwrite: list[str]
+    trio: Path, tmp_path: Path, call: Call
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
     with pycolmap.Database.open(out / "database.db") as database:
         database.write_camera(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 9.0, 8, 6))
     before = (out / "database.db").read_bytes()
-    for command in ("run", "extract"):
-        code, stdout, stderr = call(
-            command, "--image-path", trio, "--output-path", out, *FAST, *overwrite
-        )
+    for command in (["run"], ["extract", "--overwrite"]):
+        code, stdout, stderr = call(*command, "--image-path", trio, "--output-path", out, *FAST)
         assert (code, stdout, len(stderr)) == (2, "", 1)
         assert "is not empty (database.db) and was not made by colmap-affrect" in stderr[0]
         assert (out / "database.db").read_bytes() == before
 
 
-@pytest.mark.parametrize("below", ["file", "file/out"])
 def test_output_folder_that_cannot_be_made_is_refused(
-    trio: Path, tmp_path: Path, call: Call, below: str
+    trio: Path, tmp_path: Path, call: Call
 ) -> None:
     (tmp_path / "file").write_text("")
-    code, stdout, stderr = call(
-        "run", "--image-path", trio, "--output-path", tmp_path / below, *FAST
-    )
-    assert (code, stdout, len(stderr)) == (1, "", 1)
-    assert str(tmp_path / below) in stderr[0]
+    for out in (tmp_path / "file", tmp_path / "file" / "out"):
+        code, stdout, stderr = call("run", "--image-path", trio, "--output-path", out, *FAST)
+        assert (code, stdout, len(stderr)) == (1, "", 1)
+        assert str(out) in stderr[0]
 
 
 def test_unknown_name_in_the_pair_list_is_one_clear_line(

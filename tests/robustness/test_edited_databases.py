@@ -4,41 +4,33 @@ from __future__ import annotations
 
 import random
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import Call, on_photographs
-from damaged import bits, cut, damage, execute, noise, zeros
+from damaged import cut, damage, execute, noise
 from results import database_content, model_names, results
 from small_scene import write_photographs
 
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.colmap.seal import is_untouched
 from colmap_affrect.project.workspace import Workspace
 
 FIRST_PAIR = "pair_id = (SELECT min(pair_id) FROM matches)"
 MENDED = {
     "image renamed": ("UPDATE images SET name = 'x.png' WHERE image_id = 2", "1 changed (x.png)"),
-    "image deleted": ("DELETE FROM images WHERE image_id = 2", "images: 1 gone"),
     "image added": ("INSERT INTO images (name, camera_id) VALUES ('x', 1)", "1 added (x)"),
     "keypoints zero": (
         "UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = 2",
         "is written again: keypoints of 1 image",
     ),
-    "keypoints gone": ("DELETE FROM keypoints WHERE image_id = 2", "keypoints that do not exist"),
     "camera of another size": ("UPDATE cameras SET width = 100", "cameras: 3 changed"),
     "camera of no size": ("UPDATE cameras SET width = 'wide'", "(damaged (invalid"),
-    "no focal length": ("UPDATE cameras SET params = zeroblob(32)", "focal length that is not"),
-    "other matches": (
-        f"UPDATE matches SET rows = 1, data = zeroblob(8) WHERE {FIRST_PAIR}",
-        "is written again: 1 pair",
-    ),
     "other geometry": (
         f"UPDATE two_view_geometries SET F = zeroblob(72) WHERE {FIRST_PAIR}",
         "is written again: 1 pair",
     ),
-    "no geometries": ("DELETE FROM two_view_geometries", "all pairs are gone"),
     "table dropped": ("DROP TABLE frames", "no such table: frames"),
     "trigger": (
         "CREATE TRIGGER t AFTER INSERT ON matches BEGIN DELETE FROM images; END",
@@ -74,23 +66,23 @@ def again(call: Call, finished: Path, out: Path, command: str) -> list[str]:
 
 
 @pytest.mark.parametrize("case", MENDED)
-@pytest.mark.parametrize("command", ["run", pytest.param("map", marks=pytest.mark.long)])
 def test_what_the_stores_hold_is_made_again(
-    finished: Path, out: Path, call: Call, case: str, command: str
+    finished: Path, out: Path, call: Call, case: str
 ) -> None:
     statement, said = MENDED[case]
     execute(out / "database.db", statement)
-    (warning,) = again(call, finished, out, command)
+    (warning,) = again(call, finished, out, "run")
     assert warning.startswith(f"WARNING: {out / 'database.db'}: was changed since the last run")
     assert said in warning
     assert results(out) == results(finished / "out")
     assert again(call, finished, out, "map") == []
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_damaged_files_are_made_again(finished: Path, out: Path, call: Call, seed: int) -> None:
-    harms = [[noise], [zeros], [bits], [cut]]
-    damage(out / "database.db", random.Random(seed), harms[seed])
+@pytest.mark.parametrize("harm", [noise, cut])
+def test_damaged_files_are_made_again(
+    finished: Path, out: Path, call: Call, harm: Callable[..., str]
+) -> None:
+    damage(out / "database.db", random.Random(3), [harm])
     again(call, finished, out, "map")
     assert results(out) == results(finished / "out")
 
@@ -149,18 +141,6 @@ def test_pairs_of_other_programs_are_kept(finished: Path, tmp_path: Path, call: 
     assert "which is kept: 1 pair more" in ended.stderr[0]
     with open_database(tmp_path / "out" / "database.db") as database:
         assert database.read_matches(1, 2).tolist() == [[0, 1], [1, 0]]
-
-
-def test_nobody_reads_a_database_that_nobody_changed(
-    finished: Path, out: Path, call: Call, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    again(call, finished, out, "map")
-    monkeypatch.setattr("colmap_affrect.colmap.seal.read_parts", None)
-    for command in ("run", "map"):
-        assert again(call, finished, out, command) == []
-    assert is_untouched(out / "database.db")
-    assert call("map", "--output-path", out, "--extend", out / "none").code == 2
-    assert is_untouched(out / "database.db")
 
 
 def test_copies_are_made_again_from_the_original(
