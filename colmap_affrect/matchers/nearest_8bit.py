@@ -86,17 +86,20 @@ class HalfSimilarities:
 
         return torch.from_numpy(array).to(self.values.device)
 
-    def largest(self) -> tuple[Indices, Singles]:  # noqa: D102
+    def largest(self) -> tuple[Indices, Singles]:
+        """See :class:`FoldedSimilarities`."""
         values, columns = self.values.max(dim=1)
         return columns.cpu().numpy(), values.float().cpu().numpy()
 
-    def take_out(self, rows: Indices, columns: Indices) -> Singles:  # noqa: D102
+    def take_out(self, rows: Indices, columns: Indices) -> Singles:
+        """See :class:`FoldedSimilarities`."""
         places = self._there(rows), self._there(columns)
         before = self.values[places].float().cpu().numpy()
         self.values[places] = TAKEN_OUT
         return np.asarray(before)
 
-    def at_least(self, rows: Indices, least: Singles) -> tuple[Indices, Indices]:  # noqa: D102
+    def at_least(self, rows: Indices, least: Singles) -> tuple[Indices, Indices]:
+        """See :class:`FoldedSimilarities`."""
         above = self.values[self._there(rows)] >= self._there(least.astype(np.float32))[:, None]
         index, columns = (found.cpu().numpy() for found in above.nonzero(as_tuple=True))
         return index, columns
