@@ -17,23 +17,14 @@ from colmap_affrect.features.weights import resolve
 from colmap_affrect.forecast import Forecast
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions, MappingTask
-from colmap_affrect.mappers.doubts import loose_names
 from colmap_affrect.mappers.existing import Extension, existing_names, require_extends
 from colmap_affrect.mappers.sparse import SparseOptions
-from colmap_affrect.mappers.starts import MIN_SHARE_OF_RIVAL
-from colmap_affrect.mappers.summaries import (
-    GUIDED_BEFORE,
-    guided_before,
-    read_summary,
-    write_guided_before,
-)
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.outputs import remove_own
-from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
+from colmap_affrect.project.report import ReconstructionReport, StageReport
 from colmap_affrect.project.versions import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
@@ -44,21 +35,15 @@ from colmap_affrect.stages.copy import copy_verified
 from colmap_affrect.stages.escalate import escalate, pair_levels
 from colmap_affrect.stages.extract import extract, write_descriptors
 from colmap_affrect.stages.guide import (
-    current,
     guide,
     guided_counts,
-    pairs_to_guide,
-    recorded_guiding,
-    restore_exact,
 )
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.map import (
     advice,
-    agreement,
     contradicting_pairs,
     image_names,
     image_path_of,
-    images_in_need,
     map_images,
     num_verified_inliers,
     unregistered,
@@ -276,7 +261,7 @@ def map_and_report(
     if extend and overwrite:
         extend.refuse_discarding(workspace.path)
     before = existing_names(extend.model_path, image_names(workspace)) if extend else []
-    reports, models = map_guided(context, mapper, extend, overwrite=overwrite)
+    report, models = map_images(context, mapper, extend, overwrite=overwrite)
     names, copied = image_names(workspace), workspace.is_copy
     verification = recorded_verification(workspace)
     missing, pair_inliers = unregistered(context, names, models), num_verified_inliers(workspace)
@@ -287,7 +272,7 @@ def map_and_report(
         models=tuple(models),
         num_pairs=num_matched_pairs(workspace.database) if copied else len(listed_pairs(context)),
         num_verified_pairs=len(pair_inliers),
-        stages=(*earlier, *reports),
+        stages=(*earlier, report),
         recipe="" if copied else workspace.recipe(),
         versions=installed_versions(),
         presets=(verification.preset_name, options.preset_name),
@@ -341,52 +326,3 @@ def _require_photographs(context: Context) -> None:
         raise ImageError(
             f"{inputs.image_path}: {gone[0]} has features, and is gone; run extract again"
         )
-
-
-def map_guided(
-    context: Context, mapper: Mapper, extend: Extension | None = None, *, overwrite: bool = False
-) -> tuple[list[StageReport], list[ModelSummary]]:
-    """Map; where images are missing or hang on few tracks, guide their pairs and map again.
-
-    Arguments are those of :func:`~colmap_affrect.stages.map.map_images`.
-    """
-    sparse, aside = context.workspace.sparse, context.workspace.aside
-    min_num_tracks = recorded_guiding(context.workspace).min_num_tracks
-    reports: list[StageReport] = []
-    if overwrite or not aside.exists():  # else a run has been killed in what follows
-        report, models = map_images(context, mapper, extend, overwrite=overwrite)
-        reports.append(report)
-        if extend or context.workspace.is_copy:
-            return reports, models
-        if not pairs_to_guide(context, images_in_need(context, sparse, min_num_tracks)):
-            return reports, models
-        write_guided_before([pair.names for pair in current(context)], sparse)
-        sparse.rename(aside)
-    known = guided_before(aside)
-    guided = guide(context, images=images_in_need(context, aside, min_num_tracks))
-    new = {pair.names for pair in current(context)} - known
-    if new:
-        again, models = map_images(context, mapper)
-        reports += [guided, again]
-        if _are_better(context, models, aside):
-            remove_own([aside])
-            return reports, models
-        restore_exact(context, new)
-        remove_own([sparse])
-    aside.rename(sparse)
-    (sparse / GUIDED_BEFORE).unlink()
-    report, models = map_images(context, mapper)  # which reads them
-    return reports or [report], models
-
-
-def _are_better(context: Context, models: Sequence[ModelSummary], aside: Path) -> bool:
-    """Tell whether models with guided matches are better than those before, ``aside``.
-
-    They agree better with the pairs or, where only their points tell the focal lengths, nearly as
-    well with as many images.
-    """
-    old, tell_more = read_summary(aside / "0"), False
-    if old and models and len(models[0].registered_names) >= len(old.registered_names):
-        tell_more = bool(loose_names(old)) and not loose_names(models[0])
-    least = (MIN_SHARE_OF_RIVAL if tell_more else 1.0) * agreement(context, aside)
-    return agreement(context, context.workspace.sparse) > least

@@ -187,8 +187,8 @@ PRESET = _choice("--preset", list(PRESETS),
     "defaults (default: sparse)")  # fmt: skip
 MAPPER = (
     _value("--mapper", "NAME",
-        "sparse (ours), COLMAP's incremental or global, or estimate (ours, on trial: adjustments "
-        "that know what is known of the cameras) (default: sparse)"),
+        "sparse (ours: adjustments that know what is known of the cameras), or COLMAP's "
+        "incremental or global (default: sparse)"),
     _value("--mapper-options", "KEY=VALUE",
         "options of pycolmap's IncrementalPipelineOptions or GlobalPipelineOptions, e.g. "
         "ba_refine_principal_point=true mapper.abs_pose_min_num_inliers=10; they win over the "

@@ -41,13 +41,12 @@ from colmap_affrect.comparison.results import MethodResult, SeedResult
 from colmap_affrect.comparison.sift import extract_sift, match_sift, rename_images
 from colmap_affrect.comparison.task import MethodTask
 from colmap_affrect.errors import AffrectError
-from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.pairs.base import Pair, PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import peak_memory_bytes
 from colmap_affrect.parallel.subprocesses import end_with
-from colmap_affrect.pipeline import map_guided
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
@@ -61,6 +60,7 @@ from colmap_affrect.stages.escalate import escalate, unmeasured_pairs
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.inputs import Inputs
+from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import extracted_px, verify_matches
@@ -206,7 +206,7 @@ def _seed_result(task: MethodTask, seed: int, folder: Path, progress: "_Reported
             _vote(task, workspace, options, extracted_px(context), silent)
         with watch.step("map"):
             guide(context)
-            _, models = map_guided(context, mapper)
+            _, models = map_images(context, mapper)
     else:
         num_pairs = len(unverified_pairs(database_path))
         with watch.step("verify"), told.stage("verify", num_pairs, "pairs") as advance:

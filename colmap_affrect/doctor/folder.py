@@ -21,8 +21,6 @@ from colmap_affrect.doctor.findings import (
 from colmap_affrect.errors import AffrectError, OptionError, WorkspaceError
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.summaries import (
-    GUIDED_BEFORE,
-    guided_before,
     made_from,
     model_folders,
     read_summary,
@@ -226,7 +224,7 @@ class _FolderExamination:
 
     def _models(self) -> str | None:
         """Return the digests of what the models were made from, if that can be read."""
-        sparse, aside = self.workspace.sparse, self.workspace.aside
+        sparse = self.workspace.sparse
         inputs = self._read(sparse / INPUTS, lambda: made_from(sparse))
         if inputs == "":
             self._add("map-unfinished", sparse)
@@ -236,8 +234,6 @@ class _FolderExamination:
         self.found.checked.append(f"{sparse}: models of {listed} images")
         if sparse.exists() and not folders:
             self._add("no-model", sparse)
-        if aside.exists():
-            self._read(aside / GUIDED_BEFORE, lambda: guided_before(aside))
         return inputs
 
     def _size(self, folder: Path) -> int:

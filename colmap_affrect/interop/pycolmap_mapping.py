@@ -10,9 +10,9 @@ from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.useless_keypoints import KINDS
 from colmap_affrect.interop import pycolmap_options as translate
 from colmap_affrect.interop.pycolmap_api import CANCELLED, Native, PathLike, Token
-from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.existing import Extension, read_existing
+from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.project.outputs import new_results, temporary_folder
 
 

@@ -14,17 +14,19 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import TRUSTED, CameraRecord
+from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.errors import MappingError
 
 USUAL_FOCAL = 1.15  # longer sides: the median of usual lenses, which are of 25 to 70 mm on film
 USUAL_SIGMA = 0.4  # deviation of the logarithm of a focal length of which nothing is known
 EXIF_SIGMA = 0.08  # the same of one by EXIF: rounded, and of another distance of focus
 DISTORTION_SIGMA = 0.07  # of the coefficients of a lens that is no fisheye
+NOISE_PX = 0.7  # standard deviation of keypoints
 UNKNOWN_SIGMA = 1e6  # of parameters that have no prior
 DENSE_LIMIT = 60  # images up to which Ceres' dense solver is the faster one
 MIN_LONG_TRACKS = 100  # of three images, that each image needs to do without tracks of two
-FAST, FINAL = 15, 300
-"""Iterations of adjustments on the way, which are stopped early, and of the last ones."""
+FAST, MEDIUM, FINAL = 15, 50, 300
+"""Iterations of adjustments on the way, of models to compare, and of the last ones."""
 
 
 @dataclass(frozen=True)
@@ -64,25 +66,41 @@ class Adjuster:
     Attributes:
         priors: of the focal lengths, by camera id.
         noise_px: standard deviation of the keypoints, the scale of the robust loss.
+        refining: say which parameters of cameras are refined.
         constant: ids of the cameras of which nothing is refined.
+        constant_frames: ids of the frames that stay where they are.
     """
 
     priors: Mapping[int, FocalPrior]
     noise_px: float
-    constant: frozenset[int]
+    refining: pycolmap.BundleAdjustmentOptions
+    constant: frozenset[int] = frozenset()
+    constant_frames: frozenset[int] = frozenset()
+
+    def begin(self, model: pycolmap.Reconstruction) -> None:
+        """Give the cameras of a model that are not held the focal lengths of their priors."""
+        for key, camera in model.cameras.items():
+            prior = self.priors.get(key)
+            if prior and prior.sigma and key not in self.constant:
+                for index in camera.focal_length_idxs():
+                    camera.params[index] = prior.focal_px
 
     def adjust(
         self,
         model: pycolmap.Reconstruction,
         max_iterations: int,
         image_ids: Iterable[int] | None = None,
-    ) -> None:
-        """Adjust poses, points and cameras in place.
+    ) -> float:
+        """Adjust poses, points and cameras in place; return the cost, infinite if that fails.
 
-        Of some images only, the others stay, and so do the cameras that they share.
+        Of some images only, the others stay, and so do the cameras that they share. The cost is in
+        nats.
         """
         pyceres = _pyceres()
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+        options.refine_focal_length = self.refining.refine_focal_length
+        options.refine_principal_point = self.refining.refine_principal_point
+        options.refine_extra_params = self.refining.refine_extra_params
         options.min_track_length = 3 if has_long_tracks(model) else 2
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = self.noise_px
@@ -96,7 +114,10 @@ class Adjuster:
         held |= used & self.constant
         for key in sorted(held):
             config.set_constant_cam_intrinsics(key)
-        if image_ids is None:
+        frames = {model.images[image_id].frame_id for image_id in images} & self.constant_frames
+        for frame_id in frames:
+            config.set_constant_rig_from_world_pose(frame_id)
+        if image_ids is None and not frames:
             config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         problem = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).problem
         for key in sorted(used - held):
@@ -110,8 +131,11 @@ class Adjuster:
         kinds = pyceres.LinearSolverType
         is_small = len(images) <= DENSE_LIMIT
         solver.linear_solver_type = kinds.DENSE_SCHUR if is_small else kinds.SPARSE_SCHUR
-        pyceres.solve(solver, problem, pyceres.SolverSummary())
+        summary = pyceres.SolverSummary()
+        pyceres.solve(solver, problem, summary)
         model.update_point_3d_errors()
+        usable = summary.IsSolutionUsable()
+        return float(summary.final_cost) / self.noise_px**2 if usable else math.inf
 
     def _add_prior(self, problem: Any, camera: pycolmap.Camera) -> None:
         if not problem.has_parameter_block(camera.params):
@@ -138,18 +162,11 @@ def _pyceres() -> Any:
     try:
         import pyceres
     except ImportError as error:
-        raise MappingError(
-            f"the mapper 'estimate' needs pyceres ({error}): pip install pyceres"
-        ) from error
+        raise MappingError(f"this mapper needs pyceres ({error}): pip install pyceres") from error
     return pyceres
 
 
 def has_long_tracks(model: pycolmap.Reconstruction) -> bool:
     """Tell whether each image sees enough points of three images to do without those of two."""
-    counts = dict.fromkeys(model.reg_image_ids(), 0)
-    for point in model.points3D.values():
-        elements = point.track.elements
-        if len(elements) > 2:
-            for element in elements:
-                counts[element.image_id] += 1
-    return min(counts.values(), default=0) >= MIN_LONG_TRACKS
+    counts = num_long_tracks(model)
+    return all(counts[image_id] >= MIN_LONG_TRACKS for image_id in model.reg_image_ids())

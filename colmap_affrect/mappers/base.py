@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from colmap_affrect.colmap import pycolmap
     from colmap_affrect.colmap.camera_records import CameraRecord
     from colmap_affrect.mappers.existing import ExistingModel
-    from colmap_affrect.project.report import ModelSummary
 
 
 class MapperOptions(PartOptions, PresetOptions):
@@ -33,9 +32,6 @@ class MapperOptions(PartOptions, PresetOptions):
     keep_given_intrinsics: bool = True
     """Leave camera parameters that the user gave as they are; refining them on a few images of a
     sparse set moves them far away."""
-    max_num_attempts: Annotated[int, within(1, 100)] = 1
-    """While images are missing, map again with another seed and keep the largest model; one of 100
-    images or more is kept at once."""
     random_seed: Annotated[int, within(-1, MAX_SEED)] = 0
     mapper_options: dict[str, Any] = Field(default_factory=dict)
     """Other options of pycolmap's pipeline, by dotted key (``mapper.init_max_error``); they win
@@ -43,8 +39,6 @@ class MapperOptions(PartOptions, PresetOptions):
 
     extends: ClassVar[bool] = False
     """The mapper can register images into an existing model, ``MappingTask.extend``."""
-    is_complete: ClassVar[bool] = False
-    """The mapper tries first pairs and focal lengths itself, and adjusts models to the end."""
 
 
 DepthLookup = Callable[[str, NDArray[np.floating]], NDArray[np.float64]]
@@ -63,10 +57,8 @@ class MappingTask:
         snapshot_path: folder of snapshots, to be gone on from; mappers may leave it unused.
         cancellation: a token by which mapping is stopped from outside.
         guided: (M, 2) features of pairs of image ids that only guided matching has matched.
+        measured: (M, 2) inliers of measured frames, of pairs of image names that have others, too.
         cameras: what is known of the cameras, by id.
-        held: ids of cameras whose parameters stay as they are in the database.
-        told_by: the model that held cameras are from, which says whether its points told them.
-        distortion_held: only focal lengths are refined.
         depth_at: depth maps of the images, where there are any.
     """
 
@@ -76,10 +68,8 @@ class MappingTask:
     snapshot_path: Path | None = None
     cancellation: pycolmap.CancellationToken | None = None
     guided: Mapping[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
+    measured: Mapping[tuple[str, str], NDArray[np.int64]] = field(default_factory=dict)
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
-    held: frozenset[int] = frozenset()
-    told_by: ModelSummary | None = None
-    distortion_held: bool = False
     depth_at: DepthLookup | None = None
 
     @property
@@ -109,7 +99,7 @@ class MappingTask:
             for key, record in self.cameras.items()
             if record.is_fixed or (focals and "focal" in record.given)
         }
-        return (fixed if options.keep_given_intrinsics else set()) | self.held
+        return fixed if options.keep_given_intrinsics else set()
 
 
 @dataclass(frozen=True)
@@ -182,7 +172,6 @@ MAPPERS: Registry[Mapper] = Registry(
     group="colmap_affrect.mappers",
     built_in={
         "sparse": "colmap_affrect.mappers.sparse:SparseMapper",
-        "estimate": "colmap_affrect.mappers.estimate:EstimateMapper",
         "incremental": "colmap_affrect.mappers.incremental:IncrementalMapper",
         "global": "colmap_affrect.mappers.global_mapper:GlobalMapper",
     },

@@ -1,9 +1,11 @@
 """How much the verified pairs and what is known of the cameras speak for a model, in nats.
 
-A pair whose images are both in the model says how many of its inliers agree with their poses. The
-likelihood of that count is a beta-binomial distribution, one for right poses and one for wrong
-ones; their ratio, and the chance that the pair itself is wrong, make its evidence. A pair that is
-not in the model adds nothing: more images that agree are more evidence.
+A pair whose images are both in the model says how many of its inliers agree with their poses. Pairs
+alone leave scales and focal lengths open; so a feature that is matched in two other images says
+whether one point explains all three. The likelihood of such a count is a beta-binomial
+distribution, one for right models and one for wrong ones; their ratio, and the chance that the
+pair itself is wrong, make the evidence. What is not in the model adds nothing: more images that
+agree are more evidence.
 """
 
 import math
@@ -11,15 +13,17 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.model_files import seen_points
 from colmap_affrect.mappers.adjustment import FocalPrior
 from colmap_affrect.mappers.pair_graph import PairGraph, VerifiedPair, cameras_of, poses_of
 
-GRID = 8  # cells on a side of an image: inliers in one cell err together and count once
-RIGHT, CHANCE = (14.0, 1.0), (2.0, 4.0)
-"""Beta distributions of the share of inliers that agree with right poses (93 per cent on average)
-and with wrong ones (a third)."""
+GRID = 8  # cells on a side of an image: features in one cell err together and count once
+RIGHT, RIGHT_OF_THREE, CHANCE = (14.0, 1.0), (6.0, 2.0), (2.0, 4.0)
+"""Beta distributions of the share that agrees with right models, of the inliers of pairs (93 per
+cent on average) and of the features of three images (75), and with wrong ones (a third)."""
 WRONG_PAIR = 0.05  # chance that a verified pair is wrong
 MIN_GAIN = 3.0  # nats, twenty to one: what a model must have more to be taken
 
@@ -34,9 +38,9 @@ class Evidence:
     def of(self, model: pycolmap.Reconstruction) -> float:
         """Return the evidence of a model."""
         poses, cameras = poses_of(model), cameras_of(model)
-        total = 0.0
+        total = self.of_three_views(model)
         for pair in self.graph.pairs_inside(poses):
-            num = self.num_cells(pair)
+            num = self._num_cells(pair)
             total += pair_evidence(self.graph.agreement(pair, poses, cameras) * num, num)
         used = {camera.camera_id: camera for camera in cameras.values()}
         costs = (self.priors[key].cost(camera.mean_focal_length()) for key, camera in used.items())
@@ -46,14 +50,47 @@ class Evidence:
         """Return the evidence of the best of some models, 0 without any."""
         return max(map(self.of, models), default=0.0)
 
-    def num_cells(self, pair: VerifiedPair) -> int:
-        """Return how many cells of a grid over an image hold inliers, in that which has fewer."""
+    def of_three_views(self, model: pycolmap.Reconstruction) -> float:
+        """Return what the features that are matched in two other images add to the evidence."""
+        return sum(_log_ratio(*counts, RIGHT_OF_THREE) for counts in self._three_views(model))
+
+    def is_confirmed(self, model: pycolmap.Reconstruction) -> bool:
+        """Tell whether features of three images confirm each image of a model."""
+        counts = self._three_views(model)
+        return all(_log_ratio(*count, RIGHT_OF_THREE) >= MIN_GAIN for count in counts)
+
+    def _three_views(self, model: pycolmap.Reconstruction) -> list[tuple[float, int]]:
+        """Return, of each image, how many cells with features of three images agree, and all.
+
+        The first is the share of these features that are in a point which three images see, times
+        the second.
+        """
+        inside = self.graph.keypoints.keys() & set(model.reg_image_ids())
+        partners = {i: np.zeros(len(self.graph.keypoints[i]), np.int64) for i in sorted(inside)}
+        for pair in self.graph.pairs_inside(partners):
+            for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
+                partners[image_id][np.unique(features)] += 1
+        points = {image_id: seen_points(model.images[image_id]) for image_id in partners}
+        ids, lengths = np.unique(np.concatenate([*points.values(), [-1]]), return_counts=True)
+        long = ids[(lengths > 2) & (ids >= 0)]
         counts = []
-        for image_id, points in zip(pair.ids, self.graph.points(pair), strict=True):
-            camera = self.graph.cameras[image_id]
-            cells = (points / [camera.width, camera.height] * GRID).astype(int)
-            counts.append(len(np.unique(np.clip(cells, 0, GRID - 1) @ [1, GRID])))
-        return min(counts)
+        for image_id, number in partners.items():
+            features = np.flatnonzero(number > 1)
+            num = self._cells(image_id, self.graph.keypoints[image_id][features])
+            share = np.isin(points[image_id][features], long).mean() if num else 0.0
+            counts.append((float(share * num), num))
+        return counts
+
+    def _num_cells(self, pair: VerifiedPair) -> int:
+        """Return how many cells hold inliers, in that image of a pair which has fewer."""
+        both = zip(pair.ids, self.graph.points(pair), strict=True)
+        return min(self._cells(image_id, points) for image_id, points in both)
+
+    def _cells(self, image_id: int, points: NDArray[np.floating]) -> int:
+        """Return how many cells of a grid over an image hold points, (N, 2) px."""
+        camera = self.graph.cameras[image_id]
+        cells = (points / [camera.width, camera.height] * GRID).astype(int)
+        return len(np.unique(np.clip(cells, 0, GRID - 1) @ [1, GRID]))
 
 
 def pair_evidence(num_agreeing: float, num: float) -> float:
@@ -62,9 +99,13 @@ def pair_evidence(num_agreeing: float, num: float) -> float:
     >>> pair_evidence(30, 30) > pair_evidence(10, 10) > 0 > pair_evidence(5, 30) > -3.1
     True
     """
-    ratio = _log_beta_binomial(num_agreeing, num, RIGHT)
-    ratio -= _log_beta_binomial(num_agreeing, num, CHANCE)
+    ratio = _log_ratio(num_agreeing, num, RIGHT)
     return float(np.logaddexp(math.log(1.0 - WRONG_PAIR) + ratio, math.log(WRONG_PAIR)))
+
+
+def _log_ratio(count: float, total: float, right: tuple[float, float]) -> float:
+    """Return the log-likelihood ratio of a share of right models against one by chance."""
+    return _log_beta_binomial(count, total, right) - _log_beta_binomial(count, total, CHANCE)
 
 
 def _log_beta_binomial(count: float, total: float, shape: tuple[float, float]) -> float:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.cancellable import run_leavable
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.model_files import read_given_model
@@ -109,25 +108,6 @@ class ExistingModel:
             for camera_id in {image.camera_id for image in self.images}:
                 database.update_camera(self.reconstruction.camera(camera_id))
         return copy
-
-    def adjust_others(
-        self, model: pycolmap.Reconstruction, native: pycolmap.IncrementalPipelineOptions
-    ) -> None:
-        """Adjust a model whose bridged images pycolmap's mapper took for existing ones."""
-        if self.refine:
-            return
-        config, old = pycolmap.BundleAdjustmentConfig(), {image.name for image in self.images}
-        for image_id in model.reg_image_ids():
-            config.add_image(image_id)
-            image = model.images[image_id]
-            if image.name in old:
-                config.set_constant_rig_from_world_pose(image.frame_id)
-        for camera_id in native.constant_cameras:
-            config.set_constant_cam_intrinsics(camera_id)
-        adjuster = pycolmap.create_default_bundle_adjuster(
-            native.get_global_bundle_adjustment(), config, model
-        )
-        run_leavable(adjuster.solve)
 
     def is_part_of(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether a model that was made from this one has all its images, posed or not.

@@ -14,8 +14,8 @@ from colmap_affrect.colmap.database import all_cameras
 from colmap_affrect.colmap.model_files import read_written_model
 from colmap_affrect.colmap.native_options import Plain, differences, resolve, set_values
 from colmap_affrect.errors import MappingError
+from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, FocalPrior
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
-from colmap_affrect.mappers.last_adjustment import adjust
 from colmap_affrect.parallel.executor import return_freed_memory
 from colmap_affrect.parallel.subprocesses import child, end_with
 
@@ -87,12 +87,16 @@ class GlobalMapper:
         for key in moved:
             model.cameras[key].params = given[key]
         if moved:
-            adjust(model, options, constant)
+            priors = {
+                key: FocalPrior.of(camera, task.cameras.get(key))
+                for key, camera in model.cameras.items()
+            }
+            Adjuster(priors, NOISE_PX, options, frozenset(constant)).adjust(model, FINAL)
 
     def native(self, task: MappingTask, random_seed: int) -> pycolmap.GlobalPipelineOptions:
         """Translate the options into pycolmap's."""
         options = self.options
-        distortion = not (task.keeps_intrinsics(options) or task.distortion_held)
+        distortion = not task.keeps_intrinsics(options)
         native = pycolmap.GlobalPipelineOptions()
         values: dict[str, Plain] = {
             "min_model_size": options.min_model_size,

@@ -31,8 +31,6 @@ class PipelineOptions(MapperOptions):
     init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0
     init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50
     abs_pose_min_num_inliers: Annotated[int, within(3, 1_000_000)] = 12
-    max_num_attempts: Annotated[int, within(1, 100)] = 3
-    """The choice of the first pair is partly chance, and a bad one ends in a small model."""
 
     COLMAP: ClassVar[Mapping[str, Any]] = {
         "ignore_two_view_tracks": True,
@@ -40,7 +38,6 @@ class PipelineOptions(MapperOptions):
         "init_min_num_inliers": 100,
         "abs_pose_min_num_inliers": 30,
         "min_model_size": 10,
-        "max_num_attempts": 1,
         "keep_given_intrinsics": False,
     }
 
@@ -90,7 +87,7 @@ class IncrementalMapper:
         """Translate the options into pycolmap's, with what of a task's cameras is refined."""
         options = self.options
         focals = not task.keeps_focal_lengths(options)
-        distortion = not (task.keeps_intrinsics(options) or task.distortion_held)
+        distortion = not task.keeps_intrinsics(options)
         native = pycolmap.IncrementalPipelineOptions(
             min_model_size=options.min_model_size,
             random_seed=random_seed,

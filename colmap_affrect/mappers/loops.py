@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.mappers.pair_graph import PairGraph, RelativePose
-
-Ids = tuple[int, int]
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph, RelativePose
 
 MAX_ERROR_DEG = 10.0
 """A relative rotation farther from the averaged ones is wrong. Of right pairs with guessed focal

@@ -22,6 +22,7 @@ from colmap_affrect.geometry.two_views import (
 )
 from colmap_affrect.mappers.base import DepthLookup, MappingTask
 
+Ids = tuple[int, int]  # of two images
 PoseById = Mapping[int, Pose]
 CameraById = Mapping[int, pycolmap.Camera]
 """Cameras by image id."""
@@ -203,6 +204,15 @@ class PairGraph:
         poses, cameras = poses_of(model), cameras_of(model)
         return poses.keys() >= self.keypoints.keys() and all(
             self.agreement(pair, poses, cameras) >= MIN_SHARE for pair in self.pairs
+        )
+
+    def contradicted(self, model: pycolmap.Reconstruction) -> frozenset[Ids]:
+        """Return the pairs most of whose inliers disagree with a model that has both images."""
+        poses, cameras = poses_of(model), cameras_of(model)
+        return frozenset(
+            pair.ids
+            for pair in self.pairs_inside(poses)
+            if self.agreement(pair, poses, cameras) < MIN_SHARE
         )
 
     def relative_poses(

@@ -1,185 +1,149 @@
-"""The sparse mapper: COLMAP's incremental mapper, and bridges to what it leaves out."""
+"""The sparse mapper: mapping as one estimate, for small sets with few matches."""
 
-import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
-
-import numpy as np
+from typing import Annotated, Literal
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database_copy import copy_without_pairs
-from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask
-from colmap_affrect.mappers.bridging import Bridges, Hypothesis, Part
+from colmap_affrect.colmap.database import keep_inliers
+from colmap_affrect.colmap.database_copy import copy_database, copy_without_pairs
+from colmap_affrect.mappers.adjustment import EXIF_SIGMA, NOISE_PX, Adjuster, FocalPrior
+from colmap_affrect.mappers.base import MappedModel, MappingTask
+from colmap_affrect.mappers.evidence import Evidence
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.loops import contradicting_pairs
-from colmap_affrect.mappers.pair_graph import PairGraph, graph_of
+from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of
+from colmap_affrect.mappers.search import Search
+from colmap_affrect.options import within
 
-MAX_TRIALS = 5
-"""Bridges from one model that are tried before nothing more is expected to join it."""
+LARGE = 100  # images from which on COLMAP's own pipeline maps
+NONE: frozenset[Ids] = frozenset()
 
 
 class SparseOptions(PipelineOptions):
-    """Incremental mapping, then bridges by single pairs."""
+    """Incremental mapping with priors of the cameras, and bridges by single pairs."""
 
     name: Literal["sparse"] = "sparse"
+    init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 40
+    init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 4.0
+    noise_px: Annotated[float, within(0.01, 100.0)] = NOISE_PX
+    """Standard deviation of keypoints; larger errors count less and less."""
+    num_seeds: Annotated[int, within(1, 1000)] = 6
+    """First pairs in a row that bring nothing, after which no others are tried."""
 
 
 class SparseMapper(IncrementalMapper):
-    """Incremental mapping; what it leaves out, images and models, is joined by bridges.
+    """Maps small sets as one estimate; COLMAP maps large ones, and registers into a model.
 
-    Pairs that contradict the loops they stand in are left out when that explains the others
-    better; a model that has all images and contradicts no others stays as it is.
+    What that leaves out is joined by bridges here, too.
     """
 
     Options = SparseOptions
+    options: SparseOptions
 
     def map(
         self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
     ) -> list[MappedModel]:
         """See :class:`colmap_affrect.mappers.base.Mapper`."""
-        models = self._mapped(task, output_path / "all", random_seed, show)
         native = self.native(task, random_seed)
         graph = graph_of(task, native.min_num_matches)
-        if models and graph.is_explained_by(models[0]):
-            return [MappedModel(model) for model in models]
-        contradicting = contradicting_pairs(graph, random_seed)
-        trusted = graph.without(contradicting)
-        if models and trusted.is_explained_by(models[0]):
-            return [MappedModel(model) for model in models]
-        if contradicting:
-            reduced = output_path / "reduced.db"
-            copy_without_pairs(task.database_path, reduced, contradicting)
-            again = replace(task, database_path=reduced, snapshot_path=None)
-            others = self._mapped(again, output_path / "reduced", random_seed, show)
-            models = max(models, others, key=trusted.best_score)
-        if task.extend:
-            task.extend.constrain(native)
-        joined = Joiner(trusted, native, show).join(models)
-        for model in joined:
+
+        def shown(count: int) -> None:
+            if task.cancellation and task.cancellation.is_cancelled:
+                raise KeyboardInterrupt
+            show(count)
+
+        search = self._search(task, graph, native, shown)
+        if task.extend or len(graph.keypoints) >= LARGE:
+            found = super().map(task, output_path, random_seed, show)
+            if found and graph.is_explained_by(found[0].reconstruction):
+                return found
+            models = sorted((m.reconstruction for m in found), key=search.evidence.of, reverse=True)
+            best = search.joined(graph, search.grower(graph), models, num_starts=1)
             if task.extend:
-                task.extend.adjust_others(model.reconstruction, native)
-                task.extend.restore(model.reconstruction)
-            if model.bridges and native.extract_colors and task.image_path:
+                for model in best:
+                    task.extend.restore(model.reconstruction)
+        else:
+            native.mapper.init_max_forward_motion = 1.0  # the evidence decides about such pairs
+            best = self._best(search, task, output_path)
+        if native.extract_colors and task.image_path:
+            for model in best:
                 model.reconstruction.extract_colors_for_all_images(task.image_path)
-        return joined
+        return best
 
-    def _mapped(
-        self, task: MappingTask, output_path: Path, random_seed: int, show: Callable[[int], None]
-    ) -> list[pycolmap.Reconstruction]:
-        output_path.mkdir()
-        found = super().map(task, output_path, random_seed, show)
-        return [model.reconstruction for model in found]
-
-
-class Joiner:
-    """Joins models and images by bridges until nothing joins."""
-
-    def __init__(
+    def _search(
         self,
+        task: MappingTask,
         graph: PairGraph,
         native: pycolmap.IncrementalPipelineOptions,
         show: Callable[[int], None],
-    ) -> None:
-        """Keep what all steps need."""
-        self.graph, self.native, self.show = graph, native, show
-        self.bridges = Bridges(graph, native.random_seed)
-        self.score: Callable[[pycolmap.Reconstruction], float] = graph.score_of
-
-    def join(self, models: Iterable[pycolmap.Reconstruction]) -> list[MappedModel]:
-        """Let the best model grow, then the next one, with the models that are left."""
-        left = sorted(models, key=self.score, reverse=True)
-        joined = []
-        while left:
-            model, bridges, left = self.grow(left[0], left[1:])
-            inside = set(model.reg_image_ids())
-            left = [other for other in left if not inside >= set(other.reg_image_ids())]
-            joined.append(MappedModel(model, tuple(bridges)))
-        return joined
-
-    def grow(
-        self, model: pycolmap.Reconstruction, others: list[pycolmap.Reconstruction]
-    ) -> tuple[pycolmap.Reconstruction, list[Bridge], list[pycolmap.Reconstruction]]:
-        """Bridge from a model until nothing joins; return it, its bridges and the other models."""
-        built: list[Bridge] = []
-        score = self.score(model)
-        while True:
-            hypotheses = self.bridges.find(Part(model), [Part(other) for other in others])
-            for hypothesis in hypotheses[:MAX_TRIALS]:
-                grown = self.applied(hypothesis, model)
-                new_score = self.score(grown)
-                new = set(grown.reg_image_ids()) - set(model.reg_image_ids())
-                if new and new_score > score and self.graph.supports(grown, new):
-                    break
-            else:
-                return model, built, others
-            model, score = grown, new_score
-            built.append(hypothesis.bridge)
-            if hypothesis.other is not None:
-                others = [other for i, other in enumerate(others) if i != hypothesis.other]
-
-    def applied(
-        self, hypothesis: Hypothesis, model: pycolmap.Reconstruction
-    ) -> pycolmap.Reconstruction:
-        """Return a copy of a model with the images of a bridge, grown and refined from there."""
-        model = copy.deepcopy(model)
-        known = {model.images[i].camera_id for i in model.reg_image_ids()}
-        model.load(self.graph.cache)
-        for image_id, (rotation, translation) in hypothesis.poses.items():
-            image = model.images[image_id]
-            if image.has_pose or image.frame is None:
-                continue
-            if image.camera_id not in known:
-                parameters = hypothesis.cameras[image_id].params.tolist()
-                model.cameras[image.camera_id].params = parameters
-            pose = pycolmap.Rigid3d(np.column_stack([rotation, translation]))
-            image.frame.set_cam_from_world(image.camera_id, pose)
-            model.register_frame(image.frame_id)
-        mapper = pycolmap.IncrementalMapper(self.graph.cache)
-        mapper.begin_reconstruction(model)
-        for image_id in hypothesis.poses:
-            mapper.triangulate_image(self.native.get_triangulation(), image_id)
-        self.finish(mapper)
-        mapper.end_reconstruction(False)
-        self.show(model.num_reg_images())
-        return model
-
-    def finish(self, mapper: pycolmap.IncrementalMapper) -> None:
-        """Refine a model, and register what can be by its tracks now."""
-        self._refine(mapper)
-        self._register_next(mapper)
-
-    def _register_next(self, mapper: pycolmap.IncrementalMapper) -> None:
-        """Register images by their tracks as long as there are any, as COLMAP's pipeline does."""
-        native = self.native
-        options, triangulation = native.get_mapper(), native.get_triangulation()
-        registered = True
-        any_registered = False
-        while registered:
-            registered = False
-            for image_id in mapper.find_next_images(options, False):
-                if mapper.register_next_image(options, image_id):
-                    mapper.triangulate_image(triangulation, image_id)
-                    mapper.iterative_local_refinement(
-                        native.ba_local_max_refinements,
-                        native.ba_local_max_refinement_change,
-                        options,
-                        native.get_local_bundle_adjustment(),
-                        triangulation,
-                        image_id,
-                    )
-                    registered = any_registered = True
-                    break
-        if any_registered:
-            self._refine(mapper)
-
-    def _refine(self, mapper: pycolmap.IncrementalMapper) -> None:
-        native = self.native
-        mapper.iterative_global_refinement(
-            native.ba_global_max_refinements,
-            native.ba_global_max_refinement_change,
-            native.get_mapper(),
+    ) -> Search:
+        cameras = {camera.camera_id: camera for camera in graph.cameras.values()}
+        priors = {key: FocalPrior.of(c, task.cameras.get(key)) for key, c in cameras.items()}
+        if self.options.keep_given_intrinsics:
+            constant = {key for key, record in task.cameras.items() if record.is_fixed}
+        else:
+            constant = set()
+            priors = {k: replace(p, sigma=p.sigma or EXIF_SIGMA) for k, p in priors.items()}
+        frames: set[int] = set()
+        if task.extend:
+            task.extend.constrain(native)
+            constant |= native.constant_cameras
+            if not task.extend.refine:
+                frames = {image.frame_id for image in task.extend.images}
+        adjuster = Adjuster(
+            priors,
+            self.options.noise_px,
             native.get_global_bundle_adjustment(),
-            native.get_triangulation(),
+            frozenset(constant),
+            frozenset(frames),
         )
+        return Search(adjuster, Evidence(graph, priors), native, self.options.num_seeds, show)
+
+    def _best(self, search: Search, task: MappingTask, output_path: Path) -> list[MappedModel]:
+        """Map with the pairs as some databases have them; return what has most evidence.
+
+        In the first one pairs have the matches of measured frames only, where there are others:
+        these are less exact, and verify sides that look the same. They join the rest to what is
+        known by then, first without pairs that they alone verify. Pairs that contradict their
+        loops, or the best model if it lacks images, are tried without.
+        """
+        graph, native = search.evidence.graph, search.native
+        path, tried = output_path / "reduced.db", set[frozenset[Ids]]()
+        best: list[MappedModel] = []
+        if task.measured:
+            copy_database(task.database_path, path)
+            keep_inliers(path, task.measured)
+            best = search.best(PairGraph.read(path, native.min_num_matches, task.depth_at))
+        ids = {name: image_id for image_id, name in graph.names.items()}
+        pairs = (
+            sorted((ids[a], ids[b])) for (a, b), left in task.measured.items() if not len(left)
+        )
+        unmeasured = frozenset((first, second) for first, second in pairs)
+
+        def contradicted() -> frozenset[Ids]:
+            has_all = best and best[0].reconstruction.num_reg_images() == len(graph.keypoints)
+            return graph.contradicted(best[0].reconstruction) if best and not has_all else NONE
+
+        moves: tuple[Callable[[], frozenset[Ids]], ...] = (
+            lambda: unmeasured,
+            lambda: NONE,
+            lambda: contradicting_pairs(graph, native.random_seed),
+            contradicted,
+        )
+        for pairs_to_drop in moves:
+            wrong = pairs_to_drop()
+            if wrong in tried:
+                continue
+            tried.add(wrong)
+            reduced = graph
+            if wrong:
+                path.unlink(missing_ok=True)
+                copy_without_pairs(task.database_path, path, wrong)
+                reduced = PairGraph.read(path, native.min_num_matches, task.depth_at)
+            if best and reduced.is_explained_by(best[0].reconstruction):
+                continue
+            start = best[0].reconstruction if best else None
+            best = max(best, search.best(reduced, start), key=search.evidence_of)
+        return best

@@ -1,7 +1,6 @@
 """What is known of finished models, kept beside them: COLMAP's files cannot hold it all."""
 
 import re
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +14,6 @@ from colmap_affrect.project.checked_json import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import INPUTS
 
-GUIDED_BEFORE = "guided-before.json"  # beside models that wait: the pairs guided then
-
 
 @dataclass(frozen=True)
 class _Kept:
@@ -28,7 +25,6 @@ class _Kept:
 
 
 _KEPT = TypeAdapter(_Kept)
-_PAIRS = TypeAdapter(dict[str, list[tuple[str, str]]])
 
 
 def write_summary(summary: ModelSummary, folder: Path) -> None:
@@ -75,20 +71,3 @@ def made_from(sparse_path: Path) -> str:
         if not re.fullmatch("[0-9a-f]{64}( own| [0-9a-f]{64})?", text):
             raise ValueError("no digests")
         return text
-
-
-def write_guided_before(pairs: Sequence[tuple[str, str]], sparse_path: Path) -> None:
-    """Keep which pairs are guided beside models that are going to be put aside."""
-    text = _PAIRS.dump_json({"pairs": list(pairs)}).decode()
-    replace_text(sparse_path / GUIDED_BEFORE, with_checksum(text))
-
-
-def guided_before(aside: Path) -> set[tuple[str, str]]:
-    """Return the pairs guided before models were put aside; StoreError if these are damaged."""
-    path = aside / GUIDED_BEFORE
-    with damage(path, made_again("verify", aside.parent)):
-        known = set(_PAIRS.validate_json(without_checksum(path.read_bytes()))["pairs"])
-    made_from(aside)
-    for folder in model_folders(aside):
-        require_intact(folder)
-    return known

@@ -82,7 +82,6 @@ class Workspace:
         self.pairs = path / "pairs.txt"  # those to match
         self.deleted_pairs = path / "pairs.deleted.txt"  # but for those deleted in the database
         self.sparse = path / "sparse"  # folder of the COLMAP models 0, 1, ...
-        self.aside = path / "sparse.aside"  # models to be compared with those of guided matches
         self.snapshots = path / "sparse.snapshots"  # from which an interrupted mapping goes on
         self.depth = path / "depth"  # folder of the depth maps that a network made
         self.config, self.log = path / "config.toml", path / "run.log"  # options; of all runs
@@ -357,7 +356,7 @@ class Workspace:
     def _results(self, stage: str) -> list[Path]:
         """Return what a stage and those after it make."""
         made = {
-            "map": [self.sparse, self.aside, self.snapshots, self.report, self.page],
+            "map": [self.sparse, self.snapshots, self.report, self.page],
             "guide": [self.guided],
             "verify": [
                 self.cameras,

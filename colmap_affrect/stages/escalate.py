@@ -21,7 +21,7 @@ record, so that a killed run goes on in the same way:
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -30,15 +30,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database_copy import copy_database
-from colmap_affrect.colmap.verification import PairVerifier, connected_parts, verified_pairs, verify
+from colmap_affrect.colmap.verification import PairVerifier, connected_parts, verified_pairs
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.arrays import Bools, Indices, Singles
 from colmap_affrect.geometry.consistency import num_consistent_matches
 from colmap_affrect.mappers.pair_graph import MIN_SHARE
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.project.outputs import temporary_folder
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace
@@ -61,7 +58,6 @@ from colmap_affrect.stages.match import (
 from colmap_affrect.stages.one_image import ImageExtractor
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import (
-    extracted_px,
     recorded_verification,
     verified_inliers,
     verify_new,
@@ -132,72 +128,15 @@ def pair_levels(context: Context) -> dict[str, int]:
     return counts
 
 
-@contextmanager
-def _copied_database(context: Context) -> Iterator[Path]:
-    """Give a copy of the database, in a folder of its own beside it."""
-    with temporary_folder(context.workspace.path) as folder:
-        path = folder / "database.db"
-        copy_database(context.workspace.database, path)
-        yield path
-
-
-@contextmanager
-def first_level_database(context: Context) -> Iterator[Path | None]:
-    """Give a copy of the database in which the pairs that climbed are as they were before.
-
-    It is what a recipe without escalation would have made. None when no pair of the database has
-    climbed with success.
-    """
-    if not recorded_extraction(context.workspace).escalation:
-        yield None
-        return
-    escalation = Escalation(context, EscalateOptions())
-    levels = context.matches.levels(escalation.pairs)
-    climbed = [pair for pair, count in escalation.num_inliers().items() if count and levels[pair]]
-    if not climbed:
-        yield None
-        return
-    with _copied_database(context) as path:
-        escalation.match_first_level(climbed, path)
-        yield path
-
-
 def unmeasured_pairs(context: Context) -> list[Pair]:
     """Return the verified pairs that matches of measured frames alone do not verify.
 
     There are none where the others tie fewer than half of the images that all of them tie.
     """
-    return [pair for pair, indices in _measured_inliers(context).items() if not len(indices)]
+    return [pair for pair, indices in measured_inliers(context).items() if not len(indices)]
 
 
-@contextmanager
-def measured_database(context: Context) -> Iterator[tuple[Path, list[Pair]] | None]:
-    """Give a copy of the database as measured frames have it, and the pairs that it lacks.
-
-    Pairs have the inliers of measured frames there, with those of others only where these are
-    many times more. None where that changes nothing, or ties fewer than half of the images.
-    """
-    found = _measured_inliers(context)
-    if not found:
-        yield None
-        return
-    with _copied_database(context) as path:
-        colmap_database.keep_inliers(path, found)
-        yield path, [pair for pair, indices in found.items() if not len(indices)]
-
-
-def measured_keypoints(context: Context, model: pycolmap.Reconstruction) -> dict[int, Bools] | None:
-    """Return which keypoints, (N,) by image id, are of measured frames; None if all or none."""
-    escalation = Escalation(context, EscalateOptions())
-    if not escalation.has_both_kinds:
-        return None
-    return {
-        image_id: escalation.are_measured(image.name, np.arange(image.num_points2D()))
-        for image_id, image in model.images.items()
-    }
-
-
-def _measured_inliers(context: Context) -> dict[Pair, Indices]:
+def measured_inliers(context: Context) -> dict[Pair, Indices]:
     """Return the (M, 2) inliers that verified pairs have as measured frames have it, if others.
 
     M is 0 where measured ones are too few for a verified pair.
@@ -218,13 +157,6 @@ def _measured_inliers(context: Context) -> dict[Pair, Indices]:
         max(map(len, connected_parts(pairs)), default=0) for pairs in (inliers, kept)
     )
     return found if num_kept >= MIN_SHARE * num_tied else {}
-
-
-def reject(context: Context, pairs: Sequence[Pair]) -> None:
-    """Let pairs count as not verified, and none climb again: further levels would be no better."""
-    escalation = Escalation(context, EscalateOptions())
-    context.matches.write((), escalation.pairs, escalation.levels[-1])
-    colmap_database.reject_pairs(context.workspace.database, pairs)
 
 
 class Escalation:
@@ -356,12 +288,6 @@ class Escalation:
         self.matches.write((), self.pairs, 0)
         self.matches.record_step()
         self.write()
-
-    def match_first_level(self, pairs: Sequence[Pair], path: Path) -> None:
-        """Give pairs of a copy of the database the matches that they had before they climbed."""
-        found = list(matched_at_level(self.context, pairs, self.matching, 0))
-        _replace_matches(path, colmap_database.image_ids(path), found)
-        verify(path, self.verification, extracted_px(self.context))
 
     def _extend(self, names: Sequence[str], level: int, advance: Callable[[int], None]) -> None:
         """Add to images the features of all levels that they lack, up to this one."""

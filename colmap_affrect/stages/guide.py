@@ -75,11 +75,6 @@ def guide(
     return StageReport("guide", time.perf_counter() - start, len(todo), num_done)
 
 
-def pairs_to_guide(context: Context, images: Collection[str]) -> list[Pair]:
-    """Return the verified pairs of some images that :func:`guide` would match again."""
-    return Guiding(context, recorded_guiding(context.workspace)).todo(images)[0]
-
-
 def restore_exact(context: Context, pairs: Collection[Pair] | None = None) -> None:
     """Give guided pairs, by default all, their geometry without guided matches again.
 

@@ -3,39 +3,29 @@
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import read_camera_records
-from colmap_affrect.colmap.model_files import num_long_tracks
-from colmap_affrect.colmap.verification import num_tied, verified_pairs
+from colmap_affrect.colmap.verification import verified_pairs
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.features.weights import install_hint
 from colmap_affrect.features.weights import missing as missing_weights
-from colmap_affrect.mappers.attempts import LARGE_MODEL, map_database, read_models
 from colmap_affrect.mappers.base import Mapper, MappingTask
-from colmap_affrect.mappers.doubts import loose_names
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
-from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
-from colmap_affrect.mappers.starts import holding
-from colmap_affrect.mappers.summaries import made_from, model_folders, read_summary, refuse_edited
+from colmap_affrect.mappers.mapping import map_database, read_models
+from colmap_affrect.mappers.pair_graph import PairGraph
+from colmap_affrect.mappers.summaries import made_from, refuse_edited
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary, StageReport
 from colmap_affrect.project.workspace import INPUTS, Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.depth_lookup import depth_lookup
-from colmap_affrect.stages.escalate import (
-    first_level_database,
-    measured_database,
-    measured_keypoints,
-    reject,
-)
+from colmap_affrect.stages.escalate import measured_inliers
 from colmap_affrect.stages.guide import guided_matches
 from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.pairs import listed_pairs
@@ -82,19 +72,8 @@ def map_images(
     refuse_edited(workspace.sparse)
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
-        models, num_rejected = _map(context, mapper, task, advance)
-    is_large = _num_registered(models) >= LARGE_MODEL
-    if not workspace.is_copy and not is_large and _rank(models) < (True, num_images):
-        models = _or_first_level(context, mapper, task, models)
+        models = map_database(mapper, task, workspace.sparse, advance)
     warnings = {}
-    if num_rejected:
-        inputs = _inputs(workspace, extend)
-        is_one = num_rejected == 1
-        warnings[workspace.database.name] = (
-            f"{num_rejected} {'pair' if is_one else 'pairs'} that only learned matching verified "
-            f"{'contradicts the others and was' if is_one else 'contradict the others and were'} "
-            "rejected"
-        )
     replace_text(workspace.sparse / INPUTS, inputs)
     if extend and existing and existing.num_other_keypoints:
         warnings[str(extend.model_path)] = (
@@ -116,6 +95,7 @@ def _task(context: Context, existing: ExistingModel | None) -> MappingTask:
         image_path_of(workspace),
         existing,
         guided={} if copied else guided_matches(context),
+        measured={} if copied else measured_inliers(context),
         cameras=read_camera_records(workspace.cameras),
         depth_at=None if copied else depth_lookup(context),
     )
@@ -141,91 +121,6 @@ def image_names(workspace: Workspace) -> list[str]:
     if workspace.is_copy:
         return sorted(colmap_database.image_ids(workspace.database))
     return Inputs.recorded(workspace).names()
-
-
-def _or_first_level(
-    context: Context, mapper: Mapper, task: MappingTask, models: list[ModelSummary]
-) -> list[ModelSummary]:
-    """Keep the models of the pairs as they were before they climbed, where those are better.
-
-    Of two that are both contradicted, or both not, that is the one with more images, so escalation
-    never loses one; what is not takes the place of what is, however large that may be.
-    """
-    with first_level_database(context) as path:
-        least = _num_registered(models) if models and models[0].is_consistent else 0
-        if path is None or num_tied(path, _min_num_inliers(context.workspace)) <= least:
-            return models
-        sparse = path.with_name("sparse")
-        firsts = map_database(mapper, replace(task, database_path=path), sparse, _ignore)
-        if _rank(firsts) <= _rank(models):
-            return models
-        logger.info("the model of the pairs before they climbed is better and is kept")
-        remove_own([context.workspace.sparse])
-        sparse.rename(context.workspace.sparse)
-    return firsts
-
-
-def _map(
-    context: Context, mapper: Mapper, task: MappingTask, advance: Callable[[int], None]
-) -> tuple[list[ModelSummary], int]:
-    """Map, first by the matches of measured frames where there are others, too.
-
-    Learned matching is off by more than a pixel, which bends models whose cameras nobody knows, and
-    verifies sides of a building that look the same as one. So measured ones tell the cameras, and
-    which pairs are wrong: these are rejected; then all matches tie the images, among them those
-    that the measured ones alone tie by hardly any point. Returns the models, and how many pairs
-    were rejected.
-    """
-    workspace, sparse = context.workspace, context.workspace.sparse
-    if task.extend or workspace.is_copy:
-        return map_database(mapper, task, sparse, advance), 0
-    with measured_database(context) as found:
-        if not found:
-            return map_database(mapper, task, sparse, advance), 0
-        path, doubted = found
-        num_images = num_tied(workspace.database, _min_num_inliers(workspace))
-        models = map_database(mapper, replace(task, database_path=path), sparse, advance)
-        if _num_registered(models) < MIN_SHARE * num_images or not models[0].is_consistent:
-            return map_database(mapper, task, sparse, _ignore), 0
-        model = pycolmap.Reconstruction(sparse / "0")
-        contradicting = _contradicting(PairGraph.read(workspace.database), model)
-        # Images that something speaks against may stand wrong themselves.
-        unsure = models[0].doubtful.keys() - set(models[0].loose)
-        rejected = [
-            pair for pair in doubted if frozenset(pair) in contradicting and not unsure & set(pair)
-        ]
-        if rejected:
-            reject(context, rejected)
-        every = path.with_name("sparse")
-        held = holding(task, model, models[0], path.with_name("held.db"))
-        others = map_database(mapper, held, every, _ignore)
-        if _rank(others) >= _rank(models):
-            remove_own([sparse])
-            every.rename(sparse)
-            return others, len(rejected)
-    return models, len(rejected)
-
-
-def _contradicting(graph: PairGraph, model: pycolmap.Reconstruction) -> set[frozenset[str]]:
-    """Return the names of the pairs that a model contradicts."""
-    poses, cameras = poses_of(model), cameras_of(model)
-    return {
-        frozenset(graph.names[image_id] for image_id in pair.ids)
-        for pair in graph.pairs_inside(poses)
-        if graph.agreement(pair, poses, cameras) < MIN_SHARE
-    }
-
-
-def _num_registered(models: Sequence[ModelSummary]) -> int:
-    return len(models[0].registered_names) if models else 0
-
-
-def _rank(models: Sequence[ModelSummary]) -> tuple[bool, int]:
-    return bool(models) and models[0].is_consistent, _num_registered(models)
-
-
-def _ignore(_: int) -> None:
-    pass
 
 
 def num_verified_inliers(workspace: Workspace) -> dict[Pair, int]:
@@ -358,12 +253,6 @@ def _missing_places(workspace: Workspace, missing: Collection[str]) -> str:
     return ", ".join(between) or "that show the missing places"
 
 
-def agreement(context: Context, sparse_path: Path) -> float:
-    """Return how well the best of some models agrees with the verified pairs."""
-    graph = PairGraph.read(context.workspace.database)
-    return graph.best_score(map(pycolmap.Reconstruction, model_folders(sparse_path)))
-
-
 def contradicting_pairs(context: Context) -> dict[str, int]:
     """Return how many verified pairs of each level of a recipe the largest model contradicts."""
     names = [level.name for level in recorded_extraction(context.workspace).levels]
@@ -371,26 +260,7 @@ def contradicting_pairs(context: Context) -> dict[str, int]:
     if len(names) < 2 or not path.exists():
         return {}
     graph, model = PairGraph.read(context.workspace.database), pycolmap.Reconstruction(path)
-    found = _contradicting(graph, model)
+    found = {frozenset(graph.names[i] for i in ids) for ids in graph.contradicted(model)}
     pairs = [pair for pair in listed_pairs(context) if frozenset(pair) in found]
     levels = Counter(context.matches.levels(pairs).values())
     return {names[level]: levels[level] for level in sorted(levels)}
-
-
-def images_in_need(context: Context, sparse_path: Path, min_num_tracks: int) -> set[str]:
-    """Return the images that are not in the largest model, or there see few of its points.
-
-    Few are less than ``min_num_tracks`` that three images or more see. Where points do not tell the
-    focal lengths only those of measured frames count, for they tell the cameras.
-    """
-    names = set(colmap_database.image_ids(context.workspace.database))
-    path = sparse_path / "0"
-    if not path.exists() or len(names) < 3:
-        return names if len(names) > 2 else set()
-    model = pycolmap.Reconstruction(path)
-    summary = read_summary(path)
-    is_loose = summary and loose_names(summary)
-    counted = measured_keypoints(context, model) if is_loose else None
-    by_id = num_long_tracks(model, counted)
-    counts = {image.name: by_id[image_id] for image_id, image in model.images.items()}
-    return {name for name in names if counts.get(name, 0) < min_num_tracks}

@@ -16,7 +16,7 @@ from colmap_affrect import __version__, pipeline
 from colmap_affrect.cli import main
 from colmap_affrect.cli.parser import EXAMPLES, build_parser, epilog
 from colmap_affrect.errors import OptionError
-from colmap_affrect.mappers import attempts
+from colmap_affrect.mappers import mapping
 from colmap_affrect.mappers.doubts import Doubts
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe, recipe_names
@@ -394,7 +394,7 @@ def test_model_that_nobody_can_trust_ends_with_3(
     verified: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     doubts = Doubts(model=("no parallax",))
-    monkeypatch.setattr(attempts, "find_doubts", lambda *_: doubts)
+    monkeypatch.setattr(mapping, "find_doubts", lambda *_: doubts)
     assert main(["map", "--output-path", str(verified), "--overwrite"]) == 3
     printed = capfd.readouterr()
     assert "colmap gui" in printed.out

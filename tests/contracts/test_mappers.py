@@ -11,8 +11,8 @@ from small_scene import INTRINSICS, NAMES
 
 import colmap_affrect
 from colmap_affrect.errors import OptionError
-from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
+from colmap_affrect.mappers.mapping import map_database
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ from mapping_tasks import NOTHING_KNOWN, task_with_given_cameras
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.errors import MappingError, OptionError, StoreError
-from colmap_affrect.mappers import attempts, incremental, snapshots
-from colmap_affrect.mappers.attempts import map_database
+from colmap_affrect.mappers import incremental, mapping, snapshots
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing
+from colmap_affrect.mappers.mapping import map_database
 
 SEED = 3
 NUM_IMAGES, NUM_OLD = 10, 5
@@ -132,7 +132,7 @@ def test_the_model_that_is_extended_stays_until_all_is_judged(
 
     (tmp_path / "sparse").mkdir()
     existing = read_existing(Extension(written(old, tmp_path / "sparse" / "0")), database)
-    monkeypatch.setattr(attempts, "summarize", stop)
+    monkeypatch.setattr(mapping, "summarize", stop)
     with pytest.raises(KeyboardInterrupt):
         extended(database, existing, tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["sparse"]

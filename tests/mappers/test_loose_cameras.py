@@ -10,7 +10,6 @@ import pytest
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.camera_records import CameraRecord
-from colmap_affrect.mappers.attempts import _sharing_cameras
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.loose_cameras import loose_images
 
@@ -67,10 +66,3 @@ def test_what_is_known_need_not_be_told_by_points() -> None:
     assert loose_images(model, task_of(replace(UNKNOWN, source="exif"))) == ()
     assert loose_images(model, replace(task_of(), cameras={})) == ()
     assert loose_images(pycolmap.Reconstruction(), task_of()) == ()
-    assert loose_images(model, replace(task_of(), held=frozenset({1}))) == ()
-
-
-def test_images_that_share_a_loose_camera_are_loose() -> None:
-    model = ring(2)
-    assert _sharing_cameras(model, {"0.jpg"}) == {f"{number}.jpg" for number in range(NUM_IMAGES)}
-    assert _sharing_cameras(model, {"other.jpg"}) == set()

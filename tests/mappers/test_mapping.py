@@ -22,12 +22,10 @@ from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.native_options import differences, set_values
 from colmap_affrect.errors import MappingError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers import attempts
-from colmap_affrect.mappers.attempts import map_database
-from colmap_affrect.mappers.base import MAPPERS, MappedModel, Mapper
-from colmap_affrect.mappers.doubts import MIRRORED_COPY
+from colmap_affrect.mappers.base import MAPPERS, Mapper
 from colmap_affrect.mappers.global_mapper import GlobalMapper, GlobalOptions, map_globally
 from colmap_affrect.mappers.incremental import IncrementalMapper, IncrementalOptions
+from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.matchers.guided import GuidedOptions
 from colmap_affrect.options import PRESETS
 from colmap_affrect.pipeline import map_and_report
@@ -159,50 +157,6 @@ def test_mapper_that_fails_is_one_clear_line_and_leaves_nothing(
         reconstruct(path, mapper_of(mapper, mapper_options={key: -1}))
     assert "\n" not in str(error.value)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["database.db"]
-
-
-@pytest.mark.parametrize(
-    ("num_views", "large", "seeds"),
-    [
-        (0, 100, [SEED, SEED + 1_000_003, SEED + 2_000_006]),
-        (3, 100, [SEED, SEED + 1_000_003, SEED + 2_000_006]),
-        (3, 3, [SEED]),
-        (4, 100, [SEED]),
-    ],
-)
-def test_mapping_is_tried_again_while_images_are_missing_in_a_small_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_views: int, large: int, seeds: list[int]
-) -> None:
-    path = tmp_path / "database.db"
-    synthesize(path, 4)
-    model = synthesize(tmp_path / "model.db", num_views) if num_views else None
-    given: list[int] = []
-
-    def map_some(_: object, __: Path, seed: int, ___: object) -> list[MappedModel]:
-        given.append(seed)
-        return [MappedModel(model)] if model else []
-
-    mapper = mapper_of("incremental")
-    monkeypatch.setattr(mapper, "map", map_some)
-    monkeypatch.setattr(attempts, "LARGE_MODEL", large)
-    reconstruct(path, mapper)
-    assert given == seeds
-
-
-def test_mirrored_copy_that_was_taken_out_is_not_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    synthesize(tmp_path / "database.db", 4)
-    model, given = synthesize(tmp_path / "model.db", 3), []
-
-    def map_some(_: object, __: Path, seed: int, ___: object) -> list[MappedModel]:
-        given.append(seed)
-        return [MappedModel(model, taken_out={"d.png": f"{MIRRORED_COPY} a.png"})]
-
-    mapper = mapper_of("incremental")
-    monkeypatch.setattr(mapper, "map", map_some)
-    reconstruct(tmp_path / "database.db", mapper)
-    assert given == [SEED]
 
 
 @pytest.mark.long

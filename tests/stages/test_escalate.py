@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,16 +16,13 @@ from results import database_content
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import FileTransaction
-from colmap_affrect.project.report import ModelSummary, StageReport
+from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import FeatureStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
 from colmap_affrect.stages import escalate as escalation
-from colmap_affrect.stages import map as map_stage
 from colmap_affrect.stages.climbing import weakly_connected_images
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import Escalation, recorded_escalation
@@ -290,62 +286,6 @@ def test_each_climb_has_a_bar_of_its_own_that_ends_full(before: Workspace, tmp_p
     last = {line.split(":")[0]: line.split(": ")[1].split()[0].split("/") for line in lines}
     assert list(last) == sorted(last)
     assert all(done == total for done, total in last.values())
-
-
-def test_pairs_that_climbed_can_be_had_as_they_were(
-    climbed: tuple[Workspace, StageReport], before: Workspace, tmp_path: Path
-) -> None:
-    workspace = copy(climbed[0], tmp_path)
-    assert len(geometry(workspace, HARD)) > len(geometry(before, HARD))
-    content = database_content(workspace.database)
-    with escalation.first_level_database(Context(workspace)) as path:
-        assert path is not None
-        first = SimpleNamespace(database=path)
-        for pair in (EASY, HARD):
-            assert_array_equal(geometry(first, pair), geometry(before, pair))
-    assert not path.parent.exists()
-    assert database_content(workspace.database) == content
-    with escalation.first_level_database(Context(before)) as path:
-        assert path is None
-
-
-@pytest.mark.parametrize(
-    ("num_escalated", "doubts", "mapped_before", "kept"),
-    [
-        (0, (), True, "first"),
-        (2, (), True, "first"),
-        (2, ("pure rotation",), True, "escalated"),
-        (3, (), False, "escalated"),
-    ],
-)
-def test_the_model_before_the_climb_is_kept_where_it_has_more_images(
-    climbed: tuple[Workspace, StageReport],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    num_escalated: int,
-    doubts: tuple[str, ...],
-    mapped_before: bool,
-    kept: str,
-) -> None:
-    workspace, mapped = copy(climbed[0], tmp_path), []
-
-    def map_database(_, task, sparse, __):
-        is_first_level = task.database_path != workspace.database
-        mapped.append(is_first_level)
-        (sparse / "0").mkdir(parents=True)
-        (sparse / "0" / "which").write_text("first" if is_first_level else "escalated")
-        names = tuple(NAMES[: 3 if is_first_level else num_escalated])
-        return [ModelSummary(names, 10, 2.0, 0.5, doubts=doubts if is_first_level else ())]
-
-    monkeypatch.setattr(map_stage, "num_tied", lambda *_: 3)
-    monkeypatch.setattr(map_stage, "map_database", map_database)
-    with workspace.locked():
-        mapper = MAPPERS.make(IncrementalOptions())
-        _, models = map_stage.map_images(Context(workspace), mapper)
-    assert mapped == ([False, True] if mapped_before else [False])
-    assert len(models[0].registered_names) == (3 if kept == "first" else num_escalated)
-    assert (workspace.sparse / "0" / "which").read_text() == kept
-    assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == ["sparse"]
 
 
 def test_no_pair_that_verifies_unrectified_loses_inliers(

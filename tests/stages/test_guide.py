@@ -12,18 +12,12 @@ from numpy.testing import assert_array_equal
 from results import database_content
 from small_scene import INTRINSICS, NAMES
 
-from colmap_affrect import pipeline
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import geometry_digest, image_ids, open_database
-from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.base import MAPPERS
-from colmap_affrect.mappers.doubts import FOCAL_DOUBT
 from colmap_affrect.mappers.incremental import IncrementalOptions
-from colmap_affrect.mappers.last_adjustment import adjust_last
 from colmap_affrect.matchers.guided import GuidedOptions
-from colmap_affrect.pipeline import map_guided
-from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages import guide as stage
@@ -38,7 +32,6 @@ from colmap_affrect.stages.guide import (
     restore_exact,
 )
 from colmap_affrect.stages.inputs import Inputs
-from colmap_affrect.stages.map import agreement, map_images
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.stationary import NUM_CELLS
@@ -218,28 +211,7 @@ def test_command(context: Context, call: Call) -> None:
 
 
 def mapper() -> object:
-    return MAPPERS.make(IncrementalOptions(max_num_attempts=1))
-
-
-@pytest.mark.long
-def test_models_of_guided_pairs_are_adjusted_by_exact_matches(guided: Context) -> None:
-    map_images(guided, mapper())
-    model = pycolmap.Reconstruction(guided.workspace.sparse / "0")
-    assert model.num_reg_images() == 4
-    exact, verified = exact_inliers(guided, current(guided)), verified_inliers(guided)
-    seen = {image.name: [p.point3D_id if p.has_point3D() else -1 for p in image.points2D]
-            for image in model.images.values()}  # fmt: skip
-    tied = {(name, row[side]) for pair, rows in exact.items() for row in rows.tolist()
-            if seen[pair[0]][row[0]] == seen[pair[1]][row[1]] != -1
-            for side, name in enumerate(pair)}  # fmt: skip
-    guided_only = {(name, row[side]) for pair, rows in verified.items() for row in rows.tolist()
-                   if seen[pair[0]][row[0]] == seen[pair[1]][row[1]] != -1
-                   for side, name in enumerate(pair)} - tied  # fmt: skip
-    # Taken out are all, but one is left again where what fits badly went after the adjustment.
-    assert len(guided_only) < 0.002 * len(tied)
-    by_ids = inlier_matches(guided.workspace.database, 1)
-    added = guided_matches(guided)
-    assert adjust_last(model, by_ids, added, constant_cameras=model.cameras) == len(guided_only)
+    return MAPPERS.make(IncrementalOptions())
 
 
 def test_guided_matches_are_the_inliers_that_came_by_guiding(
@@ -254,111 +226,6 @@ def test_guided_matches_are_the_inliers_that_came_by_guiding(
         new = {*map(tuple, inliers.tolist())} - {*map(tuple, exact[pair].tolist())}
         rows = found.get((ids[pair[0]], ids[pair[1]]), np.zeros((0, 2)))
         assert {*map(tuple, rows.tolist())} == new
-
-
-@pytest.mark.long
-def test_images_that_are_missing_are_guided_and_the_first_model_may_stay(
-    context: Context, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Here nothing is missing; one image is said to be, and the first model to be as good."""
-    guide(context)
-    reports, models = map_guided(context, mapper())
-    assert [report.name for report in reports] == ["map"]
-    digest = geometry_digest(context.workspace.database)
-    monkeypatch.setattr(pipeline, "images_in_need", lambda *_: {NAMES[2]})
-    monkeypatch.setattr(pipeline, "agreement", lambda *_: 1.0)  # not better: the first one stays
-    reports, kept = map_guided(context, mapper())
-    assert [report.name for report in reports] == ["map", "guide", "map"]
-    assert kept == models
-    assert geometry_digest(context.workspace.database) == digest
-    assert map_images(context, mapper())[0].num_done == 0  # sparse/ belongs to the database
-    reports, _ = map_guided(context, mapper())
-    assert [report.name for report in reports] == ["map"]  # tried already
-    assert not list(context.workspace.path.glob("sparse.*"))
-
-
-@pytest.mark.long
-def test_model_of_guided_pairs_stays_where_it_agrees_better(
-    context: Context, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pipeline, "images_in_need", lambda *_: {NAMES[2]})
-    sparse = context.workspace.sparse
-    monkeypatch.setattr(pipeline, "agreement", lambda _, path: float(path == sparse))
-    reports, models = map_guided(context, mapper())
-    assert [report.name for report in reports] == ["map", "guide", "map"]
-    assert guided_counts(context)["pairs"] > 0
-    again, kept = map_images(context, mapper())
-    assert again.num_done == 0  # sparse/ belongs to the database
-    assert [m.num_points3D for m in kept] == [m.num_points3D for m in models]
-    assert not list(context.workspace.path.glob("sparse.*"))
-
-
-@pytest.mark.parametrize(
-    ("loose_before", "loose", "agreed", "is_better"),
-    [
-        (False, False, 0.99, False),
-        (False, False, 1.01, True),
-        (True, False, 0.98, True),  # only guided matches tell the focal lengths
-        (True, False, 0.96, False),
-        (True, True, 0.99, False),
-        (True, None, 0.98, False),  # there are fewer images
-    ],
-)
-def test_models_that_tell_focal_lengths_may_agree_a_little_less(
-    monkeypatch: pytest.MonkeyPatch,
-    loose_before: bool,
-    loose: bool | None,
-    agreed: float,
-    is_better: bool,
-) -> None:
-    def summary(is_loose: bool | None) -> ModelSummary:
-        names = () if is_loose is None else ("a.jpg",)
-        doubtful = {"a.jpg": f"held by only 9 points; {FOCAL_DOUBT}"} if is_loose else {}
-        return ModelSummary(names, 1, 2.0, 0.5, doubtful=doubtful)
-
-    context, aside = Context(Workspace(Path("out"))), Path("out/aside")
-    monkeypatch.setattr(pipeline, "read_summary", lambda _: summary(loose_before))
-    monkeypatch.setattr(
-        pipeline, "agreement", lambda _, path: agreed if path == context.workspace.sparse else 1.0
-    )
-    assert pipeline._are_better(context, [summary(loose)], aside) == is_better
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("killed", ["guide", "agreement"])
-def test_run_that_is_killed_beside_its_first_models_goes_on_to_compare_them(
-    context: Context, monkeypatch: pytest.MonkeyPatch, killed: str
-) -> None:
-    def kill(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(pipeline, "images_in_need", lambda *_: {NAMES[2]})
-    with monkeypatch.context() as patch:
-        patch.setattr(pipeline, killed, kill)
-        with pytest.raises(KeyboardInterrupt):
-            map_guided(context, mapper())
-    digest = geometry_digest(context.workspace.database)
-    assert context.workspace.aside.exists()
-    monkeypatch.setattr(pipeline, "agreement", lambda *_: 1.0)  # not better: the first one stays
-    reports, models = map_guided(context, mapper())
-    assert [report.name for report in reports] == ["guide", "map"]
-    assert len(models) == 1
-    assert guided_counts(context) == {}
-    assert (geometry_digest(context.workspace.database) == digest) == (killed == "guide")
-    assert map_images(context, mapper())[0].num_done == 0
-    assert not list(context.workspace.path.glob("sparse.*"))
-
-
-def test_models_with_more_images_agree_better(context: Context, tmp_path: Path) -> None:
-    map_images(context, mapper())
-    whole = context.workspace.sparse
-    model = pycolmap.Reconstruction(whole / "0")
-    model.deregister_frame(model.images[min(model.reg_image_ids())].frame_id)
-    (tmp_path / "fewer" / "0").mkdir(parents=True)
-    model.write(tmp_path / "fewer" / "0")
-    (tmp_path / "none").mkdir()
-    fewer, none = (agreement(context, tmp_path / name) for name in ("fewer", "none"))
-    assert agreement(context, whole) > fewer > none == 0.0
 
 
 def test_ids_of_a_pair_are_in_order(context: Context) -> None:

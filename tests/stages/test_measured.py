@@ -14,16 +14,12 @@ import pytest
 from numpy.typing import NDArray
 from small_scene import INTRINSICS, NAMES
 
-from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.verification import PairVerifier, VerificationOptions, verified_pairs
 from colmap_affrect.features.base import EXTRACTORS
 from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.images.photographs import CameraOptions
-from colmap_affrect.mappers.attempts import map_database
-from colmap_affrect.mappers.base import MAPPERS, Mapper, MappingTask
-from colmap_affrect.mappers.doubts import FOCAL_DOUBT
-from colmap_affrect.progress import Advance
+from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions, load_recipe
@@ -34,8 +30,6 @@ from colmap_affrect.stages.escalate import (
     OUTNUMBERED,
     Escalation,
     escalate,
-    measured_database,
-    reject,
 )
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.inputs import Inputs
@@ -239,149 +233,8 @@ def test_enough_measured_matches_decide_which_others_are_right(
         assert is_wrong.sum() == len(wrong)
 
 
-def test_measured_database_has_the_inliers_of_measured_frames_alone(context: Context) -> None:
-    escalation = escalation_of(context)
-    without = PAIR, (NAMES[1], NAMES[3])
-    shapeless_only(escalation, *without)
-    path = context.workspace.database
-    everything = verified_inliers(context)
-    with measured_database(context) as found:
-        assert found
-        copy, doubted = found
-        assert set(doubted) == set(without)
-        assert verified_pairs(copy, 1).keys() < verified_pairs(path, 1).keys()
-        copy.replace(path)
-    kept = verified_inliers(context)
-    assert kept.keys() == everything.keys() - set(without)
-    for pair, indices in kept.items():
-        measured = escalation.measured(pair, everything[pair])
-        assert not measured.all()
-        assert np.array_equal(indices, everything[pair][measured])
-    with measured_database(context) as found:
-        assert found is None
-
-
-def test_measured_database_keeps_others_that_outnumber_measured_frames(context: Context) -> None:
-    path, pairs = context.workspace.database, list(verified_inliers(context))
-    escalation, kept = escalation_of(context), {}
-    for pair, indices in verified_inliers(context).items():
-        measured = escalation.measured(pair, indices)
-        count = np.count_nonzero(~measured) // OUTNUMBERED + (pair != pairs[0])
-        kept[pair] = np.concatenate([indices[~measured], indices[measured][:count]])
-    colmap_database.keep_inliers(path, kept)
-    with measured_database(context) as found:
-        assert found
-        assert found[1] == []
-        found[0].replace(path)
-    for pair, indices in verified_inliers(context).items():
-        assert len(indices) < len(kept[pair]) or pair == pairs[0]
-        assert np.array_equal(indices, kept[pair][: len(indices)]) == (pair == pairs[0])
-
-
-def test_few_measured_matches_verify_no_pair(context: Context) -> None:
-    escalation, kept = escalation_of(context), {}
-    for pair, indices in verified_inliers(context).items():
-        measured = escalation.measured(pair, indices)
-        kept[pair] = np.concatenate([indices[measured][:14], indices[~measured][:30]])
-    colmap_database.keep_inliers(context.workspace.database, kept)
-    with measured_database(context) as found:
-        assert found is None  # nothing would be left
-
-
-def test_measured_matches_tell_the_cameras_and_all_tie_the_images(
-    context: Context, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    told: list[tuple[set[int], list[float]]] = []
-
-    def spied(mapper: Mapper, task: MappingTask, path: Path, show: Advance) -> Any:
-        models = map_database(mapper, task, path, show)
-        (camera,) = pycolmap.Reconstruction(path / "0").cameras.values()
-        told.append((set(task.held), camera.params.tolist()))
-        return models
-
-    monkeypatch.setattr(stage, "map_database", spied)
-    stage.map_images(context, MAPPERS.make(MAPPERS.options({"keep_given_intrinsics": False})))
-    (free, measured), (held, params) = told
-    assert (free, held) == (set(), {1})
-    assert measured == params != [float(value) for value in INTRINSICS.split(",")]
-    model = pycolmap.Reconstruction(context.workspace.sparse / "0")
-    assert model.cameras[1].params.tolist() == measured
-    for image in model.images.values():
-        rows = np.array([row for row, p in enumerate(image.points2D) if p.has_point3D()])
-        is_measured = rows < context.features.level_ends(image.name)[0]
-        assert is_measured.any()
-        assert not is_measured.all()
-    assert stage.images_in_need(context, context.workspace.sparse, 1) == set()
-
-
-def test_rejected_pairs_stay_so(context: Context) -> None:
-    escalation = escalation_of(context)
-    reject(context, [PAIR])
-    assert escalation.num_inliers()[PAIR] == 0
-    assert escalate(context).num_done == 0
-    verify_matches(context)
-    assert escalation.num_inliers()[PAIR] == 0
-
-
-def poses(workspace: Workspace, names: list[str]) -> list[NDArray[Any]]:
-    model = pycolmap.Reconstruction(workspace.sparse / "0")
-    images = [model.find_image_with_name(name) for name in names]
-    return [image.cam_from_world().matrix() for image in images if image]
-
-
-def swap_inliers(workspace: Workspace) -> None:
-    """Make a pair contradict all poses."""
-    ids = colmap_database.image_ids(workspace.database)
-    with colmap_database.open_database(workspace.database) as database:
-        geometry = database.read_two_view_geometry(*(ids[name] for name in PAIR))
-        inliers = np.asarray(geometry.inlier_matches)
-        geometry.inlier_matches = np.stack([inliers[:, 0], inliers[::-1, 1]], axis=1)
-        database.delete_two_view_geometry(*(ids[name] for name in PAIR))
-        database.write_two_view_geometry(*(ids[name] for name in PAIR), geometry)
-
-
-def test_pairs_of_doubtful_images_are_not_rejected(
-    context: Context, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def doubted(mapper: Mapper, task: MappingTask, path: Path, show: Advance) -> Any:
-        largest, *others = map_database(mapper, task, path, show)
-        return [replace(largest, doubtful={PAIR[0]: "held by only 9 points"}), *others]
-
-    monkeypatch.setattr(stage, "map_database", doubted)
-    shapeless_only(escalation_of(context), PAIR)
-    swap_inliers(context.workspace)
-    report, _ = stage.map_images(context, MAPPERS.make(MAPPERS.options("sparse")))
-    assert not report.warnings
-    assert escalation_of(context).num_inliers()[PAIR]
-
-
-@pytest.mark.parametrize("is_wrong", [False, True])
-def test_other_pairs_are_rejected_where_they_contradict(
-    context: Context, is_wrong: bool, caplog: pytest.LogCaptureFixture
-) -> None:
-    workspace, escalation = context.workspace, escalation_of(context)
-    shapeless_only(escalation, PAIR)
-    if is_wrong:
-        swap_inliers(workspace)
-    mapper = MAPPERS.make(MAPPERS.options("sparse"))
-    report, models = stage.map_images(context, mapper)
-    assert models[0].registered_names == tuple(sorted(NAMES))
-    assert ("rejected" in "".join(report.warnings.values())) == is_wrong
-    assert (escalation.num_inliers()[PAIR] == 0) == is_wrong
-    assert stage.contradicting_pairs(context) == {}
-    before = poses(workspace, NAMES)
-    assert stage.map_images(context, mapper)[0].num_done == 0
-    assert np.array_equal(before, poses(workspace, NAMES))
-    assert [line for line in caplog.messages if "was rejected" in line] == is_wrong * [
-        "database.db: 1 pair that only learned matching verified contradicts the others and was "
-        "rejected"
-    ]
-
-
 @pytest.mark.long
-def test_images_that_other_pairs_alone_tie_come_in(
-    context: Context, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_that_other_pairs_alone_tie_come_in(context: Context) -> None:
     workspace, escalation, last = context.workspace, escalation_of(context), NAMES[3]
     shapeless_only(escalation, *(pair for pair in escalation.pairs if last in pair))
     mapper = MAPPERS.make(MAPPERS.options("sparse"))
@@ -392,10 +245,6 @@ def test_images_that_other_pairs_alone_tie_come_in(
     assert image
     assert image.num_points3D > 50
     assert not models[0].doubtful
-    assert stage.images_in_need(context, workspace.sparse, 1) == set()
-    loose = replace(models[0], doubtful={last: FOCAL_DOUBT})
-    monkeypatch.setattr(stage, "read_summary", lambda _: loose)
-    assert stage.images_in_need(context, workspace.sparse, 1) == {last}  # of measured matches
 
 
 def test_report_counts_pairs_that_the_model_contradicts(context: Context) -> None:

@@ -23,9 +23,9 @@ from colmap_affrect.mappers.adjustment import (
     Adjuster,
     FocalPrior,
 )
-from colmap_affrect.mappers.attempts import map_database
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.evidence import Evidence, pair_evidence
+from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 
 TRUE_FOCAL, SIZE, NUM_IMAGES = 1280.0, (1024, 768), 4
@@ -60,7 +60,7 @@ def task_of(scene: Scene, record: CameraRecord) -> MappingTask:
 
 
 def mapper_of(**options: Any) -> Any:
-    return MAPPERS.make(MAPPERS.options({"name": "estimate", **options}))
+    return MAPPERS.make(MAPPERS.options({"name": "sparse", **options}))
 
 
 def focals(model: pycolmap.Reconstruction) -> list[float]:
@@ -70,7 +70,8 @@ def focals(model: pycolmap.Reconstruction) -> list[float]:
 def adjuster(
     model: pycolmap.Reconstruction, prior: FocalPrior, noise_px: float = NOISE_PX
 ) -> Adjuster:
-    return Adjuster(dict.fromkeys(model.cameras, prior), noise_px, frozenset())
+    priors = dict.fromkeys(model.cameras, prior)
+    return Adjuster(priors, noise_px, pycolmap.BundleAdjustmentOptions())
 
 
 @pytest.mark.parametrize(
@@ -177,9 +178,9 @@ def test_given_focal_lengths_are_refined_where_that_is_asked_for(
     held = []
     adjust = adjustment.Adjuster.adjust
 
-    def recorded(self: Adjuster, *given: Any) -> None:
+    def recorded(self: Adjuster, *given: Any) -> float:
         held.append({key for key, prior in self.priors.items() if not prior.sigma})
-        adjust(self, *given)
+        return adjust(self, *given)
 
     monkeypatch.setattr(adjustment.Adjuster, "adjust", recorded)
     mapper = mapper_of(keep_given_intrinsics=keep)

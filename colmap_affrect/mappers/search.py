@@ -1,0 +1,217 @@
+"""The search for the model with most evidence.
+
+Models grow from several first pairs and, where a focal length is not known, from several of these;
+bridges join them. One number chooses: how much the verified pairs speak for a model
+(:mod:`colmap_affrect.mappers.evidence`).
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.mappers.adjustment import EXIF_SIGMA, MEDIUM, Adjuster, FocalPrior
+from colmap_affrect.mappers.base import MappedModel
+from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
+from colmap_affrect.mappers.growing import Grower, Joiner, Models
+from colmap_affrect.mappers.pair_graph import PairGraph, cameras_of
+
+ZOOMS = 1.0, 1.4, 0.7, 2.0
+"""Factors of the usual focal length near which unknown ones begin: all lenses from wide to long."""
+SHARED_SIGMA = 0.1
+"""Deviation of the logarithm of those that several images share, while models grow: two or three of
+these images do not tell it, and models that are to be joined must agree."""
+FACTORS = 1.25, 0.8  # of a focal length, from which another adjustment starts
+NUM_STARTS = 3  # models that are joined to the others in turn
+MIN_RIVAL = 1.15  # factor between two focal lengths that are told apart
+
+
+@dataclass(frozen=True)
+class Search:
+    """Looks for the models with most evidence."""
+
+    adjuster: Adjuster
+    evidence: Evidence
+    native: pycolmap.IncrementalPipelineOptions
+    num_seeds: int
+    show: Callable[[int], None]
+
+    def grower(self, graph: PairGraph, adjuster: Adjuster | None = None) -> Grower:
+        """Return what grows models of a graph."""
+        return Grower(graph.cache, adjuster or self.adjuster, self.native, self.show)
+
+    def evidence_of(self, models: Sequence[MappedModel]) -> float:
+        """Return the evidence of the best of some models."""
+        return self.evidence.of_best(model.reconstruction for model in models)
+
+    def best(
+        self, graph: PairGraph, start: pycolmap.Reconstruction | None = None
+    ) -> list[MappedModel]:
+        """Return the best model, and then the best ones of images that none before has.
+
+        If a model is given to start from, it is among those that are joined, and unknown focal
+        lengths stay near its own.
+        """
+        if start:
+            return self._beyond(graph, start)
+        best: list[MappedModel] = []
+        most, rivals = -math.inf, []
+        usual = [self._near(zoom) for zoom in ZOOMS] if self._shared else [self.adjuster]
+        left = usual.copy()
+        while left:
+            adjuster = left.pop(0)
+            grower = self.grower(graph, adjuster)
+            found = self.joined(graph, grower, self._grown(graph, grower), NUM_STARTS)
+            if not found:
+                continue
+            model, evidence = self._with_free_cameras(graph, found[0].reconstruction)
+            found = [replace(found[0], reconstruction=model), *found[1:]]
+            rivals.append((evidence, model))
+            agrees = self._agrees(adjuster, model)
+            if evidence > most:
+                most, best = evidence, found
+                if adjuster in usual and not agrees:
+                    left.insert(0, self._as_found(model))
+            if self._is_certain(model, graph, agrees=agrees):
+                break
+        if not best:
+            return []
+        for mapped in best:
+            self.grower(graph).finish(mapped.reconstruction)
+        spreads = _spreads([model for evidence, model in rivals if evidence > most - MIN_GAIN])
+        return [replace(best[0], rival_focals_px=spreads), *best[1:]]
+
+    def _beyond(self, graph: PairGraph, start: pycolmap.Reconstruction) -> list[MappedModel]:
+        near = replace(self, adjuster=self._as_found(start))
+        grower, again = near.grower(graph), pycolmap.Reconstruction(start)
+        grower.finish(again)
+        models = sorted([again, *near._grown(graph, grower)], key=self.evidence.of, reverse=True)
+        found = near.joined(graph, grower, models, NUM_STARTS)
+        for model in found:
+            grower.finish(model.reconstruction)
+        return found
+
+    def _is_certain(
+        self, model: pycolmap.Reconstruction, graph: PairGraph, *, agrees: bool
+    ) -> bool:
+        """Tell whether a model has all images, and features of three images confirm it."""
+        if model.num_reg_images() < len(graph.keypoints):
+            return False
+        explained = agrees and graph.is_explained_by(model)
+        return explained or self.evidence.is_confirmed(model)
+
+    @cached_property
+    def unknown(self) -> dict[int, FocalPrior]:
+        """Priors of the cameras that nobody knows, by id."""
+        priors = self.adjuster.priors
+        return {key: prior for key, prior in priors.items() if prior.sigma > EXIF_SIGMA}
+
+    @cached_property
+    def _shared(self) -> set[int]:
+        """Cameras that nobody knows and several images share."""
+        counts = Counter(camera.camera_id for camera in self.evidence.graph.cameras.values())
+        return {key for key in self.unknown if counts[key] > 1}
+
+    def _near(self, zoom: float) -> Adjuster:
+        """Return what keeps unknown focal lengths near the usual one times a factor."""
+        near = {
+            key: FocalPrior(
+                zoom * prior.focal_px,
+                min(SHARED_SIGMA, prior.sigma) if key in self._shared else prior.sigma,
+            )
+            for key, prior in self.unknown.items()
+        }
+        return replace(self.adjuster, priors={**self.adjuster.priors, **near})
+
+    def _as_found(self, model: pycolmap.Reconstruction, factor: float = 1.0) -> Adjuster:
+        """Return what keeps unknown focal lengths near those of a model, times a factor."""
+        near = {
+            key: FocalPrior(factor * model.cameras[key].mean_focal_length(), SHARED_SIGMA)
+            for key in self.unknown.keys() & set(model.cameras)
+        }
+        return replace(self.adjuster, priors={**self.adjuster.priors, **near})
+
+    def _agrees(self, adjuster: Adjuster, model: pycolmap.Reconstruction) -> bool:
+        """Tell whether unknown focal lengths ended near those with which a model was made."""
+        return all(
+            abs(math.log(model.cameras[key].mean_focal_length() / adjuster.priors[key].focal_px))
+            <= SHARED_SIGMA
+            for key in self.unknown.keys() & {c.camera_id for c in cameras_of(model).values()}
+        )
+
+    def _with_free_cameras(
+        self, graph: PairGraph, model: pycolmap.Reconstruction
+    ) -> tuple[pycolmap.Reconstruction, float]:
+        """Adjust a model, and from other focal lengths where that is better.
+
+        Returns:
+            The model and its evidence.
+        """
+        free = self.grower(graph)
+        free.finish(model, MEDIUM)
+        most = self.evidence.of(model)
+        if len(self.unknown) != 1 or self.evidence.is_confirmed(model):
+            return model, most  # several cameras: there are too many other focal lengths
+        for factor in FACTORS:
+            other = pycolmap.Reconstruction(model)
+            near = self._as_found(model, factor)
+            near.begin(other)
+            self.grower(graph, near).finish(other, MEDIUM)
+            free.finish(other, MEDIUM)
+            evidence = self.evidence.of(other)
+            if evidence > most:
+                model, most = other, evidence
+        return model, most
+
+    def joined(
+        self, graph: PairGraph, grower: Grower, models: Models, num_starts: int
+    ) -> list[MappedModel]:
+        """Return the best model that bridges make of some, best first, and those left out of it."""
+        if not models:
+            return []
+        if graph.is_explained_by(models[0]):
+            return [MappedModel(models[0])]
+        joiner = Joiner(graph, grower, self.evidence)
+        joined = [
+            joiner.join(model, models[:index] + models[index + 1 :])
+            for index, model in enumerate(models[:num_starts])
+        ]
+        best, bridges = max(joined, key=lambda pair: self.evidence.of(pair[0]))
+        found, inside = [MappedModel(best, bridges)], set(best.reg_image_ids())
+        for model in models:
+            if inside.isdisjoint(model.reg_image_ids()):
+                found.append(MappedModel(model))
+                inside.update(model.reg_image_ids())
+        return found
+
+    def _grown(self, graph: PairGraph, grower: Grower) -> Models:
+        """Return models of different images, that with most evidence first."""
+        models: dict[frozenset[int], tuple[float, pycolmap.Reconstruction]] = {}
+        best, in_vain = 0.0, 0
+        for pair in sorted(graph.pairs, key=lambda pair: -len(pair.matches)):
+            if in_vain >= self.num_seeds:
+                break
+            model = grower.grow(pair.ids)
+            if model is None:
+                continue
+            images, evidence = frozenset(model.reg_image_ids()), self.evidence.of(model)
+            in_vain = 0 if evidence > best + MIN_GAIN else in_vain + 1
+            best = max(best, evidence)
+            if images not in models or evidence > models[images][0]:
+                models[images] = evidence, model
+            if len(images) == len(graph.keypoints) and self.evidence.is_confirmed(model):
+                break
+        ordered = sorted(models.values(), key=lambda found: -found[0])
+        return [model for _, model in ordered]
+
+
+def _spreads(rivals: Sequence[pycolmap.Reconstruction]) -> dict[str, tuple[float, float]]:
+    """Return lowest and highest focal length of images for which models differ."""
+    focals: dict[str, list[float]] = {}
+    for model in rivals:
+        for image_id, camera in cameras_of(model).items():
+            focals.setdefault(model.images[image_id].name, []).append(camera.mean_focal_length())
+    spreads = {name: (min(known), max(known)) for name, known in sorted(focals.items())}
+    return {name: ends for name, ends in spreads.items() if ends[1] > MIN_RIVAL * ends[0]}
