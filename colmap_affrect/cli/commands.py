@@ -135,7 +135,6 @@ def map(options: argparse.Namespace) -> int:
     from colmap_affrect.mappers.base import MAPPERS
     from colmap_affrect.pipeline import holds_vote, map_and_report, map_from_database
     from colmap_affrect.stages.cameras import choose_cameras
-    from colmap_affrect.stages.inputs import Inputs
 
     extend = given.extension(options)
     if options.from_database:
@@ -156,9 +155,7 @@ def map(options: argparse.Namespace) -> int:
         raise OptionError("--image-path: only with --from-database; else that of extract is used")
     with given.context(options) as context:
         mapper = MAPPERS.make(given.mapping(options, recorded=context.workspace.planned("map")))
-        is_others = context.workspace.is_copy or bool(
-            Inputs.recorded(context.workspace).from_database
-        )
+        is_others = context.workspace.is_copy or bool(context.inputs.from_database)
         votes = holds_vote(options.focal_vote, mapper.options, is_others=is_others)
         report = map_and_report(
             context,

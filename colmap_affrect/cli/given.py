@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from colmap_affrect.errors import OptionError, WorkspaceError
 from colmap_affrect.options import Options, suggestion
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.differences import WEIGHTS, placeless, without_digests
+from colmap_affrect.project.record import WEIGHTS, placeless, read_record
 from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -36,33 +36,28 @@ def record(options: argparse.Namespace) -> dict[str, Any]:
         return {}
     if not path.is_file():
         raise OptionError(f"--config {path}: no such file; give the config.toml of a run")
-    workspace = Workspace(path.parent)
-    workspace.config = path
     try:
-        found = workspace.recorded()
+        found = read_record(path, path.parent)
     except WorkspaceError as error:
         raise OptionError(f"--config {path}: of another version, or no config.toml") from error
     if "extract" not in found:
         raise OptionError(f"--config {path}: has no options of a run; give its config.toml")
-    _refuse_unknown(found, str(path))
+    _refuse_unknown(found["extract"], f"--config {path}")
     if not options.image_path:
         return found
     return {key: placeless(value) if isinstance(value, dict) else value
             for key, value in found.items()}  # fmt: skip
 
 
-def _refuse_unknown(record: Mapping[str, Any], where: str) -> None:
-    """Refuse sections, and options of extraction, that no run has recorded: typos of an editor."""
-    from colmap_affrect.project.workspace import STAGES
+def _refuse_unknown(names: Iterable[str], where: str) -> None:
+    """Refuse options of extraction that no run has recorded: typos of an editor."""
     from colmap_affrect.recipes import ExtractionOptions
     from colmap_affrect.stages.inputs import Inputs
 
-    sections = {"format_version", "recipe", "begun", *STAGES}
-    of_extract = {*Inputs.model_fields, *ExtractionOptions.model_fields, WEIGHTS}
-    for names, known in ((record, sections), (record["extract"], of_extract)):
-        for name in names:
-            if name not in known:
-                raise OptionError(f"--config {where}: unknown {name!r}{suggestion(name, known)}")
+    known = {*Inputs.model_fields, *ExtractionOptions.model_fields, WEIGHTS}
+    for name in names:
+        if name not in known:
+            raise OptionError(f"{where}: unknown {name!r}{suggestion(name, known)}")
 
 
 def inputs(
@@ -117,7 +112,9 @@ def recipe(options: argparse.Namespace, record: Mapping[str, Any] | None = None)
         return load_recipe(options.recipe or "default", settings)
     sections = {"match": "matching", "escalate": "escalate", "guide": "guided"}
     values = {
-        sections[stage]: without_digests(record[stage]) for stage in sections if stage in record
+        name: {key: value for key, value in record[stage].items() if key != WEIGHTS}
+        for stage, name in sections.items()
+        if stage in record
     }
     known = ExtractionOptions.model_fields
     values |= {key: value for key, value in record["extract"].items() if key in known}

@@ -11,7 +11,7 @@ from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.images.headers import header_size
-from colmap_affrect.project.contents import Contents
+from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.shown import such_as
 from colmap_affrect.stages.context import Context
@@ -38,9 +38,8 @@ def copy_verified(
     if image_path and not image_path.is_dir():
         raise OptionError(f"--image-path {image_path}: no such folder")
     workspace.require_own(image_path)
-    contents = Contents(workspace.contents)
-    digest, before = contents.digest(source_files(source)), contents.recorded("copy")
-    if digest != before or not workspace.database.exists():
+    digest = content_of(source_files(source)).digest
+    if digest != workspace.made_from("copy") or not workspace.database.exists():
         refuse_unusable(source)
     given = {
         "database": str(source.resolve()),
@@ -48,11 +47,11 @@ def copy_verified(
     }
     workspace.record_options("copy", given, overwrite=overwrite)
     warnings = {}
-    if digest != before:
+    if digest != (before := workspace.made_from("copy")):
         if before:
             warnings[str(source)] = "has changed; its copy and the models are made anew"
         workspace.rewind()
-        contents.record("copy", digest)
+        workspace.record_made_from("copy", digest)
     left_out = ""
     if not workspace.database.exists():
         left_out = copy_with_frames(source, workspace.database)

@@ -13,21 +13,23 @@ from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
+from colmap_affrect.features.weights import digests
 from colmap_affrect.images.photographs import checked_names, left_out, not_named
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
-from colmap_affrect.project.contents import Contents
-from colmap_affrect.project.differences import WEIGHTS
+from colmap_affrect.project.contents import Content
+from colmap_affrect.project.record import WEIGHTS
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe
 from colmap_affrect.shown import one_line
 from colmap_affrect.stages.changes import (
+    contents_of,
     forget_changed,
     refuse_changed,
     refuse_other_photographs,
 )
-from colmap_affrect.stages.context import Context, digests_to_record
+from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.one_image import (
     ExtractedImage,
@@ -63,16 +65,16 @@ def extract(
     _require_usable_cameras(workspace, inputs)
     names = inputs.names()
     names = checked_names(folder, image_names, "image_names") if image_names else names
-    contents, options = Contents(workspace.contents), recipe.extraction
-    digests = {name: contents.digest(inputs.files(name, options)) for name in names}
-    if overwrite or digests != context.features.contents():  # else they were seen to be good
+    options, known = recipe.extraction, context.features.contents()
+    contents = contents_of(inputs, names, options, known)
+    if overwrite or contents != known:  # else they were seen to be good
         inputs.check_names(names)
     whole = inputs.photographs.without_mask(names)
     extractor = prepared_recipe(context, options, names)
     if not overwrite:
-        refuse_other_photographs(workspace, inputs.image_path, digests)
+        refuse_other_photographs(workspace, inputs.image_path, contents)
     _record(workspace, inputs, recipe, extractor, later or {}, overwrite=overwrite)
-    warnings = forget_changed(context, inputs, digests, contents, are_all=not image_names)
+    warnings = forget_changed(context, inputs, contents, are_all=not image_names)
     _start_database(workspace)
     done = context.features.complete(names)
     missing = [name for name in names if name not in done]
@@ -80,7 +82,7 @@ def extract(
     warnings |= _passed_over(inputs, names, whole, is_list=bool(image_names))
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
-    failures = _extract_missing(context, inputs, extractor, missing, digests, warnings)
+    failures = _extract_missing(context, inputs, extractor, missing, contents, warnings)
     if len(failures) == len(names):
         first = failures[names[0]]
         raise ImageError(
@@ -123,7 +125,7 @@ def _record(
     *,
     overwrite: bool,
 ) -> None:
-    weights = digests_to_record(workspace, "extract", extractor.weights, overwrite=overwrite)
+    weights = digests(extractor.weights)
     planned: dict[str, Options] = {"match": recipe.matching, "guide": recipe.guided}
     if recipe.extraction.escalation:
         planned["escalate"] = recipe.escalate
@@ -144,7 +146,7 @@ def _extract_missing(
     inputs: Inputs,
     extractor: ImageExtractor,
     names: Sequence[str],
-    digests: Mapping[str, str],
+    contents: Mapping[str, Content],
     warnings: dict[str, str],
 ) -> dict[str, str]:
     """Extract images one by one; return why some cannot be used, and add to the warnings."""
@@ -165,7 +167,7 @@ def _extract_missing(
                         warnings[name] = found.warning
                     if found.stretched:
                         faded.append(name)
-                    store.write(name, found.features, found.image_size, digests[name])
+                    store.write(name, found.features, found.image_size, contents[name])
                 advance(1)
     if faded:
         warnings["contrast"] = (
@@ -195,10 +197,7 @@ def extract_images(
     if not images:
         return
     if later := {name for name, level in images if level}:
-        contents = Contents(context.workspace.contents)
-        refuse_changed(
-            context, {n: contents.digest(inputs.files(n, extractor.options)) for n in later}
-        )
+        refuse_changed(context, inputs, later)
     executor = context.executor or Threads(num_images_at_once(extractor))
     depth_folder = extractor.options.depth.folder
     if depth_folder and not executor.sees([depth_folder]):
@@ -268,7 +267,7 @@ def write_images_and_keypoints(context: Context) -> dict[str, str]:
     """Bring the database up to date; return the images that COLMAP does not take, with reasons."""
     workspace, store = context.workspace, context.features
     _start_database(workspace)
-    inputs = Inputs.recorded(workspace)
+    inputs = context.inputs
     counts = store.num_keypoints()
     rejected = import_images(
         workspace.database, Path(inputs.image_path), list(counts), inputs.cameras

@@ -18,7 +18,6 @@ from colmap_affrect.images.photographs import (
 )
 from colmap_affrect.options import Options
 from colmap_affrect.project.outputs import database_files
-from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
 
 
@@ -55,13 +54,6 @@ class Inputs(Options):
             cameras=cameras or CameraOptions(),
             masks=masks or MaskOptions(),
         )
-
-    @classmethod
-    def recorded(cls, workspace: Workspace) -> Self:
-        """Return what the extract stage of a workspace was given."""
-        record = workspace.require("extract")
-        values = {key: value for key, value in record.items() if key in cls.model_fields}
-        return cls.from_mapping(values, str(workspace.config))
 
     @property
     def photographs(self) -> Photographs:
@@ -116,14 +108,6 @@ class Inputs(Options):
     def initial_cameras(self) -> InitialCameras:
         """What decides on cameras."""
         return InitialCameras(Path(self.image_path), self.cameras)
-
-
-def recorded_extraction(workspace: Workspace) -> ExtractionOptions:
-    """Return the options that the features of a workspace were made with."""
-    record = workspace.require("extract")
-    names = ExtractionOptions.model_fields
-    options = {key: value for key, value in record.items() if key in names}
-    return ExtractionOptions.from_mapping(options, str(workspace.config))
 
 
 def source_files(path: Path) -> list[Path]:

@@ -37,9 +37,7 @@ from colmap_affrect.stages.escalate import (
     reject,
 )
 from colmap_affrect.stages.guide import guided_matches
-from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.pairs import listed_pairs
-from colmap_affrect.stages.verify import recorded_verification
 
 logger = logging.getLogger(__name__)
 
@@ -140,7 +138,7 @@ def image_names(workspace: Workspace) -> list[str]:
     """Return the names of the images of a run, or of the database that was copied."""
     if workspace.is_copy:
         return sorted(colmap_database.image_ids(workspace.database))
-    return Inputs.recorded(workspace).names()
+    return Context(workspace).inputs.names()
 
 
 def _or_first_level(
@@ -238,7 +236,7 @@ def num_verified_inliers(workspace: Workspace) -> dict[Pair, int]:
 
 def _min_num_inliers(workspace: Workspace) -> int:
     """Return how many inliers a verified pair has; another program had its own threshold."""
-    return 1 if workspace.is_copy else recorded_verification(workspace).min_num_inliers
+    return 1 if workspace.is_copy else Context(workspace).verification.min_num_inliers
 
 
 def unregistered(
@@ -304,7 +302,7 @@ def advice(
                      "them")  # fmt: skip
     if missing:
         texts += recipes
-    has_cameras = workspace.is_copy or Inputs.recorded(workspace).from_database
+    has_cameras = workspace.is_copy or Context(workspace).inputs.from_database
     if models and (models[0].rival_focals_px or models[0].loose) and not has_cameras:
         texts.append(
             "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
@@ -318,7 +316,7 @@ def advice(
         if len(cameras) > 1 and same_size and not any(c.has_prior_focal_length for c in cameras):
             texts.append("run again with --camera-mode single, if one camera took all: their size "
                          "is the same")  # fmt: skip
-        masks = Inputs.recorded(workspace).masks
+        masks = Context(workspace).inputs.masks
         if (missing or is_inconsistent) and not (masks.path or masks.camera_path):
             texts.append(
                 "run again with --mask-path, if things move, repeat or are written on the "
@@ -366,7 +364,7 @@ def agreement(context: Context, sparse_path: Path) -> float:
 
 def contradicting_pairs(context: Context) -> dict[str, int]:
     """Return how many verified pairs of each level of a recipe the largest model contradicts."""
-    names = [level.name for level in recorded_extraction(context.workspace).levels]
+    names = [level.name for level in context.extraction.levels]
     path = context.workspace.sparse / "0"
     if len(names) < 2 or not path.exists():
         return {}

@@ -42,7 +42,7 @@ from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import write_matches
 from colmap_affrect.stages.pairs import delete_pairs, listed_pairs
-from colmap_affrect.stages.verify import recorded_verification, verify_matches, verify_new
+from colmap_affrect.stages.verify import verify_matches, verify_new
 
 logger = logging.getLogger(__name__)
 
@@ -185,7 +185,7 @@ def watched(context: Context, *, follows: bool = True, discards: bool = False) -
 def mend(context: Context, *, follows: bool) -> None:
     """Make again, or keep, what others have changed in the database; a warning says what."""
     workspace, path = context.workspace, context.workspace.database
-    begun = workspace.recorded().get("begun", [])
+    begun = workspace.begun
     if not begun or not (path.exists() or "verify" in begun):
         return
     found, is_copied = edits_of(path), workspace.is_copy
@@ -271,8 +271,8 @@ def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows
         return
     if original:
         photos = record["copy"]["image_path"]
-        verification = recorded_verification(workspace)
-        copy_verified(context, original, Path(photos) if photos else None, verification)
+        photos = Path(photos) if photos else None
+        copy_verified(context, original, photos, context.verification)
         return
     verify_matches(context)
     if "escalate" in begun:

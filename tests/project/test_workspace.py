@@ -11,8 +11,9 @@ import pytest
 
 from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
 from colmap_affrect.project.outputs import temporary_folder
-from colmap_affrect.project.workspace import COPY_STAGES, Workspace
-from colmap_affrect.project.workspace import STAGES as ALL_STAGES
+from colmap_affrect.project.record import COPY_STAGES
+from colmap_affrect.project.record import STAGES as ALL_STAGES
+from colmap_affrect.project.workspace import Workspace
 
 STAGES = tuple(stage for stage in ALL_STAGES if stage != "copy")
 

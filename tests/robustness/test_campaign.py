@@ -227,7 +227,7 @@ def assert_goes_on(scene: Scene, label: str, out: Path, is_planted: bool) -> Non
 
 FILES = (
     "features.h5", "matches.h5", "guided.h5", "database.db", "pairs.txt", "config.toml",
-    "cameras.json", "contents.json", "report.json", "report.html", "run.log",
+    "cameras.json", "report.json", "report.html", "run.log",
     "sparse/inputs.sha256", "sparse/0/cameras.bin", "sparse/0/rigs.bin", "sparse/0/frames.bin",
     "sparse/0/images.bin", "sparse/0/points3D.bin", "sparse/0/summary.json",
 )  # fmt: skip

@@ -33,7 +33,7 @@ def stores(
         ones, count = np.ones(len(places)), len(places)
         lafs = lafs_from_keypoints(places, 5.0 * ones, 0.0 * ones)
         descriptors = np.ones((count, 8), np.float32) / np.sqrt(8)
-        features.write(name, LocalFeatures(lafs, np.float32(ones), descriptors), size, "")
+        features.write(name, LocalFeatures(lafs, np.float32(ones), descriptors), size)
     pairs = list(combinations(names, 2))
     count = len(points[0])
     indices = np.stack([np.arange(count)] * 2, axis=1)
