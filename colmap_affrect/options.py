@@ -46,7 +46,7 @@ def from_record(where: str, build: Callable[[], Built]) -> Built:
     finally:
         _left_out.reset(token)
     if names:
-        _warn_once(f"{where}: {', '.join(names)} no option of this version, which does without")
+        _warn_once(f"{where}: options of another version are left out: {', '.join(names)}")
     return built
 
 

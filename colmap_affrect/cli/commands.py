@@ -7,10 +7,9 @@ Modules are imported when a command needs them: ``--help`` loads no heavy packag
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +22,8 @@ from colmap_affrect.shown import such_as
 
 if TYPE_CHECKING:
     from colmap_affrect.comparison.results import Comparison
-    from colmap_affrect.project.report import ReconstructionReport
+    from colmap_affrect.project.report import ReconstructionReport, StageReport
+    from colmap_affrect.stages.context import Context
 
 
 def run(options: argparse.Namespace) -> int:
@@ -69,37 +69,45 @@ def extract(options: argparse.Namespace) -> int:
     return _exit_code(report.failures, options)
 
 
+def _stage(options: argparse.Namespace, work: Callable[[Context], StageReport]) -> None:
+    with given.context(options) as context:
+        report = work(context)
+    show(report.summary())
+
+
 def pairs(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.pairs import choose_pairs
 
-    with given.context(options) as context:
-        chosen = given.pair_options(options, context.workspace.planned("pairs"))
-        report = choose_pairs(context, chosen, overwrite=options.overwrite)
-    show(report.summary())
+    def work(context: Context) -> StageReport:
+        chosen = given.over(context.pairing, options, "pairs")
+        return choose_pairs(context, chosen, overwrite=options.overwrite)
+
+    _stage(options, work)
 
 
 def match(options: argparse.Namespace) -> None:
     from colmap_affrect.matchers.base import MATCHERS
     from colmap_affrect.stages.match import match
 
-    with given.context(options) as context:
+    def work(context: Context) -> StageReport:
         if options.recipe:
             matching = given.recipe(options).matching
         else:
-            chosen = [f"matching.name={json.dumps(options.matcher)}"] if options.matcher else []
-            values = given.changed(context, "match", "matching", [*chosen, *options.set])
+            values = given.changed(context.matching, options, "matching")
             matching = MATCHERS.options(values, where="matching")
-        report = match(context, matching, overwrite=options.overwrite)
-    show(report.summary())
+        return match(context, matching, overwrite=options.overwrite)
+
+    _stage(options, work)
 
 
 def verify(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.verify import verify_matches
 
-    with given.context(options) as context:
-        chosen = given.verification(options, context.workspace.planned("verify"))
-        report = verify_matches(context, chosen, overwrite=options.overwrite)
-    show(report.summary())
+    def work(context: Context) -> StageReport:
+        chosen = given.verification(options, context.verification)
+        return verify_matches(context, chosen, overwrite=options.overwrite)
+
+    _stage(options, work)
 
 
 def escalate(options: argparse.Namespace) -> None:
@@ -107,7 +115,7 @@ def escalate(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.escalate import escalate, pair_levels
 
     with given.context(options) as context:
-        values = given.changed(context, "escalate", "escalate", options.set)
+        values = given.changed(context.escalation, options, "escalate")
         chosen = EscalateOptions.from_mapping(values, "escalate")
         report = escalate(context, chosen, overwrite=options.overwrite)
         levels = pair_levels(context)
@@ -121,8 +129,7 @@ def guide(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.guide import guide, guided_counts
 
     with given.context(options) as context:
-        values = given.changed(context, "guide", "guided", options.set)
-        values |= {"enabled": options.guided} if options.guided else {}
+        values = given.changed(context.guiding, options, "guided")
         chosen = GuidedOptions.from_mapping(values, "guided")
         report = guide(context, chosen, overwrite=options.overwrite)
         counts = guided_counts(context)
@@ -154,7 +161,7 @@ def map(options: argparse.Namespace) -> int:
     if options.image_path:
         raise OptionError("--image-path: only with --from-database; else that of extract is used")
     with given.context(options) as context:
-        mapper = MAPPERS.make(given.mapping(options, recorded=context.workspace.planned("map")))
+        mapper = MAPPERS.make(given.mapping(options, known=context.mapping))
         is_others = context.workspace.is_copy or bool(context.inputs.from_database)
         votes = holds_vote(options.focal_vote, mapper.options, is_others=is_others)
         report = map_and_report(
@@ -342,8 +349,7 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
 
 
 def _next_steps(report: ReconstructionReport, out: Path) -> list[str]:
-    copied, begun = (Workspace(out).planned(stage) or {} for stage in ("copy", "extract"))
-    photos = copied.get("image_path") or begun.get("image_path")
+    photos = Workspace(out).photographs()
     model, page = out / "sparse" / "0", out / "report.html"
     commands: list[list[object]] = []
     if report.models:
@@ -426,7 +432,7 @@ def weights(options: argparse.Namespace) -> None:
         for path in fetch(keys, options.weights, progress=given.progress(options)).values():
             show(path)
         return
-    for row in describe_weights(given.weights_folder(options), keys):
+    for row in describe_weights(given.folder("--weights", options.weights), keys):
         file = row.published
         where = f"{row.path}{', verified' if row.verified else ''}"
         if row.path and row.verified is False:
