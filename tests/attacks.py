@@ -9,7 +9,6 @@ import os
 import runpy
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -58,22 +57,12 @@ def _be_the_command(arguments: Sequence[str], said: Path, variables: Mapping[str
 class Command:
     """The command line at work in a process and a group of its own.
 
-    The process is forked from one that has all modules; a ``fresh`` one starts from nothing, as
-    for a user.
+    The process is forked from one that has all modules.
     """
 
-    def __init__(self, *arguments: object, fresh: bool = False, **variables: str) -> None:
+    def __init__(self, *arguments: object, **variables: str) -> None:
         self.words = [str(argument) for argument in arguments]
         self.said = Path(tempfile.mkdtemp(prefix="said-"))
-        self.fresh: subprocess.Popen[bytes] | None = None
-        if fresh:
-            with (self.said / "out").open("wb") as out, (self.said / "err").open("wb") as err:
-                self.fresh = subprocess.Popen(
-                    [sys.executable, "-m", "colmap_affrect", *self.words],
-                    stdout=out, stderr=err, start_new_session=True,
-                    preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
-                )  # fmt: skip
-            return
         arguments = (self.words, self.said, variables)
         self.forked = PROCESSES.Process(target=_be_the_command, args=arguments)
         self.forked.start()
@@ -88,29 +77,14 @@ class Command:
     @property
     def group(self) -> int:
         """The process, and the group that it leads."""
-        return (self.fresh or self.forked).pid or 0
-
-    def others(self) -> list[str]:
-        """Processes that it started and that are still at work."""
-        shown = subprocess.run(
-            ["ps", "-eo", "pgid=,stat=,args="], capture_output=True, text=True, check=True
-        )
-        rows = [line.split(None, 2) for line in shown.stdout.splitlines()]
-        return [args for group, state, args in rows if int(group) == self.group and state[0] != "Z"]
-
-    def _code(self, timeout_s: float) -> int | None:
-        if self.fresh:
-            with suppress(subprocess.TimeoutExpired):
-                return self.fresh.wait(timeout_s)
-            return None
-        self.forked.join(timeout_s)
-        return self.forked.exitcode
+        return self.forked.pid or 0
 
     def ended(self, timeout_s: float = HANGING_S) -> Ended:
         """Wait for the end; a command that does not come to one is killed, and the test fails."""
-        if (code := self._code(timeout_s)) is None:
+        self.forked.join(timeout_s)
+        if (code := self.forked.exitcode) is None:
             os.killpg(self.group, signal.SIGKILL)
-            self._code(HANGING_S)
+            self.forked.join()
         text = [(self.said / name).read_text(errors="replace") for name in ("out", "err")]
         shutil.rmtree(self.said)
         assert code is not None, f"no end after {timeout_s:g} s: {self.words} {text[1][-500:]}"

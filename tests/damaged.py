@@ -92,30 +92,6 @@ def damage(
     return f"{path.name}: {done}{', times kept' if keeps_times else ''}"
 
 
-STATEMENTS = (
-    "UPDATE images SET camera_id = 999 WHERE image_id = {id}",
-    "UPDATE images SET name = x'ff00fe' WHERE image_id = {id}",
-    "DELETE FROM images WHERE image_id = {id}",
-    "INSERT INTO images (name, camera_id) VALUES ('more.png', 1)",
-    "UPDATE keypoints SET rows = -1 WHERE image_id = {id}",
-    "UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = {id}",
-    "UPDATE keypoints SET data = substr(data, 1, 101) WHERE image_id = {id}",
-    "DELETE FROM keypoints WHERE image_id = {id}",
-    "UPDATE matches SET data = x'ffffffffffffffff', rows = 1",
-    "UPDATE two_view_geometries SET config = 77",
-    "UPDATE two_view_geometries SET data = x'ffffffffffffffff', rows = 1",
-    "UPDATE cameras SET width = 100",
-    "UPDATE cameras SET params = x'00'",
-    "UPDATE frames SET rig_id = 99",
-    "DELETE FROM cameras",
-    "DROP TABLE frame_data",
-    "ALTER TABLE images RENAME COLUMN camera_id TO camera",
-    "CREATE TRIGGER nosy AFTER INSERT ON matches BEGIN DELETE FROM images; END",
-    "PRAGMA user_version = 2147483647",
-)
-"""What nobody means to do to the rows of a database; ``{id}`` is one of the images."""
-
-
 Statement = str | tuple[str, list[object]]
 """What SQLite is to do; perhaps with the values of its question marks."""
 

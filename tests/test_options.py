@@ -89,4 +89,6 @@ def test_records_of_other_versions_are_read_without_their_options(
         found = from_record("c.toml", lambda: ExtractionOptions.from_mapping(old, "c.toml"))
         assert (found.max_image_size_px, found.features) == (99, SiftOptions())
     assert len(caplog.messages) == 1
-    assert caplog.messages[0].startswith("c.toml: options of another version are left out: gone, lost")
+    assert caplog.messages[0].startswith(
+        "c.toml: options of another version are left out: gone, lost"
+    )

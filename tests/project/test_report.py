@@ -122,15 +122,6 @@ def test_status_tells_whether_all_images_are_in_the_largest_model(
     assert report.status == report.to_mapping()["status"] == status
 
 
-def test_report_without_a_model_is_all_zero() -> None:
-    values = EMPTY.to_mapping()
-    assert (values["num_models"], values["images_registered"], values["points3D"]) == (0, 0, 0)
-    assert values["registered_names"] == values["models"] == []
-    assert values["mean_track_length"] == values["mean_reprojection_error_px"] == 0.0
-    assert "registered  0 of 1 images" in EMPTY.summary()
-    assert "points" not in EMPTY.summary()
-
-
 def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
     text = REPORT.summary()
     assert len(text.splitlines()) < 24
@@ -190,10 +181,6 @@ def test_preset_names_that_of_verification_where_it_is_another_one(
     report = replace(REPORT, presets=presets)
     assert report.preset == report.to_mapping()["preset"] == preset
     assert f"preset      {preset}, incremental mapper" in report.summary()
-
-
-def test_failures_are_those_of_all_stages() -> None:
-    assert REPORT.failures == {"broken.png": "broken.png: not a readable image"}
 
 
 @pytest.mark.parametrize(

@@ -97,16 +97,6 @@ def test_read_returns_what_was_written(store: FeatureStore, count: int) -> None:
     assert_array_equal(store.read_frames("a.png"), written.lafs.astype(np.float32))
 
 
-def test_names_and_values_are_kept_with_spaces_unicode_and_folders(store: FeatureStore) -> None:
-    for seed, name in enumerate(NAMES):
-        store.write(name, some_features(5 + seed, seed), (100 + seed, 50))
-    assert store.names() == sorted(NAMES)
-    assert store.num_keypoints() == {name: 5 + seed for seed, name in enumerate(NAMES)}
-    assert store.image_sizes() == {name: (100 + seed, 50) for seed, name in enumerate(NAMES)}
-    for seed, name in enumerate(NAMES):
-        assert_same_features(store.read(name), some_features(5 + seed, seed))
-
-
 def test_features_have_the_layout_of_hloc(store: FeatureStore) -> None:
     written = some_features(7)
     store.write("west wing/a.png", written, (320, 240))
@@ -133,20 +123,6 @@ def test_files_do_not_need_the_newest_hdf5(store: FeatureStore) -> None:
     assert store.path.read_bytes()[8] == 0
 
 
-def test_write_again_replaces_the_features(store: FeatureStore) -> None:
-    store.write("a.png", some_features(9, 1), (4, 3))
-    store.write("a.png", some_features(5, 2), (8, 6))
-    assert_same_features(store.read("a.png"), some_features(5, 2))
-    assert store.image_sizes() == {"a.png": (8, 6)}
-
-
-def test_store_without_file_is_empty(store: FeatureStore) -> None:
-    assert store.names() == []
-    assert store.num_keypoints() == store.image_sizes() == {}
-    assert store.complete(["a.png"]) == set()
-    assert not store.path.exists()
-
-
 def test_incomplete_group_counts_as_absent_and_is_replaced(store: FeatureStore) -> None:
     for name in NAMES:
         store.write(name, some_features(4), (4, 3))
@@ -161,12 +137,6 @@ def test_incomplete_group_counts_as_absent_and_is_replaced(store: FeatureStore) 
         store.read(NAMES[1])
     store.write(NAMES[3], some_features(6), (4, 3))
     assert_same_features(store.read(NAMES[3]), some_features(6))
-
-
-def test_read_of_an_unknown_name_says_what_to_run(store: FeatureStore) -> None:
-    store.write("a.png", some_features(4), (4, 3))
-    with pytest.raises(StoreError, match=r"features\.h5: no features of z\.png; run extract"):
-        store.read("z.png")
 
 
 def one_line(error: pytest.ExceptionInfo[StoreError]) -> str:
@@ -354,7 +324,7 @@ def assert_holds_images(store: FeatureStore, least: int, most: int) -> None:
         assert_array_equal(lafs, np.tile(np.eye(2, 3), (1000 + index, 1, 1)) * (index + 1))
 
 
-@pytest.mark.parametrize(("deadly", "complete"), [(1, 0), (4, 0), (10, 1), (21, 2)])
+@pytest.mark.parametrize(("deadly", "complete"), [(4, 0), (21, 2)])
 def test_complete_groups_are_readable_after_a_kill_within_a_group(
     store: FeatureStore, deadly: int, complete: int
 ) -> None:
@@ -366,7 +336,7 @@ def test_complete_groups_are_readable_after_a_kill_within_a_group(
     assert "more.png" in store.names()
 
 
-@pytest.mark.parametrize("delay_s", [0.005, 0.023, 0.07])
+@pytest.mark.parametrize("delay_s", [0.005, 0.07])
 def test_complete_groups_are_readable_after_a_kill_at_any_time(
     store: FeatureStore, delay_s: float
 ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shutil
 from pathlib import Path
 
@@ -21,7 +20,6 @@ from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.project.report import EXIT_INTERRUPTED
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages import pairs as stage
-from colmap_affrect.stages.context import Context
 
 WGS84 = pycolmap.PosePriorCoordinateSystem.WGS84
 CARTESIAN = pycolmap.PosePriorCoordinateSystem.CARTESIAN
@@ -190,17 +188,6 @@ def test_one_position_is_no_pair(rooms: Workspace) -> None:
     write_positions(rooms.database, {"1.png": (50.0, 14.0, 0.0)})
     with pytest.raises(DatabaseError, match="1 images have a position"):
         nearest_positions(rooms.database, 5, 5.0)
-
-
-def test_many_images_get_a_hint(
-    rooms: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.WARNING, "colmap_affrect"):
-        stage.choose_pairs(Context(rooms))
-        assert caplog.text == ""
-        monkeypatch.setattr(stage, "MANY_IMAGES", 3)
-        stage.choose_pairs(Context(rooms))
-    assert "all pairs of 4 images are 6; --pairs retrieval" in caplog.text
 
 
 @pytest.mark.parametrize(
