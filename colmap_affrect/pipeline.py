@@ -14,7 +14,6 @@ from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
 from colmap_affrect.errors import DAMAGE, ImageError, MappingError
 from colmap_affrect.features.weights import resolve
-from colmap_affrect.forecast import Forecast
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions, MappingTask
 from colmap_affrect.mappers.doubts import loose_names
@@ -30,7 +29,7 @@ from colmap_affrect.mappers.summaries import (
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import Executor
-from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.progress import SILENT, Forecast, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport

@@ -7,8 +7,14 @@ import logging
 
 import pytest
 
-from colmap_affrect.forecast import COSTS, MAP_COST_PER_IMAGE, Forecast
-from colmap_affrect.progress import NUM_PLAIN_LINES, SILENT, Progress
+from colmap_affrect.progress import (
+    COSTS,
+    MAP_COST_PER_IMAGE,
+    NUM_PLAIN_LINES,
+    SILENT,
+    Forecast,
+    Progress,
+)
 from colmap_affrect.project import stopwatch
 from colmap_affrect.project.stopwatch import Stopwatch
 
