@@ -32,8 +32,12 @@ from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Forecast, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
-from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
-from colmap_affrect.project.versions import installed_versions
+from colmap_affrect.project.report import (
+    ModelSummary,
+    ReconstructionReport,
+    StageReport,
+    installed_versions,
+)
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.report.run_page import write_run_page

@@ -10,7 +10,7 @@ from typing import Self, TextIO
 
 from tqdm import tqdm
 
-from colmap_affrect.shown import shown
+from colmap_affrect.errors import shown
 
 logger = logging.getLogger(__name__)
 
@@ -177,7 +177,7 @@ SILENT = Progress()
 
 
 def show(text: object, *, file: TextIO | None = None, end: str = "\n") -> None:
-    """Print what people or programs read; see :mod:`colmap_affrect.shown`."""
+    """Print what people or programs read; see :mod:`colmap_affrect.errors`."""
     print(shown(str(text)), file=file, end=end)
 
 
@@ -208,3 +208,23 @@ class _PlainLines:
     def print(self, left: str) -> None:
         line = f"{self.name}: {self.done}/{self.total} {self.unit}"
         show(f"{line}, {left}" if left else line, file=self.stream)
+
+
+class Stopwatch:
+    """Adds up the seconds of named steps; while one runs inside another, only the inner counts."""
+
+    def __init__(self, *steps: str) -> None:
+        # by step; those named beforehand come first and may stay 0
+        self.seconds: dict[str, float] = dict.fromkeys(steps, 0.0)
+        self._within = 0.0
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Time a block, also if it fails."""
+        start, before, self._within = time.perf_counter(), self._within, 0.0
+        try:
+            yield
+        finally:
+            whole = time.perf_counter() - start
+            self.seconds[name] = self.seconds.get(name, 0.0) + whole - self._within
+            self._within = before + whole

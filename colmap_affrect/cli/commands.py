@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_affrect.cli import given
-from colmap_affrect.errors import ComparisonError, OptionError
+from colmap_affrect.errors import ComparisonError, OptionError, such_as
 from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK, by_level
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.shown import such_as
 
 if TYPE_CHECKING:
     from colmap_affrect.comparison.results import Comparison

@@ -42,7 +42,7 @@ from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.outputs import new_results, remove_own
 from colmap_affrect.project.record import first_difference
-from colmap_affrect.project.versions import installed_versions
+from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_affrect.colmap.checks import CHECKS, SEVERITIES, Check, Severity
+from colmap_affrect.errors import such_as
 from colmap_affrect.progress import Progress
-from colmap_affrect.shown import such_as
 
 MAX_ITEMS_SHOWN = 5
 

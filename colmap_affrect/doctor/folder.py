@@ -32,8 +32,8 @@ from colmap_affrect.project.atomic_files import NEW_SUFFIX
 from colmap_affrect.project.contents import file_sha256
 from colmap_affrect.project.record import COPY_STAGES, STAGES
 from colmap_affrect.project.workspace import INPUTS, Workspace
-from colmap_affrect.stages.changes import changed_images, contents_of
 from colmap_affrect.stages.context import Context
+from colmap_affrect.stages.extract import changed_images, contents_of
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.mend import edits_of
 from colmap_affrect.stages.pairs import without_deleted

@@ -3,12 +3,14 @@
 import csv
 import io
 import json
+import platform
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from importlib import metadata
 from typing import Any
 
-from colmap_affrect.shown import such_as
+from colmap_affrect.errors import such_as
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -23,6 +25,23 @@ SOURCES = {
 """How a summary calls where focal lengths are from; others are called by their own names."""
 
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
+
+
+REPORTED_PACKAGES = (
+    "colmap-affrect", "pycolmap", "pyceres", "opencv-python-headless", "numpy", "h5py", "torch",
+    "kornia",
+)  # fmt: skip
+
+
+def installed_versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide results."""
+    versions = {"python": platform.python_version()}
+    for package in REPORTED_PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "not installed as a package"
+    return versions
 
 
 def _some(lines: Iterable[str]) -> list[str]:

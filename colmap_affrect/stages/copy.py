@@ -9,11 +9,10 @@ from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_with_frames
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
-from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.errors import DatabaseError, OptionError, such_as
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.shown import such_as
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.inputs import source_files
 
