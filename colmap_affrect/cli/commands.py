@@ -50,6 +50,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def extract(options: argparse.Namespace) -> int:
+    from colmap_affrect.images.photographs import CameraOptions, MaskOptions
     from colmap_affrect.stages import extract as stage
     from colmap_affrect.stages.inputs import Inputs
 
@@ -57,8 +58,8 @@ def extract(options: argparse.Namespace) -> int:
         options.image_path,
         image_list_path=options.image_list_path,
         from_database=options.from_database,
-        cameras=given.cameras(options),
-        masks=given.masks(options),
+        cameras=given.built(options, "cameras", CameraOptions),
+        masks=given.built(options, "masks", MaskOptions),
     )
     with given.context(options) as context:
         report = stage.extract(context, inputs, given.recipe(options), overwrite=options.overwrite)
@@ -248,6 +249,7 @@ def _comparison_exit_code(comparison: Comparison, options: argparse.Namespace) -
 
 
 def import_h5(options: argparse.Namespace) -> None:
+    from colmap_affrect.images.photographs import CameraOptions
     from colmap_affrect.interop.hdf5 import import_h5
 
     report = import_h5(
@@ -255,7 +257,7 @@ def import_h5(options: argparse.Namespace) -> None:
         options.features_path,
         options.matches_path,
         options.database_path,
-        cameras=given.cameras(options),
+        cameras=given.built(options, "cameras", CameraOptions),
         layout=options.layout,
         pixel_origin=options.pixel_origin,
         skip_verification=options.skip_verification,
@@ -376,14 +378,14 @@ def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
 
 
 def inspect(options: argparse.Namespace) -> None:
-    from colmap_affrect.images.photographs import Photographs
+    from colmap_affrect.images.photographs import MaskOptions, Photographs
     from colmap_affrect.report.inspection import inspect_image
     from colmap_affrect.stages.one_image import prepare
 
     recipe = given.recipe(options)
     if not options.image.is_file():
         raise OptionError(f"{options.image}: no such file; give a photograph")
-    photographs = Photographs(options.image.parent, given.masks(options))
+    photographs = Photographs(options.image.parent, given.built(options, "masks", MaskOptions))
     photographs.check()
     mask = photographs.mask(options.image.name)
     extractor = prepare(recipe.extraction, given.resources(options), [options.image.name])

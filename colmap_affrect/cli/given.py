@@ -18,7 +18,6 @@ from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap.verification import VerificationOptions
-    from colmap_affrect.images.photographs import CameraOptions, MaskOptions
     from colmap_affrect.mappers.base import MapperOptions
     from colmap_affrect.mappers.existing import Extension
     from colmap_affrect.parallel.executor import Executor
@@ -63,6 +62,16 @@ def over(known: AnyOptions, options: argparse.Namespace, name: str) -> AnyOption
     return known.from_mapping({**known.to_mapping(), **section(options, name)}, name)
 
 
+def built(
+    options: argparse.Namespace,
+    name: str,
+    cls: type[AnyOptions],
+    recorded: Mapping[str, Any] | None = None,
+) -> AnyOptions:
+    """Return options of a section: as given, as on record, or their defaults."""
+    return over(cls.from_mapping(recorded or {}, "--config"), options, name)
+
+
 def record(options: argparse.Namespace) -> Mapping[str, Any]:
     """Return the options on record in --config, without places if there are other photographs."""
     path: Path | None = options.config
@@ -102,43 +111,26 @@ def inputs(
 ) -> dict[str, Any]:
     """Return the fields of InputOptions, which run and compare have in common."""
     from colmap_affrect.colmap.verification import VerificationOptions
+    from colmap_affrect.images.photographs import CameraOptions, MaskOptions
     from colmap_affrect.mappers.base import MAPPERS
     from colmap_affrect.pairs.base import PairOptions
 
     record = record or {}
     extract = record.get("extract", {})
     listed, database = extract.get("image_list_path"), extract.get("from_database")
-    verified, mapped = record.get("verify"), record.get("map")
-    pairs = PairOptions.from_mapping(record.get("pairs", {}), "--config")
+    verified = VerificationOptions.from_mapping(record.get("verify", {}), "--config")
+    mapped = MAPPERS.options(record["map"], where="--config") if "map" in record else None
     return {
-        "cameras": cameras(options, extract.get("cameras", {})),
-        "masks": masks(options, extract.get("masks", {})),
-        "pairs": over(pairs, options, "pairs"),
-        "verification": verification(
-            options, VerificationOptions.from_mapping(verified or {}, "--config")
-        ),
-        "mapping": mapping(
-            options, recipe, MAPPERS.options(mapped, where="--config") if mapped else None
-        ),
+        "cameras": built(options, "cameras", CameraOptions, extract.get("cameras", {})),
+        "masks": built(options, "masks", MaskOptions, extract.get("masks", {})),
+        "pairs": built(options, "pairs", PairOptions, record.get("pairs", {})),
+        "verification": verification(options, verified),
+        "mapping": mapping(options, recipe, mapped),
         "image_list_path": options.image_list_path or (Path(listed) if listed else None),
         "from_database": options.from_database or (Path(database) if database else None),
         "resources": resources(options),
         "focal_vote": options.focal_vote,
     }
-
-
-def cameras(
-    options: argparse.Namespace, recorded: Mapping[str, Any] | None = None
-) -> CameraOptions:
-    from colmap_affrect.images.photographs import CameraOptions
-
-    return over(CameraOptions.from_mapping(recorded or {}, "--config"), options, "cameras")
-
-
-def masks(options: argparse.Namespace, recorded: Mapping[str, Any] | None = None) -> MaskOptions:
-    from colmap_affrect.images.photographs import MaskOptions
-
-    return over(MaskOptions.from_mapping(recorded or {}, "--config"), options, "masks")
 
 
 def extension(options: argparse.Namespace) -> Extension | None:

@@ -13,7 +13,7 @@ from colmap_affrect.colmap.database import nearest_positions
 from colmap_affrect.errors import PairListError
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair, PairList, PairOptions
-from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, sequence_pairs, write_pairs
+from colmap_affrect.pairs.lists import read_pairs, sequence_pairs, write_pairs
 from colmap_affrect.pairs.retrieval import NUM_STRONGEST, low_resolution_pairs, retrieved_pairs
 from colmap_affrect.project.atomic_files import replace_lines
 from colmap_affrect.project.contents import content_of
@@ -59,7 +59,7 @@ def choose_pairs(
     start = time.perf_counter()
     workspace = context.workspace
     options = options or context.pairing
-    if options.methods == ("exhaustive",) and not options.match_list_path:
+    if "exhaustive" in options.methods and not options.match_list_path:
         return _all_pairs(context, options, start, overwrite=overwrite)
     pairs = _given_pairs(context, options)
     workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
@@ -108,10 +108,6 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
         all_names = context.inputs.names()
         listed = read_pairs(Path(options.match_list_path), all_names)
         return pairs | {pair for pair in listed if known.issuperset(pair)}
-    if "exhaustive" in options.methods:
-        pairs |= set(exhaustive_pairs(names))
-        if len(names) > MANY_IMAGES:
-            logger.warning(MANY_PAIRS, len(names), len(pairs))
     return pairs
 
 
