@@ -51,6 +51,12 @@ def exchanged(data: bytearray, chance: random.Random) -> str:
     return f"page at {source.start} written over that at {target.start}"
 
 
+def spliced(data: bytearray, chance: random.Random) -> str:
+    start = chance.randrange(len(data))
+    data[start : start + chance.choice((0, 1, 4, 40))] = chance.choice(PIECES)
+    return f"bytes at {start} replaced"
+
+
 def cut(data: bytearray, chance: random.Random) -> str:
     del data[chance.randrange(len(data)) :]
     return f"cut off at {len(data)}"
@@ -66,8 +72,14 @@ def random_bytes(data: bytearray, chance: random.Random) -> str:
     return "all bytes random"
 
 
+PIECES = (
+    b"", b"\0", b"\n", b"\t", b" ", b"#", b",", b"..", b'"', b"[" * 3000, b"{", b"=", b"9" * 30,
+    b"1e999", b"nan", b"\xff\xfe", b"\xe2\x80\xa8", b"\x1b[31m", b"a" * 300, b"../" * 20,
+)  # fmt: skip
+"""What readers of text and numbers may not expect."""
+
 HARMS: tuple[Callable[[bytearray, random.Random], str], ...] = (
-    bits, zeros, noise, header, exchanged, cut, emptied, random_bytes,
+    bits, zeros, noise, header, exchanged, spliced, cut, emptied, random_bytes,
 )  # fmt: skip
 
 

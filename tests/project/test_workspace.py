@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
-from colmap_affrect.project.outputs import temporary_folder
 from colmap_affrect.project.record import COPY_STAGES
 from colmap_affrect.project.record import STAGES as ALL_STAGES
 from colmap_affrect.project.workspace import Workspace
@@ -273,21 +272,3 @@ def test_branch_begins_after_the_raw_matches(finished: Workspace, tmp_path: Path
     branch.record_options("match", {"by": "other options"}, overwrite=True)
     assert not branch.matches.exists()
     assert finished.matches.read_bytes() == b"matches.h5"
-
-
-def test_temporary_folders_of_killed_processes_are_removed_and_no_others(tmp_path: Path) -> None:
-    (tmp_path / ".affrect-killed" / "sub").mkdir(parents=True)
-    (tmp_path / ".affrect-killed" / ".lock").touch()
-    (tmp_path / ".affrect-of-somebody").mkdir()
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / ".affrect-link").symlink_to(tmp_path / "elsewhere")
-    with temporary_folder(tmp_path) as first, temporary_folder(tmp_path) as second:
-        assert first != second
-        assert first.is_dir()
-        assert not (tmp_path / ".affrect-killed").exists()
-    assert {path.name for path in tmp_path.iterdir()} == {
-        ".affrect-link",
-        ".affrect-of-somebody",
-        "elsewhere",
-    }
-    assert not list((tmp_path / "elsewhere").iterdir())
