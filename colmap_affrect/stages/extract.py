@@ -67,9 +67,9 @@ def extract(
     _require_usable_cameras(workspace, inputs)
     names = inputs.names()
     names = checked_names(folder, image_names, "image_names") if image_names else names
-    options, known = recipe.extraction, context.features.contents()
+    options, known = recipe.extraction, {} if overwrite else context.features.contents()
     contents = contents_of(inputs, names, options, known)
-    if overwrite or contents != known:  # else they were seen to be good
+    if contents != known:  # else they were seen to be good
         inputs.check_names(names)
     whole = inputs.photographs.without_mask(names)
     extractor = prepared_recipe(context, options, names)

@@ -146,3 +146,13 @@ def test_files_of_text_may_begin_with_a_byte_order_mark(trio: Path, tmp_path: Pa
     model = written("cameras.txt", "1 PINHOLE 320 240 300 300 160 120\n")
     given = read_given_cameras(CameraOptions(cameras_path=str(model)))
     assert given["a.png"].model == "PINHOLE"
+
+
+def test_damaged_features_are_made_again_with_overwrite(
+    trio: Path, tmp_path: Path, call: Call
+) -> None:
+    extract = ["extract", "--image-path", trio, "--output-path", tmp_path / "out", *FAST]
+    assert call(*extract).code == 0
+    (tmp_path / "out" / "features.h5").write_bytes(b"damaged")
+    assert "run the same 'extract' or 'run' with --overwrite" in call(*extract).errors[0]
+    assert call(*extract, "--overwrite").code == 0
