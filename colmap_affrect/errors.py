@@ -25,7 +25,7 @@ NO_MEMORY = (
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """Tell whether Python, numpy, OpenCV, torch or COLMAP has found no memory."""
+    """Return whether Python, numpy, OpenCV, torch or COLMAP has found no memory."""
     return isinstance(error, MemoryError) or any(t in str(error).lower() for t in NO_MEMORY)
 
 

@@ -160,7 +160,7 @@ class Progress:
     def _display(
         self, name: str, total: int, unit: str
     ) -> Iterator[Callable[[int, str], None] | None]:
-        """Yield what shows that more units are done, and what it is told of the whole run."""
+        """Yield what shows how many more units are done, beside a text on the whole run."""
         if self._stream is None or total == 0:
             yield None
         elif self._stream.isatty():

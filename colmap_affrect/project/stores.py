@@ -255,9 +255,9 @@ class MatchStore(GroupStore):
                 file[pair_key(*names)].attrs["tried_level"] = tried_level
 
     def remove(self, images: Iterable[str] = (), pairs: Iterable[tuple[str, str]] = ()) -> None:
-        """Remove the matches of pairs, of all pairs of some images, and of those that climbed.
+        """Remove the matches of pairs, of all pairs of some images, and of all escalated ones.
 
-        Which pairs climb depends on all others.
+        Which pairs are escalated depends on all others.
         """
         if not self.path.exists():
             return
@@ -281,7 +281,7 @@ class MatchStore(GroupStore):
         self._record_text(STATIONARY, json.dumps([(s, c.tolist()) for s, c in cells.items()]))
 
     def has(self, pairs: Sequence[tuple[str, str]]) -> Bools:
-        """Tell, as (N,) bools, which of N pairs are there and complete."""
+        """Return, as (N,) bools, which of N pairs are there and complete."""
         if not self.path.exists():
             return np.zeros(len(pairs), np.bool_)
         with self._open("r") as file:

@@ -365,7 +365,7 @@ class Workspace:
 
 
 def _may_be_ours(path: Path) -> bool:
-    """Tell whether a file may be in an empty folder, or in that of a run that was killed early."""
+    """Return whether a file may be in an empty folder, or that of a run that was killed early."""
     name = path.name
     is_empty_log = name == "run.log" and not path.stat().st_size
     return name.startswith(".") or name in OF_SYSTEMS or name.endswith(NEW_SUFFIX) or is_empty_log

@@ -74,7 +74,7 @@ def copy_verified(
 
 
 def _other_sizes(database: Path, image_path: Path) -> dict[str, str]:
-    """Tell which photographs cannot be those that a database was made from."""
+    """Return which photographs cannot be those that a database was made from."""
     cameras = colmap_database.read_cameras(database)
     sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
     odd = [n for n, size in sizes.items() if header_size(image_path / n) not in (None, size)]

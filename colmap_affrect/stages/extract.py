@@ -99,7 +99,7 @@ def extract(
 def _passed_over(
     inputs: Inputs, names: Sequence[str], whole: Sequence[str], *, is_list: bool
 ) -> dict[str, str]:
-    """Tell which photographs are left out, and which have no mask."""
+    """Return which photographs are left out, and which have no mask."""
     folder, found = Path(inputs.image_path), dict[str, str]()
     if not (inputs.image_list_path or is_list):
         found |= not_named(folder, names) if inputs.from_database else left_out(folder)

@@ -221,7 +221,7 @@ def mend(context: Context, *, follows: bool) -> None:
 
 
 def _unlike_features(context: Context) -> tuple[str, ...]:
-    """Tell which images are not those of the features, where a killed run has left no seal."""
+    """Return which images are not those of the features, where a killed run has left no seal."""
     with open_read_only(context.workspace.database) as connection:
         tables = read_tables(connection)
     sizes, found = context.features.image_sizes(), list[str]()

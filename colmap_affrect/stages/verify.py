@@ -48,7 +48,7 @@ def verified_inliers(context: Context) -> dict[Pair, Indices]:
 
 
 def extracted_px(context: Context) -> ExtractedPx:
-    """Return the longest side that photographs were shrunk to, or pairs by what they climbed to."""
+    """Return the longest side that photographs were shrunk to; by pair, where levels differ."""
     levels = context.extraction.levels
     sizes = [level.max_image_size_px for level in levels]
     if len(set(sizes)) == 1:
