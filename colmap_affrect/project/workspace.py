@@ -40,6 +40,7 @@ FILES_OF_SPARSE = {INPUTS, "guided-before.json"}
 FILES_OF_MODEL = {
     "cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin", "summary.json",
 }  # fmt: skip
+OF_OLDER_VERSIONS = ("contents.json", ".features.h5.index")
 LOCK_WAIT_S = 1.0  # for one that a killed process still has while it ends
 OWN_STEMS = {
     "cameras", "config", "database", "depth", "features", "guided", "matches", "methods", "pairs",
@@ -256,6 +257,7 @@ class Workspace:
         """
         self._refuse_foreign_results(stage)
         self._remove(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
+        self._remove(self.path / name for name in OF_OLDER_VERSIONS)
         record, begun = self.recorded(), self.begun
         if overwrite:
             self.refuse_foreign_models()
