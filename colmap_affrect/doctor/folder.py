@@ -22,7 +22,6 @@ from colmap_affrect.errors import AffrectError, OptionError, WorkspaceError
 from colmap_affrect.mappers.summaries import (
     GUIDED_BEFORE,
     guided_before,
-    made_from,
     model_folders,
     read_summary,
 )
@@ -31,7 +30,7 @@ from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.project.atomic_files import NEW_SUFFIX
 from colmap_affrect.project.contents import file_sha256
 from colmap_affrect.project.record import COPY_STAGES, STAGES
-from colmap_affrect.project.workspace import INPUTS, Workspace
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import changed_images, contents_of
 from colmap_affrect.stages.inputs import Inputs
@@ -214,7 +213,7 @@ class _FolderExamination:
     def _models(self) -> str | None:
         """Return the digests of what the models were made from, if that can be read."""
         sparse, aside = self.workspace.sparse, self.workspace.aside
-        inputs = self._read(sparse / INPUTS, lambda: made_from(sparse))
+        inputs = self._read(sparse, self.workspace.models_made_from)
         if inputs == "":
             self._add("map-unfinished", sparse)
         folders = model_folders(sparse)

@@ -19,8 +19,10 @@ Stage = Literal["copy", "extract", "pairs", "match", "verify", "escalate", "guid
 STAGES: tuple[str, ...] = get_args(Stage)
 COPY_STAGES = ("copy", "verify", "map")  # of a folder in which another program's database is mapped
 FORMAT_VERSION = 6  # counts up when a stage records other options than before
-MADE_FROM = "made_from"  # digests of given files: of the copied database, of pairs, of cameras
-KEYS = ("recipe", "begun", MADE_FROM, *STAGES)
+MADE_FROM = (
+    "made_from"  # digests: of given lists, cameras and databases; of verified pairs for the models
+)
+KEYS = ("recipe", "begun", *STAGES, MADE_FROM)
 
 PLACES = {
     "image_path", "image_list_path", "from_database", "cameras.cameras_path", "masks.path",

@@ -11,7 +11,7 @@ from typing import Any, Self
 from filelock import FileLock, Timeout
 
 from colmap_affrect import __version__
-from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
+from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError, damage, made_again
 from colmap_affrect.options import digest_of
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
 from colmap_affrect.project.outputs import (
@@ -35,7 +35,7 @@ from colmap_affrect.project.record import (
 
 logger = logging.getLogger(__name__)
 
-INPUTS = "inputs.sha256"  # in sparse/: digests of what it was made from
+INPUTS = "inputs.sha256"  # in sparse/, of older versions: what is in ``made_from`` now
 FILES_OF_SPARSE = {INPUTS, "guided-before.json"}
 FILES_OF_MODEL = {
     "cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin", "summary.json",
@@ -239,6 +239,17 @@ class Workspace:
             known = {**record.get(MADE_FROM, {}), what: digest}
             self._write_record({**record, MADE_FROM: known})
 
+    def models_made_from(self) -> str:
+        """Return the digests of what the models were made from, empty where there are none.
+
+        Of verified pairs and, after a space, of the model that was extended, if any.
+        """
+        if not self.sparse.exists():
+            return ""
+        old = self.sparse / INPUTS
+        with damage(old, made_again("map", self.path)):
+            return self.made_from("map") or (old.read_text("ascii") if old.exists() else "")
+
     def record_options(
         self,
         stage: str,
@@ -290,9 +301,14 @@ class Workspace:
         """
         if self.users_database:
             raise StaleStoreError(f"{self.users_database}: {why}; {self._remedy}")
-        (self.sparse / INPUTS).unlink(missing_ok=True)
+        self.forget_models()
         self._remove(path for path in self._results("verify") if path != self.sparse)
         self._write_record({**self.recorded(), "begun": self._begun_before("verify")})
+
+    def forget_models(self) -> None:
+        """Have the models made anew, which stay until others take their place."""
+        (self.sparse / INPUTS).unlink(missing_ok=True)
+        self.record_made_from("map", "")
 
     @property
     def _remedy(self) -> str:

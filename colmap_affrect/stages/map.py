@@ -21,12 +21,11 @@ from colmap_affrect.mappers.doubts import loose_names
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
 from colmap_affrect.mappers.starts import holding
-from colmap_affrect.mappers.summaries import made_from, model_folders, read_summary, refuse_edited
+from colmap_affrect.mappers.summaries import model_folders, read_summary, refuse_edited
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary, StageReport
-from colmap_affrect.project.workspace import INPUTS, Workspace
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.depth_lookup import depth_lookup
@@ -66,7 +65,7 @@ def map_images(
         existing = read_existing(extend, workspace.database)  # it may be discarded now
     inputs = _inputs(workspace, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
-    known = made_from(workspace.sparse)
+    known = workspace.models_made_from()
     if known != inputs and " " in known and not extend:
         raise StaleStoreError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
@@ -78,6 +77,7 @@ def map_images(
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
     refuse_edited(workspace.sparse)
+    workspace.forget_models()  # a run that is killed begins anew
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models, num_rejected = _map(context, mapper, task, advance)
@@ -93,7 +93,7 @@ def map_images(
             f"{'contradicts the others and was' if is_one else 'contradict the others and were'} "
             "rejected"
         )
-    replace_text(workspace.sparse / INPUTS, inputs)
+    workspace.record_made_from("map", inputs)
     if extend and existing and existing.num_other_keypoints:
         warnings[str(extend.model_path)] = (
             f"keypoints of {existing.num_other_keypoints} of its {len(existing.names)} images are "

@@ -117,7 +117,7 @@ def test_links_in_output_folders_are_not_followed(scene: Scene, tmp_path: Path, 
 FILES = (
     "features.h5", "matches.h5", "guided.h5", "database.db", "pairs.txt", "config.toml",
     "cameras.json", "report.json", "report.html", "run.log",
-    "sparse/inputs.sha256", "sparse/0/cameras.bin", "sparse/0/rigs.bin", "sparse/0/frames.bin",
+    "sparse/0/cameras.bin", "sparse/0/rigs.bin", "sparse/0/frames.bin",
     "sparse/0/images.bin", "sparse/0/points3D.bin", "sparse/0/summary.json",
 )  # fmt: skip
 READERS = ("run", "map", "export", "align", "doctor")
