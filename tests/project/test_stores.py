@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -271,84 +266,6 @@ def test_read_of_a_pair_without_matches_says_what_to_run(matches: MatchStore, go
     assert matches.has([("a.png", "z.png"), ("b.png", "z.png")]).tolist() == [True, False]
     with pytest.raises(StoreError, match=r"no matches of b\.png, z\.png; run match"):
         list(matches.read([("a.png", "z.png"), ("b.png", "z.png")]))
-
-
-WRITER = """
-import os, signal, sys
-from pathlib import Path
-import h5py
-import numpy as np
-from colmap_affrect.project.stores import FeatureStore
-from colmap_affrect.data import LocalFeatures
-
-path, deadly = Path(sys.argv[1]), int(sys.argv[2])
-created = 0
-create_dataset = h5py.Group.create_dataset
-
-
-def create(*arguments, **options):
-    global created
-    created += 1
-    if created == deadly:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return create_dataset(*arguments, **options)
-
-
-h5py.Group.create_dataset = create
-store = FeatureStore(path)
-for index in range(100_000):
-    count = 1000 + index
-    lafs = np.tile(np.eye(2, 3), (count, 1, 1)) * (index + 1)
-    store.write(
-        f"folder/{index}.png",
-        LocalFeatures(lafs, np.ones(count, np.float32), np.ones((count, 128), np.float32)),
-        (640, 480),
-    )
-    print(index, flush=True)
-"""
-
-
-def start_writer(path: Path, deadly: int = 0) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", WRITER, str(path), str(deadly)], stdout=subprocess.PIPE, text=True
-    )
-
-
-def assert_holds_images(store: FeatureStore, least: int, most: int) -> None:
-    """The store is readable and holds the writer's images 0, 1, ..., each as written."""
-    counts = store.num_keypoints()
-    assert least <= len(counts) <= most
-    for index in range(len(counts)):
-        assert counts[f"folder/{index}.png"] == 1000 + index
-        lafs = store.read(f"folder/{index}.png").lafs
-        assert_array_equal(lafs, np.tile(np.eye(2, 3), (1000 + index, 1, 1)) * (index + 1))
-
-
-@pytest.mark.parametrize(("deadly", "complete"), [(4, 0), (21, 2)])
-def test_complete_groups_are_readable_after_a_kill_within_a_group(
-    store: FeatureStore, deadly: int, complete: int
-) -> None:
-    with start_writer(store.path, deadly) as writer:
-        writer.communicate(timeout=60)
-    assert writer.returncode == -signal.SIGKILL
-    assert_holds_images(store, complete, complete)
-    store.write("more.png", some_features(3), (4, 3))
-    assert "more.png" in store.names()
-
-
-@pytest.mark.parametrize("delay_s", [0.005, 0.07])
-def test_complete_groups_are_readable_after_a_kill_at_any_time(
-    store: FeatureStore, delay_s: float
-) -> None:
-    with start_writer(store.path) as writer:
-        for _ in range(3):
-            writer.stdout.readline()
-        time.sleep(delay_s)
-        os.kill(writer.pid, signal.SIGKILL)
-        printed = writer.stdout.read().split()
-    written = 3 + len([line for line in printed if line.isdigit()])
-    # The last one may be complete before it is printed.
-    assert_holds_images(store, written, written + 1)
 
 
 def test_file_that_somebody_else_has_written_is_read_again(store: FeatureStore) -> None:
