@@ -18,10 +18,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.project.contents import Content
 from colmap_affrect.project.group_store import GroupStore, checked, complete_groups, is_complete
 

@@ -7,11 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.conventions import camera_matrix, pixel_from_colmap, resized_from_original
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError, ImageError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats, Singles
+from colmap_affrect.geometry.conventions import (
+    camera_matrix,
+    pixel_from_colmap,
+    resized_from_original,
+)
 from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.mappers.base import DepthLookup

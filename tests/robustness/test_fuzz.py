@@ -16,9 +16,9 @@ import pytest
 from damaged import HARMS
 from synthetic import write_image
 
-from colmap_affrect.conventions import camera_matrix
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import AffrectError
+from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.images.depth import DepthFiles, DepthFilesOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.recipes import load_recipe, recipe_folder, recipe_names

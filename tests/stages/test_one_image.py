@@ -16,10 +16,10 @@ from numpy.testing import assert_array_equal
 
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.initial_cameras import InitialCameras
-from colmap_affrect.conventions import camera_matrix
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import DepthError, DeviceError, OptionError, WeightsError
 from colmap_affrect.features.base import FeatureOptions
+from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.warping import warp
 from colmap_affrect.project.stores import FeatureStore
