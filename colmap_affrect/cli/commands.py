@@ -458,10 +458,6 @@ def _weight_keys(names: Sequence[str]) -> list[str]:
 
     keys: list[str] = []
     for name in names:
-        if name in recipe_names():
-            keys += load_recipe(name).weights
-        elif name in WEIGHT_FILES:
-            keys.append(name)
-        else:
-            keys += [key for key in WEIGHT_FILES if key.startswith(f"{name}-")] or [name]
+        alike = [key for key in WEIGHT_FILES if key == name or key.startswith(f"{name}-")]
+        keys += load_recipe(name).weights if name in recipe_names() else alike or [name]
     return list(dict.fromkeys(keys))

@@ -75,7 +75,14 @@ def extract(
     extractor = prepared_recipe(context, options, names)
     if not overwrite:
         refuse_other_photographs(workspace, inputs.image_path, contents)
-    _record(workspace, inputs, recipe, extractor, later or {}, overwrite=overwrite)
+    weights = digests(extractor.weights)
+    workspace.record_options(
+        "extract",
+        {**inputs.to_mapping(), **options.to_mapping(), WEIGHTS: weights},
+        plan={s: x.to_mapping() for s, x in {**recipe.later_stages, **(later or {})}.items()},
+        recipe=recipe.name,
+        overwrite=overwrite,
+    )
     warnings = forget_changed(context, inputs, contents, are_all=not image_names)
     _start_database(workspace)
     done = context.features.complete(names)
@@ -116,31 +123,6 @@ def _require_usable_cameras(workspace: Workspace, inputs: Inputs) -> None:
     cameras = colmap_database.all_cameras(path) if camera_id >= 0 and path.exists() else []
     if camera_id >= 0 and all(camera.camera_id != camera_id for camera in cameras):
         raise OptionError(f"existing_camera_id={camera_id}: {path} has no such camera")
-
-
-def _record(
-    workspace: Workspace,
-    inputs: Inputs,
-    recipe: Recipe,
-    extractor: ImageExtractor,
-    later: Mapping[str, Options],
-    *,
-    overwrite: bool,
-) -> None:
-    weights = digests(extractor.weights)
-    planned: dict[str, Options] = {"match": recipe.matching, "guide": recipe.guided}
-    if recipe.extraction.escalation:
-        planned["escalate"] = recipe.escalate
-    if recipe.mapping:
-        planned["map"] = recipe.mapper_options("sparse")
-    planned |= later
-    workspace.record_options(
-        "extract",
-        {**inputs.to_mapping(), **recipe.extraction.to_mapping(), WEIGHTS: weights},
-        plan={stage: chosen.to_mapping() for stage, chosen in planned.items()},
-        recipe=recipe.name,
-        overwrite=overwrite,
-    )
 
 
 def _extract_missing(

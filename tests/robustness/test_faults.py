@@ -9,8 +9,6 @@ import errno
 import os
 import resource
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -37,15 +35,6 @@ def file_size_limit(num_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, usual)
 
 
-LIMITED_COMMAND = """
-import resource, sys
-import colmap_affrect.pipeline
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
-from colmap_affrect.cli import main
-sys.exit(main(sys.argv[2:]))
-"""
-
-
 @dataclass(frozen=True)
 class Disturbed:
     """A run whose writes are to fail, and one that nothing disturbed."""
@@ -65,15 +54,6 @@ class Disturbed:
 
     def run(self) -> Ended:
         return self.call(*self.arguments)
-
-    def run_limited(self, num_bytes: int, *arguments: object) -> Ended:
-        """Run a command in a process of its own, which pycolmap may abort."""
-        command = [*map(str, arguments)] or self.arguments
-        done = subprocess.run(
-            [sys.executable, "-c", LIMITED_COMMAND, str(num_bytes), *command],
-            capture_output=True, text=True, timeout=120, check=False,
-        )  # fmt: skip
-        return Ended(done.returncode, done.stdout, done.stderr.splitlines())
 
     def begin_without(self, *names: str) -> None:
         """Begin with the undisturbed run as it was before it made some of its files."""
@@ -130,17 +110,6 @@ def test_record_of_options_that_does_not_fit_on_the_disk(disturbed: Disturbed) -
     assert_says_what_to_do(ended, disturbed.workspace.config)
     assert not disturbed.workspace.config.exists()
     assert not disturbed.workspace.features.exists()
-
-
-def test_geometries_that_do_not_fit_on_the_disk(disturbed: Disturbed) -> None:
-    out = ["--output-path", disturbed.out, "-q"]
-    for command in (["extract", "--image-path", disturbed.photos, *FAST], ["pairs"], ["match"]):
-        assert disturbed.call(*command, *out).code == 0
-    # COLMAP would end the process in the middle of this.
-    database = disturbed.workspace.database
-    ended = disturbed.run_limited(database.stat().st_size + 10_000, "verify", *out)
-    assert_says_what_to_do(ended, database)
-    disturbed.assert_finishes()
 
 
 def test_model_that_does_not_fit_on_the_disk_is_not_taken_for_whole(disturbed: Disturbed) -> None:
