@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from colmap_affrect.colmap.database_copy import read_names
 from colmap_affrect.colmap.given_cameras import read_given_cameras
@@ -37,23 +37,14 @@ class Inputs(Options):
     """Where features may be; everywhere by default."""
 
     @classmethod
-    def of(
-        cls,
-        image_path: Path,
-        *,
-        image_list_path: Path | None = None,
-        from_database: Path | None = None,
-        cameras: CameraOptions | None = None,
-        masks: MaskOptions | None = None,
-    ) -> Self:
-        """Build from paths, which are made absolute."""
-        return cls(
-            image_path=str(image_path.resolve()),
-            image_list_path=str(image_list_path.resolve()) if image_list_path else "",
-            from_database=str(from_database.resolve()) if from_database else "",
-            cameras=cameras or CameraOptions(),
-            masks=masks or MaskOptions(),
-        )
+    def of(cls, image_path: Path, **given: Any) -> Self:
+        """Build from paths, which are made absolute, and options; None is what is not given."""
+        values = {
+            key: str(value.resolve()) if isinstance(value, Path) else value
+            for key, value in {"image_path": image_path, **given}.items()
+            if value is not None
+        }
+        return cls(**values)
 
     @property
     def photographs(self) -> Photographs:
