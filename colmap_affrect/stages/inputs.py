@@ -39,7 +39,7 @@ class Inputs(Options):
     @classmethod
     def of(cls, image_path: Path, **given: Any) -> Self:
         """Build from paths, which are made absolute, and options; None is what is not given."""
-        values = {
+        values: dict[str, Any] = {
             key: str(value.resolve()) if isinstance(value, Path) else value
             for key, value in {"image_path": image_path, **given}.items()
             if value is not None
