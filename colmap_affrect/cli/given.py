@@ -187,7 +187,7 @@ def resources(options: argparse.Namespace) -> Resources:
 def folder(option: str, path: Path | None) -> Path | None:
     """Refuse a folder to read that is not there."""
     if path and not path.is_dir():
-        raise OptionError(f"{option} {path}: no such folder")
+        raise OptionError(f"{option} {path}: no such folder; give one that is there")
     return path
 
 

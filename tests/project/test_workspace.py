@@ -196,6 +196,18 @@ def test_models_that_somebody_put_beside_ours_are_not_removed(
     assert foreign.exists()
 
 
+def test_what_models_were_made_from_is_on_record_while_they_are_there(workspace: Workspace) -> None:
+    workspace.record_options("extract", OPTIONS)
+    workspace.record_made_from("map", "ab")
+    assert workspace.models_made_from() == ""
+    workspace.sparse.mkdir()
+    assert Workspace(workspace.path).models_made_from() == "ab"
+    workspace.rewind()
+    assert workspace.models_made_from() == ""
+    (workspace.sparse / "inputs.sha256").write_text("of an older version")
+    assert workspace.models_made_from() == "of an older version"
+
+
 def test_damaged_record_is_one_clear_line(workspace: Workspace) -> None:
     workspace.config.write_text("[extract\nx = ")
     with pytest.raises(WorkspaceError, match=r"config\.toml: damaged") as error:
