@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,8 +21,7 @@ from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_affrect.comparison.results import Comparison
-    from colmap_affrect.project.report import ReconstructionReport, StageReport
-    from colmap_affrect.stages.context import Context
+    from colmap_affrect.project.report import ReconstructionReport
 
 
 def run(options: argparse.Namespace) -> int:
@@ -69,54 +68,41 @@ def extract(options: argparse.Namespace) -> int:
     return _exit_code(report.failures, options)
 
 
-def _stage(options: argparse.Namespace, work: Callable[[Context], StageReport]) -> None:
-    with given.context(options) as context:
-        report = work(context)
-    show(report.summary())
-
-
 def pairs(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.pairs import choose_pairs
 
-    def work(context: Context) -> StageReport:
+    with given.context(options) as context:
         chosen = given.over(context.pairing, options, "pairs")
-        return choose_pairs(context, chosen, overwrite=options.overwrite)
-
-    _stage(options, work)
+        report = choose_pairs(context, chosen, overwrite=options.overwrite)
+    show(report.summary())
 
 
 def match(options: argparse.Namespace) -> None:
-    from colmap_affrect.matchers.base import MATCHERS
     from colmap_affrect.stages.match import match
 
-    def work(context: Context) -> StageReport:
+    with given.context(options) as context:
         if options.recipe:
             matching = given.recipe(options).matching
         else:
-            values = given.changed(context.matching, options, "matching")
-            matching = MATCHERS.options(values, where="matching")
-        return match(context, matching, overwrite=options.overwrite)
-
-    _stage(options, work)
+            matching = given.changed(context.matching, options, "matching")
+        report = match(context, matching, overwrite=options.overwrite)
+    show(report.summary())
 
 
 def verify(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.verify import verify_matches
 
-    def work(context: Context) -> StageReport:
+    with given.context(options) as context:
         chosen = given.verification(options, context.verification)
-        return verify_matches(context, chosen, overwrite=options.overwrite)
-
-    _stage(options, work)
+        report = verify_matches(context, chosen, overwrite=options.overwrite)
+    show(report.summary())
 
 
 def escalate(options: argparse.Namespace) -> None:
-    from colmap_affrect.recipes import EscalateOptions
     from colmap_affrect.stages.escalate import escalate, pair_levels
 
     with given.context(options) as context:
-        values = given.changed(context.escalation, options, "escalate")
-        chosen = EscalateOptions.from_mapping(values, "escalate")
+        chosen = given.changed(context.escalation, options, "escalate")
         report = escalate(context, chosen, overwrite=options.overwrite)
         levels = pair_levels(context)
     show(report.summary())
@@ -125,12 +111,10 @@ def escalate(options: argparse.Namespace) -> None:
 
 
 def guide(options: argparse.Namespace) -> None:
-    from colmap_affrect.matchers.guided import GuidedOptions
     from colmap_affrect.stages.guide import guide, guided_counts
 
     with given.context(options) as context:
-        values = given.changed(context.guiding, options, "guided")
-        chosen = GuidedOptions.from_mapping(values, "guided")
+        chosen = given.changed(context.guiding, options, "guided")
         report = guide(context, chosen, overwrite=options.overwrite)
         counts = guided_counts(context)
     show(report.summary())

@@ -259,15 +259,16 @@ def key_values(option: str, settings: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def changed(known: Options, options: argparse.Namespace, name: str) -> dict[str, Any]:
+def changed(known: AnyOptions, options: argparse.Namespace, name: str) -> AnyOptions:
     """Return a section of the recipe with what is given of it, and by --set."""
-    from colmap_affrect.recipes import with_settings
+    from colmap_affrect.recipes import RecipeOptions, with_settings
 
     settings = [*_settings(options, name), *options.set]
     values = with_settings({name: known.to_mapping()}, settings)
     if len(values) > 1:
         raise OptionError(f"--set: only options of {name} can be changed here")
-    return dict(values[name])
+    found: AnyOptions = getattr(RecipeOptions.from_mapping(values, "--set"), name)
+    return found
 
 
 def distance(text: str) -> tuple[str, str, float]:

@@ -304,7 +304,6 @@ def test_digests_are_named_by_keys(tmp_path: Path) -> None:
         path.write_bytes(key.encode())
     disk, xfeat = (hashlib.sha256(key.encode()).hexdigest() for key in files)
     assert digests(files) == {"disk": disk, "xfeat": xfeat}
-    assert digests(files, {}) == {}
 
 
 @pytest.mark.parametrize(
