@@ -107,7 +107,7 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
         # Images that could not be read may be in the list; only their pairs are dropped.
         all_names = context.inputs.names()
         listed = read_pairs(Path(options.match_list_path), all_names)
-        return pairs | {pair for pair in listed if known.issuperset(pair)}
+        pairs |= {pair for pair in listed if known.issuperset(pair)}
     return pairs
 
 
