@@ -91,14 +91,6 @@ def test_one_recipe_is_printed_with_all_options_and_can_be_used_as_a_file(
     assert "# Radius r of a covering ball as a tilt ratio. Paper: 1.7.\ntilt_radius" in done.stdout
 
 
-def test_weights_are_listed_with_where_they_are(tmp_path: Path, call: Call) -> None:
-    (tmp_path / "AffNet.pth").write_bytes(b"not the published file")
-    done = call("weights", "--weights", tmp_path)
-    assert (done.code, done.stderr) == (0, [])
-    assert f"{tmp_path / 'AffNet.pth'}, NOT the published file" in done.stdout
-    assert "65c8bb2cf71e913818522d09dcc4262bcbcef5d756baa86a41f28526c2d61160" in done.stdout
-
-
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -25,7 +25,6 @@ from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.doubts import FOCAL_DOUBT
 from colmap_affrect.mappers.sparse import SparseOptions
-from colmap_affrect.matchers import nearest
 from colmap_affrect.pipeline import RunOptions, run
 from colmap_affrect.project.report import ReconstructionReport
 from colmap_affrect.project.stores import FeatureStore, MatchStore, pair_key
@@ -285,27 +284,6 @@ def test_mapper_options_are_added_to_what_is_on_record(copy: Workspace, call: Ca
     record = copy.require("map")
     assert (record["min_model_size"], record["random_seed"]) == (10, 4)
     assert record["mapper_options"] == {"ba_refine_principal_point": True}
-
-
-@pytest.mark.parametrize("seed", ["-5", "99999999999"])
-def test_seed_that_colmap_cannot_take_is_one_clear_line(
-    copy: Workspace, call: Call, seed: str
-) -> None:
-    for stage in ("verify", "map"):
-        ended = call(stage, "--output-path", copy.path, "--random-seed", seed, "--overwrite")
-        assert ended.code == 2
-        assert ended.errors[0].startswith(f"error: random_seed={seed} is outside [-1, ")
-    assert copy.sparse.exists()
-
-
-def test_device_reaches_matching(
-    copy: Workspace, call: Call, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    devices: list[str] = []
-    monkeypatch.setattr(nearest, "coarse_descriptors", lambda _, device: devices.append(device))
-    assert call("match", "--output-path", copy.path, "--overwrite").code == 0
-    assert call("match", "--output-path", copy.path, "--overwrite", "--device", "cpu").code == 0
-    assert devices == ["auto", "cpu"]
 
 
 @pytest.mark.parametrize("stage", ["pairs", "match", "verify", "map"])
