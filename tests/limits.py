@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
     "lines of the package": 32_390,
-    "lines of the tests": 27_650,
+    "lines of the tests": 27_690,
     "lines of the longest file": 500,
     "lines of the longest function": 63,
     "imports between folders": 171,
