@@ -133,8 +133,9 @@ def test_other_thresholds_than_before_need_no_new_features(
     refused = call("escalate", "--output-path", tmp_path, *setting)
     assert "with min_num_tracks=30, and it is 5 now; use --overwrite" in refused.errors[0]
     assert call("escalate", "--output-path", tmp_path, *setting, "--overwrite").code == 0
-    assert Context(workspace).escalation.min_num_tracks == 5
-    assert workspace.options_digest("extract", "match") == digest
+    now = Workspace(workspace.path)
+    assert Context(now).escalation.min_num_tracks == 5
+    assert now.options_digest("extract", "match") == digest
     wrong = call("escalate", "--output-path", tmp_path, "--set", "matching.max_ratio=0.8")
     assert wrong.errors == ["error: --set: only options of escalate can be changed here"]
 
