@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap.tables import pair_images, rows_of
+from colmap_affrect.errors import such_as
 from colmap_affrect.geometry.arrays import Bools, Singles
-from colmap_affrect.shown import such_as
 
 KINDS = {"keypoints-not-finite", "keypoints-outside", "keypoints-at-one-place"}  # of checks.CHECKS
 MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it

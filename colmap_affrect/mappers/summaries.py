@@ -1,6 +1,5 @@
 """What is known of finished models, kept beside them: COLMAP's files cannot hold it all."""
 
-import re
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,11 +7,10 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from colmap_affrect.colmap.model_files import SUMMARY, file_digests, require_intact
-from colmap_affrect.errors import DAMAGE, StoreError, damage, made_again
+from colmap_affrect.errors import DAMAGE, StoreError, made_again
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.checked_json import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.workspace import INPUTS
 
 
 @dataclass(frozen=True)
@@ -59,15 +57,3 @@ def refuse_edited(sparse_path: Path) -> None:
                 "be replaced; if you need it copy it to a folder of its own, then "
                 f"{made_again('map', sparse_path.parent)}"
             )
-
-
-def made_from(sparse_path: Path) -> str:
-    """Return the digests of what models were made from; empty where that was not finished."""
-    path = sparse_path / INPUTS
-    if not path.exists():
-        return ""
-    with damage(path, made_again("map", sparse_path.parent)):
-        text = path.read_text(encoding="ascii")
-        if not re.fullmatch("[0-9a-f]{64}( own| [0-9a-f]{64})?", text):
-            raise ValueError("no digests")
-        return text

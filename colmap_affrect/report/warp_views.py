@@ -12,9 +12,8 @@ from colmap_affrect.images.warping import warp
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.report.pictures import Picture
 from colmap_affrect.report.regions import largest_warps, tinted, warp_colors
-from colmap_affrect.stages.context import Resources
+from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.extract import image_tasks
-from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.one_image import prepare
 
 MAP_SIZE_PX = 480
@@ -58,8 +57,8 @@ def warped_photographs(
     needs, or a photograph, cannot be used.
     """
     resources = resources or Resources(depth_cache_path=workspace.depth)
-    extractor = prepare(recorded_extraction(workspace), resources)
-    inputs = Inputs.recorded(workspace)
+    extractor = prepare(Context(workspace).extraction, resources)
+    inputs = Context(workspace).inputs
     found = []
     for task in image_tasks(workspace, inputs, extractor.options, [(name, 0) for name in names]):
         path, mask = task.photographs.folder / task.name, task.photographs.mask(task.name)
@@ -98,5 +97,5 @@ def rectifies(workspace: Workspace) -> bool:
     """Tell whether photographs are warped there; COLMAP's SIFT leaves no record and warps none."""
     if workspace.planned("extract") is None:
         return False
-    levels = recorded_extraction(workspace).levels
+    levels = Context(workspace).extraction.levels
     return any(level.rectifier.name != "identity" for level in levels)

@@ -20,8 +20,8 @@ from colmap_affrect.colmap.verification import (
     verified_pairs,
     verify,
 )
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.affine import project, rotation, transform_frames
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.epipolar import turn_cosines
 
 SIZE = (640, 480)
