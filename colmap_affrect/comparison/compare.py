@@ -16,7 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
-from colmap_affrect.colmap.camera_records import read_camera_records
+from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import import_images, record_cameras

@@ -22,7 +22,7 @@ from typing import Any, TextIO
 from pydantic import TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import read_camera_records
+from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import (
     image_ids,
     keypoint_counts,

@@ -8,9 +8,8 @@ import sys
 from itertools import groupby
 from pathlib import Path
 
-from colmap_affrect.doctor.database import examine_database
 from colmap_affrect.doctor.findings import Diagnosis, Finding, Findings
-from colmap_affrect.doctor.folder import examine_folder
+from colmap_affrect.doctor.folder import examine_database, examine_folder
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import describe_weights, remedy
 from colmap_affrect.progress import SILENT, Progress

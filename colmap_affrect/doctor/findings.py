@@ -95,11 +95,10 @@ TEXTS: dict[str, Check] = CHECKS | {
 
 OWN_ADVICE: dict[str, str] = {
     **dict.fromkeys(
-        ("no-images", "no-camera", "no-frame", "keypoint-columns", "keypoint-data",
-         "keypoints-not-finite", "keypoints-outside", "descriptor-count", "descriptor-types"),
-        EXTRACT_AGAIN,
+        ("no-images", "no-parent", "no-frame", "keypoint-data", "keypoints-not-finite",
+         "keypoints-outside", "descriptor-data"), EXTRACT_AGAIN,
     ),
-    **dict.fromkeys(("self-pair", "unknown-pair", "match-data", "match-range"), MATCH_AGAIN),
+    "match-data": MATCH_AGAIN,
     "no-matches": MATCH,
     "no-geometry": "run 'colmap-affrect verify --output-path {folder}' and map",
     "undefined-geometry": VERIFY_AGAIN,

@@ -1,15 +1,22 @@
-"""Examines an output folder."""
+"""Examines output folders, and COLMAP databases in a copy."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
-from colmap_affrect.colmap.camera_records import read_camera_records
+from colmap_affrect.colmap.cameras import read_camera_records
+from colmap_affrect.colmap.checks import CHECKS, check_database, check_image_files
 from colmap_affrect.colmap.database import geometry_digest
+from colmap_affrect.colmap.database_copy import (
+    copy_as_it_is,
+    is_stamped,
+    newest_schema_version,
+    schema_version,
+)
 from colmap_affrect.colmap.model_files import SUMMARY, registered_names
-from colmap_affrect.doctor.database import examine_database, examined_copy
 from colmap_affrect.doctor.findings import (
     MATCH_AGAIN,
     OWN_ADVICE,
@@ -18,7 +25,8 @@ from colmap_affrect.doctor.findings import (
     Findings,
     without_path,
 )
-from colmap_affrect.errors import AffrectError, OptionError, WorkspaceError
+from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError
+from colmap_affrect.images.reading import readable_size
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.summaries import (
     GUIDED_BEFORE,
@@ -29,8 +37,11 @@ from colmap_affrect.mappers.summaries import (
 )
 from colmap_affrect.pairs.base import PairList, PairOptions
 from colmap_affrect.pairs.lists import read_pairs
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import NEW_SUFFIX
 from colmap_affrect.project.contents import Contents, sha256_of
+from colmap_affrect.project.outputs import leads_outside
 from colmap_affrect.project.workspace import COPY_STAGES, INPUTS, STAGES, Workspace
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages.context import Context
@@ -44,6 +55,66 @@ from colmap_affrect.stages.verify import recorded_verification
 Read = TypeVar("Read")
 
 LEFTOVERS = ("*.new", "*.partial", f"*{NEW_SUFFIX}")
+
+
+def examine_database(findings: Findings, path: Path, image_path: Path | None) -> None:
+    """Examine a COLMAP database, and the sizes of its photographs if their folder is given."""
+    with _examined_copy(findings, path, image_path, {}):
+        pass
+
+
+@contextmanager
+def _examined_copy(
+    findings: Findings, path: Path, image_path: Path | None, own_advice: Mapping[str, str]
+) -> Iterator[Path | None]:
+    """Examine a copy of a database and yield it, None if it cannot be used.
+
+    ``own_advice`` says what to do about a problem by its kind, where it is not what ``TEXTS`` says.
+    """
+    with TemporaryDirectory() as temporary:
+        copy = Path(temporary) / "database.db"
+        try:
+            version, newest = schema_version(path), newest_schema_version()
+            copy_as_it_is(path, copy)
+        except DatabaseError as error:
+            message = without_path(path, error).replace(str(copy), "a temporary file")
+            findings.add("no-database", path, error=message)
+            yield None
+            return
+        if version < newest:
+            kind = "stamped" if is_stamped(path) else "old-schema"
+            kept = path.with_suffix(".old.db")
+            findings.add(kind, path, version=version, newest=newest, path=path, copy=kept)
+        try:
+            tables, problems = check_database(copy)
+        except DatabaseError as error:
+            findings.add("database-damaged", path, error=without_path(copy, error))
+            yield None
+            return
+        findings.checked.append(f"{path}: {tables.summary()}")
+        if image_path is not None:
+            sizes = _file_sizes(image_path, tables.names.values(), findings.progress)
+            problems |= check_image_files(tables, image_path, sizes)
+            findings.checked.append(f"{image_path}: sizes of {len(sizes)} photographs")
+        for kind in sorted(problems, key=list(CHECKS).index):
+            advice = own_advice.get(kind, "")
+            findings.add(kind, path, problems[kind], advice=advice, path=path, folder=path.parent)
+        yield copy
+
+
+def _file_sizes(
+    image_path: Path, names: Iterable[str], progress: Progress
+) -> dict[str, tuple[int, int] | None]:
+    """Read photographs for their (width, height), None for those that cannot be read."""
+    present = [n for n in names if not leads_outside(n) and (image_path / n).is_file()]
+    sizes = {}
+    with progress.stage("read", len(present), "images") as advance:
+        paths = (image_path / name for name in present)
+        found = map_ordered(readable_size, paths, available_cores())
+        for name, size in zip(present, found, strict=True):
+            sizes[name] = size
+            advance(1)
+    return sizes
 
 
 def examine_folder(findings: Findings, path: Path, image_path: Path | None) -> None:
@@ -94,7 +165,7 @@ class _FolderExamination:
             return
         own_advice = {} if self.workspace.users_database else OWN_ADVICE
         edits = None if self.workspace.users_database else edits_of(database)
-        with examined_copy(self.found, database, image_path, own_advice) as copy:
+        with _examined_copy(self.found, database, image_path, own_advice) as copy:
             if copy is None:
                 return
             if edits and str(edits):

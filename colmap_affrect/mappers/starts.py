@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import CameraRecord
 from colmap_affrect.colmap.camera_vote import apply_cameras, apply_records
+from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import all_cameras, open_database
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.mappers.base import MappingTask

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import read_camera_records
+from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.model_files import num_long_tracks
 from colmap_affrect.colmap.verification import num_tied, verified_pairs
 from colmap_affrect.errors import StaleStoreError

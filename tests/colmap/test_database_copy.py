@@ -20,33 +20,9 @@ from colmap_affrect.colmap.database_copy import (
     schema_version,
 )
 from colmap_affrect.colmap.initial_cameras import import_images
+from colmap_affrect.colmap.old_databases import TABLES
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
-
-COLMAP_3_8 = """
-CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, model INTEGER NOT NULL,
-    width INTEGER NOT NULL, height INTEGER NOT NULL, params BLOB,
-    prior_focal_length INTEGER NOT NULL);
-CREATE TABLE images (image_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, name TEXT NOT NULL UNIQUE,
-    camera_id INTEGER NOT NULL, prior_qw REAL, prior_qx REAL, prior_qy REAL, prior_qz REAL,
-    prior_tx REAL, prior_ty REAL, prior_tz REAL,
-    CONSTRAINT image_id_check CHECK(image_id >= 0 and image_id < 2147483647),
-    FOREIGN KEY(camera_id) REFERENCES cameras(camera_id));
-CREATE UNIQUE INDEX index_name ON images(name);
-CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL,
-    cols INTEGER NOT NULL, data BLOB,
-    FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE);
-CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL,
-    cols INTEGER NOT NULL, data BLOB,
-    FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE);
-CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL,
-    cols INTEGER NOT NULL, data BLOB);
-CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL,
-    cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB,
-    qvec BLOB, tvec BLOB);
-PRAGMA user_version = 3800;
-"""
-"""The tables of COLMAP 3.8: no rigs, no frames, no types of descriptors."""
 
 
 @pytest.fixture
@@ -56,7 +32,7 @@ def old_database(tmp_path: Path) -> Path:
     folder.mkdir()
     path = folder / "database.db"
     with closing(sqlite3.connect(path)) as connection, connection:
-        connection.executescript(COLMAP_3_8)
+        connection.executescript(f"{TABLES} DROP TABLE pose_priors;")
         params = np.array([301.0, 161.0, 122.0, 0.01]).tobytes()
         connection.execute("INSERT INTO cameras VALUES (7, 2, 320, 240, ?, 1)", [params])
         for number, name in [(3, "b.png"), (5, "a.png")]:
@@ -175,10 +151,3 @@ def test_existing_target_is_not_overwritten(database_path: Path, tmp_path: Path)
         with pytest.raises(DatabaseError, match="exists already"):
             copy(database_path, tmp_path / "there.db")
     assert (tmp_path / "there.db").read_text() == "precious"
-
-
-def test_leftovers_of_a_killed_copy_go(database_path: Path, tmp_path: Path) -> None:
-    for suffix in ("", "-wal", "-shm", "-journal"):
-        (tmp_path / f"copy.db.new{suffix}").write_bytes(b"left")
-    copy_database(database_path, tmp_path / "copy.db")
-    assert [path.name for path in tmp_path.glob("copy.db*")] == ["copy.db"]

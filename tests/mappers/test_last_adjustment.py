@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.mappers import attempts

@@ -10,7 +10,7 @@ import pytest
 from mapping_tasks import ALL_GIVEN, WHOLE
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.mappers import attempts
 from colmap_affrect.mappers import starts as module
