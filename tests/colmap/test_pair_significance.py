@@ -22,7 +22,6 @@ from colmap_affrect.colmap.verification import (
 )
 from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.affine import project, rotation, transform_frames
-from colmap_affrect.geometry.epipolar import turn_cosines
 
 SIZE = (640, 480)
 K = np.array([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
@@ -152,16 +151,6 @@ def test_database_without_shapes_needs_more_inliers() -> None:
     assert num_inliers((upright[0], upright[1]), min_significance=5.0) == 0
     many = tuple(np.concatenate(two) for two in zip(frames, frames, strict=True))
     assert num_inliers((many[0], many[1]), columns=2, min_significance=5.0) > 0
-
-
-def test_frames_of_a_plane_turn_as_its_homography_does() -> None:
-    first, second = frames_of([HOMOGRAPHY], 40, 5)
-    np.testing.assert_allclose(second[:, :, 2], project(HOMOGRAPHY, first[:, :, 2]))
-    carried = transform_frames(HOMOGRAPHY, first)[:, :, :2]
-    np.testing.assert_allclose(turn_cosines(carried, second[:, :, :2]), 1.0)
-    turned = rotation(np.deg2rad(33.0)) @ second[:, :, :2]
-    np.testing.assert_allclose(turn_cosines(carried, turned), np.cos(np.deg2rad(33.0)))
-    assert (turn_cosines(carried, second[:, :, :2] @ np.diag([1.0, -1.0])) == -1.0).all()
 
 
 def write_pairs(path: Path) -> None:

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
-import base64
 import json
 import re
-import struct
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -218,42 +216,6 @@ def test_best_method_comes_first_and_best_values_are_marked(page: Page) -> None:
     assert "mean_reprojection_error_px" not in best  # the same in both
 
 
-def test_matrices_of_the_script_have_the_inliers(page: Page, comparison: Comparison) -> None:
-    names = comparison.image_names
-    best_first = comparison.finished[::-1]
-    for text, method in zip(page.data["matrices"], best_first, strict=True):
-        counts = np.frombuffer(base64.b64decode(text), "<u2").reshape(len(names), len(names))
-        expected = np.zeros_like(counts)
-        for (name1, name2), count in method.seeds[0].pair_inliers.items():
-            row, column = names.index(name1), names.index(name2)
-            expected[row, column] = expected[column, row] = count
-        np.testing.assert_array_equal(counts, expected)
-
-
-def test_more_photographs_than_fit_into_a_matrix_have_the_table_only(
-    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("colmap_affrect.report.view_graph.MAX_NUM_IN_MATRIX", len(NAMES) - 1)
-    html = write_page(comparison, tmp_path).read_text(encoding="utf-8")
-    assert "data-matrix=" not in html
-    assert "Table of verified pairs" in html
-
-
-def test_models_are_drawn_in_one_frame(page: Page) -> None:
-    default, sift = page.data["views"]
-    assert [len(view["cameras"]) for view in (sift, default)] == [4, 5]
-    of_default = {camera["index"]: camera["corners"] for camera in default["cameras"]}
-    centers = []
-    for camera in sift["cameras"]:
-        np.testing.assert_allclose(camera["corners"], of_default[camera["index"]], atol=2e-3)
-        centers.append(camera["corners"][:3])
-    assert np.ptp(centers, axis=0).max() > 0.3
-    data = base64.b64decode(default["points"])
-    assert len(data) == 9 * default["count"]
-    places = np.array(struct.unpack(f"<{3 * default['count']}H", data[: 6 * default["count"]]))
-    assert places.reshape(-1, 3).std(axis=0).min() > 500  # points all around, as synthesized
-
-
 def test_matches_lie_where_the_features_are(comparison: Comparison, folder: Path) -> None:
     pair = (NAMES[0], NAMES[1])
     methods = choose_pairs(comparison.finished, ["default"])[pair]
@@ -304,19 +266,6 @@ def test_what_is_missing_is_said_in_its_place(tmp_path: Path) -> None:
     page = Page(write_page(failed, tmp_path).read_text(encoding="utf-8"))
     assert "sift failed: it <broke>" in page.text
     assert "No method finished" in page.text
-
-
-def test_bars_of_wrong_poses_are_explained_where_there_are_any(
-    page: Page, comparison: Comparison, tmp_path: Path
-) -> None:
-    explanation = "The orange rest of a bar"
-    assert explanation not in page.text
-    sift = comparison.finished[0]
-    seeds = [
-        replace(s, scores=s.scores and replace(s.scores, correct_names=())) for s in sift.seeds
-    ]
-    wrong = replace(comparison, methods=(replace(sift, seeds=tuple(seeds)),))
-    assert explanation in write_page(wrong, tmp_path).read_text(encoding="utf-8")
 
 
 def test_lost_models_and_databases_are_said_in_their_place(
