@@ -24,23 +24,11 @@ from colmap_affrect.project.outputs import remove_database
 
 logger = logging.getLogger(__name__)
 
-FIRST_TYPED_SCHEMA = 4_000_000  # descriptors have a type since COLMAP 4.0
-
 
 def schema_version(path: Path) -> int:
     """Return the version of the tables, e.g. 4020100 for COLMAP 4.2.1; OptionError if no file."""
     with open_read_only(path) as connection:
         return int(connection.execute("PRAGMA user_version").fetchone()[0])
-
-
-def is_stamped(path: Path) -> bool:
-    """Tell whether an older COLMAP has put its own version on a database of COLMAP 4.
-
-    It does so when it opens one, before it fails at the tables, and changes nothing else.
-    """
-    with open_read_only(path) as connection:
-        columns = columns_of(connection, "descriptors")
-    return schema_version(path) < FIRST_TYPED_SCHEMA and "type" in columns
 
 
 @cache

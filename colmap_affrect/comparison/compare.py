@@ -21,14 +21,13 @@ from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.colmap.poses import Poses, read_poses
-from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
-from colmap_affrect.comparison.methods import SIFT_COLMAP, Method, parse_methods, without_weights
+from colmap_affrect.comparison.methods import Method, parse_methods, without_weights
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.pose_scores import disagreeing_images, pose_scores
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.tables import to_json
-from colmap_affrect.comparison.task import Layout, MethodTask
+from colmap_affrect.comparison.task import CompareOptions, Layout, MethodTask
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
 from colmap_affrect.features.weights import install_hint, resolve
 from colmap_affrect.mappers.base import MAPPERS
@@ -36,7 +35,6 @@ from colmap_affrect.options import Options
 from colmap_affrect.pairs.base import Pair, PairOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.parallel.subprocesses import child
-from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import Contents
@@ -44,28 +42,8 @@ from colmap_affrect.project.differences import first_difference
 from colmap_affrect.project.outputs import new_results, remove_own
 from colmap_affrect.project.versions import installed_versions
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import DEFAULT_MAPPERS
 
-DEFAULT_SEEDS = (0, 1, 2)
 NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareOptions(InputOptions):
-    """Everything a comparison depends on beside its images and its output folder.
-
-    The other attributes are those of :class:`~colmap_affrect.pipeline.InputOptions`.
-
-    Attributes:
-        methods: names of methods as the command line takes them, or methods; None for those that
-            need no weights, and learned ones whose weights are there.
-        seeds: of verification and mapping, which run once for each.
-        ground_truth_path: folder of a COLMAP model with true poses, in any frame; None for none.
-    """
-
-    methods: Sequence[str | Method] | None = None
-    seeds: Sequence[int] = DEFAULT_SEEDS
-    ground_truth_path: Path | None = None
 
 
 def compare(
@@ -86,7 +64,10 @@ def compare(
     options = options or CompareOptions()
     Workspace(output_path).require_own(image_path)
     plan = _Plan.checked(image_path, Layout(output_path), options)
-    tasks = plan.tasks()
+    tasks = [
+        MethodTask(method, output_path.resolve(), image_path.resolve(), plan.options)
+        for method in plan.methods
+    ]
     todo = [item.method.recipe for item in tasks if overwrite or not item.finished()]
     keys = {key for recipe in todo if recipe for key in recipe.weights}
     resolve(sorted(keys), options.resources.weights_path, progress=progress)
@@ -192,30 +173,6 @@ class _Plan:
             "verification": self.inputs["verification"],
             "mapping": self.inputs["mapping"],
         }
-
-    def tasks(self) -> list[MethodTask]:
-        """Return what is to be done for each method."""
-        options = self.options
-        mapper = MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset("colmap")
-        colmaps = VerificationOptions.preset("colmap"), mapper, False
-        ours = options.verification, options.mapping, options.holds_vote
-        tasks = []
-        for method in self.methods:
-            verification, mapping, focal_vote = colmaps if method.label == SIFT_COLMAP else ours
-            task = MethodTask(
-                method=method,
-                output_path=self.layout.path.resolve(),
-                image_path=self.image_path.resolve(),
-                masks=options.masks,
-                verification=verification,
-                mapping=mapping,
-                focal_vote=focal_vote,
-                may_share=options.cameras.mode == "auto",
-                seeds=tuple(options.seeds),
-                resources=options.resources,
-            )
-            tasks.append(task)
-        return tasks
 
 
 def _without_seed(options: Options) -> dict[str, Any]:

@@ -5,18 +5,34 @@ import textwrap
 from collections.abc import Sequence
 from itertools import zip_longest
 
-from colmap_affrect.comparison.results import Comparison, MethodResult, Span
+from colmap_affrect.comparison.method_table import columns_of, summary_rows
+from colmap_affrect.comparison.results import Comparison
 from colmap_affrect.comparison.verdict import verdict
 
 WIDTH = 88
 
 
+SHOWN = {
+    "registered": "registered", "correct": "correct", "verified_pairs": "verified",
+    "points3D": "points", "mean_track_length": "track", "mean_reprojection_error_px": "px",
+    "total_s": "seconds", "peak_memory_bytes": "MB",
+}  # fmt: skip
+"""Lines of the table of methods that the terminal shows, as columns, and their short titles."""
+
+
 def summary(comparison: Comparison) -> str:
     """Return the verdict under a table of methods."""
-    columns = ["method", "registered", "verified", "points", "track", "px", "seconds", "MB"]
-    if comparison.has_ground_truth:
-        columns.insert(2, "correct")
-    lines = [aligned([columns, *(_row(method, comparison) for method in comparison.methods)])]
+    columns = columns_of(comparison)
+    rows = [row for row in summary_rows(columns, comparison) if row.key in SHOWN]
+    cells = {
+        column.name: [
+            f"{row.cells[index]}{f' of {len(comparison.image_names)}' * (row.key == 'registered')}"
+            for row in rows
+        ]
+        for index, column in enumerate(columns)
+    }
+    table = [[method.name, *cells.get(method.name, ["failed"])] for method in comparison.methods]
+    lines = [aligned([["method", *(SHOWN[row.key] for row in rows)], *table])]
     only = comparison.only_registered_by if len(comparison.finished) > 1 else {}
     lines += [""] * bool(only)
     lines += [f"only {method} registers {name}" for name, method in only.items()]
@@ -40,30 +56,6 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
         ).rstrip()
         for row in rows
     )
-
-
-def _row(method: MethodResult, comparison: Comparison) -> list[str]:
-    if method.failed:
-        return [method.name, "failed"]
-    return [
-        method.name,
-        f"{_span(method.registered)} of {len(comparison.image_names)}",
-        *([_span(method.correct)] if comparison.has_ground_truth else []),
-        _span(method.span("verified_pairs")),
-        _mean(method.span("points3D"), 0),
-        _mean(method.span("mean_track_length"), 2),
-        _mean(method.span("mean_reprojection_error_px"), 2),
-        f"{method.total_s:.1f}",
-        f"{method.peak_memory_bytes / 1e6:.0f}",
-    ]
-
-
-def _mean(span: Span | None, digits: int) -> str:
-    return f"{span.mean:.{digits}f}" if span else "-"
-
-
-def _span(span: Span | None) -> str:
-    return span.text("{0.mean:.1f} [{0.min:g}-{0.max:g}]") if span else "-"
 
 
 def to_json(comparison: Comparison) -> str:

@@ -48,10 +48,6 @@ TEXTS: dict[str, Check] = CHECKS | {
         "has the tables of an older COLMAP (schema {version}, now {newest}); COLMAP 4 and pycolmap "
         "change them as soon as they open it, and an older COLMAP cannot read it any more",
         "keep a copy: cp {path} {copy}"),
-    "stamped": ("note",
-        "is of COLMAP 4, and an older COLMAP that failed to open it has put its own version on it "
-        "(schema {version}); nothing is lost, and COLMAP 4 or pycolmap puts it right",
-        "for an older COLMAP: colmap-affrect export-database {path} {copy}"),
     "database-damaged": ("error", "{error}", f"{RECOVER} of it; else make it anew"),
     # an output folder
     "foreign-folder": ("note",

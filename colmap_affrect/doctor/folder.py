@@ -12,7 +12,6 @@ from colmap_affrect.colmap.checks import CHECKS, check_database, check_image_fil
 from colmap_affrect.colmap.database import geometry_digest
 from colmap_affrect.colmap.database_copy import (
     copy_as_it_is,
-    is_stamped,
     newest_schema_version,
     schema_version,
 )
@@ -82,9 +81,8 @@ def _examined_copy(
             yield None
             return
         if version < newest:
-            kind = "stamped" if is_stamped(path) else "old-schema"
             kept = path.with_suffix(".old.db")
-            findings.add(kind, path, version=version, newest=newest, path=path, copy=kept)
+            findings.add("old-schema", path, version=version, newest=newest, path=path, copy=kept)
         try:
             tables, problems = check_database(copy)
         except DatabaseError as error:

@@ -14,9 +14,12 @@ from command import Call
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
-from colmap_affrect.colmap.database_copy import copy_with_frames, copy_without_features, is_stamped
+from colmap_affrect.colmap.database_copy import (
+    copy_with_frames,
+    copy_without_features,
+    schema_version,
+)
 from colmap_affrect.colmap.old_databases import MAPPER_OPTIONS, export_database
-from colmap_affrect.doctor import diagnose
 from colmap_affrect.errors import DatabaseError
 
 GPS = np.array([47.5, 8.25, 400.0])
@@ -178,26 +181,6 @@ def test_positions_of_old_databases_are_pose_priors_of_the_copy(
 
 
 @pytest.mark.long
-def test_doctor_tells_an_old_database_from_one_that_an_old_colmap_stamped(
-    source: Path, tmp_path: Path
-) -> None:
-    export_database(source, tmp_path / "old.db")
-    stamped = Path(shutil.copy(source, tmp_path / "stamped.db"))
-    with closing(sqlite3.connect(stamped)) as connection:
-        connection.execute("PRAGMA user_version = 3800")
-    said = {
-        path.name: " ".join(finding.what for finding in diagnose(path).findings)
-        for path in (source, tmp_path / "old.db", stamped)
-    }
-    assert "older COLMAP" not in said["new.db"]
-    assert "has the tables of an older COLMAP (" in said["old.db"]
-    assert "has put its own version on it (schema 3800); nothing is lost" in said["stamped.db"]
-    copy_with_frames(stamped, tmp_path / "copy.db")
-    with open_database(tmp_path / "copy.db") as copy, open_database(source) as database:
-        assert copy.num_verified_image_pairs() == database.num_verified_image_pairs()
-
-
-@pytest.mark.long
 @pytest.mark.skipif(not OLD_COLMAP, reason="the program colmap is not on PATH")
 def test_the_program_colmap_works_on_what_is_exported(source: Path, tmp_path: Path) -> None:
     def colmap(*arguments: str | Path) -> str:
@@ -220,6 +203,6 @@ def test_the_program_colmap_works_on_what_is_exported(source: Path, tmp_path: Pa
     text = colmap("model_analyzer", "--path", tmp_path / "sparse" / "0")
     assert f"Registered images: {NUM_IMAGES}" in text
     colmap("database_cleaner", *given, "--type", "features")
-    assert not is_stamped(tmp_path / "old.db")
+    assert schema_version(tmp_path / "old.db") == 3800
     assert rows(tmp_path / "old.db", "SELECT count(*) FROM keypoints") == [(0,)]
     assert rows(tmp_path / "old.db", "SELECT count(*) FROM images") == [(NUM_IMAGES,)]
