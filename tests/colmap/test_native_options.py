@@ -54,7 +54,7 @@ def test_option_is_converted_to_pycolmaps_type_and_taken_by_pycolmap(
         ("incremental", "min_model_size", "2.5", "min_model_size=2.5: expected int"),
         ("incremental", "min_model_size", "9" * 11, "outside the range of int"),
         ("incremental", "init_max_error", "nan", "expected float (a finite number)"),
-        ("incremental", "multiple_models", "yes", "expected bool (true or false)"),
+        ("incremental", "multiple_models", "maybe", "expected bool (true or false)"),
         ("incremental", "ba_local_backend", "GPU", "expected one of CERES, CASPAR"),
         ("global", "gravity_dir", "1", "of type ndarray"),
         ("incremental", "image_path", "x", "it is the one that extract was given"),
