@@ -82,11 +82,11 @@ def copy_database(
     remove_database(new)
     try:
         copy_as_it_is(source, new)
-        left_out = leave_out_useless(new) if has_useless else ""
-        if left_out:
-            logger.warning("%s: %s", source, left_out)
         positions = _old_positions(new)
         with open_database(new) as database:  # COLMAP migrates it
+            left_out = leave_out_useless(database) if has_useless else ""
+            if left_out:
+                logger.warning("%s: %s", source, left_out)
             _add_positions(database, positions)
             if change:
                 change(database)

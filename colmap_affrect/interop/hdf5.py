@@ -121,8 +121,8 @@ def import_h5(
                 f"mode {cameras.mode} allows): {listed(lost)}"
             )
         _fill_database(new, files, pixel_origin, progress)
-        useless = leave_out_useless(new)
         with open_database(new) as database:
+            useless = leave_out_useless(database)
             counts = database.num_keypoints(), len(files.pairs), database.num_matches()
         without = sorted(set(names) - set(rejected) - files.keys.keys())
         notes = [
