@@ -90,7 +90,7 @@ def compare(
             versions=installed_versions(),
         )
         replace_text(output_path / "comparison.json", to_json(comparison))
-        write_page(comparison, output_path, progress, options.resources)
+        write_page(comparison, output_path, progress)
     return comparison
 
 
