@@ -129,28 +129,6 @@ def test_methods_register_the_scene_and_one_fails_with_its_reason(compared) -> N
     assert any(text.startswith("depth-planes-recommended failed: ") for text in verdict(comparison))
 
 
-def test_figures_equal_those_of_the_models_on_disk(compared) -> None:
-    comparison, out = compared
-    for method in comparison.finished:
-        for seed in method.seeds:
-            model = pycolmap.Reconstruction(out / seed.model_path)
-            images = [model.images[image_id] for image_id in model.reg_image_ids()]
-            assert seed.registered_names == tuple(sorted(image.name for image in images))
-            lengths = [len(point.track.elements) for point in model.points3D.values()]
-            assert seed.num_points3D == len(lengths)
-            assert seed.mean_track_length == pytest.approx(fmean(lengths))
-            assert seed.mean_observations == pytest.approx(sum(lengths) / len(images))
-            assert sum(seed.num_observations.values()) == sum(lengths)
-            errors = [point.error for point in model.points3D.values()]
-            assert seed.mean_reprojection_error_px == pytest.approx(fmean(errors))
-            assert all(count >= 20 for count in seed.pair_inliers.values())
-            with open_copy(out / method.folder / f"seed-{seed.seed}" / "database.db") as database:
-                ids = {image.name: image.image_id for image in database.read_all_images()}
-                for (first, second), count in seed.pair_inliers.items():
-                    geometry = database.read_two_view_geometry(ids[first], ids[second])
-                    assert count == len(geometry.inlier_matches)
-
-
 def test_methods_had_the_same_cameras_images_and_pairs(compared) -> None:
     comparison, out = compared
     shared = []

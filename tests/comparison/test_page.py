@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -24,14 +23,7 @@ VOID = {"meta", "img", "link", "br", "hr", "input"}
 
 
 class Page(HTMLParser):
-    """Reads a page; fails on tags that are not balanced.
-
-    Attributes:
-        tags: all tags with their attributes.
-        text: all that is shown or run.
-        cells: text of the table of methods by metric and method.
-        data: what the script reads.
-    """
+    """Reads a page, whose tags must be balanced: tags, text, cells of the table of methods."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -49,8 +41,6 @@ class Page(HTMLParser):
             for attributes, text in self._texts
             if "data-metric" in attributes
         }
-        (data,) = [text for attributes, text in self._texts if attributes.get("id") == "data"]
-        self.data = json.loads(data)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))

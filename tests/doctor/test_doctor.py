@@ -105,17 +105,6 @@ def unmatch(file: h5py.File) -> None:
     del file["a.png/b c.png"]
 
 
-def zero(file: h5py.File) -> None:
-    file["a.png/b c.png/matches0"][:9] = 0
-
-
-def flip(path: Path) -> None:
-    """Change a digit in the middle."""
-    text = path.read_text()
-    place = next(k for k in range(len(text) // 2, len(text)) if text[k].isdigit())
-    path.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :])
-
-
 def edit_model(path: Path) -> None:
     model = pycolmap.Reconstruction(path)
     model.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(), np.zeros(3)))
@@ -186,16 +175,6 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
         Finding("error", "{out}/sparse/0", "points3D.bin: damaged",
                 "run 'colmap-affrect map --output-path {out} --overwrite'"),
     ),
-    "cameras": (
-        lambda f: flip(f.out / "cameras.json"),
-        Finding("error", "{out}/cameras.json", "not as it was written",
-                "verify --output-path {out} --overwrite"),
-    ),
-    "a page of matches": (
-        lambda f: break_h5(f.out / "matches.h5", zero),
-        Finding("error", "{out}/matches.h5", "/a.png/b c.png/matches0 is not as it was written",
-                "match --output-path {out} --overwrite"),
-    ),
     "list of pairs cut": (
         lambda f: (f.out / "pairs.txt").write_text("a.png\tb c.png\n"),
         Finding("error", "{out}/pairs.txt", "is not the list whose pairs were matched", "match"),
@@ -255,23 +234,6 @@ def test_folder_in_use_is_left_alone(folders: Folders) -> None:
     assert found.severity == "warning"
     assert "another colmap-affrect is working in this folder" in found.what
     assert found.advice == "run doctor again when it is done"
-
-
-@pytest.mark.parametrize(("change", "severity"), [(-1, "note"), (1, "error")])
-def test_schema_of_another_version_is_found_and_not_migrated(
-    folders: Folders, change: int, severity: str
-) -> None:
-    with closing(sqlite3.connect(folders.database)) as connection:
-        version = connection.execute("PRAGMA user_version").fetchone()[0] + change
-        connection.execute(f"PRAGMA user_version = {version}")
-        connection.execute("PRAGMA journal_mode = DELETE")
-    before = folders.database.read_bytes()
-    (found,) = findings(folders.database)
-    assert found.severity == severity
-    assert str(version) in found.what
-    assert ("keep a copy: cp " in found.advice) == (change < 0)
-    assert folders.database.read_bytes() == before
-    assert not list(folders.out.glob("database.db-*"))
 
 
 def test_what_is_no_database_is_one_error(tmp_path: Path, folders: Folders) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -232,13 +231,9 @@ ERRORS: dict[str, tuple[Callable[[Files], object], str]] = {
     ),
     "data in another file": (outside_data, r"not followed: a\.png/keypoints"),
     "huge": (huge, "too large to be true"),
-    "text": (change_features(keypoints=np.full((3, 2), b"x")), "does not hold numbers"),
     "frames of others": (
         change_features(lafs=np.zeros((4, 2, 3))),
         r"a\.png/lafs has shape \(4, 2, 3\), expected \(3, 2, 3\)",
-    ),
-    "negative scale": (
-        change_features(scales=[1.0, -1.0, 1.0], oris=np.zeros(3)), "scales holds negative"
     ),
     "other size": (
         change_features(image_size=[48, 64]),
@@ -283,14 +278,3 @@ def test_matches_of_another_layout_than_asked_for_are_refused(files: Files) -> N
         files.import_all(layout="hloc")
     with pytest.raises(OptionError, match="layout 'kapture': not one of auto, hloc, dim"):
         files.import_all(layout="kapture")
-
-
-@pytest.mark.parametrize(("width", "fits"), [(2051, True), (2057, False)])
-def test_size_in_float16_is_compared_as_it_is_rounded(files: Files, width: int, fits: bool) -> None:
-    """As deep-image-matching writes it: 2051 px are stored as 2052."""
-    write_photos(files.photos, ["a.png"], (width, 8))
-    group = hloc_group(1, image_size=np.array([2051, 8], np.float16))
-    write_h5(files.features, {"a.png": group})
-    write_h5(files.matches, {})
-    with nullcontext() if fits else pytest.raises(StoreError, match="was 2052 x 8 px"):
-        files.import_all()

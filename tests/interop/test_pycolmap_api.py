@@ -196,22 +196,11 @@ def test_options_of_verification_come_from_pycolmap_or_a_dictionary(
     colmap_affrect.match_exhaustive(path, verification_options=pycolmaps)
     recorded = recorded_verification(Workspace.beside(path))
     assert (recorded.min_num_inliers, recorded.max_error_px) == (31, 2.5)
-    with pytest.raises(StaleStoreError, match="random_seed=0, and it is 3 now"):
-        colmap_affrect.match_exhaustive(path, verification_options=pycolmaps, random_seed=3)
     with pytest.raises(StaleStoreError, match=r"max_error_px=2\.5, and it is 3\.0 now; use a new"):
         colmap_affrect.match_exhaustive(path)
     with pytest.raises(OptionError, match="multiple_models=True cannot be carried over"):
-        colmap_affrect.match_exhaustive(
-            path, verification_options=pycolmap.TwoViewGeometryOptions(multiple_models=True)
-        )
-    with pytest.raises(OptionError, match="unknown option 'max_err'"):
-        colmap_affrect.match_exhaustive(path, verification_options={"max_err": 1})
-    for options, message in (
-        ({"max_ratio": 3.0}, "^matching_options: max_ratio=3.0 is outside .0.1, 1.$"),
-        ({"max_rato": 0.8}, "^matching_options: unknown option 'max_rato'"),
-        (3, "^matching_options: int does not apply here; give colmap_affrect.NearestOptions or"),
-    ):
-        with pytest.raises(OptionError, match=message):
-            colmap_affrect.match_exhaustive(path, options)
+        colmap_affrect.match_exhaustive(path, verification_options={"multiple_models": True})
+    with pytest.raises(OptionError, match=r"^matching_options: int does not apply here; give colm"):
+        colmap_affrect.match_exhaustive(path, 3)
     with pytest.raises(PairListError, match="give match_list_path"):
         colmap_affrect.match_image_pairs(path)

@@ -19,7 +19,7 @@ import colmap_affrect
 from colmap_affrect import pycolmap as replaced
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.errors import AffrectError, DeviceError, OptionError
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.interop.pycolmap_options import (
     HONOURED,
     changes,
@@ -212,26 +212,6 @@ def test_cancelled_token_stops_and_what_is_done_is_kept(photos: Path, tmp_path: 
     assert (report.num_done, report.num_kept) == (len(NAMES) - 1, 1)
     with pytest.raises(InterruptedError):
         replaced.match_exhaustive(path, cancellation_token=token)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("options", "device", "message"),
-    [
-        ({}, "cuda", "finds no CUDA device"),
-        ({"gpu_index": "0"}, pycolmap.Device.cuda, "--device cuda:0: torch finds no CUDA device"),
-        ({"gpu_index": "0,1"}, "cuda", "gpu_index=0,1: give the number of one GPU"),
-    ],
-)
-def test_gpu_that_is_not_there_is_refused(
-    extracted: Path, options: dict[str, Any], device: Any, message: str
-) -> None:
-    import torch
-
-    if torch.cuda.is_available():
-        pytest.skip("there is a GPU")
-    with pytest.raises((DeviceError, OptionError), match=message):
-        replaced.match_exhaustive(extracted, options, device=device)
 
 
 def test_names_of_pycolmap_say_what_replaces_them() -> None:
