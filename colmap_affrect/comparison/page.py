@@ -7,15 +7,15 @@ from math import log
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.comparison.method_table import (
+from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, MAX_CORRECT_ERROR_DEG
+from colmap_affrect.comparison.results import Comparison, MethodResult
+from colmap_affrect.comparison.tables import (
     Column,
     columns_of,
     digits_of,
     span_text,
     summary_rows,
 )
-from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, MAX_CORRECT_ERROR_DEG
-from colmap_affrect.comparison.results import Comparison, MethodResult
 from colmap_affrect.comparison.verdict import cautions, changes, headline, is_rectified, wrong_poses
 from colmap_affrect.options import flat
 from colmap_affrect.pairs.base import Pair

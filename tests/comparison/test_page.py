@@ -12,9 +12,9 @@ from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
-from colmap_affrect.comparison.method_table import columns_of
 from colmap_affrect.comparison.page import cards_of, choose_pairs, plot_pairs, write_page
 from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
+from colmap_affrect.comparison.tables import columns_of
 from colmap_affrect.comparison.verdict import verdict
 from colmap_affrect.report.match_plots import PLOT_HEIGHT
 from colmap_affrect.report.pictures import Picture

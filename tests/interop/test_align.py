@@ -11,8 +11,7 @@ from exported_model import write_model
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
-from colmap_affrect.interop.align import Reference, align
-from colmap_affrect.interop.georeference import Georeference
+from colmap_affrect.interop.align import Georeference, Reference, align
 
 ORIGIN = Georeference(49.5, 15.25, 300.0)
 TRUE_FROM_OLD = pycolmap.Sim3d(

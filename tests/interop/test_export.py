@@ -13,8 +13,8 @@ from exported_model import NAMES, write_model, write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.interop.align import Georeference
 from colmap_affrect.interop.export import FORMATS, export
-from colmap_affrect.interop.georeference import Georeference
 
 
 @pytest.fixture
