@@ -8,7 +8,6 @@ import sqlite3
 import struct
 from collections import defaultdict
 from collections.abc import Collection, Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Any, Literal
 
@@ -135,8 +134,7 @@ def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> Problems:
     It is only read; ``kinds`` of problems are keys of ``CHECKS``, and DatabaseError has one line.
     Returns all other problems.
     """
-    with open_read_only(path) as connection:
-        _, problems = _check(connection, path)
+    _, problems = check_database(path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         _, what, advice = CHECKS[kind]
         items = such_as(problems[kind])
@@ -145,12 +143,9 @@ def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> Problems:
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:
-    """Check a database that nobody is writing to; DatabaseError if damaged."""
-    try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
-            return _check(connection, path)
-    except DAMAGED as error:
-        raise DatabaseError(f"{path}: damaged ({error})") from error
+    """Check a database, which is only read; DatabaseError if damaged."""
+    with open_read_only(path) as connection:
+        return _check(connection, path)
 
 
 def _check(connection: sqlite3.Connection, path: Path) -> tuple[Tables, Problems]:

@@ -41,18 +41,24 @@ def newest_schema_version() -> int:
         return schema_version(path)
 
 
+def refuse_newer(path: Path) -> int:
+    """Return the version of the tables; DatabaseError if pycolmap does not know it."""
+    version, newest = schema_version(path), newest_schema_version()
+    if version > newest:
+        raise DatabaseError(
+            f"{path}: was made by a newer COLMAP (schema {version}, pycolmap "
+            f"{pycolmap.__version__} knows {newest}); update pycolmap"
+        )
+    return version
+
+
 def copy_as_it_is(source: Path, target: Path) -> None:
     """Copy a database as it is now, including its write-ahead log, with the schema that it has.
 
     Raises OptionError when there is none, DatabaseError unless it is an intact one of a COLMAP that
     is not newer than pycolmap.
     """
-    version, newest = schema_version(source), newest_schema_version()
-    if version > newest:
-        raise DatabaseError(
-            f"{source}: was made by a newer COLMAP (schema {version}, pycolmap "
-            f"{pycolmap.__version__} knows {newest}); update pycolmap"
-        )
+    refuse_newer(source)
     try:
         with open_read_only(source) as original, closing(sqlite3.connect(target)) as copy:
             original.backup(copy)

@@ -1,20 +1,17 @@
-"""Examines output folders, and COLMAP databases in a copy."""
+"""Examines output folders and COLMAP databases, which are only read."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import CHECKS, check_database, check_image_files
 from colmap_affrect.colmap.database import geometry_digest
-from colmap_affrect.colmap.database_copy import (
-    copy_as_it_is,
-    newest_schema_version,
-    schema_version,
-)
+from colmap_affrect.colmap.database_copy import copy_as_it_is, newest_schema_version, refuse_newer
 from colmap_affrect.colmap.model_files import SUMMARY, registered_names
 from colmap_affrect.doctor.findings import (
     MATCH_AGAIN,
@@ -56,48 +53,39 @@ Read = TypeVar("Read")
 LEFTOVERS = ("*.new", "*.partial", f"*{NEW_SUFFIX}")
 
 
-def examine_database(findings: Findings, path: Path, image_path: Path | None) -> None:
-    """Examine a COLMAP database, and the sizes of its photographs if their folder is given."""
-    with _examined_copy(findings, path, image_path, {}):
-        pass
-
-
-@contextmanager
-def _examined_copy(
-    findings: Findings, path: Path, image_path: Path | None, own_advice: Mapping[str, str]
-) -> Iterator[Path | None]:
-    """Examine a copy of a database and yield it, None if it cannot be used.
+def examine_database(
+    findings: Findings,
+    path: Path,
+    image_path: Path | None,
+    own_advice: Mapping[str, str] = MappingProxyType({}),
+) -> bool:
+    """Examine a COLMAP database, and the sizes of its photographs if their folder is given.
 
     ``own_advice`` says what to do about a problem by its kind, where it is not what ``TEXTS`` says.
+    Returns whether the database can be used.
     """
-    with TemporaryDirectory() as temporary:
-        copy = Path(temporary) / "database.db"
-        try:
-            version, newest = schema_version(path), newest_schema_version()
-            copy_as_it_is(path, copy)
-        except DatabaseError as error:
-            message = without_path(path, error).replace(str(copy), "a temporary file")
-            findings.add("no-database", path, error=message)
-            yield None
-            return
-        if version < newest:
-            kept = path.with_suffix(".old.db")
-            findings.add("old-schema", path, version=version, newest=newest, path=path, copy=kept)
-        try:
-            tables, problems = check_database(copy)
-        except DatabaseError as error:
-            findings.add("database-damaged", path, error=without_path(copy, error))
-            yield None
-            return
-        findings.checked.append(f"{path}: {tables.summary()}")
-        if image_path is not None:
-            sizes = _file_sizes(image_path, tables.names.values(), findings.progress)
-            problems |= check_image_files(tables, image_path, sizes)
-            findings.checked.append(f"{image_path}: sizes of {len(sizes)} photographs")
-        for kind in sorted(problems, key=list(CHECKS).index):
-            advice = own_advice.get(kind, "")
-            findings.add(kind, path, problems[kind], advice=advice, path=path, folder=path.parent)
-        yield copy
+    try:
+        version, newest = refuse_newer(path), newest_schema_version()
+    except DatabaseError as error:
+        findings.add("no-database", path, error=without_path(path, error))
+        return False
+    if version < newest:
+        kept = path.with_suffix(".old.db")
+        findings.add("old-schema", path, version=version, newest=newest, path=path, copy=kept)
+    try:
+        tables, problems = check_database(path)
+    except DatabaseError as error:
+        findings.add("database-damaged", path, error=without_path(path, error))
+        return False
+    findings.checked.append(f"{path}: {tables.summary()}")
+    if image_path is not None:
+        sizes = _file_sizes(image_path, tables.names.values(), findings.progress)
+        problems |= check_image_files(tables, image_path, sizes)
+        findings.checked.append(f"{image_path}: sizes of {len(sizes)} photographs")
+    for kind in sorted(problems, key=list(CHECKS).index):
+        advice = own_advice.get(kind, "")
+        findings.add(kind, path, problems[kind], advice=advice, path=path, folder=path.parent)
+    return True
 
 
 def _file_sizes(
@@ -163,15 +151,17 @@ class _FolderExamination:
             return
         own_advice = {} if self.workspace.users_database else OWN_ADVICE
         edits = None if self.workspace.users_database else edits_of(database)
-        with _examined_copy(self.found, database, image_path, own_advice) as copy:
-            if copy is None:
-                return
-            if edits and str(edits):
-                self._add("database-changed", database, edits=edits)
-            elif features is not None and "match" in done:
-                self._matches(sorted(images.union(features)))
-            if inputs and not inputs.startswith(geometry_digest(copy)):
-                self._add("map-stale", self.workspace.sparse)
+        if not examine_database(self.found, database, image_path, own_advice):
+            return
+        if edits and str(edits):
+            self._add("database-changed", database, edits=edits)
+        elif features is not None and "match" in done:
+            self._matches(sorted(images.union(features)))
+        if inputs:
+            with TemporaryDirectory() as folder:  # COLMAP would change the original
+                copy_as_it_is(database, copy := Path(folder) / database.name)
+                if not inputs.startswith(geometry_digest(copy)):
+                    self._add("map-stale", self.workspace.sparse)
 
     def _add(self, kind: str, where: Path, **values: Any) -> None:
         self.found.add(kind, where, folder=self.workspace.path, **values)
