@@ -25,7 +25,7 @@ from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
 from colmap_affrect.comparison.methods import Method, parse_methods, without_weights
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.pose_scores import disagreeing_images, pose_scores
-from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
+from colmap_affrect.comparison.results import Comparison, MethodResult
 from colmap_affrect.comparison.tables import to_json
 from colmap_affrect.comparison.task import CompareOptions, Layout, MethodTask
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
@@ -282,34 +282,30 @@ def _run(task: MethodTask, progress: Progress, title: str) -> MethodResult:
 
 def _measured(results: Sequence[MethodResult], plan: _Plan) -> tuple[MethodResult, ...]:
     """Add what needs the models: scores against ground truth, and where models contradict."""
-
-    def poses_of(seed: SeedResult) -> Poses:
-        return read_poses(plan.layout.path / seed.model_path) if seed.model_path else {}
-
-    def scored(seed: SeedResult, poses: Poses) -> SeedResult:
-        truth = plan.truth
-        return (
-            seed if truth is None else replace(seed, scores=pose_scores(poses, truth, plan.names))
-        )
-
-    all_poses = {result.name: [poses_of(seed) for seed in result.seeds] for result in results}
-    measured = []
+    folder, truth, measured = plan.layout.path, plan.truth, []
+    all_poses = {
+        result.name: [
+            read_poses(folder / seed.model_path) if seed.model_path else {} for seed in result.seeds
+        ]
+        for result in results
+    }
     for result in results:
-        poses = all_poses[result.name]
+        poses, seeds = all_poses[result.name], result.seeds
         first, *later = poses or [{}]
+        if truth is not None:
+            scores = (pose_scores(each, truth, plan.names) for each in poses)
+            seeds = tuple(map(lambda seed, each: replace(seed, scores=each), seeds, scores))
+        unstable = {image for other in later for image in disagreeing_images(first, other)}
         others = {
             name: disagreeing_images(first, other[0])
             for name, other in all_poses.items()
             if other and name != result.name
         }
-        measured.append(
-            replace(
-                result,
-                seeds=tuple(map(scored, result.seeds, poses)),
-                unstable_names=tuple(
-                    sorted({image for other in later for image in disagreeing_images(first, other)})
-                ),
-                disagreements={other: images for other, images in others.items() if images},
-            )
+        found = replace(
+            result,
+            seeds=seeds,
+            unstable_names=tuple(sorted(unstable)),
+            disagreements={other: images for other, images in others.items() if images},
         )
+        measured.append(found)
     return tuple(measured)
