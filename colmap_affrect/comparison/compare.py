@@ -293,19 +293,23 @@ def _measured(results: Sequence[MethodResult], plan: _Plan) -> tuple[MethodResul
         poses, seeds = all_poses[result.name], result.seeds
         first, *later = poses or [{}]
         if truth is not None:
-            scores = (pose_scores(each, truth, plan.names) for each in poses)
-            seeds = tuple(map(lambda seed, each: replace(seed, scores=each), seeds, scores))
+            seeds = tuple(
+                replace(seed, scores=pose_scores(found, truth, plan.names))
+                for seed, found in zip(seeds, poses, strict=True)
+            )
         unstable = {image for other in later for image in disagreeing_images(first, other)}
         others = {
             name: disagreeing_images(first, other[0])
             for name, other in all_poses.items()
             if other and name != result.name
         }
-        found = replace(
-            result,
-            seeds=seeds,
-            unstable_names=tuple(sorted(unstable)),
-            disagreements={other: images for other, images in others.items() if images},
+        contradicted = {other: images for other, images in others.items() if images}
+        measured.append(
+            replace(
+                result,
+                seeds=seeds,
+                unstable_names=tuple(sorted(unstable)),
+                disagreements=contradicted,
+            )
         )
-        measured.append(found)
     return tuple(measured)
