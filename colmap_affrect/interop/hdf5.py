@@ -222,15 +222,13 @@ def export_h5(
     half: bool = False,
     progress: Progress = SILENT,
 ) -> InterchangeReport:
-    """Write features and raw matches of an output folder of ours or a database.
+    """Write features and raw matches of an output folder of ours or a database, which stay so.
 
     Features keep their indices. ``scales`` and ``oris`` are those of hloc: sigma in px, and degrees
-    from x towards y. Descriptors are of unit length. Scores, which a database does not have, are 1
-    then. The database is copied first and stays as it is.
+    from x towards y. Descriptors are of unit length. Scores, which a database does not have, are 1.
 
     ``layout`` is ``hloc`` or ``dim``; with ``half`` all real numbers are float16, coordinates too.
-    Raises OptionError when a file exists, WorkspaceError when it cannot be written, StoreError when
-    the layout cannot hold the content, DatabaseError when the database cannot be used.
+    Raises OptionError when a file exists, StoreError when the layout cannot hold the content.
     """
     _check_choice("layout", layout, tuple(LAYOUTS))
     if features_path.resolve() == matches_path.resolve():
