@@ -12,8 +12,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import NoReturn
 
+from colmap_affrect.errors import INTERRUPTED, say
 from colmap_affrect.parallel.subprocesses import end_with
-from colmap_affrect.shown import INTERRUPTED, say
 
 PATIENCE_S = 4.0  # that a command has to end after Ctrl-C or SIGTERM, before it is killed
 SIGNALS = {signal.SIGINT, signal.SIGTERM}

@@ -7,9 +7,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.conventions import is_inside
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Singles
+from colmap_affrect.geometry.conventions import is_inside
 
 GrayImage = Bytes  # (H, W) gray values, 0.299 R + 0.587 G + 0.114 B
 ColorImage = Bytes  # (H, W, 3) red, green, blue

@@ -1,11 +1,10 @@
-"""Errors that a user can act on: one line that says what, where, and what to do."""
+"""What is said to people: errors of one line, what, where and what to do; names out of files."""
 
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-
-from colmap_affrect.shown import one_line
 
 DAMAGE = (
     OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError,
@@ -26,7 +25,7 @@ NO_MEMORY = (
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """Tell whether Python, numpy, OpenCV, torch or COLMAP has found no memory."""
+    """Return whether Python, numpy, OpenCV, torch or COLMAP has found no memory."""
     return isinstance(error, MemoryError) or any(t in str(error).lower() for t in NO_MEMORY)
 
 
@@ -116,3 +115,55 @@ def made_again(stage: str, folder: Path) -> str:
         return "run the same 'extract' or 'run' with --overwrite (run.log has the command)"
     again = f"run 'colmap-affrect {stage} --output-path {shlex.quote(str(folder))} --overwrite'"
     return again if stage == "map" else f"{again}, then the same 'run' again"
+
+
+# Everything that is shown goes through here: names come out of files, and may be made to mislead.
+
+MAX_NAMES = 3  # examples in a line
+INTERRUPTED = "interrupted; run the same command again to go on"
+
+
+def shown(text: str) -> str:
+    r"""Write characters that do not print, or turn text round, as JSON does; lines stay lines.
+
+    Control and format characters of a terminal are among them, and what is no Unicode.
+
+    >>> shown("a\x1b[31m\u202eb\nc")
+    'a\\u001b[31m\\u202eb\nc'
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else _escaped(c) for c in text)
+
+
+def _escaped(character: str) -> str:
+    units = character.encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{units[k : k + 2].hex()}" for k in range(0, len(units), 2))
+
+
+def one_line(text: str) -> str:
+    r"""Return the same in one line.
+
+    >>> one_line("a\nb")
+    'a\\u000ab'
+    """
+    return shown(text).replace("\n", _escaped("\n"))
+
+
+def say(line: str) -> None:
+    """Print a line on stderr, which nobody may read any more."""
+    with suppress(OSError):
+        if sys.stderr:  # it may have been closed
+            sys.stderr.write(f"{line}\n")
+            sys.stderr.flush()
+
+
+def such_as(names: Iterable[str], most: int = MAX_NAMES) -> str:
+    """Return the first few names, and how many there are more.
+
+    >>> such_as(["a", "b", "c", "d", "e"])
+    'a, b, c and 2 more'
+    """
+    listed = list(names)
+    more = f" and {len(listed) - most} more" if len(listed) > most else ""
+    return ", ".join(listed[:most]) + more

@@ -8,9 +8,12 @@ of range, in one line. A part is a class with its options class as attribute ``O
 import difflib
 import hashlib
 import json
+import logging
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import metadata
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
@@ -25,6 +28,31 @@ MAX_SEED = 2_000_000_000  # COLMAP keeps 32 bits; repeated mapping counts up fro
 PLAIN_NAMES = {"model": "options", "dict": "options", "tuple": "list"}  # types in messages
 MAX_COMMENT = 96  # width of comments in printed options
 CUSTOM = "custom"  # name of options that are no preset
+
+logger = logging.getLogger(__name__)
+_left_out: ContextVar[list[str] | None] = ContextVar("_left_out", default=None)
+Built = TypeVar("Built")
+
+
+def from_record(where: str, build: Callable[[], Built]) -> Built:
+    """Build options from a record, perhaps of another version: unknown ones are left out.
+
+    A warning names them once.
+    """
+    names: list[str] = []
+    token = _left_out.set(names)
+    try:
+        built = build()
+    finally:
+        _left_out.reset(token)
+    if names:
+        _warn_once(f"{where}: options of another version are left out: {', '.join(names)}")
+    return built
+
+
+@lru_cache
+def _warn_once(text: str) -> None:
+    logger.warning("%s", text)
 
 
 def within(low: float, high: float) -> Any:
@@ -41,6 +69,10 @@ class Options(BaseModel):
 
     def __init__(self, /, **values: Any) -> None:
         """Check the values; OptionError names the option."""
+        if (names := _left_out.get()) is not None:
+            unknown = values.keys() - type(self).model_fields
+            names += sorted(unknown)
+            values = {key: value for key, value in values.items() if key not in unknown}
         try:
             super().__init__(**values)
         except ValidationError as error:

@@ -14,7 +14,6 @@ from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.colmap.verification import VerificationOptions, verification_differences
 from colmap_affrect.errors import DAMAGE, ImageError, MappingError
 from colmap_affrect.features.weights import resolve
-from colmap_affrect.forecast import Forecast
 from colmap_affrect.images.photographs import CameraOptions, MaskOptions
 from colmap_affrect.mappers.base import MAPPERS, Mapper, MapperOptions, MappingTask
 from colmap_affrect.mappers.doubts import loose_names
@@ -30,11 +29,15 @@ from colmap_affrect.mappers.summaries import (
 from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import Executor
-from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.progress import SILENT, Forecast, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
-from colmap_affrect.project.report import ModelSummary, ReconstructionReport, StageReport
-from colmap_affrect.project.versions import installed_versions
+from colmap_affrect.project.report import (
+    ModelSummary,
+    ReconstructionReport,
+    StageReport,
+    installed_versions,
+)
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.report.run_page import write_run_page
@@ -48,7 +51,6 @@ from colmap_affrect.stages.guide import (
     guide,
     guided_counts,
     pairs_to_guide,
-    recorded_guiding,
     restore_exact,
 )
 from colmap_affrect.stages.inputs import Inputs
@@ -66,7 +68,7 @@ from colmap_affrect.stages.map import (
 from colmap_affrect.stages.match import load_matchers, match
 from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed_pairs
-from colmap_affrect.stages.verify import recorded_verification, verify_matches
+from colmap_affrect.stages.verify import verify_matches
 
 FocalVote = Literal["auto", "always", "never"]
 
@@ -278,7 +280,7 @@ def map_and_report(
     before = existing_names(extend.model_path, image_names(workspace)) if extend else []
     reports, models = map_guided(context, mapper, extend, overwrite=overwrite)
     names, copied = image_names(workspace), workspace.is_copy
-    verification = recorded_verification(workspace)
+    verification = context.verification
     missing, pair_inliers = unregistered(context, names, models), num_verified_inliers(workspace)
     cameras = read_camera_records(workspace.cameras)
     result = ReconstructionReport(
@@ -331,7 +333,7 @@ def _require_photographs(context: Context) -> None:
     """Refuse to map photographs that are not where they were when they were extracted."""
     if context.workspace.is_copy:
         return
-    inputs = Inputs.recorded(context.workspace)
+    inputs = context.inputs
     if not Path(inputs.image_path).is_dir():
         raise ImageError(
             f"{inputs.image_path}: no such folder; if the photographs have moved, run extract "
@@ -351,7 +353,7 @@ def map_guided(
     Arguments are those of :func:`~colmap_affrect.stages.map.map_images`.
     """
     sparse, aside = context.workspace.sparse, context.workspace.aside
-    min_num_tracks = recorded_guiding(context.workspace).min_num_tracks
+    min_num_tracks = context.guiding.min_num_tracks
     reports: list[StageReport] = []
     if overwrite or not aside.exists():  # else a run has been killed in what follows
         report, models = map_images(context, mapper, extend, overwrite=overwrite)

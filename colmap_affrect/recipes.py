@@ -195,6 +195,16 @@ class Recipe:
         matchers = self.extraction.matchers(self.matching)
         return tuple(sorted({*self.extraction.weights}.union(*(item.weights for item in matchers))))
 
+    @property
+    def later_stages(self) -> dict[str, Options]:
+        """Options of the stages after extraction, by stage."""
+        found: dict[str, Options] = {"match": self.matching, "guide": self.guided}
+        if self.extraction.escalation:
+            found["escalate"] = self.escalate
+        if self.mapping:
+            found["map"] = self.mapper_options("sparse")
+        return found
+
     def to_mapping(self) -> dict[str, Any]:
         """Return all sections with all options, as :meth:`from_mapping` takes them."""
         return {

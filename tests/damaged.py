@@ -51,6 +51,12 @@ def exchanged(data: bytearray, chance: random.Random) -> str:
     return f"page at {source.start} written over that at {target.start}"
 
 
+def spliced(data: bytearray, chance: random.Random) -> str:
+    start = chance.randrange(len(data))
+    data[start : start + chance.choice((0, 1, 4, 40))] = chance.choice(PIECES)
+    return f"bytes at {start} replaced"
+
+
 def cut(data: bytearray, chance: random.Random) -> str:
     del data[chance.randrange(len(data)) :]
     return f"cut off at {len(data)}"
@@ -66,8 +72,14 @@ def random_bytes(data: bytearray, chance: random.Random) -> str:
     return "all bytes random"
 
 
+PIECES = (
+    b"", b"\0", b"\n", b"\t", b" ", b"#", b",", b"..", b'"', b"[" * 3000, b"{", b"=", b"9" * 30,
+    b"1e999", b"nan", b"\xff\xfe", b"\xe2\x80\xa8", b"\x1b[31m", b"a" * 300, b"../" * 20,
+)  # fmt: skip
+"""What readers of text and numbers may not expect."""
+
 HARMS: tuple[Callable[[bytearray, random.Random], str], ...] = (
-    bits, zeros, noise, header, exchanged, cut, emptied, random_bytes,
+    bits, zeros, noise, header, exchanged, spliced, cut, emptied, random_bytes,
 )  # fmt: skip
 
 
@@ -90,30 +102,6 @@ def damage(
     if keeps_times := chance.random() < 0.5:
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     return f"{path.name}: {done}{', times kept' if keeps_times else ''}"
-
-
-STATEMENTS = (
-    "UPDATE images SET camera_id = 999 WHERE image_id = {id}",
-    "UPDATE images SET name = x'ff00fe' WHERE image_id = {id}",
-    "DELETE FROM images WHERE image_id = {id}",
-    "INSERT INTO images (name, camera_id) VALUES ('more.png', 1)",
-    "UPDATE keypoints SET rows = -1 WHERE image_id = {id}",
-    "UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = {id}",
-    "UPDATE keypoints SET data = substr(data, 1, 101) WHERE image_id = {id}",
-    "DELETE FROM keypoints WHERE image_id = {id}",
-    "UPDATE matches SET data = x'ffffffffffffffff', rows = 1",
-    "UPDATE two_view_geometries SET config = 77",
-    "UPDATE two_view_geometries SET data = x'ffffffffffffffff', rows = 1",
-    "UPDATE cameras SET width = 100",
-    "UPDATE cameras SET params = x'00'",
-    "UPDATE frames SET rig_id = 99",
-    "DELETE FROM cameras",
-    "DROP TABLE frame_data",
-    "ALTER TABLE images RENAME COLUMN camera_id TO camera",
-    "CREATE TRIGGER nosy AFTER INSERT ON matches BEGIN DELETE FROM images; END",
-    "PRAGMA user_version = 2147483647",
-)
-"""What nobody means to do to the rows of a database; ``{id}`` is one of the images."""
 
 
 Statement = str | tuple[str, list[object]]

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_affrect.conventions import pixel_from_colmap
 from colmap_affrect.data import Photograph
+from colmap_affrect.geometry.conventions import pixel_from_colmap
 from colmap_affrect.images.reading import read_gray
 
 COURTYARD = Path(__file__).parents[1] / "sample_scenes" / "courtyard"

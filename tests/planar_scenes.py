@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.data import GrayImage, Photograph, ShapeGrid, ShapeSamples
+from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.geometry.tilts import metrics_from_tilts
 
 Array = NDArray[np.float64]

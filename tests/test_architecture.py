@@ -61,7 +61,7 @@ def test_half_pixels_are_added_in_conventions_only() -> None:
             for node in nodes(path)
         )
     }
-    assert users <= {"conventions"}
+    assert users <= {"geometry.conventions"}
 
 
 def test_library_neither_prints_nor_exits_outside_the_command_line() -> None:

@@ -13,16 +13,16 @@ from strategies import Array
 from synthetic import blobs
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.conventions import (
+from colmap_affrect.data import LocalFeatures
+from colmap_affrect.features.sift import RootSift, SiftOptions
+from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.conventions import (
     colmap_from_pixel,
     grid_origin,
     is_inside,
     pixel_from_colmap,
     resized_from_original,
 )
-from colmap_affrect.data import LocalFeatures
-from colmap_affrect.features.sift import RootSift, SiftOptions
-from colmap_affrect.geometry.affine import project, transform_frames
 
 sizes = st.tuples(st.integers(1, 4000), st.integers(1, 4000))
 

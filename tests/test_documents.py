@@ -16,7 +16,7 @@ import pytest
 
 import colmap_affrect
 from colmap_affrect.cli.parser import COMMANDS, build_parser
-from colmap_affrect.project.workspace import STAGES
+from colmap_affrect.project.record import STAGES
 from colmap_affrect.recipes import load_recipe
 
 ROOT = Path(__file__).parents[1]

@@ -7,10 +7,16 @@ import logging
 
 import pytest
 
-from colmap_affrect.forecast import COSTS, MAP_COST_PER_IMAGE, Forecast
-from colmap_affrect.progress import NUM_PLAIN_LINES, SILENT, Progress
-from colmap_affrect.project import stopwatch
-from colmap_affrect.project.stopwatch import Stopwatch
+from colmap_affrect import progress
+from colmap_affrect.progress import (
+    COSTS,
+    MAP_COST_PER_IMAGE,
+    NUM_PLAIN_LINES,
+    SILENT,
+    Forecast,
+    Progress,
+    Stopwatch,
+)
 
 
 class Terminal(io.StringIO):
@@ -20,11 +26,11 @@ class Terminal(io.StringIO):
 
 def test_progress_is_a_bar_on_a_terminal_lines_elsewhere_and_nothing_when_silent() -> None:
     terminal, file = Terminal(), io.StringIO()
-    for progress in (Progress(terminal), Progress(file), SILENT):
-        with progress.stage("match", 400, "pairs") as advance:
+    for kind in (Progress(terminal), Progress(file), SILENT):
+        with kind.stage("match", 400, "pairs") as advance:
             for _ in range(400):
                 advance(1)
-        with progress.stage("verify", 0, "pairs") as advance:
+        with kind.stage("verify", 0, "pairs") as advance:
             advance(1)
     assert "\r" in terminal.getvalue()
     assert "400/400" in terminal.getvalue()
@@ -104,7 +110,7 @@ def test_forecast_is_in_lines_and_log_and_not_where_nothing_is_shown(
 def test_inner_steps_are_not_counted_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     """The clock reads 0, 1, 2, ...: outer from 0 to 5, inner from 1 to 2 and from 3 to 4."""
     ticks = iter(range(100))
-    monkeypatch.setattr(stopwatch.time, "perf_counter", lambda: next(ticks))
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: next(ticks))
     watch = Stopwatch("never", "outer")
     with watch.step("outer"):
         for _ in range(2):

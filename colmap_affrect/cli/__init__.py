@@ -13,11 +13,18 @@ from typing import NoReturn, TextIO
 
 from colmap_affrect import __version__
 from colmap_affrect.cli.parser import build_parser
-from colmap_affrect.errors import MEMORY_HINT, AffrectError, OptionError, lacks_memory
+from colmap_affrect.errors import (
+    INTERRUPTED,
+    MEMORY_HINT,
+    AffrectError,
+    OptionError,
+    lacks_memory,
+    one_line,
+    say,
+)
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.shown import INTERRUPTED, one_line, say
 
 logger = logging.getLogger("colmap_affrect")
 

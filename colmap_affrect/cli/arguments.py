@@ -88,11 +88,10 @@ CAMERAS = (
     _choice("--camera-mode", ["auto", "single", "per-folder", "per-image"],
         "which images share a camera (default: auto, as --cameras-path says, else those of one "
         "body, lens, focal length and size by EXIF; without EXIF one camera each, unless matches "
-        "show that images of one size share one)", default="auto"),
-    _value("--camera-model", "MODEL", "COLMAP camera model (default: SIMPLE_RADIAL)",
-        default="SIMPLE_RADIAL"),
+        "show that images of one size share one)"),
+    _value("--camera-model", "MODEL", "COLMAP camera model (default: SIMPLE_RADIAL)"),
     _value("--camera-params", "A,B,...",
-        "known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792.0,524.5", default=""),
+        "known intrinsics in COLMAP's order, e.g. 1437.2,1440.1,792.0,524.5"),
     _path("--cameras-path", "FILE",
         "known cameras: folder or cameras.txt of a COLMAP model of these images, or a CSV file "
         "with the columns name and any of focal_px, focal_mm with sensor_width_mm or "
@@ -100,10 +99,10 @@ CAMERAS = (
         "with one label share a camera)"),
     _value("--focal-length-px", "PX",
         "known focal length of images that --cameras-path does not name; the rest is refined",
-        type=float, default=0.0),
+        type=float),
     _value("--principal-point", "CX,CY",
         "where the optical axis meets the image, in px from its corner (default: its middle, wrong "
-        "for prints and scans that were cropped off centre)", default=""),
+        "for prints and scans that were cropped off centre)"),
     _flag("--ignore-exif", "take neither focal lengths nor who shares a camera from EXIF"),
 )  # fmt: skip
 SELECTION = (

@@ -7,7 +7,6 @@ Modules are imported when a command needs them: ``--help`` loads no heavy packag
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -15,11 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_affrect.cli import given
-from colmap_affrect.errors import ComparisonError, OptionError
+from colmap_affrect.errors import ComparisonError, OptionError, such_as
 from colmap_affrect.progress import SILENT, Progress, show
 from colmap_affrect.project.report import EXIT_FAILED, EXIT_NO_MODEL, EXIT_OK, by_level
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.shown import such_as
 
 if TYPE_CHECKING:
     from colmap_affrect.comparison.results import Comparison
@@ -51,6 +49,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def extract(options: argparse.Namespace) -> int:
+    from colmap_affrect.images.photographs import CameraOptions, MaskOptions
     from colmap_affrect.stages import extract as stage
     from colmap_affrect.stages.inputs import Inputs
 
@@ -58,8 +57,8 @@ def extract(options: argparse.Namespace) -> int:
         options.image_path,
         image_list_path=options.image_list_path,
         from_database=options.from_database,
-        cameras=given.cameras(options),
-        masks=given.masks(options),
+        cameras=given.built(options, "cameras", CameraOptions),
+        masks=given.built(options, "masks", MaskOptions),
     )
     with given.context(options) as context:
         report = stage.extract(context, inputs, given.recipe(options), overwrite=options.overwrite)
@@ -73,22 +72,19 @@ def pairs(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.pairs import choose_pairs
 
     with given.context(options) as context:
-        chosen = given.pair_options(options, context.workspace.planned("pairs"))
+        chosen = given.over(context.pairing, options, "pairs")
         report = choose_pairs(context, chosen, overwrite=options.overwrite)
     show(report.summary())
 
 
 def match(options: argparse.Namespace) -> None:
-    from colmap_affrect.matchers.base import MATCHERS
     from colmap_affrect.stages.match import match
 
     with given.context(options) as context:
         if options.recipe:
             matching = given.recipe(options).matching
         else:
-            chosen = [f"matching.name={json.dumps(options.matcher)}"] if options.matcher else []
-            values = given.changed(context, "match", "matching", [*chosen, *options.set])
-            matching = MATCHERS.options(values, where="matching")
+            matching = given.changed(context.matching, options, "matching")
         report = match(context, matching, overwrite=options.overwrite)
     show(report.summary())
 
@@ -97,18 +93,16 @@ def verify(options: argparse.Namespace) -> None:
     from colmap_affrect.stages.verify import verify_matches
 
     with given.context(options) as context:
-        chosen = given.verification(options, context.workspace.planned("verify"))
+        chosen = given.verification(options, context.verification)
         report = verify_matches(context, chosen, overwrite=options.overwrite)
     show(report.summary())
 
 
 def escalate(options: argparse.Namespace) -> None:
-    from colmap_affrect.recipes import EscalateOptions
     from colmap_affrect.stages.escalate import escalate, pair_levels
 
     with given.context(options) as context:
-        values = given.changed(context, "escalate", "escalate", options.set)
-        chosen = EscalateOptions.from_mapping(values, "escalate")
+        chosen = given.changed(context.escalation, options, "escalate")
         report = escalate(context, chosen, overwrite=options.overwrite)
         levels = pair_levels(context)
     show(report.summary())
@@ -117,13 +111,10 @@ def escalate(options: argparse.Namespace) -> None:
 
 
 def guide(options: argparse.Namespace) -> None:
-    from colmap_affrect.matchers.guided import GuidedOptions
     from colmap_affrect.stages.guide import guide, guided_counts
 
     with given.context(options) as context:
-        values = given.changed(context, "guide", "guided", options.set)
-        values |= {"enabled": options.guided} if options.guided else {}
-        chosen = GuidedOptions.from_mapping(values, "guided")
+        chosen = given.changed(context.guiding, options, "guided")
         report = guide(context, chosen, overwrite=options.overwrite)
         counts = guided_counts(context)
     show(report.summary())
@@ -135,7 +126,6 @@ def map(options: argparse.Namespace) -> int:
     from colmap_affrect.mappers.base import MAPPERS
     from colmap_affrect.pipeline import holds_vote, map_and_report, map_from_database
     from colmap_affrect.stages.cameras import choose_cameras
-    from colmap_affrect.stages.inputs import Inputs
 
     extend = given.extension(options)
     if options.from_database:
@@ -155,10 +145,8 @@ def map(options: argparse.Namespace) -> int:
     if options.image_path:
         raise OptionError("--image-path: only with --from-database; else that of extract is used")
     with given.context(options) as context:
-        mapper = MAPPERS.make(given.mapping(options, recorded=context.workspace.planned("map")))
-        is_others = context.workspace.is_copy or bool(
-            Inputs.recorded(context.workspace).from_database
-        )
+        mapper = MAPPERS.make(given.mapping(options, known=context.mapping))
+        is_others = context.workspace.is_copy or bool(context.inputs.from_database)
         votes = holds_vote(options.focal_vote, mapper.options, is_others=is_others)
         report = map_and_report(
             context,
@@ -246,6 +234,7 @@ def _comparison_exit_code(comparison: Comparison, options: argparse.Namespace) -
 
 
 def import_h5(options: argparse.Namespace) -> None:
+    from colmap_affrect.images.photographs import CameraOptions
     from colmap_affrect.interop.hdf5 import import_h5
 
     report = import_h5(
@@ -253,7 +242,7 @@ def import_h5(options: argparse.Namespace) -> None:
         options.features_path,
         options.matches_path,
         options.database_path,
-        cameras=given.cameras(options),
+        cameras=given.built(options, "cameras", CameraOptions),
         layout=options.layout,
         pixel_origin=options.pixel_origin,
         skip_verification=options.skip_verification,
@@ -346,8 +335,7 @@ def _print_reconstruction(report: ReconstructionReport, options: argparse.Namesp
 
 
 def _next_steps(report: ReconstructionReport, out: Path) -> list[str]:
-    copied, begun = (Workspace(out).planned(stage) or {} for stage in ("copy", "extract"))
-    photos = copied.get("image_path") or begun.get("image_path")
+    photos = Workspace(out).photographs()
     model, page = out / "sparse" / "0", out / "report.html"
     commands: list[list[object]] = []
     if report.models:
@@ -375,14 +363,14 @@ def _exit_code(failures: Mapping[str, str], options: argparse.Namespace) -> int:
 
 
 def inspect(options: argparse.Namespace) -> None:
-    from colmap_affrect.images.photographs import Photographs
+    from colmap_affrect.images.photographs import MaskOptions, Photographs
     from colmap_affrect.report.inspection import inspect_image
     from colmap_affrect.stages.one_image import prepare
 
     recipe = given.recipe(options)
     if not options.image.is_file():
         raise OptionError(f"{options.image}: no such file; give a photograph")
-    photographs = Photographs(options.image.parent, given.masks(options))
+    photographs = Photographs(options.image.parent, given.built(options, "masks", MaskOptions))
     photographs.check()
     mask = photographs.mask(options.image.name)
     extractor = prepare(recipe.extraction, given.resources(options), [options.image.name])
@@ -430,7 +418,7 @@ def weights(options: argparse.Namespace) -> None:
         for path in fetch(keys, options.weights, progress=given.progress(options)).values():
             show(path)
         return
-    for row in describe_weights(given.weights_folder(options), keys):
+    for row in describe_weights(given.folder("--weights", options.weights), keys):
         file = row.published
         where = f"{row.path}{', verified' if row.verified else ''}"
         if row.path and row.verified is False:
@@ -455,10 +443,6 @@ def _weight_keys(names: Sequence[str]) -> list[str]:
 
     keys: list[str] = []
     for name in names:
-        if name in recipe_names():
-            keys += load_recipe(name).weights
-        elif name in WEIGHT_FILES:
-            keys.append(name)
-        else:
-            keys += [key for key in WEIGHT_FILES if key.startswith(f"{name}-")] or [name]
+        alike = [key for key in WEIGHT_FILES if key == name or key.startswith(f"{name}-")]
+        keys += load_recipe(name).weights if name in recipe_names() else alike or [name]
     return list(dict.fromkeys(keys))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -13,21 +13,66 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from colmap_affrect.errors import OptionError, WorkspaceError
 from colmap_affrect.options import Options, suggestion
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.differences import WEIGHTS, placeless, without_digests
+from colmap_affrect.project.record import WEIGHTS, placeless, read_record
 from colmap_affrect.project.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap.verification import VerificationOptions
-    from colmap_affrect.images.photographs import CameraOptions, MaskOptions
     from colmap_affrect.mappers.base import MapperOptions
     from colmap_affrect.mappers.existing import Extension
-    from colmap_affrect.pairs.base import PairOptions
     from colmap_affrect.parallel.executor import Executor
     from colmap_affrect.recipes import Recipe
     from colmap_affrect.stages.context import Context, Resources
 
+AnyOptions = TypeVar("AnyOptions", bound=Options)
 
-def record(options: argparse.Namespace) -> dict[str, Any]:
+SECTIONS = {
+    "cameras": {
+        "camera_mode": "mode", "camera_model": "model", "camera_params": "params",
+        "cameras_path": "cameras_path", "focal_length_px": "focal_length_px",
+        "principal_point": "principal_point", "ignore_exif": "ignore_exif",
+    },
+    "masks": {"mask_path": "path", "camera_mask_path": "camera_path"},
+    "pairs": {
+        "pairs": "methods", "num_neighbors": "num_neighbors", "max_distance_m": "max_distance_m",
+        "match_list_path": "match_list_path",
+    },
+    "matching": {"matcher": "name"},
+    "guided": {"guided": "enabled"},
+    "depth": {"depth_path": "path", "depth_model": "model", "depth_kind": "kind"},
+}  # fmt: skip
+"""Options of the command line that are fields of an options class."""
+
+
+def section(options: argparse.Namespace, name: str) -> dict[str, Any]:
+    """Return what is given of a section, by the fields of its options."""
+    given = {
+        field: getattr(options, argument, None)
+        for argument, field in SECTIONS.get(name, {}).items()
+    }
+    return {
+        field: str(value.resolve()) if isinstance(value, Path) else value
+        for field, value in given.items()
+        if value is not None and value is not False
+    }
+
+
+def over(known: AnyOptions, options: argparse.Namespace, name: str) -> AnyOptions:
+    """Return options that are known, and in their place those of a section that are given."""
+    return known.from_mapping({**known.to_mapping(), **section(options, name)}, name)
+
+
+def built(
+    options: argparse.Namespace,
+    name: str,
+    cls: type[AnyOptions],
+    recorded: Mapping[str, Any] | None = None,
+) -> AnyOptions:
+    """Return options of a section: as given, as on record, or their defaults."""
+    return over(cls.from_mapping(recorded or {}, "--config"), options, name)
+
+
+def record(options: argparse.Namespace) -> Mapping[str, Any]:
     """Return the options on record in --config, without places if there are other photographs."""
     path: Path | None = options.config
     if not path:
@@ -36,33 +81,27 @@ def record(options: argparse.Namespace) -> dict[str, Any]:
         return {}
     if not path.is_file():
         raise OptionError(f"--config {path}: no such file; give the config.toml of a run")
-    workspace = Workspace(path.parent)
-    workspace.config = path
     try:
-        found = workspace.recorded()
+        found = read_record(path, path.parent)
     except WorkspaceError as error:
         raise OptionError(f"--config {path}: of another version, or no config.toml") from error
     if "extract" not in found:
         raise OptionError(f"--config {path}: has no options of a run; give its config.toml")
-    _refuse_unknown(found, str(path))
+    _refuse_unknown(found["extract"], f"--config {path}")
     if not options.image_path:
         return found
-    return {key: placeless(value) if isinstance(value, dict) else value
-            for key, value in found.items()}  # fmt: skip
+    return {key: placeless(v) if isinstance(v, dict) else v for key, v in found.items()}
 
 
-def _refuse_unknown(record: Mapping[str, Any], where: str) -> None:
-    """Refuse sections, and options of extraction, that no run has recorded: typos of an editor."""
-    from colmap_affrect.project.workspace import STAGES
+def _refuse_unknown(names: Iterable[str], where: str) -> None:
+    """Refuse options of extraction that no run has recorded: typos of an editor."""
     from colmap_affrect.recipes import ExtractionOptions
     from colmap_affrect.stages.inputs import Inputs
 
-    sections = {"format_version", "recipe", "begun", *STAGES}
-    of_extract = {*Inputs.model_fields, *ExtractionOptions.model_fields, WEIGHTS}
-    for names, known in ((record, sections), (record["extract"], of_extract)):
-        for name in names:
-            if name not in known:
-                raise OptionError(f"--config {where}: unknown {name!r}{suggestion(name, known)}")
+    known = {*Inputs.model_fields, *ExtractionOptions.model_fields, WEIGHTS}
+    for name in names:
+        if name not in known:
+            raise OptionError(f"{where}: unknown {name!r}{suggestion(name, known)}")
 
 
 def inputs(
@@ -71,29 +110,27 @@ def inputs(
     record: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the fields of InputOptions, which run and compare have in common."""
+    from colmap_affrect.colmap.verification import VerificationOptions
+    from colmap_affrect.images.photographs import CameraOptions, MaskOptions
+    from colmap_affrect.mappers.base import MAPPERS
+    from colmap_affrect.pairs.base import PairOptions
+
     record = record or {}
     extract = record.get("extract", {})
     listed, database = extract.get("image_list_path"), extract.get("from_database")
+    verified = VerificationOptions.from_mapping(record.get("verify", {}), "--config")
+    mapped = MAPPERS.options(record["map"], where="--config") if "map" in record else None
     return {
-        "cameras": _or_recorded(cameras(options), extract.get("cameras")),
-        "masks": _or_recorded(masks(options), extract.get("masks")),
-        "pairs": pair_options(options, record.get("pairs")),
-        "verification": verification(options, record.get("verify")),
-        "mapping": mapping(options, recipe, record.get("map")),
+        "cameras": built(options, "cameras", CameraOptions, extract.get("cameras", {})),
+        "masks": built(options, "masks", MaskOptions, extract.get("masks", {})),
+        "pairs": built(options, "pairs", PairOptions, record.get("pairs", {})),
+        "verification": verification(options, verified),
+        "mapping": mapping(options, recipe, mapped),
         "image_list_path": options.image_list_path or (Path(listed) if listed else None),
         "from_database": options.from_database or (Path(database) if database else None),
         "resources": resources(options),
         "focal_vote": options.focal_vote,
     }
-
-
-AnyOptions = TypeVar("AnyOptions", bound=Options)
-
-
-def _or_recorded(given: AnyOptions, recorded: Mapping[str, Any] | None) -> AnyOptions:
-    if not recorded or given != type(given)():
-        return given
-    return type(given).from_mapping(recorded, "--config")
 
 
 def extension(options: argparse.Namespace) -> Extension | None:
@@ -110,43 +147,47 @@ def recipe(options: argparse.Namespace, record: Mapping[str, Any] | None = None)
     """Return the recipe that is named, or the one on record, with single options changed."""
     from colmap_affrect.recipes import ExtractionOptions, Recipe, load_recipe, with_settings
 
-    given = {"matching.name": options.matcher, "guided.enabled": options.guided}
-    settings = [f"{key}={json.dumps(value)}" for key, value in given.items() if value]
-    settings += [*options.set, *depth_settings(options)]
+    changes = [*_settings(options, "matching", "guided"), *options.set, *depth_settings(options)]
     if options.recipe or not record:
-        return load_recipe(options.recipe or "default", settings)
+        return load_recipe(options.recipe or "default", changes)
     sections = {"match": "matching", "escalate": "escalate", "guide": "guided"}
     values = {
-        sections[stage]: without_digests(record[stage]) for stage in sections if stage in record
+        name: {key: value for key, value in record[stage].items() if key != WEIGHTS}
+        for stage, name in sections.items()
+        if stage in record
     }
     known = ExtractionOptions.model_fields
     values |= {key: value for key, value in record["extract"].items() if key in known}
-    return Recipe.from_mapping(record["recipe"], with_settings(values, settings), "--config")
+    return Recipe.from_mapping(record["recipe"], with_settings(values, changes), "--config")
+
+
+def _settings(options: argparse.Namespace, *names: str) -> list[str]:
+    return [
+        f"{name}.{key}={json.dumps(value)}"
+        for name in names
+        for key, value in section(options, name).items()
+    ]
 
 
 def depth_settings(options: argparse.Namespace) -> list[str]:
-    path, model = options.depth_path, options.depth_model
-    if path and not path.is_dir():
-        raise OptionError(f"--depth-path {path}: no such folder; give the folder of the depth maps")
-    given = {
-        "name": "monocular" if model else "files" if path else None,
-        "path": _text(path),
-        "model": model,
-        "kind": options.depth_kind,
-    }
-    return [f"depth.{key}={json.dumps(value)}" for key, value in given.items() if value]
+    """Return the changes of a recipe that the options of depth maps ask for."""
+    folder("--depth-path", options.depth_path)
+    depth = section(options, "depth")
+    chosen = {"model": "monocular", "path": "files"}
+    names = [f'depth.name="{name}"' for key, name in chosen.items() if key in depth]
+    return [*names, *_settings(options, "depth")]
 
 
 def resources(options: argparse.Namespace) -> Resources:
     from colmap_affrect.stages.context import Resources
 
-    return Resources(weights_folder(options), options.device)
+    return Resources(folder("--weights", options.weights), options.device)
 
 
-def weights_folder(options: argparse.Namespace) -> Path | None:
-    path: Path | None = options.weights
+def folder(option: str, path: Path | None) -> Path | None:
+    """Refuse a folder to read that is not there."""
     if path and not path.is_dir():
-        raise OptionError(f"--weights {path}: no such folder; give the folder of the weights")
+        raise OptionError(f"{option} {path}: no such folder; give one that is there")
     return path
 
 
@@ -176,75 +217,33 @@ def context(options: argparse.Namespace) -> Iterator[Context]:
             yield found
 
 
-def cameras(options: argparse.Namespace) -> CameraOptions:
-    from colmap_affrect.images.photographs import CameraOptions
-
-    return CameraOptions(
-        mode=options.camera_mode,
-        model=options.camera_model,
-        params=options.camera_params,
-        ignore_exif=options.ignore_exif,
-        cameras_path=_text(options.cameras_path),
-        focal_length_px=options.focal_length_px,
-        principal_point=options.principal_point,
-    )
-
-
-def masks(options: argparse.Namespace) -> MaskOptions:
-    from colmap_affrect.images.photographs import MaskOptions
-
-    return MaskOptions(path=_text(options.mask_path), camera_path=_text(options.camera_mask_path))
-
-
-def _text(path: Path | None) -> str:
-    return str(path.resolve()) if path else ""
-
-
-def pair_options(
-    options: argparse.Namespace, recorded: Mapping[str, Any] | None = None
-) -> PairOptions:
-    """Return what is given on the command line, over what is on record."""
-    from colmap_affrect.pairs.base import PairOptions
-
-    given = {
-        "methods": options.pairs,
-        "num_neighbors": options.num_neighbors,
-        "max_distance_m": options.max_distance_m,
-        "match_list_path": _text(options.match_list_path) or None,
-    }
-    chosen = {key: value for key, value in given.items() if value is not None}
-    return PairOptions.from_mapping({**(recorded or {}), **chosen}, "pairs")
-
-
 def verification(
-    options: argparse.Namespace, recorded: Mapping[str, Any] | None = None
+    options: argparse.Namespace, known: VerificationOptions | None = None
 ) -> VerificationOptions:
-    """Return the preset that is given, or what is on record."""
+    """Return the preset that is given, or what is known."""
     from colmap_affrect.colmap.verification import VerificationOptions
 
-    if recorded and not options.preset:
-        return VerificationOptions(**{**recorded, **seed(options)})
-    return VerificationOptions.preset(options.preset or "sparse", **seed(options))
+    if known and not options.preset:
+        return known.changed(**_seed(options))
+    return VerificationOptions.preset(options.preset or "sparse", **_seed(options))
 
 
-def seed(options: argparse.Namespace) -> dict[str, int]:
+def _seed(options: argparse.Namespace) -> dict[str, int]:
     return {} if options.random_seed is None else {"random_seed": options.random_seed}
 
 
 def mapping(
     options: argparse.Namespace,
     recipe: Recipe | None = None,
-    recorded: Mapping[str, Any] | None = None,
+    known: MapperOptions | None = None,
 ) -> MapperOptions:
-    """Return the mapper that is given, or what is on record."""
-    from colmap_affrect.mappers.base import MAPPERS
+    """Return the mapper that is given, or what is known."""
     from colmap_affrect.recipes import Recipe
 
     native = key_values("--mapper-options", options.mapper_options)
-    given = {**seed(options), **({"mapper_options": native} if native else {})}
-    if recorded and not (options.preset or options.mapper):
-        found: MapperOptions = MAPPERS.options({**recorded, **given})
-        return found
+    given = {**_seed(options), **({"mapper_options": native} if native else {})}
+    if known and not (options.preset or options.mapper):
+        return known.changed(**given)
     recipe = recipe or Recipe("")
     return recipe.mapper_options(options.preset or "sparse", options.mapper or "", **given)
 
@@ -260,15 +259,16 @@ def key_values(option: str, settings: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def changed(context: Context, stage: str, section: str, settings: Sequence[str]) -> dict[str, Any]:
-    """Return the options on record of a stage, a section of the recipe, some of them changed."""
-    from colmap_affrect.recipes import with_settings
+def changed(known: AnyOptions, options: argparse.Namespace, name: str) -> AnyOptions:
+    """Return a section of the recipe with what is given of it, and by --set."""
+    from colmap_affrect.recipes import RecipeOptions, with_settings
 
-    values = with_settings({section: context.workspace.planned(stage) or {}}, settings)
+    settings = [*_settings(options, name), *options.set]
+    values = with_settings({name: known.to_mapping()}, settings)
     if len(values) > 1:
-        raise OptionError(f"--set: only options of {section} can be changed here")
-    changed: dict[str, Any] = values[section]
-    return changed
+        raise OptionError(f"--set: only options of {name} can be changed here")
+    found: AnyOptions = getattr(RecipeOptions.from_mapping(values, "--set"), name)
+    return found
 
 
 def distance(text: str) -> tuple[str, str, float]:

@@ -120,13 +120,10 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 ABSENT: dict[str, Any] = {
-    **dict.fromkeys((
-        "output_path", "matcher", "guided", "depth_path", "depth_model", "depth_kind", "weights",
-        "scheduler", "pairs", "num_neighbors", "max_distance_m", "random_seed",
-    )),
+    **dict.fromkeys(("output_path", "weights", "scheduler", "random_seed")),
     "device": "auto",
     "max_failures": 0,
-}  # fmt: skip
+}
 """What commands read that not all of them have as options."""
 
 

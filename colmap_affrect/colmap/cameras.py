@@ -15,13 +15,12 @@ from pydantic import TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import camera_like, read_given_model
-from colmap_affrect.errors import OptionError, WorkspaceError, damage, made_again
+from colmap_affrect.errors import OptionError, WorkspaceError, damage, made_again, such_as
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.checked_json import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.tables import read_lines, read_table
-from colmap_affrect.shown import such_as
 
 Source = Literal["given", "exif", "exif-rescaled", "pairs", "guess"]
 """By the user; by EXIF as it is, or scaled to a photograph that was shrunk; by the votes of

@@ -26,10 +26,9 @@ from colmap_affrect.colmap.tables import (
     rows_of,
 )
 from colmap_affrect.colmap.useless_keypoints import MAX_SIDE_PX, useless
-from colmap_affrect.errors import DatabaseError
+from colmap_affrect.errors import DatabaseError, such_as
 from colmap_affrect.images.exif import PLAUSIBLE_FOCALS
 from colmap_affrect.project.outputs import leads_outside
-from colmap_affrect.shown import such_as
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")

@@ -18,9 +18,13 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.tables import MAX_NUM_IMAGES
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.geometry.arrays import Array, Bools, Bytes, Floats, Indices, Singles
+from colmap_affrect.geometry.conventions import (
+    MEASUREMENT_SIGMAS,
+    colmap_from_pixel,
+    pixel_from_colmap,
+)
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 
 BYTES_PER_ROW = 4096

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import cameras_of_images
+from colmap_affrect.errors import such_as
 from colmap_affrect.geometry.arrays import Bools, Singles
-from colmap_affrect.shown import such_as
 
 KINDS = {"keypoints-not-finite", "keypoints-outside", "keypoints-at-one-place"}  # of checks.CHECKS
 MAX_SIDE_PX = 1 << 24  # of a photograph; the largest panoramas have a tenth of it

@@ -37,10 +37,10 @@ from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.parallel.subprocesses import child
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.contents import Contents
-from colmap_affrect.project.differences import first_difference
+from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.outputs import new_results, remove_own
-from colmap_affrect.project.versions import installed_versions
+from colmap_affrect.project.record import first_difference
+from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
 
 NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
@@ -143,12 +143,11 @@ class _Plan:
     @cached_property
     def inputs(self) -> dict[str, Any]:
         """What all methods begin with, for the record; digests stand for the files."""
-        options, contents = self.options, Contents(Workspace(self.layout.path).contents)
+        options = self.options
         given = options.inputs(self.image_path)
         files = {name: given.photographs.files(name) for name in self.names}
         files[""] = given.camera_files
-        digests = {name: contents.digest(paths)[:NUM_DIGITS] for name, paths in files.items()}
-        contents.save()
+        digests = {name: content_of(paths).digest[:NUM_DIGITS] for name, paths in files.items()}
         return {
             "photographs": digests,
             "images": _fingerprint(self.names),

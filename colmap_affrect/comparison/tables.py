@@ -13,7 +13,7 @@ from typing import Any
 from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, PoseScores
 from colmap_affrect.comparison.results import Comparison, MethodResult, Span
 from colmap_affrect.comparison.verdict import ranked, verdict
-from colmap_affrect.project.workspace import STAGES
+from colmap_affrect.project.record import STAGES
 
 METHOD_COLORS = (
     "#0b62a8", "#a34700", "#00714f", "#9b2d79", "#5d4bb0", "#7a5c00", "#a3213b", "#46606e",

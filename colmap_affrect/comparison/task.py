@@ -18,8 +18,8 @@ from colmap_affrect.comparison.sift import describe_options
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
 from colmap_affrect.pipeline import InputOptions
-from colmap_affrect.project.differences import first_difference
 from colmap_affrect.project.outputs import remove_own
+from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 

@@ -47,11 +47,10 @@ from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import peak_memory_bytes
 from colmap_affrect.parallel.subprocesses import end_with
 from colmap_affrect.pipeline import map_guided
-from colmap_affrect.progress import SILENT, Advance, Progress
+from colmap_affrect.progress import SILENT, Advance, Progress, Stopwatch
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.stopwatch import Stopwatch
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
 from colmap_affrect.stages.cameras import hold_vote

@@ -13,7 +13,7 @@ from colmap_affrect.doctor.folder import examine_database, examine_folder
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import describe_weights, remedy
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.versions import installed_versions
+from colmap_affrect.project.report import installed_versions
 
 __all__ = ["Diagnosis", "Finding", "diagnose"]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_affrect.colmap.checks import CHECKS, SEVERITIES, Check, Severity
+from colmap_affrect.errors import such_as
 from colmap_affrect.progress import Progress
-from colmap_affrect.shown import such_as
 
 MAX_ITEMS_SHOWN = 5
 
@@ -61,7 +61,6 @@ TEXTS: dict[str, Check] = CHECKS | {
     "read-only": ("warning", "{error}", "make it writable before running anything in it"),
     "leftover": ("note", "left behind by a run that was killed", "remove it: rm -r {path}"),
     "damaged": ("error", "{error}", "restore it, or use another --output-path than {folder}"),
-    "damaged-cache": ("note", "damaged", "nothing to do: the next run reads photographs again"),
     "stages-missing": ("note", "not run yet: {stages}", "run the same 'run' again"),
     "features-missing": ("error", "is missing", SAME_RUN),
     "photographs-gone": ("warning", "its photographs are not there ({error})",

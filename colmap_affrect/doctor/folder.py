@@ -23,30 +23,26 @@ from colmap_affrect.doctor.findings import (
 )
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError
 from colmap_affrect.images.reading import readable_size
-from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.summaries import (
     GUIDED_BEFORE,
     guided_before,
-    made_from,
     model_folders,
     read_summary,
 )
-from colmap_affrect.pairs.base import PairList, PairOptions
+from colmap_affrect.pairs.base import PairList
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import NEW_SUFFIX
-from colmap_affrect.project.contents import Contents, sha256_of
+from colmap_affrect.project.contents import file_sha256
 from colmap_affrect.project.outputs import leads_outside
-from colmap_affrect.project.workspace import COPY_STAGES, INPUTS, STAGES, Workspace
-from colmap_affrect.recipes import EscalateOptions
+from colmap_affrect.project.record import COPY_STAGES, STAGES
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.guide import recorded_guiding
-from colmap_affrect.stages.inputs import Inputs, recorded_extraction
-from colmap_affrect.stages.match import recorded_matching
+from colmap_affrect.stages.extract import changed_images, contents_of
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.mend import edits_of
 from colmap_affrect.stages.pairs import without_deleted
-from colmap_affrect.stages.verify import recorded_verification
 
 Read = TypeVar("Read")
 
@@ -180,19 +176,13 @@ class _FolderExamination:
         if items:
             self.found.add(kind, where, items, folder=self.workspace.path)
 
-    def _record(self) -> dict[str, Any]:
+    def _record(self) -> Mapping[str, Any]:
         """Return the record, with options that later stages would take."""
-        record, workspace = self.workspace.recorded(), self.workspace
-        if "extract" in record.get("begun", []):
-            Inputs.recorded(workspace)
-            recorded_extraction(workspace)
-        where = str(workspace.config)
-        PairOptions.from_mapping(workspace.planned("pairs") or {}, where)
-        EscalateOptions.from_mapping(workspace.planned("escalate") or {}, where)
-        MAPPERS.options(workspace.planned("map") or {}, where=where)
-        recorded_matching(workspace)
-        recorded_verification(workspace)
-        recorded_guiding(workspace)
+        context, record = Context(self.workspace), self.workspace.recorded()
+        if "extract" in self.workspace.begun:
+            _ = context.inputs, context.extraction
+        _ = context.pairing, context.matching, context.verification, context.escalation
+        _ = context.guiding, context.mapping
         return record
 
     def _stages(self) -> list[str]:
@@ -204,7 +194,7 @@ class _FolderExamination:
         done = [stage for stage in STAGES if stage in record.get("begun", [])]
         wanted = list(COPY_STAGES if "copy" in done else STAGES[1:])
         wanted = [stage for stage in wanted if stage != "guide"]  # map does that when needed
-        if "extract" in done and not recorded_extraction(workspace).escalation:
+        if "extract" in done and not Context(workspace).extraction.escalation:
             wanted.remove("escalate")
         self.found.checked.append(
             f"{workspace.path}: stages on record: {', '.join(done) or 'none'}; recipe "
@@ -233,7 +223,7 @@ class _FolderExamination:
     def _photographs(self, features: Mapping[str, int] | None) -> set[str]:
         """Return the names of the photographs that were recorded, if they can be found."""
         try:
-            inputs = Inputs.recorded(self.workspace)
+            inputs = Context(self.workspace).inputs
             names = set(inputs.names())
         except AffrectError as error:
             self._add("photographs-gone", self.workspace.path, error=error)
@@ -247,12 +237,10 @@ class _FolderExamination:
 
     def _changed(self, inputs: Inputs, names: Collection[str]) -> list[str]:
         """Return the photographs that are not any more what their features are from."""
-        options, contents = recorded_extraction(self.workspace), Contents(self.workspace.contents)
-        return [
-            name
-            for name, known in Context(self.workspace).features.contents().items()
-            if known and name in names and known != contents.digest(inputs.files(name, options))
-        ]
+        context = Context(self.workspace)
+        known = context.features.contents()
+        both = known.keys() & names
+        return changed_images(known, contents_of(inputs, both, context.extraction, known))
 
     def _matches(self, names: Sequence[str]) -> None:
         path, listed = self.workspace.matches, self.workspace.pairs
@@ -267,7 +255,7 @@ class _FolderExamination:
         is_there = self._read(path, lambda: store.has(pairs), MATCH_AGAIN)
         if is_there is None or self._read(path, store.check_all, MATCH_AGAIN) is None:
             return
-        if store.finished_list() not in (None, "", sha256_of(listed)):
+        if store.finished_list() not in (None, "", file_sha256(listed)):
             self._add("pairs-changed", listed)
         self.found.checked.append(f"{path}: matches of {is_there.sum()} pairs of {len(pairs)}")
         missing = [
@@ -280,13 +268,11 @@ class _FolderExamination:
         cameras, guided = self.workspace.cameras, Context(self.workspace).guided
         self._read(cameras, lambda: read_camera_records(cameras))
         self._read(guided.path, guided.check_all)
-        if Contents(self.workspace.contents).is_damaged:
-            self._add("damaged-cache", self.workspace.contents)
 
     def _models(self) -> str | None:
         """Return the digests of what the models were made from, if that can be read."""
         sparse, aside = self.workspace.sparse, self.workspace.aside
-        inputs = self._read(sparse / INPUTS, lambda: made_from(sparse))
+        inputs = self._read(sparse, self.workspace.models_made_from)
         if inputs == "":
             self._add("map-unfinished", sparse)
         folders = model_folders(sparse)

@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import BeforeValidator
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.conventions import pixel_from_colmap
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.geometry.conventions import pixel_from_colmap
 from colmap_affrect.options import Options, within
 
 Number = Annotated[int | float, BeforeValidator(lambda value: math.inf if value is None else value)]

@@ -54,16 +54,15 @@ import numpy as np
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, relative_pose
-from colmap_affrect.conventions import colmap_from_pixel, pixel_from_colmap
-from colmap_affrect.errors import AffrectError, EvaluationError, OptionError
+from colmap_affrect.errors import AffrectError, EvaluationError, OptionError, such_as
 from colmap_affrect.evaluation.data import Dataset, EvaluationImage, EvaluationPair
 from colmap_affrect.evaluation.truths import Correspondences, TrueHomography, TruePose
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.geometry.conventions import colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.images.reading import IMAGE_SUFFIXES
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.project.outputs import leads_outside
-from colmap_affrect.shown import such_as
 
 Names = tuple[str, str]  # of the images of a pair, without suffix
 Views = Mapping[str, tuple[pycolmap.Camera, Pose]]

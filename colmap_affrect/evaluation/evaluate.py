@@ -13,7 +13,7 @@ from statistics import fmean
 import numpy as np
 
 from colmap_affrect.comparison.methods import Method, parse_methods
-from colmap_affrect.errors import EvaluationError, OptionError
+from colmap_affrect.errors import EvaluationError, OptionError, such_as
 from colmap_affrect.evaluation import datasets, truths
 from colmap_affrect.evaluation.data import Dataset, PairResult, ScoreOptions
 from colmap_affrect.evaluation.plots import write_plots
@@ -23,9 +23,8 @@ from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.reading import require_png
 from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.atomic_files import replace_text
-from colmap_affrect.project.versions import installed_versions
+from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.shown import such_as
 from colmap_affrect.stages.context import Resources
 
 NUM_RESAMPLES = 2000  # of the bootstrap

@@ -24,12 +24,12 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import colmap_keypoints
 from colmap_affrect.colmap.verification import Side, VerificationOptions, estimate_geometry
 from colmap_affrect.comparison.methods import Method
-from colmap_affrect.conventions import DEFAULT_FOCAL_RATIO
 from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.evaluation import data
 from colmap_affrect.evaluation.data import EvaluationPair, PairResult, PairScore
 from colmap_affrect.features.weights import digests
 from colmap_affrect.geometry.arrays import Array, Floats
+from colmap_affrect.geometry.conventions import DEFAULT_FOCAL_RATIO
 from colmap_affrect.options import digest_of
 from colmap_affrect.parallel.executor import available_cores, map_ordered
 from colmap_affrect.progress import Progress

@@ -19,11 +19,11 @@ import numpy as np
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, pose_errors
 from colmap_affrect.comparison.pose_scores import area_under_curve
-from colmap_affrect.conventions import colmap_from_pixel, is_inside
 from colmap_affrect.errors import EvaluationError
 from colmap_affrect.evaluation.data import PairResult, PairScore, ScoreOptions
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats
+from colmap_affrect.geometry.conventions import colmap_from_pixel, is_inside
 from colmap_affrect.geometry.epipolar import epipolar_lines, sampson_errors
 from colmap_affrect.geometry.two_views import essential_matrix, homogeneous
 from colmap_affrect.images.reading import read_gray

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
-from colmap_affrect.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS
 from colmap_affrect.data import GrayImage, LocalFeatures, View, in_mask, union
 from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.features.sift import DogOptions, detect_dog, is_searchable
 from colmap_affrect.geometry.affine import determinants, lafs_from_keypoints, rotation
 from colmap_affrect.geometry.arrays import Array, Bools, Floats, Singles
+from colmap_affrect.geometry.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.shapes import frames_from_affnet
 from colmap_affrect.options import within
 

@@ -17,12 +17,16 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS, grid_origin, resized_from_original
 from colmap_affrect.data import GrayImage, Mask, ShapeGrid, ShapeSamples
 from colmap_affrect.features.base import PATCH_SIZE_PX, FeatureOptions, NetworkContext, ShapeOptions
 from colmap_affrect.features.sift import DogOptions, detect_dog
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Floats, Singles
+from colmap_affrect.geometry.conventions import (
+    MEASUREMENT_SIGMAS,
+    grid_origin,
+    resized_from_original,
+)
 from colmap_affrect.geometry.shapes import (
     STEP_PX,
     frames_from_affnet,

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from colmap_affrect.conventions import HALF_PIXEL
 from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, Mask, View, in_mask
 from colmap_affrect.features.base import FeatureExtractor, FeatureOptions, NetworkContext
 from colmap_affrect.features.sift import is_searchable
 from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.geometry.arrays import Singles
+from colmap_affrect.geometry.conventions import HALF_PIXEL
 from colmap_affrect.options import within
 
 if TYPE_CHECKING:

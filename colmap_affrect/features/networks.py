@@ -19,14 +19,13 @@ from torch import Tensor, nn
 from torch.nn.functional import affine_grid, grid_sample
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from colmap_affrect.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS
-from colmap_affrect.errors import DeviceError, OptionError
+from colmap_affrect.errors import DeviceError, OptionError, such_as
 from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
+from colmap_affrect.geometry.conventions import HALF_PIXEL, MEASUREMENT_SIGMAS
 from colmap_affrect.images.warping import halved
-from colmap_affrect.shown import such_as
 
 Network = TypeVar("Network", bound=nn.Module)
 

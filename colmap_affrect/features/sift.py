@@ -6,11 +6,11 @@ from typing import Annotated, ClassVar, Literal
 import cv2
 import numpy as np
 
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures, View
 from colmap_affrect.features.base import FeatureExtractor, FeatureOptions, NetworkContext
 from colmap_affrect.geometry.affine import lafs_from_keypoints
 from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Indices, Singles
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.options import within
 
 

@@ -17,8 +17,7 @@ import tomllib
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from hashlib import file_digest
+from functools import cache
 from http.client import HTTPException
 from importlib import metadata
 from itertools import count
@@ -31,6 +30,7 @@ from pydantic import TypeAdapter
 from colmap_affrect.errors import OptionError, WeightsError
 from colmap_affrect.options import suggestion
 from colmap_affrect.progress import SILENT, Progress
+from colmap_affrect.project.contents import file_sha256
 
 logger = logging.getLogger(__name__)
 
@@ -189,28 +189,9 @@ def remedy(path: Path) -> str:
     return f"{first}run: colmap-affrect weights fetch {key}{folder}"
 
 
-def digests(files: Mapping[str, Path], recorded: Iterable[str] | None = None) -> dict[str, str]:
-    """Return the sha256 of files by key, for records.
-
-    Of what a record already has digests of (``recorded``) only these are returned; where an older
-    version recorded a file by its name, by that name.
-    """
-    names = {key: key for key in files}
-    if recorded is not None:
-        names = {_key_of(name): name for name in recorded}
-    return {names[key]: file_sha256(path) for key, path in files.items() if key in names}
-
-
-def file_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file in hexadecimal digits."""
-    there = path.stat()
-    return _sha256(path, there.st_mtime_ns, there.st_size)
-
-
-@lru_cache(maxsize=64)
-def _sha256(path: Path, _modified_ns: int, _size: int) -> str:
-    with path.open("rb") as file:
-        return file_digest(file, "sha256").hexdigest()
+def digests(files: Mapping[str, Path]) -> dict[str, str]:
+    """Return the sha256 of files by key, for records."""
+    return {key: file_sha256(path) for key, path in files.items()}
 
 
 def load_state_dict(path: Path) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.conventions import grid_origin
 from colmap_affrect.geometry.arrays import Array, Floats, Indices
+from colmap_affrect.geometry.conventions import grid_origin
 
 WINDOW_RADIUS = 2
 WINDOW_SIGMA_PX = 0.8  # Gaussian weights of the 5 x 5 window of a plane (the authors' values)

@@ -19,10 +19,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError, OptionError, WorkspaceError
 from colmap_affrect.geometry.arrays import Array, Bytes, Floats, Singles
+from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.images.depth_files import SUFFIXES, UnusableMap, read_map
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.images.reading import read_color, shrink_to

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.conventions import is_inside
 from colmap_affrect.data import ColorImage, GrayImage, Mask, Rectification
 from colmap_affrect.geometry.affine import lafs_from_keypoints, transform_frames
 from colmap_affrect.geometry.arrays import Array, Bytes, Singles
+from colmap_affrect.geometry.conventions import is_inside
 from colmap_affrect.images.masks import mask_values
 
 ANTI_ALIASING_SIGMA = 0.8  # px of the source, times sqrt(c^2 - 1) before a compression by c (ASIFT)

@@ -22,9 +22,13 @@ from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.initial_cameras import InitialCameras, import_images
 from colmap_affrect.colmap.useless_keypoints import leave_out_useless
 from colmap_affrect.colmap.verification import VerificationOptions, verified_pairs, verify
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS, colmap_from_pixel, pixel_from_colmap
 from colmap_affrect.errors import DatabaseError, ImageError, OptionError, StoreError
 from colmap_affrect.geometry.arrays import Indices, Singles
+from colmap_affrect.geometry.conventions import (
+    MEASUREMENT_SIGMAS,
+    colmap_from_pixel,
+    pixel_from_colmap,
+)
 from colmap_affrect.images.photographs import CameraOptions, list_images
 from colmap_affrect.interop.hdf5_layouts import (
     LAYOUTS,

@@ -27,14 +27,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.errors import OptionError, StoreError, damage, reason
+from colmap_affrect.errors import OptionError, StoreError, damage, reason, such_as
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.images.photographs import refuse_colliding_keys
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.atomic_files import cannot_write, require_space
 from colmap_affrect.project.outputs import leads_outside
 from colmap_affrect.project.stores import PairMatches, hloc_matches, pair_key
-from colmap_affrect.shown import such_as
 
 Datasets = dict[str, NDArray[Any]]
 

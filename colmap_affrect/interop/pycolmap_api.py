@@ -37,7 +37,7 @@ from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract, write_descriptors, write_images_and_keypoints
 from colmap_affrect.stages.guide import guide
-from colmap_affrect.stages.inputs import Inputs, recorded_extraction
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import add_pairs
@@ -289,7 +289,7 @@ def _match(
         if asked.get("skip_geometric_verification"):
             return tuple(reports)
         reports.append(verify_stage.verify_matches(context, verification))
-        if recorded_extraction(context.workspace).escalation:
+        if context.extraction.escalation:
             reports.append(escalate(context))
         if asked.get("rig_verification"):
             _verify_rigs(context.workspace.database, verification, token)

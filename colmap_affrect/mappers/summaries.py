@@ -1,6 +1,5 @@
 """What is known of finished models, kept beside them: COLMAP's files cannot hold it all."""
 
-import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,7 +12,6 @@ from colmap_affrect.errors import DAMAGE, StoreError, damage, made_again
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.checked_json import with_checksum, without_checksum
 from colmap_affrect.project.report import ModelSummary
-from colmap_affrect.project.workspace import INPUTS
 
 GUIDED_BEFORE = "guided-before.json"  # beside models that wait: the pairs guided then
 
@@ -65,18 +63,6 @@ def refuse_edited(sparse_path: Path) -> None:
             )
 
 
-def made_from(sparse_path: Path) -> str:
-    """Return the digests of what models were made from; empty where that was not finished."""
-    path = sparse_path / INPUTS
-    if not path.exists():
-        return ""
-    with damage(path, made_again("map", sparse_path.parent)):
-        text = path.read_text(encoding="ascii")
-        if not re.fullmatch("[0-9a-f]{64}( own| [0-9a-f]{64})?", text):
-            raise ValueError("no digests")
-        return text
-
-
 def write_guided_before(pairs: Sequence[tuple[str, str]], sparse_path: Path) -> None:
     """Keep which pairs are guided beside models that are going to be put aside."""
     text = _PAIRS.dump_json({"pairs": list(pairs)}).decode()
@@ -88,7 +74,6 @@ def guided_before(aside: Path) -> set[tuple[str, str]]:
     path = aside / GUIDED_BEFORE
     with damage(path, made_again("verify", aside.parent)):
         known = set(_PAIRS.validate_json(without_checksum(path.read_bytes()))["pairs"])
-    made_from(aside)
     for folder in model_folders(aside):
         require_intact(folder)
     return known

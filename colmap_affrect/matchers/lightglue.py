@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Indices, Singles
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.neighbors import without_duplicates
 from colmap_affrect.geometry.shapes import of_unit_area
 from colmap_affrect.matchers.base import (

@@ -141,15 +141,15 @@ def uninterrupted() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    told: list[int] = []
+    put_off: list[int] = []
     for number in known:
-        signal.signal(number, lambda told_of, _: told.append(told_of))
+        signal.signal(number, lambda number, _: put_off.append(number))
     try:
         yield
     finally:
         for number, handler in known.items():
             signal.signal(number, handler)
-        for again in dict.fromkeys(told):
+        for again in dict.fromkeys(put_off):
             signal.raise_signal(again)
 
 

@@ -1,4 +1,4 @@
-"""JSON objects that tell whether they are as they were written, by a checksum as last entry."""
+"""JSON objects with a checksum as last entry, to see that they are as they were written."""
 
 import re
 import zlib

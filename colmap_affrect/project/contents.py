@@ -1,72 +1,56 @@
-"""What input files hold: SHA-256 digests, kept with size and times so that an idle run reads none.
+"""What given files hold: SHA-256 digests, kept with size and times so that an idle run reads none.
 
-The digest of what an image was extracted from is stored with its features; here is only what saves
-reading files again, and the digests of what a database and a list of pairs were made from.
+A store keeps with the features of an image what they were extracted from.
 """
 
 import hashlib
-import json
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
-
-from colmap_affrect.errors import DAMAGE
-from colmap_affrect.project.atomic_files import replace_text
+from typing import NamedTuple
 
 
-def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file in hexadecimal digits."""
+class Content(NamedTuple):
+    """What files hold."""
+
+    digest: str = ""  # sha256: of the file, or of the digests of several; empty if not known
+    stamp: str = ""  # their sizes and times: while these stay, nobody has to read the files
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal digits; read once while it stays as it is."""
+    return _sha256(path, _stamp(path))
+
+
+@lru_cache(maxsize=64)
+def _sha256(path: Path, _: str) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-class Contents:
-    """Digests of files; those whose size and times are on record are not read again."""
+def _stamp(path: Path) -> str:
+    there = path.stat()
+    return f"{there.st_size} {there.st_mtime_ns} {there.st_ctime_ns}"
 
-    def __init__(self, path: Path) -> None:
-        """Read a record; one that is missing or damaged only means that files are read again."""
-        self._path, self._known, self.is_damaged = path, dict[str, Any](), path.exists()
-        with suppress(*DAMAGE):
-            self._known = dict(json.loads(path.read_text(encoding="utf-8")))
-            self.is_damaged = False
-        self._is_saved = True
 
-    def sha256(self, path: Path) -> str:
-        """Return the digest of a file, empty if it cannot be read."""
-        try:
-            there = path.stat()
-            stamp = [there.st_size, there.st_mtime_ns, there.st_ctime_ns]
-            known = self._known.get(str(path))
-            if not isinstance(known, list) or known[:-1] != stamp:
-                known = [*stamp, sha256_of(path)]
-                self._set(str(path), known)
-            return str(known[-1])
-        except OSError:
-            return ""
+def content_of(paths: Iterable[Path], known: Content | None = None) -> Content:
+    """Return what files hold, without reading them if sizes and times are those that are known.
 
-    def digest(self, paths: Iterable[Path]) -> str:
-        """Return a digest of several files in their order: that of the file if it is only one."""
-        digests = [self.sha256(path) for path in paths]
-        if len(digests) == 1:
-            return digests[0]
-        return hashlib.sha256("\n".join(digests).encode()).hexdigest() if digests else ""
+    One that cannot be read counts as empty.
+    """
+    files = list(paths)
+    stamp = ", ".join(_or_empty(_stamp, path) for path in files)
+    if known and known.stamp == stamp:
+        return known
+    digests = [_or_empty(file_sha256, path) for path in files]
+    if len(digests) == 1:
+        return Content(digests[0], stamp)
+    joined = hashlib.sha256("\n".join(digests).encode()).hexdigest() if digests else ""
+    return Content(joined, stamp)
 
-    def recorded(self, purpose: str) -> str:
-        """Return the digest of what something was made from, empty if it is not known."""
-        return str(self._known.get(f":{purpose}", ""))
 
-    def record(self, purpose: str, digest: str) -> None:
-        """Put on record what something is made from now."""
-        self._set(f":{purpose}", digest)
-        self.save()
-
-    def _set(self, key: str, value: object) -> None:
-        if self._known.get(key) != value:
-            self._known[key], self._is_saved = value, False
-
-    def save(self) -> None:
-        """Write the record if anything in it is new."""
-        if not self._is_saved:
-            replace_text(self._path, json.dumps(self._known, indent=0, sort_keys=True))
-            self._is_saved = True
+def _or_empty(read: Callable[[Path], str], path: Path) -> str:
+    try:
+        return read(path)
+    except OSError:
+        return ""

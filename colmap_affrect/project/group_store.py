@@ -151,7 +151,7 @@ def _checksum(values: Any) -> int:
 
 
 def is_complete(file: h5py.File, key: str) -> bool:
-    """Tell whether a group is there and complete."""
+    """Return whether a group is there and complete."""
     return key in file and bool(file[key].attrs.get("complete", False))
 
 

@@ -25,7 +25,7 @@ MARKS = (
 )  # fmt: skip
 """Files of ours, also of older versions, and what each has at its beginning."""
 SPARE_BYTES = 1 << 16  # a disk with less room may have cut off what was written last
-BYTES_OF_MARK = 200  # at the beginning of these files, in which they tell whose they are
+BYTES_OF_MARK = 200  # at the beginning of these files, which say whose they are
 
 
 OF_SYSTEMS = {"Thumbs.db", "desktop.ini", "lost+found"}
@@ -34,7 +34,7 @@ files."""
 
 
 def is_output_folder(path: Path) -> bool:
-    """Tell whether this program has written its record or its log into a folder."""
+    """Return whether this program has written its record or its log into a folder."""
     for name, mark in MARKS:
         with suppress(OSError), (path / name).open("rb") as file:
             if mark in file.read(BYTES_OF_MARK):
@@ -43,7 +43,7 @@ def is_output_folder(path: Path) -> bool:
 
 
 def leads_outside(name: str) -> bool:
-    r"""Tell whether a file of this name, taken from a model or a database, may leave its folder.
+    r"""Return whether a file of this name, taken from a model or a database, may leave its folder.
 
     >>> [leads_outside(name) for name in ("a/b.jpg", "/a.jpg", "a/../../b.jpg", "C:a", "..\\b")]
     [False, True, True, True, True]

@@ -3,12 +3,14 @@
 import csv
 import io
 import json
+import platform
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from importlib import metadata
 from typing import Any
 
-from colmap_affrect.shown import such_as
+from colmap_affrect.errors import such_as
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_NO_MODEL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -22,7 +24,34 @@ SOURCES = {
 }  # fmt: skip
 """How a summary calls where focal lengths are from; others are called by their own names."""
 
+OF_LARGEST = (
+    "registered_names", "doubtful", "doubts", "mean_track_length", "mean_reprojection_error_px",
+)  # fmt: skip
+OF_RUN = (
+    "unregistered", "advice", "extended", "added", "num_pairs", "num_verified_pairs", "pair_levels",
+    "contradicting_pairs", "guided", "cameras", "recipe", "preset", "differs_from_colmap",
+    "versions",
+)  # fmt: skip
+"""What ``report.json`` has of the largest model and of the run under its own name."""
+
 USUAL = "sparse, sparse mapper"  # preset and mapper that a summary does not name
+
+
+REPORTED_PACKAGES = (
+    "colmap-affrect", "pycolmap", "pyceres", "opencv-python-headless", "numpy", "h5py", "torch",
+    "kornia",
+)  # fmt: skip
+
+
+def installed_versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide results."""
+    versions = {"python": platform.python_version()}
+    for package in REPORTED_PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "not installed as a package"
+    return versions
 
 
 def _some(lines: Iterable[str]) -> list[str]:
@@ -302,40 +331,24 @@ class ReconstructionReport:
         random_seed = mapping.pop("random_seed")
         verification.pop("random_seed")
         largest = self.models[0] if self.models else ModelSummary((), 0, 0.0, 0.0)
-        return {
+        found: dict[str, Any] = {
             "status": self.status,
             "images_total": self.images_total,
             "images_registered": len(largest.registered_names),
-            "registered_names": list(largest.registered_names),
-            "unregistered": self.unregistered,
-            "doubtful": largest.doubtful,
-            "doubts": list(largest.doubts),
-            "arrivals": {name: item.to_mapping() for name, item in largest.arrivals.items()},
-            "advice": list(self.advice),
-            "num_models": len(self.models),
+            **{key: getattr(largest, key) for key in OF_LARGEST},
             "points3D": largest.num_points3D,
-            "mean_track_length": largest.mean_track_length,
-            "mean_reprojection_error_px": largest.mean_reprojection_error_px,
+            "arrivals": {name: item.to_mapping() for name, item in largest.arrivals.items()},
+            "num_models": len(self.models),
             "models": [list(model.registered_names) for model in self.models],
-            "extended": list(self.extended),
-            "added": list(self.added),
-            "num_pairs": self.num_pairs,
-            "num_verified_pairs": self.num_verified_pairs,
-            "pair_levels": self.pair_levels,
-            "contradicting_pairs": self.contradicting_pairs,
-            "guided": self.guided,
-            "cameras": list(self.cameras),
+            **{key: getattr(self, key) for key in OF_RUN},
             "stages": [asdict(stage) for stage in self.stages],
-            "recipe": self.recipe,
-            "preset": self.preset,
             "mapper": mapper,
             "mapper_options": mapper_options,
             "verification": verification,
             "mapping": mapping,
-            "differs_from_colmap": self.differs_from_colmap,
             "random_seed": random_seed,
-            "versions": self.versions,
         }
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items()}
 
     def to_json(self) -> str:
         """Return ``report.json`` as text."""

@@ -12,22 +12,31 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import LocalFeatures, of_one_size, union
 from colmap_affrect.errors import StoreError
 from colmap_affrect.geometry.arrays import Bools, Floats, Indices, Singles
-from colmap_affrect.project.feature_index import Entries, entries, forget
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
+from colmap_affrect.project.contents import Content
 from colmap_affrect.project.group_store import GroupStore, checked, complete_groups, is_complete
 
 MAX_INT16 = 32767
+NOT_KNOWN = Content()
 STATIONARY = "stationary_cells"
 STEP = "step"
 FINISHED = "finished_list"
+
+
+Entries = dict[str, tuple[Content, int, tuple[int, int]]]
+"""By image: what it was extracted from, the number of its features, and (width, height) in px."""
+
+_known: dict[Path, tuple[tuple[int, ...], Entries]] = {}
+"""What files held when they were last gone through, which takes long, by size and times."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +54,12 @@ def _entries_of(file: h5py.File) -> Entries:
     found: Entries = {}
     for name, group in complete_groups(file):
         width, height = checked(group, "image_size").tolist()
-        content = str(group.attrs.get("content", ""))
-        found[name] = content, len(group["keypoints"]), (width, height)
+        found[name] = _content(group), len(group["keypoints"]), (width, height)
     return found
+
+
+def _content(group: h5py.Group) -> Content:
+    return Content(str(group.attrs.get("content", "")), str(group.attrs.get("stamp", "")))
 
 
 def frame_datasets(lafs: Floats) -> dict[str, Singles]:
@@ -68,13 +80,17 @@ class FeatureStore(GroupStore):
     def _entries(self) -> Entries:
         if not self.path.exists():
             return {}
-        with self._open("r") as file:
-            return entries(self.path, lambda: _entries_of(file))
+        with self._open("r") as file:  # refuses what is not ours
+            there = self.path.stat()
+            stamp = there.st_ino, there.st_size, there.st_mtime_ns, there.st_ctime_ns
+            if self.path not in _known or _known[self.path][0] != stamp:
+                _known[self.path] = stamp, dict(sorted(_entries_of(file).items()))
+            return _known[self.path][1]
 
     @contextmanager
     def _open(self, mode: str) -> Iterator[h5py.File]:
         if mode != "r":
-            forget(self.path)
+            _known.pop(self.path, None)  # it may change again within one tick of the clock
         with super()._open(mode) as file:
             yield file
 
@@ -87,21 +103,25 @@ class FeatureStore(GroupStore):
         return self._entries().keys() & set(keys)
 
     def write(
-        self, name: str, features: LocalFeatures, image_size: tuple[int, int], content: str = ""
+        self,
+        name: str,
+        features: LocalFeatures,
+        image_size: tuple[int, int],
+        content: Content = NOT_KNOWN,
     ) -> None:
-        """Write the features of one image, and the digest of the files that they are from."""
+        """Write the features of one image, and what the files hold that they are from."""
         with self._open("a") as file:
             self._write_features(file, name, features, image_size, [len(features)], content)
 
-    def contents(self) -> dict[str, str]:
-        """Return for each image the digest of the files that it was extracted from, if known."""
+    def contents(self) -> dict[str, Content]:
+        """Return for each image what the files hold that it was extracted from."""
         return {name: content for name, (content, *_) in self._entries().items()}
 
-    def record_contents(self, contents: Mapping[str, str]) -> None:
+    def record_contents(self, contents: Mapping[str, Content]) -> None:
         """Put on record what images were extracted from."""
         with self._open("a") as file:
             for name, content in contents.items():
-                file[name].attrs["content"] = content
+                file[name].attrs.update(content=content.digest, stamp=content.stamp)
 
     def remove(self, names: Iterable[str]) -> None:
         """Remove the features of images."""
@@ -120,8 +140,7 @@ class FeatureStore(GroupStore):
             ids = features.rectification_ids
             added = replace(features, rectification_ids=np.where(ids, ids + first_id, 0))
             both = union(of_one_size([there, added]))
-            content = str(group.attrs.get("content", ""))
-            self._write_features(file, name, both, size, [*ends, len(both)], content)
+            self._write_features(file, name, both, size, [*ends, len(both)], _content(group))
 
     def _write_features(
         self,
@@ -130,7 +149,7 @@ class FeatureStore(GroupStore):
         features: LocalFeatures,
         image_size: tuple[int, int],
         level_ends: list[int],
-        content: str,
+        content: Content,
     ) -> None:
         datasets = {
             "keypoints": features.keypoints.astype(np.float32),
@@ -141,7 +160,7 @@ class FeatureStore(GroupStore):
             "rectification_ids": features.rectification_ids,
             "level_ends": np.asarray(level_ends),
         }
-        self._write(file, name, datasets, content=content)
+        self._write(file, name, datasets, content=content.digest, stamp=content.stamp)
 
     def read(self, name: str) -> LocalFeatures:
         """Read all features of one image; StoreError if they are missing or incomplete."""
@@ -236,9 +255,9 @@ class MatchStore(GroupStore):
                 file[pair_key(*names)].attrs["tried_level"] = tried_level
 
     def remove(self, images: Iterable[str] = (), pairs: Iterable[tuple[str, str]] = ()) -> None:
-        """Remove the matches of pairs, of all pairs of some images, and of those that climbed.
+        """Remove the matches of pairs, of all pairs of some images, and of all escalated ones.
 
-        Which pairs climb depends on all others.
+        Which pairs are escalated depends on all others.
         """
         if not self.path.exists():
             return
@@ -262,7 +281,7 @@ class MatchStore(GroupStore):
         self._record_text(STATIONARY, json.dumps([(s, c.tolist()) for s, c in cells.items()]))
 
     def has(self, pairs: Sequence[tuple[str, str]]) -> Bools:
-        """Tell, as (N,) bools, which of N pairs are there and complete."""
+        """Return, as (N,) bools, which of N pairs are there and complete."""
         if not self.path.exists():
             return np.zeros(len(pairs), np.bool_)
         with self._open("r") as file:

@@ -3,28 +3,17 @@
 import logging
 import os
 import shutil
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from copy import deepcopy
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
 
-import tomli_w
 from filelock import FileLock, Timeout
 
 from colmap_affrect import __version__
-from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError, damage
-from colmap_affrect.options import digest_of, suggestion
+from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError, damage, made_again
+from colmap_affrect.options import digest_of
 from colmap_affrect.project.atomic_files import NEW_SUFFIX, replace_text
-from colmap_affrect.project.differences import (
-    GIVEN,
-    LOCAL,
-    first_difference,
-    placeless,
-    without_digests,
-)
 from colmap_affrect.project.outputs import (
     LOCK,
     OF_SYSTEMS,
@@ -33,41 +22,42 @@ from colmap_affrect.project.outputs import (
     refuse_link,
     remove_own,
 )
+from colmap_affrect.project.record import (
+    GIVEN,
+    MADE_FROM,
+    STAGES,
+    WEIGHTS,
+    first_difference,
+    placeless,
+    read_record,
+    record_text,
+)
 
 logger = logging.getLogger(__name__)
 
-INPUTS = "inputs.sha256"  # in sparse/: digests of what it was made from
+INPUTS = "inputs.sha256"  # in sparse/, of older versions: what is in ``made_from`` now
 FILES_OF_SPARSE = {INPUTS, "guided-before.json"}
 FILES_OF_MODEL = {
     "cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin", "summary.json",
 }  # fmt: skip
-STAGES = ("copy", "extract", "pairs", "match", "verify", "escalate", "guide", "map")
-COPY_STAGES = ("copy", "verify", "map")  # of a folder in which another program's database is mapped
+OF_OLDER_VERSIONS = ("contents.json", ".features.h5.index")
 LOCK_WAIT_S = 1.0  # for one that a killed process still has while it ends
 OWN_STEMS = {
-    "cameras", "config", "contents", "database", "depth", "features", "guided", "matches",
-    "methods", "pairs", "report", "run", "shared", "sparse",
+    "cameras", "config", "database", "depth", "features", "guided", "matches", "methods", "pairs",
+    "report", "run", "shared", "sparse",
 }  # fmt: skip
 """How names of files and folders begin that are written here."""
 
-SEAL_SUFFIXES = (".seal", ".seal-open", ".parts")  # beside a database; the last of older versions
-FORMAT_VERSION = 6  # of ``config.toml``: counts up when a stage records other options than before
-
-
-@lru_cache(maxsize=2)
-def _parsed(record: str) -> dict[str, Any]:
-    """Parse a record of options, which a run reads many times."""
-    return tomllib.loads(record)
+SEAL_SUFFIXES = (".seal", ".seal-open")  # beside a database
+NOT_IN_DIGESTS = ("image_path", "image_list_path", "from_database", "cameras")
 
 
 class Workspace:
-    """Paths below an output folder.
+    """Paths below an output folder, and the record of the stages that were run there.
 
-    ``config.toml`` records, by stage, the options of a run, and under ``begun`` the stages that
-    have been run with them. A stage that is run again with the same options goes on where it
-    stopped; with other options it refuses, and ``overwrite`` removes its results and those of the
-    stages after it. A stage that has not begun takes the options on record unless it is given
-    others.
+    A stage that is run again with the same options goes on where it stopped; with other options it
+    refuses, and ``overwrite`` removes its results and those of the stages after it. A stage that
+    has not begun takes the options on record unless it is given others.
 
     A folder begins with ``extract``, or with ``copy`` of another program's database to be mapped.
     """
@@ -88,7 +78,7 @@ class Workspace:
         self.config, self.log = path / "config.toml", path / "run.log"  # options; of all runs
         self.report, self.page = path / "report.json", path / "report.html"  # of the last run
         self.cameras = path / "cameras.json"  # what is known of the database's, and from where
-        self.contents = path / "contents.json"  # digests of the files that were read
+        self._record: dict[str, Any] | None = None
 
     @classmethod
     def beside(cls, database_path: Path) -> Self:
@@ -106,17 +96,14 @@ class Workspace:
         Files are shared where the file system can do that.
         """
         path.mkdir(parents=True, exist_ok=True)
-        shared = [self.features, self.pairs, self.matches]
-        for source in [*shared, *([self.cameras] if self.cameras.exists() else [])]:
+        for source in (self.features, self.pairs, self.matches, self.cameras):
             try:
                 os.link(source, path / source.name)
             except OSError:
-                shutil.copy(source, path / source.name)
-        record = self.recorded()
-        later = STAGES[STAGES.index("verify") :]
-        record["begun"] = [stage for stage in record["begun"] if stage not in later]
+                if source.exists():
+                    shutil.copy(source, path / source.name)
         made = Workspace(path)
-        made._write_record(record)
+        made._write_record({**self.recorded(), "begun": self._begun_before("verify")})
         return made
 
     def require_own(self, photographs: Path | None = None) -> None:
@@ -130,11 +117,11 @@ class Workspace:
                 f"{self.path}: is the folder of the photographs; give another one as --output-path"
             )
         with suppress(OSError):  # not there, or refused when it is to be used
-            names = {path.name: path for path in self.path.iterdir()}
-            for name, path in names.items():
-                if name.partition(".")[0] in OWN_STEMS or name == LOCK:
+            paths = list(self.path.iterdir())
+            for path in paths:
+                if path.name.partition(".")[0] in OWN_STEMS or path.name == LOCK:
                     refuse_link(path)
-            foreign = [name for name, path in names.items() if not _may_be_ours(path)]
+            foreign = [path.name for path in paths if not _may_be_ours(path)]
             if foreign and not is_output_folder(self.path):
                 raise OptionError(
                     f"{self.path}: is not empty ({min(foreign)}) and was not made by "
@@ -159,7 +146,7 @@ class Workspace:
 
     @contextmanager
     def locked(self) -> Iterator[Self]:
-        """Make the folder and keep other runs out.
+        """Make the folder and keep other runs out; the record is read anew.
 
         Raises OptionError for a folder of somebody else, WorkspaceError when it cannot be used.
         """
@@ -174,6 +161,7 @@ class Workspace:
             ) from error
         except OSError as error:
             raise self._unusable(error) from error
+        self._record = None
         try:
             yield self
         finally:
@@ -190,31 +178,28 @@ class Workspace:
                     raise
             yield self
 
-    def recorded(self) -> dict[str, Any]:
-        """Return the options on record by stage; empty where there are none.
+    def recorded(self) -> Mapping[str, Any]:
+        """Return the record, see :func:`~colmap_affrect.project.record.read_record`."""
+        if self._record is None:
+            self._record = read_record(self.config, self.path)
+        return self._record
 
-        Raises WorkspaceError when the record is damaged or of another version of this package.
-        """
-        if not self.config.exists():
-            return {}
-        mend = f"restore it, or use another --output-path than {self.path}"
-        with damage(self.config, mend, WorkspaceError):
-            record = deepcopy(_parsed(self.config.read_text(encoding="utf-8")))
-        if record.pop("format_version", None) != FORMAT_VERSION:
-            raise WorkspaceError(
-                f"{self.path}: was made by another version of colmap-affrect, which cannot be "
-                "gone on with; use another --output-path or remove it"
-            )
-        for name in record.keys() - {"recipe", "begun", *STAGES}:
-            raise OptionError(f"{self.config}: unknown {name!r}{suggestion(name, STAGES)}; {mend}")
-        with damage(self.config, mend, WorkspaceError):
-            _require_complete(record)
-        return record
+    def _write_record(self, record: Mapping[str, Any]) -> None:
+        replace_text(self.config, record_text(record))
+        self._record = None
+
+    @property
+    def begun(self) -> list[str]:
+        """The stages that have been run, in their order."""
+        return list(self.recorded().get("begun", []))
+
+    def _begun_before(self, stage: str) -> list[str]:
+        return [name for name in self.begun if STAGES.index(name) < STAGES.index(stage)]
 
     @property
     def is_copy(self) -> bool:
         """Whether the folder holds a copy of another program's database."""
-        return "copy" in self.recorded().get("begun", [])
+        return "copy" in self.begun
 
     def recipe(self) -> str:
         """Return the name of the recipe that the features were made with."""
@@ -224,16 +209,46 @@ class Workspace:
     def planned(self, stage: str) -> dict[str, Any] | None:
         """Return the options on record for a stage, begun or not; None if there are none."""
         options = self.recorded().get(stage)
-        return None if options is None else without_digests(options)
+        return None if options is None else {k: v for k, v in options.items() if k != WEIGHTS}
+
+    def require(self, stage: str) -> dict[str, Any]:
+        """Return the recorded options of an earlier stage; OptionError when it was not run."""
+        if stage not in self.begun:
+            raise OptionError(
+                f"{self.path}: the {stage} stage has not been run there; run "
+                f"'colmap-affrect {stage}' with this --output-path first"
+            )
+        return dict(self.recorded()[stage])
 
     def photographs(self) -> Path | None:
         """Return the folder of the photographs on record, None where none is known."""
         with suppress(WorkspaceError):
-            record = self.recorded()
             for stage in ("extract", "copy"):
-                if path := record.get(stage, {}).get("image_path"):
+                if path := self.recorded().get(stage, {}).get("image_path"):
                     return Path(path)
         return None
+
+    def made_from(self, what: str) -> str:
+        """Return the digest of the files that something was made from, empty if not known."""
+        return str(self.recorded().get(MADE_FROM, {}).get(what, ""))
+
+    def record_made_from(self, what: str, digest: str) -> None:
+        """Put on record what something is made from now."""
+        if self.made_from(what) != digest:
+            record = self.recorded()
+            known = {**record.get(MADE_FROM, {}), what: digest}
+            self._write_record({**record, MADE_FROM: known})
+
+    def models_made_from(self) -> str:
+        """Return the digests of what the models were made from, empty where there are none.
+
+        Of verified pairs and, after a space, of the model that was extended, if any.
+        """
+        if not self.sparse.exists():
+            return ""
+        old = self.sparse / INPUTS
+        with damage(old, made_again("map", self.path)):
+            return self.made_from("map") or (old.read_text("ascii") if old.exists() else "")
 
     def record_options(
         self,
@@ -251,36 +266,32 @@ class Workspace:
         and the later ones first; with the first stage their options are forgotten, too. Raises
         StaleStoreError when other options made the results that are there.
         """
-        record = self.recorded()
-        self._refuse_foreign_results(record, stage)
+        self._refuse_foreign_results(stage)
         self._remove(self.path.glob(f"*{NEW_SUFFIX}"))  # of a run that was killed
-        begun = record.get("begun", [])
+        self._remove(self.path / name for name in OF_OLDER_VERSIONS)
+        record, begun = self.recorded(), self.begun
         if overwrite:
             self.refuse_foreign_models()
             self._remove(self._results(stage))
-            begun = [name for name in begun if STAGES.index(name) < STAGES.index(stage)]
+            begun = self._begun_before(stage)
             record = record if begun else {}
         if stage in begun:
-            known, now = record.get("recipe"), recipe
-            other = known and now and known != now
-            if difference := first_difference(
-                placeless(record[stage], GIVEN), placeless(options, GIVEN)
-            ):
-                why = f" (recipe {known!r} there, {now!r} now)" if other else ""
-                raise StaleStoreError(
-                    f"{self.path}: the {stage} stage was run there with {difference}{why}; "
-                    f"{self._remedy}"
-                )
+            self._refuse_other_options(stage, options, recipe)
         begun = [name for name in STAGES if name in begun or name == stage]
         later = {name: dict(values) for name, values in (plan or {}).items() if name not in begun}
-        record = {**record, **later, stage: dict(options), "begun": begun}
-        if recipe:
-            record["recipe"] = recipe
-        self._write_record(record)
+        changed = {**record, **later, stage: dict(options), "begun": begun}
+        self._write_record({**changed, "recipe": recipe or record.get("recipe", "")})
 
-    def _write_record(self, record: Mapping[str, Any]) -> None:
-        ordered = {key: record[key] for key in ("recipe", "begun", *STAGES) if key in record}
-        replace_text(self.config, tomli_w.dumps({"format_version": FORMAT_VERSION, **ordered}))
+    def _refuse_other_options(self, stage: str, options: Mapping[str, Any], recipe: str) -> None:
+        known, record = self.recorded().get("recipe"), self.recorded()[stage]
+        difference = first_difference(placeless(record, GIVEN), placeless(options, GIVEN))
+        if difference:
+            other = known and recipe and known != recipe
+            why = f" (recipe {known!r} there, {recipe!r} now)" if other else ""
+            raise StaleStoreError(
+                f"{self.path}: the {stage} stage was run there with {difference}{why}; "
+                f"{self._remedy}"
+            )
 
     def rewind(self, why: str = "what it was made from has changed") -> None:
         """Remove the database and what was made from it, for inputs that have changed.
@@ -290,11 +301,14 @@ class Workspace:
         """
         if self.users_database:
             raise StaleStoreError(f"{self.users_database}: {why}; {self._remedy}")
-        (self.sparse / INPUTS).unlink(missing_ok=True)
+        self.forget_models()
         self._remove(path for path in self._results("verify") if path != self.sparse)
-        record, first = self.recorded(), STAGES.index("verify")
-        record["begun"] = [name for name in record["begun"] if STAGES.index(name) < first]
-        self._write_record(record)
+        self._write_record({**self.recorded(), "begun": self._begun_before("verify")})
+
+    def forget_models(self) -> None:
+        """Have the models made anew, which stay until others take their place."""
+        (self.sparse / INPUTS).unlink(missing_ok=True)
+        self.record_made_from("map", "")
 
     @property
     def _remedy(self) -> str:
@@ -303,36 +317,25 @@ class Workspace:
         return "use --overwrite to redo it and the stages after it, or another --output-path"
 
     def options_digest(self, *stages: str) -> str:
-        """Return a sha256 of the recorded options of stages, without those in ``LOCAL``.
+        """Return a sha256 of the recorded options of stages, for what they leave.
 
         The digest stays the same when files are moved or photographs get other cameras.
         """
         record = self.recorded()
         chosen = {stage: placeless(record.get(stage, {}), GIVEN) for stage in stages}
         for options in chosen.values():
-            for key in LOCAL:
+            for key in NOT_IN_DIGESTS:
                 options.pop(key, None)
         return digest_of(chosen)
 
-    def require(self, stage: str) -> dict[str, Any]:
-        """Return the recorded options of an earlier stage; OptionError when it was not run."""
-        record = self.recorded()
-        if stage not in record.get("begun", []):
-            raise OptionError(
-                f"{self.path}: the {stage} stage has not been run there; run "
-                f"'colmap-affrect {stage}' with this --output-path first"
-            )
-        return dict(record[stage])
-
-    def _refuse_foreign_results(self, record: Mapping[str, Any], stage: str) -> None:
-        begun = record.get("begun", [])
+    def _refuse_foreign_results(self, stage: str) -> None:
         first = {"copy": "extract", "extract": "copy"}.get(stage)
-        if first in begun:
+        if first in self.begun:
             raise StaleStoreError(
                 f"{self.path}: the {first} stage was run there, which {stage} cannot go on from; "
                 "use another --output-path"
             )
-        if {"copy", "extract"} & set(begun):
+        if {"copy", "extract"} & set(self.begun):
             return
         database = [] if self.users_database else [self.database]
         for path in (*database, self.sparse, self.features, self.matches, self.guided):
@@ -366,7 +369,7 @@ class Workspace:
             ],
             "match": [self.matches],
             "pairs": [self.pairs, self.deleted_pairs],
-            "extract": [self.features, self.contents],
+            "extract": [self.features],
         }
         later = STAGES[STAGES.index(stage) :]
         return [path for name, paths in made.items() if name in later for path in paths]
@@ -380,18 +383,7 @@ class Workspace:
 
 
 def _may_be_ours(path: Path) -> bool:
-    """Tell whether a file may be in an empty folder, or in that of a run that was killed early."""
+    """Return whether a file may be in an empty folder, or that of a run that was killed early."""
     name = path.name
     is_empty_log = name == "run.log" and not path.stat().st_size
     return name.startswith(".") or name in OF_SYSTEMS or name.endswith(NEW_SUFFIX) or is_empty_log
-
-
-def _require_complete(record: Mapping[str, Any]) -> None:
-    """Refuse a record that lacks options of a stage that has begun; ValueError."""
-    begun = record.get("begun", [])
-    tables = [record.get(stage, None if stage in begun else {}) for stage in STAGES]
-    texts = [record.get("recipe", ""), *begun]
-    if not (set(begun) <= set(STAGES) and all(isinstance(each, dict) for each in tables)):
-        raise ValueError("options of stages that have begun are missing")
-    if not all(isinstance(each, str) for each in texts):
-        raise ValueError("names are no texts")

@@ -11,9 +11,9 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan
 from colmap_affrect.geometry.arrays import Array, Floats
+from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.geometry.planes import (
     cluster_normals,
     fronto_parallel_homography,

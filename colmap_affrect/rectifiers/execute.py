@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.data import (
     ColorImage,
     GrayImage,
@@ -19,6 +18,7 @@ from colmap_affrect.data import (
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.geometry.affine import ellipse_extents, transform_frames
 from colmap_affrect.geometry.arrays import Singles
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.geometry.neighbors import neighbors_within
 from colmap_affrect.images.masks import mask_values
 from colmap_affrect.images.warping import warp, warp_mask

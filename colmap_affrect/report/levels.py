@@ -15,7 +15,7 @@ from colmap_affrect.data import (
     View,
 )
 from colmap_affrect.features.base import FeatureExtractor
-from colmap_affrect.project.stopwatch import Stopwatch
+from colmap_affrect.progress import Stopwatch
 from colmap_affrect.rectifiers.base import RectifierOptions
 from colmap_affrect.report.regions import bounding_box, region_area_px
 from colmap_affrect.stages.one_image import ImageExtractor

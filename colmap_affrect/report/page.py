@@ -10,9 +10,9 @@ from typing import Any
 
 import jinja2
 
+from colmap_affrect.errors import shown
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.report import match_plots, view_graph
-from colmap_affrect.shown import shown
 
 TEMPLATES = Path(__file__).parent / "templates"
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from colmap_affrect.errors import such_as
 from colmap_affrect.options import flat
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
@@ -15,7 +16,6 @@ from colmap_affrect.report import view_graph
 from colmap_affrect.report.page import TEMPLATES, write_page
 from colmap_affrect.report.pictures import thumbnails
 from colmap_affrect.report.scene import read_scene
-from colmap_affrect.shown import such_as
 
 KINDS = {
     "tracks": "registered by common points",

@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.patheffects import withStroke
 
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import ColorImage, GrayImage, LocalFeatures
 from colmap_affrect.geometry.affine import transform_frames
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.report.levels import InspectedLevel, summary
 from colmap_affrect.report.regions import (
     UNIT_CIRCLE,

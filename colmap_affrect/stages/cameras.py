@@ -25,8 +25,7 @@ from colmap_affrect.progress import SILENT, Progress
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import unmeasured_pairs
-from colmap_affrect.stages.inputs import Inputs
-from colmap_affrect.stages.verify import extracted_px, recorded_verification
+from colmap_affrect.stages.verify import extracted_px
 
 logger = logging.getLogger(__name__)
 
@@ -43,11 +42,11 @@ def choose_cameras(context: Context, *, may_share: bool = True) -> StageReport:
     copied = workspace.is_copy
     size_px = None if copied else extracted_px(context)
     is_new = needs_vote(read_camera_records(workspace.cameras))
-    may_share = may_share and not copied and Inputs.recorded(workspace).cameras.mode == "auto"
+    may_share = may_share and not copied and context.inputs.cameras.mode == "auto"
     hold_vote(
         workspace.database,
         workspace.cameras,
-        recorded_verification(workspace),
+        context.verification,
         size_px,
         may_share=may_share,
         silent=[] if copied else unmeasured_pairs(context),

@@ -3,14 +3,25 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, TypeVar
 
+from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import WeightsError
-from colmap_affrect.features.weights import digests, file_sha256
+from colmap_affrect.mappers.base import MAPPERS, MapperOptions
+from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
+from colmap_affrect.matchers.guided import GuidedOptions
+from colmap_affrect.options import Options, Registry, from_record
+from colmap_affrect.pairs.base import PairOptions
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.differences import WEIGHTS
+from colmap_affrect.project.contents import file_sha256
+from colmap_affrect.project.record import WEIGHTS
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
+from colmap_affrect.recipes import EscalateOptions, ExtractionOptions
+from colmap_affrect.stages.inputs import Inputs
+
+AnyOptions = TypeVar("AnyOptions", bound=Options)
 
 
 @dataclass(frozen=True)
@@ -46,27 +57,75 @@ def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) 
             )
 
 
-def digests_to_record(
-    workspace: Workspace, stage: str, weights: Mapping[str, Path], *, overwrite: bool
-) -> dict[str, str]:
-    """Return the sha256 of weights by key, for the record of a stage.
-
-    Those of a stage that has begun are named as there, where older versions had names of files and,
-    of recipes that escalate, no matchers but the first.
-    """
-    record = workspace.recorded()
-    has_begun = stage in record.get("begun", []) and not overwrite
-    return digests(weights, record[stage].get(WEIGHTS, {}) if has_begun else None)
-
-
 @dataclass(frozen=True)
 class Context:
-    """Where a run works and with what; none of it changes a result."""
+    """Where a run works and with what; none of it changes a result.
+
+    Options are those on record of the folder, which the workspace reads when a command begins: of
+    photographs and features once these have been extracted, of other stages those that were done
+    with or are still to be done with.
+    """
 
     workspace: Workspace  # the output folder
     resources: Resources = field(default_factory=Resources)  # weights and device
     executor: Executor | None = None  # for images and pairs, e.g. a cluster; None: threads here
     progress: Progress = SILENT  # where to show progress
+
+    @property
+    def inputs(self) -> Inputs:
+        """Which photographs the run is about, and what is known of them."""
+        return self._built(Inputs, self._extract_section(Inputs))
+
+    @property
+    def extraction(self) -> ExtractionOptions:
+        """How features are extracted."""
+        return self._built(ExtractionOptions, self._extract_section(ExtractionOptions))
+
+    @property
+    def pairing(self) -> PairOptions:
+        """How pairs are chosen."""
+        return self._built(PairOptions, self.workspace.planned("pairs"))
+
+    @property
+    def matching(self) -> MatcherOptions:
+        """How pairs are matched."""
+        options: MatcherOptions = self._part(MATCHERS, "match")
+        return options
+
+    @property
+    def verification(self) -> VerificationOptions:
+        """How pairs are verified."""
+        return self._built(VerificationOptions, self.workspace.planned("verify"))
+
+    @property
+    def escalation(self) -> EscalateOptions:
+        """Which pairs are escalated."""
+        return self._built(EscalateOptions, self.workspace.planned("escalate"))
+
+    @property
+    def guiding(self) -> GuidedOptions:
+        """How verified pairs are matched again."""
+        return self._built(GuidedOptions, self.workspace.planned("guide"))
+
+    @property
+    def mapping(self) -> MapperOptions:
+        """How images are registered."""
+        options: MapperOptions = self._part(MAPPERS, "map")
+        return options
+
+    def _extract_section(self, cls: type[Options]) -> dict[str, Any]:
+        """Return what belongs to some options, of which the extract stage has two."""
+        others = {*Inputs.model_fields, *ExtractionOptions.model_fields} - cls.model_fields.keys()
+        record = self.workspace.require("extract")
+        return {key: value for key, value in record.items() if key not in {*others, WEIGHTS}}
+
+    def _built(self, cls: type[AnyOptions], values: dict[str, Any] | None) -> AnyOptions:
+        where = str(self.workspace.config)
+        return from_record(where, lambda: cls.from_mapping(values or {}, where))
+
+    def _part(self, registry: Registry[Any], stage: str) -> Any:
+        where, values = str(self.workspace.config), self.workspace.planned(stage) or {}
+        return from_record(where, lambda: registry.options(values, where=where))
 
     @property
     def features(self) -> FeatureStore:

@@ -9,11 +9,10 @@ from colmap_affrect.colmap.checks import refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_with_frames
 from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, verify
-from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.errors import DatabaseError, OptionError, such_as
 from colmap_affrect.images.headers import header_size
-from colmap_affrect.project.contents import Contents
+from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.shown import such_as
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.inputs import source_files
 
@@ -38,9 +37,8 @@ def copy_verified(
     if image_path and not image_path.is_dir():
         raise OptionError(f"--image-path {image_path}: no such folder")
     workspace.require_own(image_path)
-    contents = Contents(workspace.contents)
-    digest, before = contents.digest(source_files(source)), contents.recorded("copy")
-    if digest != before or not workspace.database.exists():
+    digest = content_of(source_files(source)).digest
+    if digest != workspace.made_from("copy") or not workspace.database.exists():
         refuse_unusable(source)
     given = {
         "database": str(source.resolve()),
@@ -48,11 +46,11 @@ def copy_verified(
     }
     workspace.record_options("copy", given, overwrite=overwrite)
     warnings = {}
-    if digest != before:
+    if digest != (before := workspace.made_from("copy")):
         if before:
             warnings[str(source)] = "has changed; its copy and the models are made anew"
         workspace.rewind()
-        contents.record("copy", digest)
+        workspace.record_made_from("copy", digest)
     left_out = ""
     if not workspace.database.exists():
         left_out = copy_with_frames(source, workspace.database)
@@ -76,7 +74,7 @@ def copy_verified(
 
 
 def _other_sizes(database: Path, image_path: Path) -> dict[str, str]:
-    """Tell which photographs cannot be those that a database was made from."""
+    """Return which photographs cannot be those that a database was made from."""
     cameras = colmap_database.read_cameras(database)
     sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
     odd = [n for n, size in sizes.items() if header_size(image_path / n) not in (None, size)]

@@ -7,16 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import database as colmap_database
-from colmap_affrect.conventions import camera_matrix, pixel_from_colmap, resized_from_original
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import DepthError, ImageError
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats, Singles
+from colmap_affrect.geometry.conventions import (
+    camera_matrix,
+    pixel_from_colmap,
+    resized_from_original,
+)
 from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.mappers.base import DepthLookup
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 
 logger = logging.getLogger(__name__)
 
@@ -26,12 +29,12 @@ NUM_CACHED_MAPS = 8  # one image is asked for each of its pairs
 def depth_lookup(context: Context) -> DepthLookup | None:
     """Return where mapping finds depths, NaN without a usable map; None if no maps were given."""
     workspace = context.workspace
-    options = recorded_extraction(workspace)
+    options = context.extraction
     if not options.depth.is_given:
         return None
     device = context.resources.require_device(uses_network=options.depth.uses_network)
     source = DEPTH_SOURCES.make(options.depth, DepthContext(workspace.depth, device))
-    folder = Path(Inputs.recorded(workspace).image_path)
+    folder = Path(context.inputs.image_path)
     cameras = colmap_database.read_cameras(workspace.database)
 
     @lru_cache(NUM_CACHED_MAPS)

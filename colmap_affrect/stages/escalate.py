@@ -41,7 +41,6 @@ from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.outputs import temporary_folder
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
-from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import EscalateOptions
 from colmap_affrect.stages.climbing import ClimbingGraph, insecure_images, weakly_connected_images
 from colmap_affrect.stages.context import Context
@@ -51,18 +50,15 @@ from colmap_affrect.stages.extract import (
     write_images_and_keypoints,
 )
 from colmap_affrect.stages.guide import restore_exact
-from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.match import (
     PAIRS_PER_WRITE,
     match_pairs,
     matched_at_level,
-    recorded_matching,
 )
 from colmap_affrect.stages.one_image import ImageExtractor
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.verify import (
     extracted_px,
-    recorded_verification,
     verified_inliers,
     verify_new,
 )
@@ -80,11 +76,6 @@ OUTNUMBERED = 4
 these: of what changes, such as a sitter, few gradients match, and their geometry is off."""
 
 
-def recorded_escalation(workspace: Workspace) -> EscalateOptions:
-    """Return the options on record of escalation, done or still to be done."""
-    return EscalateOptions.from_mapping(workspace.planned("escalate") or {}, str(workspace.config))
-
-
 def escalate(
     context: Context, options: EscalateOptions | None = None, *, overwrite: bool = False
 ) -> StageReport:
@@ -97,7 +88,7 @@ def escalate(
     start = time.perf_counter()
     context.resources.require_device()
     context.workspace.require("verify")
-    options = options or recorded_escalation(context.workspace)
+    options = options or context.escalation
     if overwrite:
         restore_exact(context)
     context.workspace.record_options("escalate", options.to_mapping(), overwrite=overwrite)
@@ -120,7 +111,7 @@ def pair_levels(context: Context) -> dict[str, int]:
 
     Keys are the names of the levels, in order, and ``none``; empty without escalation.
     """
-    extraction = recorded_extraction(context.workspace)
+    extraction = context.extraction
     if not extraction.escalation:
         return {}
     names = [level.name for level in extraction.levels]
@@ -148,7 +139,7 @@ def first_level_database(context: Context) -> Iterator[Path | None]:
     It is what a recipe without escalation would have made. None when no pair of the database has
     climbed with success.
     """
-    if not recorded_extraction(context.workspace).escalation:
+    if not context.extraction.escalation:
         yield None
         return
     escalation = Escalation(context, EscalateOptions())
@@ -232,9 +223,9 @@ class Escalation:
 
     def __init__(self, context: Context, options: EscalateOptions) -> None:
         self.context, self.options = context, options
-        self.extraction = recorded_extraction(context.workspace)
-        self.matching = recorded_matching(context.workspace)
-        self.verification = recorded_verification(context.workspace)
+        self.extraction = context.extraction
+        self.matching = context.matching
+        self.verification = context.verification
         self.pairs = listed_pairs(context)
         self.features, self.matches = context.features, context.matches
         self.path = context.workspace.database
@@ -372,7 +363,7 @@ class Escalation:
             for name in names
             for lacking in range(len(self.features.level_ends(name)), level + 1)
         ]
-        inputs = Inputs.recorded(self.context.workspace)
+        inputs = self.context.inputs
         images = extract_images(self.context, inputs, self.extractor, missing)
         with closing(images) as found_images:
             for (name, reached), found in zip(missing, found_images, strict=True):

@@ -12,22 +12,26 @@ from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
-from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
+from colmap_affrect.errors import (
+    ClusterError,
+    DatabaseError,
+    ImageError,
+    OptionError,
+    StaleStoreError,
+    one_line,
+    such_as,
+)
+from colmap_affrect.features.weights import digests
 from colmap_affrect.images.photographs import checked_names, left_out, not_named
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
-from colmap_affrect.project.contents import Contents
-from colmap_affrect.project.differences import WEIGHTS
+from colmap_affrect.project.contents import Content, content_of
+from colmap_affrect.project.record import WEIGHTS
 from colmap_affrect.project.report import StageReport
+from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, Recipe
-from colmap_affrect.shown import one_line
-from colmap_affrect.stages.changes import (
-    forget_changed,
-    refuse_changed,
-    refuse_other_photographs,
-)
-from colmap_affrect.stages.context import Context, digests_to_record
+from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.one_image import (
     ExtractedImage,
@@ -63,16 +67,23 @@ def extract(
     _require_usable_cameras(workspace, inputs)
     names = inputs.names()
     names = checked_names(folder, image_names, "image_names") if image_names else names
-    contents, options = Contents(workspace.contents), recipe.extraction
-    digests = {name: contents.digest(inputs.files(name, options)) for name in names}
-    if overwrite or digests != context.features.contents():  # else they were seen to be good
+    options, known = recipe.extraction, {} if overwrite else context.features.contents()
+    contents = contents_of(inputs, names, options, known)
+    if contents != known:  # else they were seen to be good
         inputs.check_names(names)
     whole = inputs.photographs.without_mask(names)
     extractor = prepared_recipe(context, options, names)
     if not overwrite:
-        refuse_other_photographs(workspace, inputs.image_path, digests)
-    _record(workspace, inputs, recipe, extractor, later or {}, overwrite=overwrite)
-    warnings = forget_changed(context, inputs, digests, contents, are_all=not image_names)
+        refuse_other_photographs(workspace, inputs.image_path, contents)
+    weights = digests(extractor.weights)
+    workspace.record_options(
+        "extract",
+        {**inputs.to_mapping(), **options.to_mapping(), WEIGHTS: weights},
+        plan={s: x.to_mapping() for s, x in {**recipe.later_stages, **(later or {})}.items()},
+        recipe=recipe.name,
+        overwrite=overwrite,
+    )
+    warnings = forget_changed(context, inputs, contents, are_all=not image_names)
     _start_database(workspace)
     done = context.features.complete(names)
     missing = [name for name in names if name not in done]
@@ -80,7 +91,7 @@ def extract(
     warnings |= _passed_over(inputs, names, whole, is_list=bool(image_names))
     for kind, what in warnings.items():
         logger.warning("%s: %s", kind, what)
-    failures = _extract_missing(context, inputs, extractor, missing, digests, warnings)
+    failures = _extract_missing(context, inputs, extractor, missing, contents, warnings)
     if len(failures) == len(names):
         first = failures[names[0]]
         raise ImageError(
@@ -95,7 +106,7 @@ def extract(
 def _passed_over(
     inputs: Inputs, names: Sequence[str], whole: Sequence[str], *, is_list: bool
 ) -> dict[str, str]:
-    """Tell which photographs are left out, and which have no mask."""
+    """Return which photographs are left out, and which have no mask."""
     folder, found = Path(inputs.image_path), dict[str, str]()
     if not (inputs.image_list_path or is_list):
         found |= not_named(folder, names) if inputs.from_database else left_out(folder)
@@ -114,37 +125,12 @@ def _require_usable_cameras(workspace: Workspace, inputs: Inputs) -> None:
         raise OptionError(f"existing_camera_id={camera_id}: {path} has no such camera")
 
 
-def _record(
-    workspace: Workspace,
-    inputs: Inputs,
-    recipe: Recipe,
-    extractor: ImageExtractor,
-    later: Mapping[str, Options],
-    *,
-    overwrite: bool,
-) -> None:
-    weights = digests_to_record(workspace, "extract", extractor.weights, overwrite=overwrite)
-    planned: dict[str, Options] = {"match": recipe.matching, "guide": recipe.guided}
-    if recipe.extraction.escalation:
-        planned["escalate"] = recipe.escalate
-    if recipe.mapping:
-        planned["map"] = recipe.mapper_options("sparse")
-    planned |= later
-    workspace.record_options(
-        "extract",
-        {**inputs.to_mapping(), **recipe.extraction.to_mapping(), WEIGHTS: weights},
-        plan={stage: chosen.to_mapping() for stage, chosen in planned.items()},
-        recipe=recipe.name,
-        overwrite=overwrite,
-    )
-
-
 def _extract_missing(
     context: Context,
     inputs: Inputs,
     extractor: ImageExtractor,
     names: Sequence[str],
-    digests: Mapping[str, str],
+    contents: Mapping[str, Content],
     warnings: dict[str, str],
 ) -> dict[str, str]:
     """Extract images one by one; return why some cannot be used, and add to the warnings."""
@@ -165,7 +151,7 @@ def _extract_missing(
                         warnings[name] = found.warning
                     if found.stretched:
                         faded.append(name)
-                    store.write(name, found.features, found.image_size, digests[name])
+                    store.write(name, found.features, found.image_size, contents[name])
                 advance(1)
     if faded:
         warnings["contrast"] = (
@@ -195,10 +181,7 @@ def extract_images(
     if not images:
         return
     if later := {name for name, level in images if level}:
-        contents = Contents(context.workspace.contents)
-        refuse_changed(
-            context, {n: contents.digest(inputs.files(n, extractor.options)) for n in later}
-        )
+        refuse_changed(context, inputs, later)
     executor = context.executor or Threads(num_images_at_once(extractor))
     depth_folder = extractor.options.depth.folder
     if depth_folder and not executor.sees([depth_folder]):
@@ -268,7 +251,7 @@ def write_images_and_keypoints(context: Context) -> dict[str, str]:
     """Bring the database up to date; return the images that COLMAP does not take, with reasons."""
     workspace, store = context.workspace, context.features
     _start_database(workspace)
-    inputs = Inputs.recorded(workspace)
+    inputs = context.inputs
     counts = store.num_keypoints()
     rejected = import_images(
         workspace.database, Path(inputs.image_path), list(counts), inputs.cameras
@@ -305,3 +288,88 @@ def write_descriptors(context: Context) -> None:
             if count and not written[name]:
                 descriptors = features.read(name).descriptors
                 colmap_database.write_descriptors(database, ids[name], descriptors)
+
+
+# Inputs that have changed since a run began: what was made from them is forgotten, and made again.
+# Features hang on photographs, masks and depth maps; matches on the features of two images; pairs,
+# the database and all that follows on all images, and on cameras that are given.
+
+
+def refuse_other_photographs(
+    workspace: Workspace, image_path: str, contents: Mapping[str, Content]
+) -> None:
+    """Refuse another folder of photographs unless it has some that were worked on."""
+    before = (workspace.planned("extract") or {}).get("image_path", image_path)
+    if before == image_path:
+        return
+    known = FeatureStore(workspace.features).contents()
+    if known and len(changed_images(known, contents)) == len(known.keys() & contents.keys()):
+        raise StaleStoreError(
+            f"{workspace.path}: the extract stage was run there with image_path={before!r}, and "
+            f"none of the photographs in {image_path} is one of them; use --overwrite to discard "
+            "the results, or another --output-path"
+        )
+
+
+def contents_of(
+    inputs: Inputs,
+    names: Iterable[str],
+    options: ExtractionOptions,
+    known: Mapping[str, Content],
+) -> dict[str, Content]:
+    """Return what the files of images hold now; ``known`` ones are read only if they changed."""
+    return {name: content_of(inputs.files(name, options), known.get(name)) for name in names}
+
+
+def changed_images(known: Mapping[str, Content], now: Mapping[str, Content]) -> list[str]:
+    """Return the images whose files are not those any more that their features are from."""
+    both = [name for name in now if name in known and known[name].digest]
+    return [name for name in both if known[name].digest != now[name].digest]
+
+
+def forget_changed(
+    context: Context, inputs: Inputs, contents: Mapping[str, Content], *, are_all: bool
+) -> dict[str, str]:
+    """Remove what was made from inputs that have changed since, so that it is made again.
+
+    The changed images lose their features last: a run that is killed before finds them changed
+    again. ``contents`` are those of each image now; ``are_all`` says that there are no other
+    images. Returns one line by the folder of the photographs, empty if nothing has changed.
+    StaleStoreError for results in a user's database.
+    """
+    workspace, store = context.workspace, context.features
+    known = store.contents()
+    changed = changed_images(known, contents)
+    are_all = are_all and not workspace.users_database
+    gone = sorted(known.keys() - contents.keys()) if are_all else []
+    cameras, before = content_of(inputs.camera_files).digest, workspace.made_from("cameras")
+    other_cameras = ["cameras are given by other files"] if before not in ("", cameras) else []
+    lines = [*_counted(changed, "changed"), *_counted(gone, "gone"), *other_cameras]
+    if lines:
+        workspace.rewind(f"since it was made, {', '.join(lines)}")
+        workspace.pairs.unlink(missing_ok=True)
+        context.matches.remove({*changed, *gone})
+        if changed or gone:
+            store.remove({*changed, *gone})
+    left = known.keys() & contents.keys() - set(changed)
+    if other := {name: contents[name] for name in left if known[name] != contents[name]}:
+        store.record_contents(other)
+    workspace.record_made_from("cameras", cameras)
+    if not lines:
+        return {}
+    return {inputs.image_path: f"{', '.join(lines)}; all that hangs on them is made again"}
+
+
+def _counted(names: Sequence[str], what: str) -> list[str]:
+    return [f"{len(names)} {what} ({such_as(names)})"] if names else []
+
+
+def refuse_changed(context: Context, inputs: Inputs, names: Iterable[str]) -> None:
+    """Refuse to add to the features of photographs that have changed; StaleStoreError."""
+    known = context.features.contents()
+    now = contents_of(inputs, names, context.extraction, known)
+    if changed := _counted(changed_images(known, now), "changed"):
+        raise StaleStoreError(
+            f"{context.workspace.features}: {changed[0]} since their features were extracted; run "
+            "extract again"
+        )

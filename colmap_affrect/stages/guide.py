@@ -23,16 +23,13 @@ from colmap_affrect.pairs.lists import ordered_for_reuse
 from colmap_affrect.parallel.executor import Threads, available_cores
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import GuidedPair
-from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.climbing import weakly_connected_images
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.inputs import recorded_extraction
 from colmap_affrect.stages.match import PAIRS_PER_WRITE
 from colmap_affrect.stages.one_guided_pair import GuidedMatcher, GuidedTask, guided_task
 from colmap_affrect.stages.stationary import StationaryFilter
 from colmap_affrect.stages.verify import (
     extracted_px,
-    recorded_verification,
     verified_inliers,
     verify_new,
 )
@@ -40,11 +37,6 @@ from colmap_affrect.stages.verify import (
 Matches = Indices
 MIN_SHARE_KEPT = 0.8  # of the inliers before, in a geometry with guided matches
 IMAGES_IN_MEMORY = 40  # of 13,000 features; pairs come in an order that reads these seldom
-
-
-def recorded_guiding(workspace: Workspace) -> GuidedOptions:
-    """Return the options on record of guided matching, done or still to be done."""
-    return GuidedOptions.from_mapping(workspace.planned("guide") or {}, str(workspace.config))
 
 
 def guide(
@@ -64,7 +56,7 @@ def guide(
     start = time.perf_counter()
     workspace = context.workspace
     workspace.require("verify")
-    options = options or recorded_guiding(workspace)
+    options = options or context.guiding
     if overwrite:
         restore_exact(context)
     workspace.record_options("guide", options.to_mapping(), overwrite=overwrite)
@@ -77,7 +69,7 @@ def guide(
 
 def pairs_to_guide(context: Context, images: Collection[str]) -> list[Pair]:
     """Return the verified pairs of some images that :func:`guide` would match again."""
-    return Guiding(context, recorded_guiding(context.workspace)).todo(images)[0]
+    return Guiding(context, context.guiding).todo(images)[0]
 
 
 def restore_exact(context: Context, pairs: Collection[Pair] | None = None) -> None:
@@ -165,12 +157,10 @@ class Guiding:
         self.context, self.options = context, options
         self.path = context.workspace.database
         self.ids = colmap_database.image_ids(self.path)
-        max_size_px = recorded_extraction(context.workspace).max_image_size_px
+        max_size_px = context.extraction.max_image_size_px
         sizes = context.features.image_sizes()
         self.scales = {name: max(1.0, max(size) / max_size_px) for name, size in sizes.items()}
-        self.verifier = PairVerifier(
-            self.path, recorded_verification(context.workspace), extracted_px(context)
-        )
+        self.verifier = PairVerifier(self.path, context.verification, extracted_px(context))
 
     def todo(self, images: Collection[str] | None) -> tuple[list[Pair], int]:
         """Return the pairs to guide, and how many are done."""

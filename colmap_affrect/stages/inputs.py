@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from colmap_affrect.colmap.cameras import read_given_cameras
 from colmap_affrect.colmap.database_copy import read_names
@@ -18,7 +18,6 @@ from colmap_affrect.images.photographs import (
 )
 from colmap_affrect.options import Options
 from colmap_affrect.project.outputs import database_files
-from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
 
 
@@ -38,30 +37,14 @@ class Inputs(Options):
     """Where features may be; everywhere by default."""
 
     @classmethod
-    def of(
-        cls,
-        image_path: Path,
-        *,
-        image_list_path: Path | None = None,
-        from_database: Path | None = None,
-        cameras: CameraOptions | None = None,
-        masks: MaskOptions | None = None,
-    ) -> Self:
-        """Build from paths, which are made absolute."""
-        return cls(
-            image_path=str(image_path.resolve()),
-            image_list_path=str(image_list_path.resolve()) if image_list_path else "",
-            from_database=str(from_database.resolve()) if from_database else "",
-            cameras=cameras or CameraOptions(),
-            masks=masks or MaskOptions(),
-        )
-
-    @classmethod
-    def recorded(cls, workspace: Workspace) -> Self:
-        """Return what the extract stage of a workspace was given."""
-        record = workspace.require("extract")
-        values = {key: value for key, value in record.items() if key in cls.model_fields}
-        return cls.from_mapping(values, str(workspace.config))
+    def of(cls, image_path: Path, **given: Any) -> Self:
+        """Build from paths, which are made absolute, and options; None is what is not given."""
+        values: dict[str, Any] = {
+            key: str(value.resolve()) if isinstance(value, Path) else value
+            for key, value in {"image_path": image_path, **given}.items()
+            if value is not None
+        }
+        return cls(**values)
 
     @property
     def photographs(self) -> Photographs:
@@ -116,14 +99,6 @@ class Inputs(Options):
     def initial_cameras(self) -> InitialCameras:
         """What decides on cameras."""
         return InitialCameras(Path(self.image_path), self.cameras)
-
-
-def recorded_extraction(workspace: Workspace) -> ExtractionOptions:
-    """Return the options that the features of a workspace were made with."""
-    record = workspace.require("extract")
-    names = ExtractionOptions.model_fields
-    options = {key: value for key, value in record.items() if key in names}
-    return ExtractionOptions.from_mapping(options, str(workspace.config))
 
 
 def source_files(path: Path) -> list[Path]:

@@ -21,12 +21,11 @@ from colmap_affrect.mappers.doubts import loose_names
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.pair_graph import MIN_SHARE, PairGraph, cameras_of, poses_of
 from colmap_affrect.mappers.starts import holding
-from colmap_affrect.mappers.summaries import made_from, model_folders, read_summary, refuse_edited
+from colmap_affrect.mappers.summaries import model_folders, read_summary, refuse_edited
 from colmap_affrect.pairs.base import Pair
-from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.report import ModelSummary, StageReport
-from colmap_affrect.project.workspace import INPUTS, Workspace
+from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.depth_lookup import depth_lookup
@@ -37,9 +36,7 @@ from colmap_affrect.stages.escalate import (
     reject,
 )
 from colmap_affrect.stages.guide import guided_matches
-from colmap_affrect.stages.inputs import Inputs, recorded_extraction
 from colmap_affrect.stages.pairs import listed_pairs
-from colmap_affrect.stages.verify import recorded_verification
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +65,7 @@ def map_images(
         existing = read_existing(extend, workspace.database)  # it may be discarded now
     inputs = _inputs(workspace, extend)
     workspace.record_options("map", mapper.options.to_mapping(), overwrite=overwrite)
-    known = made_from(workspace.sparse)
+    known = workspace.models_made_from()
     if known != inputs and " " in known and not extend:
         raise StaleStoreError(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
@@ -80,6 +77,7 @@ def map_images(
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
     workspace.refuse_foreign_models()
     refuse_edited(workspace.sparse)
+    workspace.forget_models()  # a run that is killed begins anew
     num_images = len(colmap_database.image_ids(workspace.database))
     with context.progress.stage("map", num_images, "images") as advance:
         models, num_rejected = _map(context, mapper, task, advance)
@@ -95,7 +93,7 @@ def map_images(
             f"{'contradicts the others and was' if is_one else 'contradict the others and were'} "
             "rejected"
         )
-    replace_text(workspace.sparse / INPUTS, inputs)
+    workspace.record_made_from("map", inputs)
     if extend and existing and existing.num_other_keypoints:
         warnings[str(extend.model_path)] = (
             f"keypoints of {existing.num_other_keypoints} of its {len(existing.names)} images are "
@@ -140,7 +138,7 @@ def image_names(workspace: Workspace) -> list[str]:
     """Return the names of the images of a run, or of the database that was copied."""
     if workspace.is_copy:
         return sorted(colmap_database.image_ids(workspace.database))
-    return Inputs.recorded(workspace).names()
+    return Context(workspace).inputs.names()
 
 
 def _or_first_level(
@@ -238,7 +236,7 @@ def num_verified_inliers(workspace: Workspace) -> dict[Pair, int]:
 
 def _min_num_inliers(workspace: Workspace) -> int:
     """Return how many inliers a verified pair has; another program had its own threshold."""
-    return 1 if workspace.is_copy else recorded_verification(workspace).min_num_inliers
+    return 1 if workspace.is_copy else Context(workspace).verification.min_num_inliers
 
 
 def unregistered(
@@ -304,7 +302,7 @@ def advice(
                      "them")  # fmt: skip
     if missing:
         texts += recipes
-    has_cameras = workspace.is_copy or Inputs.recorded(workspace).from_database
+    has_cameras = workspace.is_copy or Context(workspace).inputs.from_database
     if models and (models[0].rival_focals_px or models[0].loose) and not has_cameras:
         texts.append(
             "run again with --focal-length-px or --cameras-path, if a camera or its lens is known: "
@@ -318,7 +316,7 @@ def advice(
         if len(cameras) > 1 and same_size and not any(c.has_prior_focal_length for c in cameras):
             texts.append("run again with --camera-mode single, if one camera took all: their size "
                          "is the same")  # fmt: skip
-        masks = Inputs.recorded(workspace).masks
+        masks = Context(workspace).inputs.masks
         if (missing or is_inconsistent) and not (masks.path or masks.camera_path):
             texts.append(
                 "run again with --mask-path, if things move, repeat or are written on the "
@@ -366,7 +364,7 @@ def agreement(context: Context, sparse_path: Path) -> float:
 
 def contradicting_pairs(context: Context) -> dict[str, int]:
     """Return how many verified pairs of each level of a recipe the largest model contradicts."""
-    names = [level.name for level in recorded_extraction(context.workspace).levels]
+    names = [level.name for level in context.extraction.levels]
     path = context.workspace.sparse / "0"
     if len(names) < 2 or not path.exists():
         return {}

@@ -10,17 +10,15 @@ import numpy as np
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.errors import OptionError
-from colmap_affrect.features.weights import resolve
+from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.matchers.base import MATCHERS, MatcherContext, MatcherOptions
 from colmap_affrect.pairs.base import Pair, PairList
-from colmap_affrect.project.contents import sha256_of
-from colmap_affrect.project.differences import WEIGHTS
+from colmap_affrect.project.contents import file_sha256
+from colmap_affrect.project.record import WEIGHTS
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
-from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context, digests_to_record
+from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import write_images_and_keypoints
-from colmap_affrect.stages.inputs import recorded_extraction
 from colmap_affrect.stages.one_pair import Matching, iterate_matches
 from colmap_affrect.stages.pairs import listed_pairs
 from colmap_affrect.stages.stationary import StationaryFilter
@@ -29,12 +27,6 @@ logger = logging.getLogger(__name__)
 
 PAIRS_PER_WRITE = 64
 SECONDS_PER_WRITE = 30.0  # pairs of a network take seconds each
-
-
-def recorded_matching(workspace: Workspace) -> MatcherOptions:
-    """Return the options on record of matching, done or still to be done."""
-    options: MatcherOptions = MATCHERS.options(workspace.planned("match") or {})
-    return options
 
 
 def match(
@@ -48,18 +40,17 @@ def match(
     start = time.perf_counter()
     context.resources.require_device()
     pairs = listed_pairs(context)
-    options = options or recorded_matching(context.workspace)
-    workspace, extraction = context.workspace, recorded_extraction(context.workspace)
+    options = options or context.matching
+    workspace, extraction = context.workspace, context.extraction
     try:
         extraction.require_matching(options)
     except OptionError as error:
         other = "other features than those here take 'run' with another --output-path"
         raise OptionError(f"{error}; {other}") from error
     weights = load_matchers(context, extraction.matchers(options))
-    digests = digests_to_record(workspace, "match", weights, overwrite=overwrite)
-    record = options.to_mapping() | ({WEIGHTS: digests} if digests else {})
+    record = options.to_mapping() | ({WEIGHTS: digests(weights)} if weights else {})
     workspace.record_options("match", record, overwrite=overwrite)
-    matches, digest = context.matches, sha256_of(context.workspace.pairs)
+    matches, digest = context.matches, file_sha256(workspace.pairs)
     finished = matches.finished_list()
     is_finished = finished == digest and matches.num_pairs() == len(pairs)
     missing = pairs.at(slice(0) if is_finished else ~matches.has(pairs))
@@ -88,7 +79,7 @@ def load_matchers(context: Context, matchers: Iterable[MatcherOptions]) -> dict[
     resources, learned = context.resources, {m for m in matchers if m.weights}
     keys = sorted({key for options in learned for key in options.weights})
     weights = resolve(keys, resources.weights_path)
-    if "match" not in context.workspace.recorded().get("begun", []):
+    if "match" not in context.workspace.begun:
         for options in learned:
             MATCHERS.make(options, MatcherContext(weights, "cpu"))
     return weights
@@ -120,7 +111,7 @@ def matched_at_level(
 
     ``options`` count where the level has none of its own.
     """
-    features, chosen = context.features, recorded_extraction(context.workspace).levels[level]
+    features, chosen = context.features, context.extraction.levels[level]
     options, extractor = chosen.matching or options, chosen.features.kind
     matching = Matching(features, options, level, chosen.base, extractor, context.resources)
     stationary = StationaryFilter(features, context.matches)

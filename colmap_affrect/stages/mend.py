@@ -29,12 +29,11 @@ from colmap_affrect.colmap.seal import (
 )
 from colmap_affrect.colmap.tables import Tables, delete_rows, open_read_only, read_tables
 from colmap_affrect.colmap.useless_keypoints import KINDS
-from colmap_affrect.errors import AffrectError, DatabaseError
+from colmap_affrect.errors import AffrectError, DatabaseError, such_as
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.shown import such_as
 from colmap_affrect.stages.cameras import choose_cameras
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copy_verified
@@ -42,7 +41,7 @@ from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.match import write_matches
 from colmap_affrect.stages.pairs import delete_pairs, listed_pairs
-from colmap_affrect.stages.verify import recorded_verification, verify_matches, verify_new
+from colmap_affrect.stages.verify import verify_matches, verify_new
 
 logger = logging.getLogger(__name__)
 
@@ -185,7 +184,7 @@ def watched(context: Context, *, follows: bool = True, discards: bool = False) -
 def mend(context: Context, *, follows: bool) -> None:
     """Make again, or keep, what others have changed in the database; a warning says what."""
     workspace, path = context.workspace, context.workspace.database
-    begun = workspace.recorded().get("begun", [])
+    begun = workspace.begun
     if not begun or not (path.exists() or "verify" in begun):
         return
     found, is_copied = edits_of(path), workspace.is_copy
@@ -203,12 +202,9 @@ def mend(context: Context, *, follows: bool) -> None:
     if found.lost or (found.written and is_all):
         _make_again(context, found, begun, follows=follows)
         return
-    if found.kept:
-        logger.warning("%s: was changed since the last run, which is kept: %s", path, found.kept)
-    if found.written:
-        logger.warning(
-            "%s: was changed since the last run, and is written again: %s", path, found.written
-        )
+    for what, done in (found.kept, "which is kept"), (found.written, "and is written again"):
+        if what:
+            logger.warning("%s: was changed since the last run, %s: %s", path, done, what)
     remove_seal(path)  # what is deleted now was not by others
     pairs = np.concatenate([found.pairs, np.array(list(found.deleted), np.int64)])
     delete_rows(
@@ -225,7 +221,7 @@ def mend(context: Context, *, follows: bool) -> None:
 
 
 def _unlike_features(context: Context) -> tuple[str, ...]:
-    """Tell which images are not those of the features, where a killed run has left no seal."""
+    """Return which images are not those of the features, where a killed run has left no seal."""
     with open_read_only(context.workspace.database) as connection:
         tables = read_tables(connection)
     sizes, found = context.features.image_sizes(), list[str]()
@@ -250,8 +246,8 @@ def _without_others(context: Context, found: Edits) -> Edits:
 
 
 def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows: bool) -> None:
-    workspace, record = context.workspace, context.workspace.recorded()
-    original = Path(record["copy"]["database"]) if workspace.is_copy else None
+    workspace = context.workspace
+    original = Path(workspace.require("copy")["database"]) if workspace.is_copy else None
     if original and not original.exists():
         raise DatabaseError(
             f"{workspace.database}: was changed since the last run ({found}), and {original} is "
@@ -270,9 +266,7 @@ def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows
     if not (follows and "verify" in begun):
         return
     if original:
-        photos = record["copy"]["image_path"]
-        verification = recorded_verification(workspace)
-        copy_verified(context, original, Path(photos) if photos else None, verification)
+        copy_verified(context, original, workspace.photographs(), context.verification)
         return
     verify_matches(context)
     if "escalate" in begun:
@@ -304,8 +298,10 @@ def _has_voted(workspace: Workspace) -> bool:
 
 def _keep_cameras(workspace: Workspace, changed: Sequence[int]) -> None:
     """Count intrinsics that were changed in the database as known: no vote is to change them."""
+    if not changed:
+        return
     records = read_camera_records(workspace.cameras)
-    for camera in all_cameras(workspace.database) if changed else ():
+    for camera in all_cameras(workspace.database):
         if camera.camera_id in changed and camera.camera_id in records:
             records[camera.camera_id] = replace(
                 records[camera.camera_id],
@@ -316,5 +312,4 @@ def _keep_cameras(workspace: Workspace, changed: Sequence[int]) -> None:
                 why="changed in the database",
                 may_be_shared=False,
             )
-    if changed:
-        write_camera_records(workspace.cameras, records)
+    write_camera_records(workspace.cameras, records)

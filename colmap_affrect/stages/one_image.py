@@ -15,7 +15,6 @@ from typing import Any, Self
 
 import numpy as np
 
-from colmap_affrect.conventions import camera_matrix, resized_from_original
 from colmap_affrect.data import (
     GrayImage,
     LocalFeatures,
@@ -29,6 +28,7 @@ from colmap_affrect.features.base import EXTRACTORS, SHAPES, FeatureExtractor, N
 from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.geometry.affine import transform_frames
 from colmap_affrect.geometry.arrays import Array
+from colmap_affrect.geometry.conventions import camera_matrix, resized_from_original
 from colmap_affrect.images.depth import DEPTH_SOURCES, DepthContext
 from colmap_affrect.images.masks import shrink_mask
 from colmap_affrect.images.photographs import Photographs

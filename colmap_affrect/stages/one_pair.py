@@ -77,22 +77,6 @@ class StoredFeatures:
     image: ImageFeatures  # the features
     indices: Indices  # (N,) int64 that they have in the store
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Send what the store holds, in its precision."""
-        return _received, (_of_types(self.image, np.float32, np.float16), self.indices)
-
-
-def _received(image: ImageFeatures, indices: Indices) -> StoredFeatures:
-    return StoredFeatures(_of_types(image, np.float64, np.float32), indices)
-
-
-def _of_types(
-    image: ImageFeatures, lafs: type[np.floating[Any]], descriptors: type[np.floating[Any]]
-) -> ImageFeatures:
-    old = image.features
-    frames, rows = old.lafs.astype(lafs), old.descriptors.astype(descriptors)
-    return replace(image, features=replace(old, lafs=frames, descriptors=rows))
-
 
 @dataclass(frozen=True)
 class PairTask:

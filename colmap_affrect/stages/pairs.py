@@ -13,15 +13,14 @@ from colmap_affrect.colmap.database import nearest_positions
 from colmap_affrect.errors import PairListError
 from colmap_affrect.matchers.nearest import NearestOptions
 from colmap_affrect.pairs.base import Pair, PairList, PairOptions
-from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, sequence_pairs, write_pairs
+from colmap_affrect.pairs.lists import read_pairs, sequence_pairs, write_pairs
 from colmap_affrect.pairs.retrieval import NUM_STRONGEST, low_resolution_pairs, retrieved_pairs
 from colmap_affrect.project.atomic_files import replace_lines
-from colmap_affrect.project.contents import Contents
+from colmap_affrect.project.contents import content_of
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import write_images_and_keypoints
-from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.one_pair import CachedMatcher, Matching
 
 logger = logging.getLogger(__name__)
@@ -59,22 +58,20 @@ def choose_pairs(
     """
     start = time.perf_counter()
     workspace = context.workspace
-    options = options or PairOptions.from_mapping(
-        workspace.planned("pairs") or {}, str(workspace.config)
-    )
-    if options.methods == ("exhaustive",) and not options.match_list_path:
+    options = options or context.pairing
+    if "exhaustive" in options.methods and not options.match_list_path:
         return _all_pairs(context, options, start, overwrite=overwrite)
     pairs = _given_pairs(context, options)
     workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
     there = kept = _pairs_there(context)
-    contents, listed = Contents(workspace.contents), options.match_list_path
-    digest = contents.digest([Path(listed)]) if listed else ""
-    if contents.recorded("pairs") not in ("", digest):
+    listed = options.match_list_path
+    digest = content_of([Path(listed)]).digest if listed else ""
+    if workspace.made_from("pairs") not in ("", digest):
         kept = set()
     pairs |= kept | _similar_pairs(context, options, kept)
     warnings = _forget_lost(context, there - pairs)
     write_pairs(workspace.pairs, sorted(pairs))
-    contents.record("pairs", digest)
+    workspace.record_made_from("pairs", digest)
     return StageReport("pairs", time.perf_counter() - start, len(pairs), warnings=warnings)
 
 
@@ -90,7 +87,7 @@ def _all_pairs(
         logger.warning(MANY_PAIRS, len(names), count)
     workspace.record_options("pairs", options.to_mapping(), overwrite=overwrite)
     write_pairs(workspace.pairs, combinations(names, 2), names)
-    Contents(workspace.contents).record("pairs", "")
+    workspace.record_made_from("pairs", "")
     return StageReport("pairs", time.perf_counter() - start, count)
 
 
@@ -108,13 +105,9 @@ def _given_pairs(context: Context, options: PairOptions) -> set[Pair]:
         pairs |= {pair for pair in near if known.issuperset(pair)}
     if options.match_list_path:
         # Images that could not be read may be in the list; only their pairs are dropped.
-        all_names = Inputs.recorded(context.workspace).names()
+        all_names = context.inputs.names()
         listed = read_pairs(Path(options.match_list_path), all_names)
-        return pairs | {pair for pair in listed if known.issuperset(pair)}
-    if "exhaustive" in options.methods:
-        pairs |= set(exhaustive_pairs(names))
-        if len(names) > MANY_IMAGES:
-            logger.warning(MANY_PAIRS, len(names), len(pairs))
+        pairs |= {pair for pair in listed if known.issuperset(pair)}
     return pairs
 
 

@@ -1,7 +1,7 @@
 """Matches that never move: captions, frames of scans, watermarks, dust on the sensor.
 
-Such a thing is at the same place of many photographs, whatever they show. Its matches tell a
-camera that does not move, and can outvote those of the scene.
+Such a thing is at the same place of many photographs, whatever they show. Its matches fit a
+camera that does not move, and may be more than those of the scene.
 """
 
 import logging
@@ -81,7 +81,7 @@ class StationaryFilter:
         return replace(found, indices=found.indices[left], scores=found.scores[left])
 
     def left(self, names: Pair, indices: Indices) -> Mask:
-        """Tell which (M, 2) matches of a pair are kept.
+        """Return which (M, 2) matches of a pair are kept.
 
         Left out is what does not move at a place where nothing does, or beside it, since what is
         faint matches less; and what goes from one such place to another, as of equal letters.
@@ -139,7 +139,7 @@ class StationaryFilter:
         return {size: np.argwhere(e.places())[:, ::-1] for size, e in evidence.items()}
 
     def _still(self, names: Pair, indices: Indices, size: Size) -> tuple[Mask, Indices, Indices]:
-        """Tell which matches do not move; also the (M, 2) cells, column and row, of both ends."""
+        """Return which matches do not move; also the (M, 2) cells, column and row, of both ends."""
         first, second = (self._points(name)[indices[:, side]] for side, name in enumerate(names))
         motion = np.linalg.norm(second - first, axis=1)
         return motion <= MAX_MOTION_FRAC * max(size), _cells(first, size), _cells(second, size)

@@ -13,18 +13,9 @@ from colmap_affrect.colmap.verification import (
 from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.report import StageReport
-from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.inputs import recorded_extraction
 from colmap_affrect.stages.match import write_matches
 from colmap_affrect.stages.pairs import listed_pairs
-
-
-def recorded_verification(workspace: Workspace) -> VerificationOptions:
-    """Return the options on record of verification, done or still to be done."""
-    return VerificationOptions.from_mapping(
-        workspace.planned("verify") or {}, str(workspace.config)
-    )
 
 
 def verify_matches(
@@ -39,7 +30,7 @@ def verify_matches(
     workspace = context.workspace
     workspace.require("match")
     pairs = listed_pairs(context)
-    options = options or recorded_verification(workspace)
+    options = options or context.verification
     workspace.record_options("verify", options.to_mapping(), overwrite=overwrite)
     write_matches(context, pairs)
     todo = len(colmap_database.unverified_pairs(workspace.database))
@@ -52,13 +43,13 @@ def verified_inliers(context: Context) -> dict[Pair, Indices]:
     """Return the (M, 2) features of each verified pair that are inliers."""
     path = context.workspace.database
     names = {number: name for name, number in colmap_database.image_ids(path).items()}
-    found = inlier_matches(path, recorded_verification(context.workspace).min_num_inliers)
+    found = inlier_matches(path, context.verification.min_num_inliers)
     return {(names[one], names[two]): indices for (one, two), indices in found.items()}
 
 
 def extracted_px(context: Context) -> ExtractedPx:
-    """Return the longest side that photographs were shrunk to, or pairs by what they climbed to."""
-    levels = recorded_extraction(context.workspace).levels
+    """Return the longest side that photographs were shrunk to; by pair, where levels differ."""
+    levels = context.extraction.levels
     sizes = [level.max_image_size_px for level in levels]
     if len(set(sizes)) == 1:
         return sizes[0]
@@ -73,6 +64,5 @@ def extracted_px(context: Context) -> ExtractedPx:
 
 def verify_new(context: Context, advance: Callable[[int], None] | None = None) -> None:
     """Verify the pairs of the database that have matches and no two-view geometry, good or bad."""
-    workspace = context.workspace
-    options = recorded_verification(workspace)
-    verify(workspace.database, options, extracted_px(context), advance)
+    path, options = context.workspace.database, context.verification
+    verify(path, options, extracted_px(context), advance)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from colmap_affrect.parallel.executor import available_cores
-from colmap_affrect.project.versions import installed_versions
+from colmap_affrect.project.report import installed_versions
 
 MATRIX_SIZE = 2048
 NUM_PRODUCTS = 5

@@ -31,7 +31,6 @@ from colmap_affrect.progress import SILENT
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.one_pair import CachedMatcher, Matching
-from colmap_affrect.stages.verify import recorded_verification
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class MatchedSet:
 def read_set(path: Path) -> MatchedSet:
     """Read the pairs that verify in an output folder."""
     workspace = Workspace(path)
-    verification = recorded_verification(workspace)
+    verification = Context(workspace).verification
     folder_of = {f"{path.name}:{name}": workspace for name in Context(workspace).features.names()}
     with open_database(workspace.database) as database:
         names = {i.image_id: f"{path.name}:{i.name}" for i in database.read_all_images()}

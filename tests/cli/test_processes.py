@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from command import Call, on_photographs, run_in_process_of_its_own, start
+from command import on_photographs, run_in_process_of_its_own, start
 
 from colmap_affrect.project.workspace import Workspace
 
@@ -35,20 +35,6 @@ def test_json_goes_to_stdout_alone_and_progress_to_stderr(photos: Path, tmp_path
     log = (tmp_path / "out" / "run.log").read_text(encoding="utf-8")
     assert "colmap-affrect" in log
     assert ".cc:" in log
-
-
-@pytest.mark.long
-def test_quiet_prints_the_result_only_and_verbose_every_image(
-    photos: Path, tmp_path: Path, call: Call
-) -> None:
-    arguments = on_photographs(photos, tmp_path / "out")
-    done = run_in_process_of_its_own("run", *arguments, "-q", python=("-W", "error"))
-    assert (done.code, done.stderr) == (0, [])
-    assert done.stdout.startswith("registered  3 of 3 images\n")
-    done = call("extract", *arguments, "--overwrite", "--verbose")
-    assert done.code == 0
-    assert done.stdout.startswith("extract: 3 done in ")
-    assert any(line.startswith("DEBUG: a.png: ") for line in done.stderr)
 
 
 @pytest.mark.long

@@ -22,8 +22,8 @@ from colmap_affrect.colmap.verification import (
     verify,
 )
 from colmap_affrect.comparison.pose_scores import pair_errors
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS, pixel_from_colmap
 from colmap_affrect.errors import OptionError
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, pixel_from_colmap
 from colmap_affrect.mappers.base import MAPPERS
 from colmap_affrect.mappers.incremental import IncrementalOptions
 from colmap_affrect.options import PRESETS

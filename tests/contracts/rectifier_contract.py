@@ -10,10 +10,10 @@ import pytest
 from numpy.testing import assert_array_equal
 from synthetic import texture
 
-from colmap_affrect.conventions import camera_matrix
 from colmap_affrect.data import GrayImage, Photograph, Rectification, RectificationPlan
 from colmap_affrect.features.sift import RootSift, SiftOptions
 from colmap_affrect.geometry.affine import project, transform_frames
+from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.rectifiers.base import Rectifier
 from colmap_affrect.stages.one_image import ImageExtractor

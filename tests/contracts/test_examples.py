@@ -21,7 +21,7 @@ from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.inputs import Inputs
-from colmap_affrect.stages.match import match, recorded_matching
+from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 
 TEXT = (Path(__file__).parents[2] / "ARCHITECTURE.md").read_text(encoding="utf-8")
@@ -68,7 +68,7 @@ def test_new_extractor_and_matcher_are_chosen_by_name(
     with context.workspace.locked():
         extract(context, Inputs.of(photos), recipe)
         choose_pairs(context)
-        assert recorded_matching(context.workspace).name == "mutual"
+        assert context.matching.name == "mutual"
         assert match(context).num_done == 1
     features = context.features
     first, second = (features.read(name).keypoints for name in ("a.png", "b.png"))

@@ -180,7 +180,7 @@ FOLDER_CASES: dict[str, tuple[Callable[[Folders], object], Finding]] = {
         Finding("error", "{out}/pairs.txt", "is not the list whose pairs were matched", "match"),
     ),
     "pairs verified anew": (
-        lambda f: (f.out / "sparse" / "inputs.sha256").write_text("0" * 64),
+        lambda f: Workspace(f.out).record_made_from("map", "0" * 64),
         Finding("warning", "{out}/sparse", "the models were made before", "map"),
     ),
     "config.toml damaged": (
@@ -217,7 +217,7 @@ def test_an_edited_model_is_refused_and_replaced_only_if_that_is_said(
     target = ["--model-path", str(model), "--output-path", str(tmp_path / "new"), "--format=text"]
     for inputs in (None, "0" * 64):  # and where mapping would begin anew
         if inputs:
-            (folders.out / "sparse" / "inputs.sha256").write_text(inputs)
+            Workspace(folders.out).record_made_from("map", inputs)
         for arguments in (["map", "--output-path", out], ["export", *target]):
             assert main([*arguments, "--quiet"]) == 1
             (line,) = capsys.readouterr().err.splitlines()

@@ -11,7 +11,6 @@ import pytest
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose, relative_pose
-from colmap_affrect.conventions import pixel_from_colmap
 from colmap_affrect.evaluation.data import PairResult, PairScore, ScoreOptions
 from colmap_affrect.evaluation.truths import (
     Correspondences,
@@ -23,6 +22,7 @@ from colmap_affrect.evaluation.truths import (
     recalls,
     symmetric_epipolar_distances,
 )
+from colmap_affrect.geometry.conventions import pixel_from_colmap
 
 TRUTH = np.array([[0.9, 0.2, 30.0], [-0.1, 1.1, -20.0], [3e-4, -1e-4, 1.0]])
 SIZE1, SIZE2 = (320, 200), (240, 260)

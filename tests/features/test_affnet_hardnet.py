@@ -14,7 +14,6 @@ from random_weights import write_random_weights
 from synthetic import blobs, texture
 from torch import nn
 
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import GrayImage, LocalFeatures
 from colmap_affrect.features.affnet_hardnet import (
     KEYNET_RADIUS_PX,
@@ -24,6 +23,7 @@ from colmap_affrect.features.affnet_hardnet import (
 )
 from colmap_affrect.features.base import NetworkContext
 from colmap_affrect.geometry.affine import lafs_from_keypoints, rotation
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.geometry.tilts import tilts_from_metrics, unit_metrics
 
 FLOAT32_ROUNDING = 1e-6

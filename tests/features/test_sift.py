@@ -11,9 +11,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import blobs, texture
 
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS
 from colmap_affrect.data import GrayImage, LocalFeatures
 from colmap_affrect.features.sift import DogOptions, RootSift, SiftOptions, detect_dog
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
 
 FLOAT32_ROUNDING = 1e-6
 

@@ -14,9 +14,9 @@ import pytest
 from numpy.testing import assert_allclose
 from synthetic import blobs, centroid, png_of_size, write_image
 
-from colmap_affrect.conventions import resized_from_original
 from colmap_affrect.errors import ImageError
 from colmap_affrect.geometry.affine import project
+from colmap_affrect.geometry.conventions import resized_from_original
 from colmap_affrect.images.headers import header_size
 from colmap_affrect.images.reading import (
     IMAGE_SUFFIXES,

@@ -25,7 +25,7 @@ from colmap_affrect.errors import (
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.verify import recorded_verification
+from colmap_affrect.stages.context import Context
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +194,7 @@ def test_options_of_verification_come_from_pycolmap_or_a_dictionary(
     colmap_affrect.extract_features(path, photos, NAMES[:2], extraction_options={})
     pycolmaps = pycolmap.TwoViewGeometryOptions(min_num_inliers=31, ransac=dict(max_error=2.5))
     colmap_affrect.match_exhaustive(path, verification_options=pycolmaps)
-    recorded = recorded_verification(Workspace.beside(path))
+    recorded = Context(Workspace.beside(path)).verification
     assert (recorded.min_num_inliers, recorded.max_error_px) == (31, 2.5)
     with pytest.raises(StaleStoreError, match=r"max_error_px=2\.5, and it is 3\.0 now; use a new"):
         colmap_affrect.match_exhaustive(path)

@@ -6,7 +6,6 @@ import errno
 import io
 import os
 import signal
-import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -326,17 +325,4 @@ def test_interrupt_is_put_off_until_the_block_has_ended() -> None:
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, handler)
-    assert done
-
-
-def test_uninterrupted_works_in_any_thread() -> None:
-    done = []
-
-    def work() -> None:
-        with uninterrupted():
-            done.append(1)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
     assert done

@@ -10,7 +10,12 @@ import pytest
 
 import colmap_affrect
 from colmap_affrect.errors import OptionError
-from colmap_affrect.project.outputs import new_results, publish, refuse_photographs
+from colmap_affrect.project.outputs import (
+    new_results,
+    publish,
+    refuse_photographs,
+    temporary_folder,
+)
 from colmap_affrect.project.workspace import Workspace
 
 PACKAGE = Path(colmap_affrect.__file__).parent
@@ -124,6 +129,24 @@ def test_among_photographs_only_work_folders_are_written(tmp_path: Path) -> None
     (tmp_path / "link").symlink_to(photographs)
     with pytest.raises(OptionError, match="lies in the folder of the photographs"):
         refuse_photographs(tmp_path / "link" / "a.ply", photographs)
+
+
+def test_temporary_folders_of_killed_processes_are_removed_and_no_others(tmp_path: Path) -> None:
+    (tmp_path / ".affrect-killed" / "sub").mkdir(parents=True)
+    (tmp_path / ".affrect-killed" / ".lock").touch()
+    (tmp_path / ".affrect-of-somebody").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / ".affrect-link").symlink_to(tmp_path / "elsewhere")
+    with temporary_folder(tmp_path) as first, temporary_folder(tmp_path) as second:
+        assert first != second
+        assert first.is_dir()
+        assert not (tmp_path / ".affrect-killed").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {
+        ".affrect-link",
+        ".affrect-of-somebody",
+        "elsewhere",
+    }
+    assert not list((tmp_path / "elsewhere").iterdir())
 
 
 OUTSIDE = ("interop", "comparison", "evaluation", "report", "cli", "images/conversion.py",

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,16 +92,6 @@ def test_read_returns_what_was_written(store: FeatureStore, count: int) -> None:
     assert_array_equal(store.read_frames("a.png"), written.lafs.astype(np.float32))
 
 
-def test_names_and_values_are_kept_with_spaces_unicode_and_folders(store: FeatureStore) -> None:
-    for seed, name in enumerate(NAMES):
-        store.write(name, some_features(5 + seed, seed), (100 + seed, 50))
-    assert store.names() == sorted(NAMES)
-    assert store.num_keypoints() == {name: 5 + seed for seed, name in enumerate(NAMES)}
-    assert store.image_sizes() == {name: (100 + seed, 50) for seed, name in enumerate(NAMES)}
-    for seed, name in enumerate(NAMES):
-        assert_same_features(store.read(name), some_features(5 + seed, seed))
-
-
 def test_features_have_the_layout_of_hloc(store: FeatureStore) -> None:
     written = some_features(7)
     store.write("west wing/a.png", written, (320, 240))
@@ -133,20 +118,6 @@ def test_files_do_not_need_the_newest_hdf5(store: FeatureStore) -> None:
     assert store.path.read_bytes()[8] == 0
 
 
-def test_write_again_replaces_the_features(store: FeatureStore) -> None:
-    store.write("a.png", some_features(9, 1), (4, 3))
-    store.write("a.png", some_features(5, 2), (8, 6))
-    assert_same_features(store.read("a.png"), some_features(5, 2))
-    assert store.image_sizes() == {"a.png": (8, 6)}
-
-
-def test_store_without_file_is_empty(store: FeatureStore) -> None:
-    assert store.names() == []
-    assert store.num_keypoints() == store.image_sizes() == {}
-    assert store.complete(["a.png"]) == set()
-    assert not store.path.exists()
-
-
 def test_incomplete_group_counts_as_absent_and_is_replaced(store: FeatureStore) -> None:
     for name in NAMES:
         store.write(name, some_features(4), (4, 3))
@@ -161,12 +132,6 @@ def test_incomplete_group_counts_as_absent_and_is_replaced(store: FeatureStore) 
         store.read(NAMES[1])
     store.write(NAMES[3], some_features(6), (4, 3))
     assert_same_features(store.read(NAMES[3]), some_features(6))
-
-
-def test_read_of_an_unknown_name_says_what_to_run(store: FeatureStore) -> None:
-    store.write("a.png", some_features(4), (4, 3))
-    with pytest.raises(StoreError, match=r"features\.h5: no features of z\.png; run extract"):
-        store.read("z.png")
 
 
 def one_line(error: pytest.ExceptionInfo[StoreError]) -> str:
@@ -301,84 +266,6 @@ def test_read_of_a_pair_without_matches_says_what_to_run(matches: MatchStore, go
     assert matches.has([("a.png", "z.png"), ("b.png", "z.png")]).tolist() == [True, False]
     with pytest.raises(StoreError, match=r"no matches of b\.png, z\.png; run match"):
         list(matches.read([("a.png", "z.png"), ("b.png", "z.png")]))
-
-
-WRITER = """
-import os, signal, sys
-from pathlib import Path
-import h5py
-import numpy as np
-from colmap_affrect.project.stores import FeatureStore
-from colmap_affrect.data import LocalFeatures
-
-path, deadly = Path(sys.argv[1]), int(sys.argv[2])
-created = 0
-create_dataset = h5py.Group.create_dataset
-
-
-def create(*arguments, **options):
-    global created
-    created += 1
-    if created == deadly:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return create_dataset(*arguments, **options)
-
-
-h5py.Group.create_dataset = create
-store = FeatureStore(path)
-for index in range(100_000):
-    count = 1000 + index
-    lafs = np.tile(np.eye(2, 3), (count, 1, 1)) * (index + 1)
-    store.write(
-        f"folder/{index}.png",
-        LocalFeatures(lafs, np.ones(count, np.float32), np.ones((count, 128), np.float32)),
-        (640, 480),
-    )
-    print(index, flush=True)
-"""
-
-
-def start_writer(path: Path, deadly: int = 0) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", WRITER, str(path), str(deadly)], stdout=subprocess.PIPE, text=True
-    )
-
-
-def assert_holds_images(store: FeatureStore, least: int, most: int) -> None:
-    """The store is readable and holds the writer's images 0, 1, ..., each as written."""
-    counts = store.num_keypoints()
-    assert least <= len(counts) <= most
-    for index in range(len(counts)):
-        assert counts[f"folder/{index}.png"] == 1000 + index
-        lafs = store.read(f"folder/{index}.png").lafs
-        assert_array_equal(lafs, np.tile(np.eye(2, 3), (1000 + index, 1, 1)) * (index + 1))
-
-
-@pytest.mark.parametrize(("deadly", "complete"), [(1, 0), (4, 0), (10, 1), (21, 2)])
-def test_complete_groups_are_readable_after_a_kill_within_a_group(
-    store: FeatureStore, deadly: int, complete: int
-) -> None:
-    with start_writer(store.path, deadly) as writer:
-        writer.communicate(timeout=60)
-    assert writer.returncode == -signal.SIGKILL
-    assert_holds_images(store, complete, complete)
-    store.write("more.png", some_features(3), (4, 3))
-    assert "more.png" in store.names()
-
-
-@pytest.mark.parametrize("delay_s", [0.005, 0.023, 0.07])
-def test_complete_groups_are_readable_after_a_kill_at_any_time(
-    store: FeatureStore, delay_s: float
-) -> None:
-    with start_writer(store.path) as writer:
-        for _ in range(3):
-            writer.stdout.readline()
-        time.sleep(delay_s)
-        os.kill(writer.pid, signal.SIGKILL)
-        printed = writer.stdout.read().split()
-    written = 3 + len([line for line in printed if line.isdigit()])
-    # The last one may be complete before it is printed.
-    assert_holds_images(store, written, written + 1)
 
 
 def test_file_that_somebody_else_has_written_is_read_again(store: FeatureStore) -> None:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
 
 from colmap_affrect.errors import OptionError, StaleStoreError, WorkspaceError
-from colmap_affrect.project.outputs import temporary_folder
-from colmap_affrect.project.workspace import COPY_STAGES, Workspace
-from colmap_affrect.project.workspace import STAGES as ALL_STAGES
+from colmap_affrect.project.record import COPY_STAGES
+from colmap_affrect.project.record import STAGES as ALL_STAGES
+from colmap_affrect.project.workspace import Workspace
 
 STAGES = tuple(stage for stage in ALL_STAGES if stage != "copy")
 
@@ -55,13 +54,6 @@ def test_record_options_puts_the_options_on_record(workspace: Workspace) -> None
         workspace.require("match")
     assert workspace.require("extract")["camera"] == {"mode": "auto"}
     assert [path.name for path in workspace.path.iterdir()] == ["config.toml"]
-
-
-def test_record_options_again_with_the_same_options_is_accepted(workspace: Workspace) -> None:
-    workspace.record_options("extract", OPTIONS)
-    before = workspace.config.read_bytes()
-    workspace.record_options("extract", {**OPTIONS, "sigmas": [8, 16]})
-    assert tomllib.loads(workspace.config.read_text()) == tomllib.loads(before.decode())
 
 
 @pytest.mark.parametrize(
@@ -204,9 +196,16 @@ def test_models_that_somebody_put_beside_ours_are_not_removed(
     assert foreign.exists()
 
 
-def test_require_of_a_stage_not_run_says_what_to_run(workspace: Workspace) -> None:
-    with pytest.raises(OptionError, match=r"run 'colmap-affrect match' .* first"):
-        workspace.require("match")
+def test_what_models_were_made_from_is_on_record_while_they_are_there(workspace: Workspace) -> None:
+    workspace.record_options("extract", OPTIONS)
+    workspace.record_made_from("map", "ab")
+    assert workspace.models_made_from() == ""
+    workspace.sparse.mkdir()
+    assert Workspace(workspace.path).models_made_from() == "ab"
+    workspace.rewind()
+    assert workspace.models_made_from() == ""
+    (workspace.sparse / "inputs.sha256").write_text("of an older version")
+    assert workspace.models_made_from() == "of an older version"
 
 
 def test_damaged_record_is_one_clear_line(workspace: Workspace) -> None:
@@ -247,33 +246,11 @@ def test_folder_in_use_by_another_process_is_refused_until_it_ends(tmp_path: Pat
         assert again is workspace
 
 
-def test_locked_releases_the_folder_after_an_error(workspace: Workspace) -> None:
-    with pytest.raises(KeyError), workspace.locked():
-        raise KeyError
-    with workspace.locked():
-        pass
-
-
 def test_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     workspace = Workspace(tmp_path / "file" / "out")
     with (
         pytest.raises(WorkspaceError, match=r"out: cannot be used as output folder \(Not a dir"),
-        workspace.locked(),
-    ):
-        pass
-
-
-def test_folder_that_cannot_be_written_is_one_clear_line(
-    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Permissions do not stop root, who runs tests in containers: the error is raised by hand.
-    def refuse(*_: object, **__: object) -> None:
-        raise PermissionError(13, "Permission denied", str(workspace.path))
-
-    monkeypatch.setattr("filelock.FileLock.acquire", refuse)
-    with (
-        pytest.raises(WorkspaceError, match=r"output folder \(Permission denied\)"),
         workspace.locked(),
     ):
         pass
@@ -307,33 +284,3 @@ def test_branch_begins_after_the_raw_matches(finished: Workspace, tmp_path: Path
     branch.record_options("match", {"by": "other options"}, overwrite=True)
     assert not branch.matches.exists()
     assert finished.matches.read_bytes() == b"matches.h5"
-
-
-def test_branch_copies_where_files_cannot_be_shared(
-    finished: Workspace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(*_: object) -> None:
-        raise OSError("another file system")
-
-    monkeypatch.setattr("os.link", refused)
-    branch = finished.branch(tmp_path / "branch")
-    assert branch.features.read_bytes() == b"features.h5"
-    assert branch.features.stat().st_nlink == 1
-
-
-def test_temporary_folders_of_killed_processes_are_removed_and_no_others(tmp_path: Path) -> None:
-    (tmp_path / ".affrect-killed" / "sub").mkdir(parents=True)
-    (tmp_path / ".affrect-killed" / ".lock").touch()
-    (tmp_path / ".affrect-of-somebody").mkdir()
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / ".affrect-link").symlink_to(tmp_path / "elsewhere")
-    with temporary_folder(tmp_path) as first, temporary_folder(tmp_path) as second:
-        assert first != second
-        assert first.is_dir()
-        assert not (tmp_path / ".affrect-killed").exists()
-    assert {path.name for path in tmp_path.iterdir()} == {
-        ".affrect-link",
-        ".affrect-of-somebody",
-        "elsewhere",
-    }
-    assert not list((tmp_path / "elsewhere").iterdir())

@@ -24,9 +24,9 @@ from planar_scenes import (
 from small_scene import cached_texture
 from strategies import Array, tilt_distance
 
-from colmap_affrect.conventions import camera_matrix
 from colmap_affrect.data import Mask, Photograph, Rectification, RectificationPlan
 from colmap_affrect.geometry.affine import project, rectifying_affine
+from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.images.reading import read_gray
 from colmap_affrect.images.warping import warp, warp_mask
 from colmap_affrect.rectifiers.base import RectifierInputs

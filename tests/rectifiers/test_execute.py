@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose
 from strategies import Array
 from synthetic import blobs, texture
 
-from colmap_affrect.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.data import (
     LocalFeatures,
     Mask,
@@ -23,6 +22,7 @@ from colmap_affrect.geometry.affine import (
     fit_canvas,
     rectifying_affine,
 )
+from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS, is_inside
 from colmap_affrect.rectifiers.execute import extract_rectified
 
 KEYPOINT_ERROR_PX = 0.1

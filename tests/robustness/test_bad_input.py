@@ -5,19 +5,16 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
-from command import FAST, Call, pair_list
-from small_scene import IMAGE_SIZE, photograph, write_photographs
+from command import FAST, Call
+from small_scene import photograph, write_photographs
 from synthetic import write_image
 
-from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cameras import read_given_cameras
 from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.images.photographs import CameraOptions, list_images
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.pipeline import RunOptions, run
-from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context
@@ -57,22 +54,6 @@ def test_folder_of_unreadable_images_only_is_one_clear_line(tmp_path: Path, call
     ]
 
 
-@pytest.mark.long
-def test_blank_image_has_no_features_and_the_run_goes_on(
-    trio: Path, tmp_path: Path, call: Call
-) -> None:
-    write_image(trio / "blank.png", np.full(IMAGE_SIZE[::-1], 128, np.uint8))
-    code, stdout, stderr = call(
-        "run", "--image-path", trio, "--output-path", tmp_path / "out", *FAST, "--json"
-    )
-    assert code == 0, stderr
-    report = json.loads(stdout)
-    assert report["unregistered"] == {"blank.png": "no features"}
-    assert report["images_registered"] == 3
-    assert (report["num_pairs"], report["num_verified_pairs"]) == (6, 3)
-    assert FeatureStore(tmp_path / "out" / "features.h5").num_keypoints()["blank.png"] == 0
-
-
 def test_one_image_ends_without_a_model(tmp_path: Path, call: Call) -> None:
     write_photographs(tmp_path / "photos", 1)
     out = tmp_path / "out"
@@ -107,44 +88,6 @@ def test_bad_input_is_one_clear_line_and_writes_no_results(
         assert stderr[0].startswith("error: ")
         assert message in stderr[0]
         assert not (tmp_path / "out").exists()
-
-
-def test_database_of_another_program_is_refused_and_left_as_it_is(
-    trio: Path, tmp_path: Path, call: Call
-) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    with pycolmap.Database.open(out / "database.db") as database:
-        database.write_camera(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 9.0, 8, 6))
-    before = (out / "database.db").read_bytes()
-    for command in (["run"], ["extract", "--overwrite"]):
-        code, stdout, stderr = call(*command, "--image-path", trio, "--output-path", out, *FAST)
-        assert (code, stdout, len(stderr)) == (2, "", 1)
-        assert "is not empty (database.db) and was not made by colmap-affrect" in stderr[0]
-        assert (out / "database.db").read_bytes() == before
-
-
-def test_output_folder_that_cannot_be_made_is_refused(
-    trio: Path, tmp_path: Path, call: Call
-) -> None:
-    (tmp_path / "file").write_text("")
-    for out in (tmp_path / "file", tmp_path / "file" / "out"):
-        code, stdout, stderr = call("run", "--image-path", trio, "--output-path", out, *FAST)
-        assert (code, stdout, len(stderr)) == (1, "", 1)
-        assert str(out) in stderr[0]
-
-
-def test_unknown_name_in_the_pair_list_is_one_clear_line(
-    trio: Path, tmp_path: Path, call: Call
-) -> None:
-    unknown = pair_list(tmp_path, "a.png", "b d.png")
-    code, stdout, stderr = call(
-        "run", "--image-path", trio, "--output-path", tmp_path / "out", *FAST,
-        "--match-list-path", unknown, "-q",
-    )  # fmt: skip
-    assert (code, stdout, len(stderr)) == (1, "", 1)
-    assert f"{unknown}: names that are not among the images: line 1" in stderr[0]
-    assert not Workspace(tmp_path / "out").pairs.exists()
 
 
 def test_pair_list_may_name_an_image_that_cannot_be_read(
@@ -203,3 +146,13 @@ def test_files_of_text_may_begin_with_a_byte_order_mark(trio: Path, tmp_path: Pa
     model = written("cameras.txt", "1 PINHOLE 320 240 300 300 160 120\n")
     given = read_given_cameras(CameraOptions(cameras_path=str(model)))
     assert given["a.png"].model == "PINHOLE"
+
+
+def test_damaged_features_are_made_again_with_overwrite(
+    trio: Path, tmp_path: Path, call: Call
+) -> None:
+    extract = ["extract", "--image-path", trio, "--output-path", tmp_path / "out", *FAST]
+    assert call(*extract).code == 0
+    (tmp_path / "out" / "features.h5").write_bytes(b"damaged")
+    assert "run the same 'extract' or 'run' with --overwrite" in call(*extract).errors[0]
+    assert call(*extract, "--overwrite").code == 0

@@ -4,7 +4,7 @@
     CAMPAIGN=10 pytest -m long --dist load tests/robustness/test_campaign.py
 
 The second line makes ten times as many trials by chance. Each trial has a number, which seeds it,
-stands alone, and says what it did when it fails. Moments depend on how fast the machine is. Kills
+stands alone, and says what it did when it fails. Kills
 at system calls and full disks: tests/benchmarks/campaign.py.
 """
 
@@ -13,9 +13,7 @@ from __future__ import annotations
 import os
 import random
 import shutil
-import signal
 import sqlite3
-import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -23,9 +21,7 @@ from typing import Any
 
 import pytest
 from attacks import (
-    COMPARED,
     TRAPS,
-    Command,
     Scene,
     assert_clear,
     assert_no_traceback,
@@ -34,10 +30,8 @@ from attacks import (
     empty_folder,
     ended,
     exports,
-    finished,
     folder_commands,
     foreign_folder,
-    is_temporary,
     make_scene,
     make_world,
     placed,
@@ -45,15 +39,12 @@ from attacks import (
     tell,
     tree,
 )
-from command import FAST, Ended
-from damaged import STATEMENTS, damage, execute
+from damaged import damage
 from results import database_content, results
 
 pytestmark = pytest.mark.long
 
 TIMES = int(os.environ.get("CAMPAIGN", "1"))
-INTERRUPTED = "interrupted; run the same command again to go on"
-CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -signal.SIGKILL}
 
 
 def trials(count: int) -> pytest.MarkDecorator:
@@ -69,12 +60,10 @@ def scene(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Scene:
 # Part 1: names and links that lead astray.
 
 NAMES = (
-    "{photos}/b c.png", "{world}/elsewhere/new.png", "//{photos}/b c.png", "../../x.png",
-    "../photos/b c.png", "../../../photos/b c.png", "side/../../../../../photos/x.png", "x.png",
-    "side/../b c.png", "x.png/..", "..", ".", "side//x.png", "side/", "C:\\x.png",
-    "\\\\server\\share\\x.png", "..\\..\\x.png", "x.png ", "\u202egnp.x", "side/c\u030c.png",
-    "line\nbreak.png", "\x1b[31mred\x7f.png", "ž" * 148 + ".png", "~/x.png", "-rf.png",
-    "/".join(["deep" * 12] * 20) + "/x.png", "dense/images/x.png", "sparse/0/cameras.bin", "",
+    "{photos}/b c.png", "{world}/elsewhere/new.png", "../../../photos/b c.png",
+    "side/../../../../../photos/x.png", "x.png", "x.png/..", "..", "C:\\x.png", "..\\..\\x.png",
+    "\u202egnp.x", "line\nbreak.png", "~/x.png", "-rf.png", "/".join(["deep" * 12] * 20) + "/x.png",
+    "dense/images/x.png", "sparse/0/cameras.bin", "",
 )  # fmt: skip
 """Of an image in the place of a.png; x.png is harmless. A photograph is where a name leads."""
 
@@ -123,112 +112,12 @@ def test_links_in_output_folders_are_not_followed(scene: Scene, tmp_path: Path, 
     assert not wrong, "\n".join([trap, *wrong])
 
 
-# Part 2: exports that are interrupted, with something of the user in their folder.
-
-ALL_FORMATS = "ply,text,cameras,bundler,nerfstudio,geojson of lens"
-WRITERS = (ALL_FORMATS, "align", "export-h5", "export-database", "convert")
-MINE = {"mine.txt": ("file",), "mine": ("folder",), "mine/report.html": ("file",)}
-
-
-def plant(out: Path) -> bool:
-    """Put a file and a folder of the user into an output folder, if it is there."""
-    with suppress(FileNotFoundError):
-        (out / "mine.txt").write_text("mine")
-        (out / "mine").mkdir()
-        (out / "mine" / "report.html").write_text("mine")
-    return (out / "mine").exists()
-
-
-def left(out: Path, is_planted: bool) -> dict[str, Any]:
-    """What is in a folder beside the files of the user, which have to be there."""
-    found = tree(out, times=False)
-    for name in ("mine.txt", "mine/report.html") if is_planted else ():
-        assert (out / name).exists(), f"{name} was removed"
-        assert (out / name).read_text() == "mine", f"{name} was changed"
-    return {key: value for key, value in found.items() if key not in MINE}
-
-
-def assert_final_is_whole(found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Whatever stands under a final name is that of the undisturbed command, and all of it."""
-    tops = {key.split("/")[0] for key in found}
-    for key in found.keys() | {key for key in expected if key.split("/")[0] in tops}:
-        assert key in expected, f"{key} is not of the undisturbed command"
-        assert key in found, f"{key} is missing under a final name"
-        assert found[key] == expected[key], f"{key} is not whole"
-
-
-def assert_ended_by(end: Ended, number: signal.Signals) -> None:
-    """Exit code and one line, or the command was done before the signal came."""
-    assert_no_traceback(end)
-    assert end.code in (0, CODES[number]), end
-    if end.code in (130, 143):
-        assert len(end.stderr) == 1, end
-        assert number == signal.SIGTERM or end.stderr == [INTERRUPTED], end
-
-
-@trials(60)
-def test_interrupted_export_takes_away_its_own_only(
-    scene: Scene, tmp_path: Path, number: int
-) -> None:
-    chance, label = random.Random(f"interrupt {number}"), WRITERS[number % len(WRITERS)]
-    sent = chance.choice(list(CODES))
-    expected, seconds = scene.ended(label, tmp_path / "undisturbed")
-    out = tmp_path / "out"
-    if is_there := label in ("export-h5", "export-database") or chance.random() < 0.6:
-        out.mkdir()
-    moments = sorted(chance.uniform(0.01, 1.1 * seconds) for _ in range(2))
-    command = Command(*placed(exports(scene.folder)[label][0], out))
-    time.sleep(moments[0])
-    is_planted = plant(out)
-    time.sleep(moments[1] - moments[0])
-    command.send(sent)
-    end = command.ended()
-    tell(f"{label}, {sent.name} at {moments[1]:.3f} of {seconds:.3f} s, planted: {is_planted}")
-    if is_planted and end.errors:  # it saw them before it began
-        assert_clear(end, 1, 2)
-    else:
-        assert_ended_by(end, sent)
-    found = left(out, is_planted)
-    if label == "convert":  # whose pictures are results of their own
-        assert finished(found).items() <= expected.items()
-    else:
-        assert_final_is_whole(finished(found), finished(expected))
-    assert {path.name for path in tmp_path.iterdir() if not is_temporary(path.name)} <= {"out"}
-    is_whole = finished(found) == finished(expected)  # the signal came when all was done
-    if end.code in (130, 143) and label != "convert" and not is_whole:
-        assert not found, f"left over: {sorted(found)}"
-        assert out.exists() == (is_there or is_planted), "the output folder is left over"
-        assert {path.name for path in tmp_path.iterdir()} <= {"out"}
-    assert_goes_on(scene, label, out, is_planted)
-
-
-def assert_goes_on(scene: Scene, label: str, out: Path, is_planted: bool) -> None:
-    """The same command again works, or refuses what is whole already, or what is the user's."""
-    expected = finished(scene.undisturbed[label][0])
-    before = finished(left(out, is_planted))
-    if label in ("export-h5", "export-database"):
-        out.mkdir(exist_ok=True)
-    again = ended(*placed(exports(scene.folder)[label][0], out))
-    assert_clear(again, 0, 1, 2)
-    found = finished(left(out, is_planted))
-    if again.code == 0:
-        assert found == expected, differences(expected, found)
-    elif is_planted and not before:
-        assert not found, found
-        shutil.rmtree(out / "mine")
-        (out / "mine.txt").unlink()
-        assert_goes_on(scene, label, out, is_planted=False)
-    else:
-        assert before, f"refused, and nothing is there: {again.errors}"
-        assert found == before, differences(before, found)
-
-
-# Part 3: damaged files.
+# Part 2: damaged files.
 
 FILES = (
     "features.h5", "matches.h5", "guided.h5", "database.db", "pairs.txt", "config.toml",
-    "cameras.json", "contents.json", "report.json", "report.html", "run.log",
-    "sparse/inputs.sha256", "sparse/0/cameras.bin", "sparse/0/rigs.bin", "sparse/0/frames.bin",
+    "cameras.json", "report.json", "report.html", "run.log",
+    "sparse/0/cameras.bin", "sparse/0/rigs.bin", "sparse/0/frames.bin",
     "sparse/0/images.bin", "sparse/0/points3D.bin", "sparse/0/summary.json",
 )  # fmt: skip
 READERS = ("run", "map", "export", "align", "doctor")
@@ -269,7 +158,8 @@ def outcome(name: str, out: Path, target: Path) -> dict[str, Any]:
     models = {key: value for key, value in tree(out, times=False).items() if key.endswith(".bin")}
     if name == "map":
         return database_content(out / "database.db") | models
-    return results(out) | models
+    kept = {"features", "matches"}  # what an idle run does not read; doctor does
+    return {key: value for key, value in results(out).items() if key not in kept} | models
 
 
 def assert_right(name: str, out: Path, target: Path, expected: Mapping[str, Any]) -> None:
@@ -281,7 +171,7 @@ def assert_right(name: str, out: Path, target: Path, expected: Mapping[str, Any]
     assert not wrong, f"success with a wrong result: {wrong}"
 
 
-@trials(300)
+@trials(150)
 def test_damaged_file_is_mended_or_named(
     scene: Scene, expected: dict[str, Any], tmp_path: Path, number: int
 ) -> None:
@@ -307,76 +197,9 @@ def test_damaged_file_is_mended_or_named(
         assert Path(name).name in doctor.stdout, (end.errors, doctor)
 
 
-# Part 4: the database between two runs.
+# Part 3: folders that are not ours.
 
-
-@pytest.mark.parametrize("statement", STATEMENTS, ids=lambda text: text[:70])
-def test_edited_database_is_made_again_or_refused(
-    scene: Scene, expected: dict[str, Any], tmp_path: Path, statement: str
-) -> None:
-    out = scene.copy(tmp_path)
-    execute(out / "database.db", statement.format(id=2))
-    end = ended(*scene.run(out))
-    assert_clear(end, 0, 1, 2)
-    if end.code == 0:
-        assert_right("run", out, tmp_path, expected)
-
-
-# Part 5: Ctrl-C at any moment.
-
-AT_ONCE_S = 5.0
-BEFORE_PYTHON_S = 0.3  # Python may not have started yet, and a signal simply ends it
-
-
-def ready(scene: Scene, command: str, folder: Path) -> list[object]:
-    """Arguments of a command that is to be interrupted, whose input is ready."""
-    out, database = folder / "out", folder / "hanging.db"
-    images = ["--image-path", scene.folder / "photos", "--output-path", out]
-    if command == "match":
-        for stage in (["extract", "-q", *images, *FAST], ["pairs", "-q", "--output-path", out]):
-            assert ended(*stage).code == 0
-    if command == "hanging map":
-        shutil.copy(scene.folder / "any.db", database)
-        at_zero = "UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = 1"
-        execute(database, at_zero)
-    return {
-        "run": ["run", "-q", *images, *FAST],
-        "map": ["map", "-q", "--from-database", scene.folder / "any.db", *images[2:]],
-        "hanging map": ["map", "-q", "--from-database", database, *images[2:]],
-        "extract": ["extract", "-q", *images, *FAST],
-        "match": ["match", "-q", "--output-path", out],
-        "compare": ["compare", "-q", *images, *COMPARED],
-        "export": placed(exports(scene.folder)[ALL_FORMATS][0], out),
-        "import-h5": placed(exports(scene.folder)["import-h5"][0], folder),
-    }[command]
-
-
-LONGEST_S = {"run": 1.4, "map": 1.0, "hanging map": 4.0, "extract": 0.9, "match": 0.9,
-             "compare": 2.2, "export": 0.8, "import-h5": 0.9}  # fmt: skip
-
-
-@trials(60)
-def test_signal_ends_any_command_at_once(scene: Scene, tmp_path: Path, number: int) -> None:
-    chance = random.Random(f"at once {number}")
-    sent = signal.SIGTERM if number % 3 == 2 else signal.SIGINT
-    name = sorted(LONGEST_S)[number // 3 % len(LONGEST_S)]
-    delay_s = chance.uniform(0.0, LONGEST_S[name])
-    tell(f"{name}, {sent.name} after {delay_s:.3f} s")
-    command = Command(*ready(scene, name, tmp_path), fresh=True)
-    time.sleep(delay_s)
-    command.send(sent)
-    begun = time.monotonic()
-    end = command.ended(AT_ONCE_S)
-    if delay_s > BEFORE_PYTHON_S:
-        assert_ended_by(end, sent)
-    while (others := command.others()) and time.monotonic() < begun + AT_ONCE_S:
-        time.sleep(0.1)
-    assert not others, f"still at work after {AT_ONCE_S:g} s"
-
-
-# Part 6: folders that are not ours.
-
-FOLDERS = ("report", "notes", "database", "photographs", "above the photographs")
+FOLDERS = ("report", "photographs", "above the photographs")
 FILLERS = ("run", "extract", "compare", "evaluate", "inspect", "map", "convert")
 
 
@@ -389,25 +212,3 @@ def test_foreign_folder_is_refused(scene: Scene, tmp_path: Path, name: str, kind
     end = ended(*folder_commands(scene, photos)[name], "--output-path", out)
     assert not (harmed := differences(before, tree(tmp_path))), (harmed, end.code)
     assert_clear(end, 1, 2)
-
-
-@pytest.mark.parametrize("target", ["nothing", "photograph", "folder", "moved"])
-@pytest.mark.parametrize("name", ["run.log", "database.db", "features.h5", "sparse", ".lock"])
-def test_link_in_a_folder_of_ours_is_not_followed(
-    scene: Scene, expected: dict[str, Any], tmp_path: Path, name: str, target: str
-) -> None:
-    out, outside = scene.copy(tmp_path), tmp_path / "outside"
-    shutil.copytree(scene.folder / "photos", outside)
-    (out / name).touch()
-    (out / name).rename(outside / "moved")
-    places = {"photograph": "a.png", "folder": "side"}
-    (out / name).symlink_to(outside / places.get(target, target))
-    before = tree(outside)
-    for more in ([], ["--overwrite"]):
-        end = ended(*scene.run(out), *more)
-        harmed = differences(before, tree(outside))
-        assert not harmed, f"{harmed}, exit code {end.code}, {more}"
-        assert_clear(end, 0, 1, 2)
-        if end.code == 0:
-            assert not (out / name).is_symlink(), more
-            assert_right("run", out, tmp_path, expected)

@@ -227,6 +227,18 @@ def test_stages_after_extract_ask_for_what_a_change_took_away(tmp_path: Path, ca
     assert "the photographs have changed; run 'colmap-affrect pairs'" in refused.errors[0]
 
 
+def test_photograph_that_was_only_touched_is_read_once_more(
+    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = Scene(tmp_path)
+    write_photographs(scene.photos, 2)
+    extracted(call, scene)
+    (scene.photos / FIRST).touch()
+    assert extracted(call, scene) == ["extract: 0 done, 2 already there"]
+    monkeypatch.setattr("colmap_affrect.project.contents.file_sha256", None)
+    assert extracted(call, scene) == ["extract: 0 done, 2 already there"]
+
+
 def test_other_folder_with_none_of_the_photographs_is_refused(tmp_path: Path, call: Call) -> None:
     scene = Scene(tmp_path)
     write_photographs(scene.photos, 2)

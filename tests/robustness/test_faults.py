@@ -9,11 +9,8 @@ import errno
 import os
 import resource
 import shutil
-import sqlite3
-import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,15 +35,6 @@ def file_size_limit(num_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, usual)
 
 
-LIMITED_COMMAND = """
-import resource, sys
-import colmap_affrect.pipeline
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
-from colmap_affrect.cli import main
-sys.exit(main(sys.argv[2:]))
-"""
-
-
 @dataclass(frozen=True)
 class Disturbed:
     """A run whose writes are to fail, and one that nothing disturbed."""
@@ -66,15 +54,6 @@ class Disturbed:
 
     def run(self) -> Ended:
         return self.call(*self.arguments)
-
-    def run_limited(self, num_bytes: int, *arguments: object) -> Ended:
-        """Run a command in a process of its own, which pycolmap may abort."""
-        command = [*map(str, arguments)] or self.arguments
-        done = subprocess.run(
-            [sys.executable, "-c", LIMITED_COMMAND, str(num_bytes), *command],
-            capture_output=True, text=True, timeout=120, check=False,
-        )  # fmt: skip
-        return Ended(done.returncode, done.stdout, done.stderr.splitlines())
 
     def begin_without(self, *names: str) -> None:
         """Begin with the undisturbed run as it was before it made some of its files."""
@@ -125,58 +104,12 @@ def test_hdf5_write_that_fails_loses_nothing_else(
     disturbed.assert_finishes()
 
 
-def test_features_that_do_not_fit_on_the_disk(disturbed: Disturbed) -> None:
-    features = disturbed.workspace.features
-    with file_size_limit(disturbed.undisturbed.out.joinpath("features.h5").stat().st_size * 2 // 3):
-        assert_says_what_to_do(disturbed.run(), features)
-        assert disturbed.run().code == 1  # nor does it get worse
-    assert 1 <= len(FeatureStore(features).names()) < 4
-    disturbed.assert_finishes()
-
-
 def test_record_of_options_that_does_not_fit_on_the_disk(disturbed: Disturbed) -> None:
     with file_size_limit(700):
         ended = disturbed.run()
     assert_says_what_to_do(ended, disturbed.workspace.config)
     assert not disturbed.workspace.config.exists()
     assert not disturbed.workspace.features.exists()
-
-
-def test_report_that_cannot_be_written(disturbed: Disturbed) -> None:
-    disturbed.begin_without("database.db.seal")  # as after a kill
-    (disturbed.out / "report.json").mkdir()
-    assert_says_what_to_do(disturbed.run(), disturbed.workspace.report)
-    (disturbed.out / "report.json").rmdir()
-    disturbed.assert_finishes()
-
-
-def test_new_database_that_does_not_fit_on_the_disk(disturbed: Disturbed) -> None:
-    # COLMAP would end the process in the middle of its images.
-    disturbed.begin_without("database.db")
-    assert_says_what_to_do(disturbed.run_limited(160_000), disturbed.out / "database.db.new")
-    disturbed.assert_finishes()
-
-
-def test_database_that_grows_too_large_for_the_disk(disturbed: Disturbed) -> None:
-    disturbed.begin_without("database.db.seal")  # as after a kill
-    path = disturbed.workspace.database
-    with closing(sqlite3.connect(path, isolation_level=None)) as database:
-        for table in ("two_view_geometries", "keypoints", "matches"):
-            database.execute(f"DELETE FROM {table}")
-        database.execute("VACUUM")
-    assert_says_what_to_do(disturbed.run_limited(path.stat().st_size + 20_000), path)
-    disturbed.assert_finishes()
-
-
-def test_geometries_that_do_not_fit_on_the_disk(disturbed: Disturbed) -> None:
-    out = ["--output-path", disturbed.out, "-q"]
-    for command in (["extract", "--image-path", disturbed.photos, *FAST], ["pairs"], ["match"]):
-        assert disturbed.call(*command, *out).code == 0
-    # COLMAP would end the process in the middle of this.
-    database = disturbed.workspace.database
-    ended = disturbed.run_limited(database.stat().st_size + 10_000, "verify", *out)
-    assert_says_what_to_do(ended, database)
-    disturbed.assert_finishes()
 
 
 def test_model_that_does_not_fit_on_the_disk_is_not_taken_for_whole(disturbed: Disturbed) -> None:
@@ -188,15 +121,3 @@ def test_model_that_does_not_fit_on_the_disk_is_not_taken_for_whole(disturbed: D
     assert not disturbed.workspace.sparse.exists()
     assert not disturbed.workspace.report.exists()
     disturbed.assert_finishes()
-
-
-def test_model_that_was_damaged_later_is_named(disturbed: Disturbed) -> None:
-    shutil.copytree(disturbed.undisturbed.out, disturbed.out)
-    damaged = disturbed.workspace.sparse / "0" / "points3D.bin"
-    os.truncate(damaged, damaged.stat().st_size // 2)
-    ended = disturbed.run()
-    assert (ended.code, ended.stdout, len(ended.stderr)) == (1, "", 1)
-    assert ended.stderr[0].startswith(f"error: {damaged}: damaged")
-    assert f"run 'colmap-affrect map --output-path {disturbed.out} --overwrite'" in ended.stderr[0]
-    assert disturbed.call("map", "--output-path", disturbed.out, "--overwrite").code == 0
-    assert results(disturbed.out) == disturbed.undisturbed.results

@@ -1,7 +1,6 @@
 """Random and damaged input of all readers: only our errors, nothing executed.
 
-Lists of pairs, recipes, depth maps. Half of the inputs are random bytes, half are valid ones with a
-few changes.
+Lists of pairs, recipes, depth maps: valid ones with a few changes, and random bytes.
 """
 
 from __future__ import annotations
@@ -14,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from damaged import HARMS
 from synthetic import write_image
 
-from colmap_affrect.conventions import camera_matrix
 from colmap_affrect.data import Photograph
 from colmap_affrect.errors import AffrectError
+from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.images.depth import DepthFiles, DepthFilesOptions
 from colmap_affrect.pairs.lists import read_pairs
 from colmap_affrect.recipes import load_recipe, recipe_folder, recipe_names
@@ -26,36 +26,6 @@ from colmap_affrect.recipes import load_recipe, recipe_folder, recipe_names
 NAMES = ["a.png", "b c.png", "side/č.png", "side/d,e.png", "# f.png"]
 
 PAIRS = "# pairs\na.png b c.png\nside/č.png\ta.png\na.png,side/d,e.png\n# f.png a.png\n"
-
-PIECES = [
-    b"", b"\0", b"\n", b"\r\n", b"\t", b" ", b"#", b",", b"..", b"/", b"\\", b'"', b"'", b"'''",
-    b"[", b"]" * 3, b"[[", b"{", b"}", b"=", b"-", b"9" * 30, b"1e999", b"nan", b"-inf", b"true",
-    b"0x", b"1979-05-27", b"\xff\xfe", b"\xef\xbb\xbf", b"\xe2\x80\xa8", b"\xc2\x85", b"\x1b[31m",
-    b"%s", b"{0}", b"a" * 300, "🏛".encode(), b"\xed\xa0\x80", b"../" * 20, b"/dev/zero", b"depth",
-    b"\xff" * 8, b"\x7f\xff\xff\xff", b"[" * 3000,
-]  # fmt: skip
-
-
-def damaged(valid: bytes, chance: random.Random) -> bytes:
-    """Change a few places, or make up something as long."""
-    if chance.random() < 0.5:
-        return chance.randbytes(chance.choice([0, 1, 7, 60, len(valid)]))
-    data = bytearray(valid)
-    for _ in range(chance.randint(1, 4)):
-        start = chance.randrange(len(data) + 1)
-        end = min(len(data), start + chance.choice([0, 1, 1, 4, 40]))
-        kind = chance.randrange(5)
-        if kind == 0 and start < len(data):
-            data[start] ^= 1 << chance.randrange(8)
-        elif kind == 1:
-            data[start:end] = chance.choice(PIECES)
-        elif kind == 2:
-            data[start:end] = chance.randbytes(end - start)
-        elif kind == 3:
-            data[start:start] = data[end : end + chance.randrange(200)]
-        else:
-            del data[start : chance.choice([end, len(data)])]
-    return bytes(data)
 
 
 def write_anew(path: Path, data: bytes) -> None:
@@ -71,7 +41,10 @@ def fuzz(
     chance = random.Random(seed)
     taken = refused = 0
     for _ in range(count):
-        data = damaged(chance.choice(valid), chance)
+        content = bytearray(chance.choice(valid))
+        for harm in chance.choices(HARMS, k=chance.choice((1, 1, 3))):
+            harm(content, chance) if content else None
+        data = bytes(content)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

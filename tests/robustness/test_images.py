@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import struct
-import unicodedata
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,6 @@ from synthetic import write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.images.reading import IMAGE_SUFFIXES, read_gray
-from colmap_affrect.project.stores import FeatureStore
 
 TRIO = sorted(NAMES[:3])
 
@@ -127,29 +125,6 @@ def test_formats_that_are_taken_are_read_alike_by_colmap(tmp_path, suffix) -> No
 
 
 @pytest.mark.long
-def test_pixels_of_all_kinds_register(trio, run_images, tmp_path) -> None:
-    gray = fifth_photograph()
-    image = PIL.Image.fromarray(gray)
-    image.convert("RGBA").save(trio / "rgba.png")
-    image.convert("CMYK").save(trio / "cmyk.jpg", quality=95)
-    image.convert("P").save(trio / "palette.png")
-    image.convert("RGB").quantize(64).save(trio / "palette.tif")
-    image.convert("1", dither=PIL.Image.Dither.NONE).save(trio / "bilevel.png")
-    write_image(trio / "deep.png", gray.astype(np.uint16) * 257)
-    write_image(trio / "float.tif", gray.astype(np.float32) / 255)
-    image.save(trio / "progressive.jpg", progressive=True, quality=95)
-    added = sorted({path.name for path in trio.iterdir() if path.is_file()} - set(NAMES))
-    assert len(added) == 8
-    pairs = tmp_path / "pairs.txt"  # each with the trio only: copies of one image prove nothing
-    lines = [f"{one}\t{name}\n" for one in TRIO for name in TRIO if one < name]
-    lines += [f"{name}\t{one}\n" for one in TRIO[:2] for name in added]
-    pairs.write_text("".join(lines), encoding="utf-8")
-    ended = run_images(trio, *FAST, "--match-list-path", pairs)
-    assert ended.code == 0, ended.stderr
-    assert ended.report["unregistered"] == {}
-
-
-@pytest.mark.long
 def test_tiny_images_are_no_obstacle(trio, run_images) -> None:
     gray = fifth_photograph()
     sizes = {"1x1": (1, 1), "1 high": (1, 320), "1 wide": (240, 1), "7": (7, 7), "31": (31, 31)}
@@ -161,37 +136,6 @@ def test_tiny_images_are_no_obstacle(trio, run_images) -> None:
     assert ended.report["registered_names"] == TRIO
     assert set(ended.report["unregistered"]) == {f"{name}.png" for name in [*sizes, "flat strip"]}
     assert set(ended.report["unregistered"].values()) <= {"no features", "no verified pair"}
-
-
-@pytest.mark.long
-def test_names_of_all_kinds_go_through(tmp_path, run_images, call) -> None:
-    accented = "ž é.png"
-    names = [
-        "# first.png",
-        " leading space.png",
-        unicodedata.normalize("NFC", accented),
-        unicodedata.normalize("NFD", accented),
-        "back\\slash/a,b 'c'  \"d\" %41 $HOME *.png.\u56fe\U0001f3db.png",
-    ]
-    assert len(set(names)) == 5
-    photos = tmp_path / "photos"
-    for index, name in enumerate(names):
-        (photos / name).parent.mkdir(parents=True, exist_ok=True)
-        shift = 0.3 * (index - 2)
-        write_image(tmp_path / "one.png", photograph((shift, -0.05 * index, 0.0), 0.0))
-        (tmp_path / "one.png").rename(photos / name)
-    ended = run_images(photos)
-    assert ended.code == 0, ended.stderr
-    assert ended.report["registered_names"] == sorted(names)
-    listed = tmp_path / "list.txt"
-    listed.write_text("# a comment\n" + "".join(f"{name}\n" for name in names), encoding="utf-8")
-    again = ["--output-path", tmp_path / "again"]
-    images = ["--image-path", photos, "--image-list-path", listed]
-    assert call("extract", *again, *images, *FAST).code == 0
-    assert FeatureStore(tmp_path / "again" / "features.h5").names() == sorted(names)
-    # The list of pairs that the run wrote is one that it reads.
-    ended = call("pairs", *again, "--match-list-path", tmp_path / "out" / "pairs.txt")
-    assert ended.stdout.startswith("pairs: 10 done")
 
 
 def test_float_pixels_that_are_not_finite_are_black_or_white(tmp_path) -> None:

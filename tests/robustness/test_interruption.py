@@ -5,16 +5,14 @@ Many more: tests/benchmarks/campaign.py; of other commands: test_campaign.py.
 
 from __future__ import annotations
 
-import os
 import random
 import signal
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
-from command import FAST, run_in_process_of_its_own, start
+from command import FAST, run_in_process_of_its_own
 from results import Undisturbed, end_again_and_again, results, run_arguments
 
 
@@ -35,22 +33,3 @@ def test_run_ended_again_and_again_has_the_results_of_an_undisturbed_one(
     out = tmp_path / "out"
     end_again_and_again(photos, out, FAST, worked_s, signals, chance)
     assert finish(photos, out, FAST) == expected
-
-
-@pytest.mark.long
-def test_two_runs_at_once_are_one_that_works_and_one_that_is_refused(
-    photos: Path, tmp_path: Path, undisturbed: Undisturbed
-) -> None:
-    out = tmp_path / "out"
-    arguments = run_arguments(photos, out, FAST)
-    with start(*arguments) as first:
-        while not (out / "config.toml").exists():
-            time.sleep(0.005)
-        children = Path(f"/proc/{first.pid}/task/{first.pid}/children").read_text().split()
-        os.kill(int(children[0]), signal.SIGSTOP)
-        refused = run_in_process_of_its_own(*arguments)
-        os.kill(int(children[0]), signal.SIGCONT)
-        first.communicate(timeout=120)
-    assert (first.returncode, refused.code, len(refused.stderr)) == (0, 1, 1)
-    assert "another colmap-affrect is working in this folder" in refused.stderr[0]
-    assert results(out) == undisturbed.results

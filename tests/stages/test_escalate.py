@@ -29,9 +29,9 @@ from colmap_affrect.stages import escalate as escalation
 from colmap_affrect.stages import map as map_stage
 from colmap_affrect.stages.climbing import weakly_connected_images
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import Escalation, recorded_escalation
+from colmap_affrect.stages.escalate import Escalation
 from colmap_affrect.stages.extract import extract
-from colmap_affrect.stages.inputs import Inputs, recorded_extraction
+from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
 from colmap_affrect.stages.verify import extracted_px, verify_matches
@@ -133,8 +133,9 @@ def test_other_thresholds_than_before_need_no_new_features(
     refused = call("escalate", "--output-path", tmp_path, *setting)
     assert "with min_num_tracks=30, and it is 5 now; use --overwrite" in refused.errors[0]
     assert call("escalate", "--output-path", tmp_path, *setting, "--overwrite").code == 0
-    assert recorded_escalation(workspace).min_num_tracks == 5
-    assert workspace.options_digest("extract", "match") == digest
+    now = Workspace(workspace.path)
+    assert Context(now).escalation.min_num_tracks == 5
+    assert now.options_digest("extract", "match") == digest
     wrong = call("escalate", "--output-path", tmp_path, "--set", "matching.max_ratio=0.8")
     assert wrong.errors == ["error: --set: only options of escalate can be changed here"]
 
@@ -176,7 +177,7 @@ def test_trial_of_a_pair_is_what_the_database_then_holds(
     climbed: tuple[Workspace, StageReport],
 ) -> None:
     workspace = climbed[0]
-    size_px = recorded_extraction(workspace).max_image_size_px
+    size_px = Context(workspace).extraction.max_image_size_px
     verifier = PairVerifier(workspace.database, VerificationOptions(), size_px)
     store = FeatureStore(workspace.features)
     for pair in (EASY, HARD, HARD[::-1]):

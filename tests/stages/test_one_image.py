@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import pickle
 import re
 import shutil
@@ -17,17 +16,17 @@ from numpy.testing import assert_array_equal
 
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.initial_cameras import InitialCameras
-from colmap_affrect.conventions import camera_matrix
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.errors import DepthError, DeviceError, OptionError, WeightsError
 from colmap_affrect.features.base import FeatureOptions
+from colmap_affrect.geometry.conventions import camera_matrix
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.images.warping import warp
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, load_recipe
 from colmap_affrect.stages import one_image
-from colmap_affrect.stages.context import Context, Resources, digests_to_record
+from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.one_image import num_images_at_once, prepare
@@ -85,19 +84,6 @@ def test_faded_photograph_is_stretched_and_said_to_be(tmp_path, stretch):
     assert (counts["faded.png"] > 0.9 * counts["good.png"]) == stretch
     said = "is low in 1 of 2 photographs, such as faded.png; it was stretched"
     assert [w.startswith(said) for w in report.warnings.values()] == [True] * stretch
-
-
-def test_features_of_a_shrunk_image_lie_within_the_stored_one(tmp_path):
-    path = tmp_path / "noise.png"
-    noise = np.random.default_rng(3).integers(0, 255, (301, 457), dtype=np.uint8)
-    cv2.imwrite(str(path), cv2.GaussianBlur(noise, (0, 0), 2.0))
-    recipe = load_recipe("default", ["max_image_size_px=200"])
-    extracted = prepare(recipe.extraction).extract_file(path)
-    features, size = extracted.features, extracted.image_size
-    assert size == (457, 301)
-    assert len(features) > 20
-    assert features.keypoints[:, 0].max() > 380
-    assert features.inside(size).all()
 
 
 COURTYARD = Path(__file__).parents[2] / "sample_scenes" / "courtyard"
@@ -169,15 +155,6 @@ def test_features_of_a_gpu_without_memory_are_those_of_the_cpu():
     assert_array_equal(found.features.lafs, extractor.extract_file(photo).features.lafs)
 
 
-def test_other_failures_of_a_gpu_are_not_passed_over():
-    extractor = prepare(load_recipe("default", ["max_image_size_px=200"]).extraction)
-    broken = replace(
-        extractor, extractors=(FailingExtractor("CUDA error: device-side assert triggered"),)
-    )
-    with pytest.raises(RuntimeError, match="device-side assert"):
-        broken.extract_file(COURTYARD / "images" / "court_4.jpg")
-
-
 def test_device_that_is_not_there_is_one_clear_line(monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(DeviceError, match=r"--device cuda: .*use --device cpu or auto") as error:
@@ -226,22 +203,6 @@ def test_extractor_in_another_process_refuses_other_weights(
     found["affnet"].write_bytes(b"of another release")
     with pytest.raises(WeightsError, match=r"AffNet\.pth: is another file than affnet on the"):
         pickle.loads(pickled)
-
-
-def test_digests_continue_the_record_of_an_older_version(tmp_path: Path) -> None:
-    here = tmp_path / "here"
-    workspace, files = Workspace(tmp_path / "out"), {"affnet": here, "disk": here}
-    files["disk"].write_bytes(b"content")
-    digest = hashlib.sha256(b"content").hexdigest()
-    assert digests_to_record(workspace, "extract", files, overwrite=False) == {
-        "affnet": digest,
-        "disk": digest,
-    }
-    old = {"AffNet.pth": digest}  # names of files, and not all
-    with workspace.locked():
-        workspace.record_options("extract", {"weights": old})
-    assert digests_to_record(workspace, "extract", files, overwrite=False) == old
-    assert list(digests_to_record(workspace, "extract", files, overwrite=True)) == list(files)
 
 
 class ColorOptions(FeatureOptions):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shutil
 from pathlib import Path
 
@@ -12,16 +11,13 @@ from command import FAST, Call
 from small_scene import photograph
 from synthetic import write_image
 
-from colmap_affrect import pipeline
 from colmap_affrect.cli import main
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, nearest_positions, open_database
-from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.errors import OptionError
 from colmap_affrect.pairs.base import PairOptions
-from colmap_affrect.project.report import EXIT_INTERRUPTED
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages import pairs as stage
-from colmap_affrect.stages.context import Context
 
 WGS84 = pycolmap.PosePriorCoordinateSystem.WGS84
 CARTESIAN = pycolmap.PosePriorCoordinateSystem.CARTESIAN
@@ -111,34 +107,6 @@ def test_methods_and_a_list_are_joined(rooms: Workspace, call: Call) -> None:
     }  # fmt: skip
 
 
-def test_other_options_than_before_are_refused(rooms: Workspace, call: Call) -> None:
-    choose(call, rooms)
-    code, stdout, stderr = call("pairs", "--output-path", rooms.path, "--pairs", "sequence")
-    assert (code, stdout, len(stderr)) == (1, "", 1)
-    assert "methods=['exhaustive'], and it is ['sequence'] now" in stderr[0]
-    pairs = choose(call, rooms, "--pairs", "sequence", "--num-neighbors", 1, "--overwrite")
-    assert pairs == ["1.png 2.png", "2.png 3.png", "3.png 4.png"]
-
-
-def test_wrong_way_to_choose_pairs_is_one_clear_line(rooms: Workspace, call: Call) -> None:
-    ended = call("pairs", "--output-path", rooms.path, "--pairs", "sequense")
-    assert ended.code == 2
-    assert ended.errors[0].startswith("error: pairs: methods='sequense' is not one of 'exh")
-
-
-def test_run_chooses_pairs_as_asked(
-    extracted: Path, rooms: Workspace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stop(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(pipeline, "match", stop)
-    command = ["run", "--image-path", extracted / "photos", "--output-path", rooms.path, "-q"]
-    options = [*FAST, "--pairs", "sequence", "--num-neighbors", 2]
-    assert main([str(argument) for argument in command + options]) == EXIT_INTERRUPTED
-    assert len(rooms.pairs.read_text().splitlines()) == 3 + 2
-
-
 def test_gps_without_positions_is_refused_and_nothing_discarded(
     rooms: Workspace, call: Call
 ) -> None:
@@ -184,23 +152,6 @@ def test_nearest_positions_take_cartesian_ones_and_images_without(rooms: Workspa
     positions = {"1.png": (0.0, 0.0, 0.0), "2.png": (3.0, 4.0, 9.0), "3.png": (0.0, 20.0, 0.0)}
     write_positions(rooms.database, positions, CARTESIAN)
     assert nearest_positions(rooms.database, 5, 5.1) == [("1.png", "2.png")]
-
-
-def test_one_position_is_no_pair(rooms: Workspace) -> None:
-    write_positions(rooms.database, {"1.png": (50.0, 14.0, 0.0)})
-    with pytest.raises(DatabaseError, match="1 images have a position"):
-        nearest_positions(rooms.database, 5, 5.0)
-
-
-def test_many_images_get_a_hint(
-    rooms: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.WARNING, "colmap_affrect"):
-        stage.choose_pairs(Context(rooms))
-        assert caplog.text == ""
-        monkeypatch.setattr(stage, "MANY_IMAGES", 3)
-        stage.choose_pairs(Context(rooms))
-    assert "all pairs of 4 images are 6; --pairs retrieval" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import FAST, Call
 from numpy.typing import NDArray
-from small_scene import write_photographs
 
 from colmap_affrect.data import LocalFeatures
 from colmap_affrect.geometry.affine import lafs_from_keypoints
@@ -33,7 +31,7 @@ def stores(
         ones, count = np.ones(len(places)), len(places)
         lafs = lafs_from_keypoints(places, 5.0 * ones, 0.0 * ones)
         descriptors = np.ones((count, 8), np.float32) / np.sqrt(8)
-        features.write(name, LocalFeatures(lafs, np.float32(ones), descriptors), size, "")
+        features.write(name, LocalFeatures(lafs, np.float32(ones), descriptors), size)
     pairs = list(combinations(names, 2))
     count = len(points[0])
     indices = np.stack([np.arange(count)] * 2, axis=1)
@@ -114,26 +112,6 @@ def test_call_that_was_killed_is_repeated_to_the_same_result(
     line = StationaryFilter(features, matches).learn(pairs)
     assert line.startswith(f"{2 * len(CAPTION)} matches of 2 pairs never move")
     assert all(len(found.indices) == len(SCENE) for found in matches.read(pairs))
-
-
-def test_matches_that_a_killed_run_did_not_look_at_are_looked_at_by_the_next(
-    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_photographs(tmp_path / "photos", 2)
-    out = ["--output-path", tmp_path / "out", "-q"]
-    for stage in (["extract", "--image-path", tmp_path / "photos", *FAST], ["pairs"]):
-        assert call(*stage, *out).code == 0
-    looked: list[int] = []
-
-    def learn(_: StationaryFilter, pairs: list[tuple[str, str]]) -> str:
-        looked.append(len(pairs))
-        if len(looked) == 1:
-            raise KeyboardInterrupt
-        return ""
-
-    monkeypatch.setattr(StationaryFilter, "learn", learn)
-    assert [call("match", *out).code for _ in range(3)] == [130, 0, 0]
-    assert looked == [1, 1]
 
 
 @pytest.mark.parametrize(
