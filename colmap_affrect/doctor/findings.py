@@ -62,7 +62,6 @@ TEXTS: dict[str, Check] = CHECKS | {
     "leftover": ("note", "left behind by a run that was killed", "remove it: rm -r {path}"),
     "damaged": ("error", "{error}", "restore it, or use another --output-path than {folder}"),
     "stages-missing": ("note", "not run yet: {stages}", "run the same 'run' again"),
-    "features-missing": ("error", "is missing", SAME_RUN),
     "photographs-gone": ("warning", "its photographs are not there ({error})",
         "put them back before running another stage"),
     "no-features": ("warning",
@@ -72,7 +71,7 @@ TEXTS: dict[str, Check] = CHECKS | {
     "photographs-changed": ("warning",
         "images that have changed since their features were extracted, or their masks or depth "
         "maps", SAME_RUN),
-    "database-missing": ("error", "is missing", f"{SAME_RUN} to make it anew"),
+    "missing": ("error", "is missing", f"{SAME_RUN} to make it anew"),
     "database-changed": ("warning", "was changed since the last run: {edits}",
         f"{SAME_RUN}, or any stage: what features.h5 and matches.h5 hold is made again from these"),
     "pairs-changed": ("error", "is not the list whose pairs were matched",

@@ -143,7 +143,7 @@ class _FolderExamination:
         images = self._photographs(features) if "extract" in done else set()
         inputs = self._models() if "map" in done else ""
         if not database.exists():
-            self._add("database-missing", database)
+            self._add("missing", database)
             return
         own_advice = {} if self.workspace.users_database else OWN_ADVICE
         edits = None if self.workspace.users_database else edits_of(database)
@@ -212,7 +212,7 @@ class _FolderExamination:
         """Return the number of features by image name, None if the file cannot be used."""
         path, store = self.workspace.features, Context(self.workspace).features
         if not path.exists():
-            self._add("features-missing", path)
+            self._add("missing", path)
             return None
         counts = self._read(path, store.num_keypoints)
         if counts is None or self._read(path, store.check_all) is None:
