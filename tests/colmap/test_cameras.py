@@ -17,6 +17,7 @@ from colmap_affrect.colmap.cameras import (
 )
 from colmap_affrect.errors import OptionError, WorkspaceError
 from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.project.report import ModelSummary
 
 
 def given(path: Path, **options: object):
@@ -172,6 +173,18 @@ def test_damaged_records_are_one_clear_line(tmp_path: Path, text: str) -> None:
     path.write_text(text)
     with pytest.raises(WorkspaceError, match=r"cameras\.json: damaged .*; run .*verify"):
         read_camera_records(path)
+
+
+def test_report_has_the_focal_length_in_longer_sides_and_the_spread() -> None:
+    model = ModelSummary((), 0, 0.0, 0.0, focals_px={"c.jpg": 470.0, "z": 9.0},
+                         rival_focals_px={"c.jpg": (460.0, 560.0)})  # fmt: skip
+    entry = VOTED.to_report(12, model)
+    assert (entry["refined_px"], entry["rival_px"]) == (470.0, (460.0, 560.0))
+    assert (entry["id"], entry["num_images"], entry["source"]) == (12, 1, "pairs")
+    assert entry["focal_longer_sides"] == pytest.approx(1.25)
+    assert entry["spread_px"] == [480.0, 530.0]
+    known = FROM_EXIF.to_report(3, None)
+    assert known["spread_px"] is known["refined_px"] is known["rival_px"] is None
 
 
 def test_only_cameras_with_a_story_are_named_and_not_all() -> None:
