@@ -23,8 +23,8 @@ from damaged import execute
 from planar_pairs import TRUTH, write_pair
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.interop.align import Georeference
 from colmap_affrect.interop.export import FORMATS
-from colmap_affrect.interop.georeference import Georeference
 
 HANGING_S = 30.0
 PLAIN = ["--recipe", "unrectified-rootsift"]

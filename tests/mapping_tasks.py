@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import all_cameras
 from colmap_affrect.mappers.base import MappingTask
 

@@ -18,8 +18,6 @@ from colmap_affrect.data import LocalFeatures
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import load_recipe
-from colmap_affrect.stages.inputs import Inputs
 
 NAMES = ("<img src=x onerror=alert(1)>.png", "a & b.png", "c.png", "d.png", "e.png", "f.png")
 IMAGE_SIZE = (160, 120)
@@ -105,13 +103,8 @@ def _write_method(
 
 
 def _write_features(method_path: Path) -> None:
-    """Write the record of the recipe, and features of which every second one is from a warp."""
-    workspace = Workspace(method_path)
-    inputs = Inputs.of(method_path.parents[1] / "photographs")
-    recipe = load_recipe("default")
-    record = {**inputs.to_mapping(), **recipe.extraction.to_mapping()}
-    workspace.record_options("extract", record, recipe=recipe.name)
-    store = FeatureStore(workspace.features)
+    """Write features of which every second one is from a warp."""
+    store = FeatureStore(Workspace(method_path).features)
     with open_database(method_path / "seed-0" / "database.db") as database:
         for image in database.read_all_images():
             count = database.num_keypoints_for_image(image.image_id)
@@ -164,7 +157,7 @@ def _method(name: str, seeds: Sequence[SeedResult], failed: str = "") -> MethodR
         wall_s={"extract": 12.25, "match": 1.5},
         peak_memory_bytes=123_400_000,
         failures={"broken.png": "not a <readable> image"} if name == "sift" else {},
-        options={"features": {"profile": "rootsift"}},
+        options={"rectifier": {"name": "dense-shapes"}} if name == "default" else {},
         folder=f"methods/{name}",
         failed=failed,
     )

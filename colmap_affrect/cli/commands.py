@@ -160,9 +160,10 @@ def map(options: argparse.Namespace) -> int:
 
 
 def compare(options: argparse.Namespace) -> int:
-    from colmap_affrect.comparison.compare import CompareOptions, compare
+    from colmap_affrect.comparison.compare import compare
     from colmap_affrect.comparison.methods import parse_methods
     from colmap_affrect.comparison.tables import summary, to_json
+    from colmap_affrect.comparison.task import CompareOptions
     from colmap_affrect.comparison.viewer import log_comparison, require_viewer
 
     if options.viewer:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import cameras_of_images, open_database, working_seal
 from colmap_affrect.colmap.two_views import PLANAR
 from colmap_affrect.colmap.verification import NUM_CACHED_IMAGES, ExtractedPx, of_pair

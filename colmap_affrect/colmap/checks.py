@@ -8,7 +8,6 @@ import sqlite3
 import struct
 from collections import defaultdict
 from collections.abc import Collection, Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,18 +37,15 @@ Check = tuple[Severity, str, str]  # how serious a problem is, what it is, and w
 CHECKS: dict[str, Check] = {
     "no-images": ("warning", "holds no images",
         "import some, e.g. by 'colmap feature_extractor --database_path {path} --image_path X'"),
-    "no-camera": ("error", "images whose camera does not exist",
+    "no-parent": ("error",
+        "images whose camera does not exist, or rows of rigs and frames that belong to nothing",
         "import these images again into a new database"),
-    "camera-model": ("error", "cameras of a model that COLMAP does not have",
-        "import their images again into a new database"),
     "camera-panorama": ("warning", "cameras that look all around, which have no focal length",
         "cut perspective views out of the panoramas, as COLMAP's example panorama.py does, and "
         "give these"),
-    "camera-size": ("error", "cameras of a size that no photograph has",
-        "import their images again into a new database"),
-    "camera-params": ("error",
-        "cameras whose parameters are more or fewer than their model has, a focal length that is "
-        "not positive, or not finite numbers",
+    "bad-camera": ("error",
+        "cameras of a model that COLMAP does not have, of a size that no photograph has, with more "
+        "or fewer parameters than their model, or without a finite and positive focal length",
         "import their images again into a new database"),
     "implausible-focal": ("warning",
         "cameras with focal lengths that hardly any photograph has, in px of the image and longer "
@@ -62,8 +58,6 @@ CHECKS: dict[str, Check] = {
     "no-frame": ("error", "images without a frame while others have one, at which mapping aborts",
         "give each of them a frame (pycolmap.Database.write_frame), or begin anew with "
         "'colmap-affrect run --database-path {path}', which adds frames to its copy"),
-    "frame-links": ("error", "rows of rigs and frames that belong to nothing",
-        "import the images again into a new database"),
     "matrix-data": ("error",
         "rows whose matrices or cameras have more or less data than they should, or no finite "
         "numbers", "delete these rows; two-view geometries are made anew by 'colmap "
@@ -74,10 +68,8 @@ CHECKS: dict[str, Check] = {
         "rename these images; programs that write a file per image would write elsewhere"),
     "no-keypoints": ("warning", "images without keypoints, which cannot be registered",
         "extract their features, unless they are blank"),
-    "keypoint-columns": ("error", "images whose keypoints do not have 2, 4 or 6 columns",
-        "write them again as x, y; or x, y, scale, orientation; or x, y and an affine shape"),
     "keypoint-data": ("error",
-        "images whose keypoints have more or less data than rows and columns",
+        "images whose keypoints do not have 2, 4 or 6 columns, or are more or fewer than recorded",
         "extract these images again into a new database"),
     "keypoints-not-finite": ("error",
         "images with keypoints that are not finite numbers, or are where no image reaches",
@@ -87,20 +79,15 @@ CHECKS: dict[str, Check] = {
         "extract these images again; 'map --from-database' leaves these keypoints out"),
     "keypoints-outside": ("warning", "images with keypoints outside of them",
         "see that they were found in the images as stored: not rotated, not resized"),
-    "descriptor-count": ("error", "images with another number of descriptors than of keypoints",
-        "extract these images again into a new database"),
-    "descriptor-types": ("error", "descriptors of several types, which COLMAP does not match",
+    "descriptor-data": ("error",
+        "images with another number of descriptors than of keypoints, or with several types, which "
+        "COLMAP does not match",
         "extract all images with the same features into a new database"),
     "no-matches": ("note", "no pairs are matched yet",
         "match them, e.g. by 'colmap exhaustive_matcher --database_path {path}'"),
-    "self-pair": ("error", "images that are matched with themselves",
-        "delete the matches of these pairs"),
-    "unknown-pair": ("error", "matches of images that do not exist",
-        "delete the matches of these pairs"),
-    "match-data": ("error", "pairs whose matches have more or less data than rows and 2 columns",
-        "delete the matches of these pairs and match them again"),
-    "match-range": ("error",
-        "pairs with matches of keypoints that do not exist, at which COLMAP crashes",
+    "match-data": ("error",
+        "pairs with matches of keypoints that do not exist, of images that do not exist or of one "
+        "with itself, or not in 2 columns, at which COLMAP crashes",
         "delete the matches of these pairs and match them again"),
     "no-geometry": ("warning",
         "matched pairs without a two-view geometry, which mapping does not see",
@@ -109,25 +96,17 @@ CHECKS: dict[str, Check] = {
         "two-view geometries of undefined configuration, which mapping passes over",
         "verify these pairs again: in a copy, delete their two-view geometries and run 'colmap "
         "geometric_verifier'"),
-    "file-missing": ("warning", "images whose file is missing",
+    "file-missing": ("warning", "images whose file is missing or cannot be read",
         "put the files back, or give another --image-path"),
-    "file-unreadable": ("warning", "images whose file cannot be read",
-        "replace the files"),
     "file-size": ("error", "images of another size than their camera",
         "use the photographs that the database was made from: not resized, not rotated"),
 }  # fmt: skip
 """The problems of a database by kind."""
 
-FATAL_FOR_IMAGES = frozenset({
-    "bad-name", "no-camera", "camera-model", "camera-panorama", "camera-size", "camera-params",
-    "frame-links",
-})  # fmt: skip
+FATAL_FOR_IMAGES = frozenset({"bad-name", "no-parent", "bad-camera", "camera-panorama"})
 """Problems of names, cameras, rigs and frames at which COLMAP, or what reads it, fails or ends."""
 
-FATAL = FATAL_FOR_IMAGES | {
-    "keypoint-columns", "keypoint-data", "self-pair", "unknown-pair", "match-data", "match-range",
-    "matrix-data",
-}  # fmt: skip
+FATAL = FATAL_FOR_IMAGES | {"keypoint-data", "match-data", "matrix-data"}
 """The same of keypoints and matches."""
 
 Problems = dict[str, list[str]]  # by kind the images, pairs or cameras concerned, if any
@@ -154,8 +133,7 @@ def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> Problems:
     It is only read; ``kinds`` of problems are keys of ``CHECKS``, and DatabaseError has one line.
     Returns all other problems.
     """
-    with open_read_only(path) as connection:
-        _, problems = _check(connection, path)
+    _, problems = check_database(path)
     for kind in sorted(kinds & problems.keys(), key=list(CHECKS).index):
         _, what, advice = CHECKS[kind]
         items = such_as(problems[kind])
@@ -164,12 +142,9 @@ def refuse_unusable(path: Path, kinds: Collection[str] = FATAL) -> Problems:
 
 
 def check_database(path: Path) -> tuple[Tables, Problems]:
-    """Check a database that nobody is writing to; DatabaseError if damaged."""
-    try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
-            return _check(connection, path)
-    except DAMAGED as error:
-        raise DatabaseError(f"{path}: damaged ({error})") from error
+    """Check a database, which is only read; DatabaseError if damaged."""
+    with open_read_only(path) as connection:
+        return _check(connection, path)
 
 
 def _check(connection: sqlite3.Connection, path: Path) -> tuple[Tables, Problems]:
@@ -209,16 +184,13 @@ def check_image_files(
         if leads_outside(name):
             continue
         camera = tables.cameras.get(tables.camera_ids[image_id])
-        if not (image_path / name).is_file():
+        size = sizes.get(name) if (image_path / name).is_file() else None
+        if size is None:
             found["file-missing"].append(name)
-        elif name in sizes and camera:
-            size = sizes[name]
-            if size is None:
-                found["file-unreadable"].append(name)
-            elif size != (camera.width, camera.height):
-                found["file-size"].append(
-                    f"{name} is {size[0]} x {size[1]}, its camera {camera.width} x {camera.height}"
-                )
+        elif camera and size != (camera.width, camera.height):
+            found["file-size"].append(
+                f"{name} is {size[0]} x {size[1]}, its camera {camera.width} x {camera.height}"
+            )
     return dict(found)
 
 
@@ -227,7 +199,7 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
         label = f"camera {camera_id}"
         like = camera_like(camera.model)
         if not like:
-            found["camera-model"].append(f"{label}: model {camera.model}")
+            found["bad-camera"].append(f"{label}: model {camera.model}")
             continue
         if not len(like.focal_length_idxs()):
             found["camera-panorama"].append(f"{label}: {like.model.name}")
@@ -237,14 +209,14 @@ def _check_cameras(tables: Tables, found: Problems) -> None:
             or not np.isfinite(params).all()
             or (params[0, like.focal_length_idxs()] <= 0.0).any()
         ):
-            found["camera-params"].append(label)
+            found["bad-camera"].append(label)
         elif indices := like.focal_length_idxs():
             focal_px, longer = float(params[0, indices].mean()), max(camera.width, camera.height)
             focal = focal_px / max(longer, 1)
             if longer <= MAX_SIDE_PX and not PLAUSIBLE_FOCALS[0] <= focal <= PLAUSIBLE_FOCALS[1]:
                 found["implausible-focal"].append(f"{label}: {focal_px:.0f} px, {focal:.2g}")
         if not all(0 < side <= MAX_SIDE_PX for side in (camera.width, camera.height)):
-            found["camera-size"].append(f"{label}: {camera.width} x {camera.height} px")
+            found["bad-camera"].append(f"{label}: {camera.width} x {camera.height} px")
 
 
 def _check_names(connection: sqlite3.Connection, found: Problems) -> None:
@@ -258,14 +230,14 @@ def _check_links(connection: sqlite3.Connection, found: Problems) -> None:
     tables = ("rig_sensors", "frames", "frame_data")
     for table in [name for name in tables if columns_of(connection, name)]:
         for _, row, parent, _ in connection.execute(f"PRAGMA foreign_key_check({table})"):
-            found["frame-links"].append(f"row {row} of {table}, {parent}")
+            found["no-parent"].append(f"row {row} of {table}, {parent}")
     if columns_of(connection, "rigs"):
         query = (
             "SELECT rig_id FROM rigs WHERE ref_sensor_type = ? AND ref_sensor_id NOT IN "
             "(SELECT camera_id FROM cameras)"
         )
         for (rig_id,) in connection.execute(query, [SENSOR_CAMERA]):
-            found["frame-links"].append(f"rig {rig_id}, cameras")
+            found["no-parent"].append(f"rig {rig_id}, cameras")
 
 
 def _check_matrices(connection: sqlite3.Connection, found: Problems) -> None:
@@ -299,7 +271,7 @@ def _check_cameras_of_pairs(connection: sqlite3.Connection, found: Problems) -> 
 def _check_images(tables: Tables, found: Problems) -> None:
     for image_id, name in tables.names.items():
         if tables.camera_ids[image_id] not in tables.cameras:
-            found["no-camera"].append(name)
+            found["no-parent"].append(name)
         if tables.num_frames and image_id not in tables.frame_images:
             found["no-frame"].append(name)
         if leads_outside(name):
@@ -317,7 +289,7 @@ def _check_keypoints(connection: sqlite3.Connection, tables: Tables, found: Prob
             continue
         count, width = tables.keypoints[image_id]
         if count and width not in KEYPOINT_COLUMNS:
-            found["keypoint-columns"].append(f"{name} has {width}")
+            found["keypoint-data"].append(f"{name} has {width}")
             continue
         (blob,) = connection.execute(query, [image_id]).fetchone()
         keypoints = _array(blob, count, width, np.dtype("<f4"))
@@ -343,10 +315,10 @@ def _check_descriptors(tables: Tables, found: Problems) -> None:
     for image_id, (_, rows) in tables.descriptors.items():
         count, _ = tables.keypoints.get(image_id, (0, 0))
         if image_id in tables.names and rows != count:
-            found["descriptor-count"].append(f"{tables.names[image_id]} has {rows} of {count}")
+            found["descriptor-data"].append(f"{tables.names[image_id]} has {rows} of {count}")
     types = sorted({kind for kind, rows in tables.descriptors.values() if rows})
     if len(types) > 1:
-        found["descriptor-types"] = [f"type {kind}" for kind in types]
+        found["descriptor-data"] = [f"type {kind}" for kind in types]
 
 
 def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems) -> None:
@@ -355,16 +327,13 @@ def _check_pairs(connection: sqlite3.Connection, tables: Tables, found: Problems
             label = f"{tables.pair_label(pair_id)} ({what})"
             images = pair_images(pair_id)
             indices = _array(blob, rows, columns, np.dtype("<u4"))
-            if images[0] == images[1]:
-                found["self-pair"].append(label)
-            elif not tables.names.keys() >= set(images):
-                found["unknown-pair"].append(label)
-            elif indices is None or (rows and columns != 2):
+            is_known = images[0] != images[1] and tables.names.keys() >= set(images)
+            if not is_known or indices is None or (rows and columns != 2):
                 found["match-data"].append(label)
             elif rows:
                 counts = [tables.keypoints.get(image, (0, 0))[0] for image in images]
                 if (indices.max(axis=0) >= counts).any():
-                    found["match-range"].append(label)
+                    found["match-data"].append(label)
     for pair_id, count in tables.matches.items():
         if count and pair_id not in tables.geometries:
             found["no-geometry"].append(tables.pair_label(pair_id))

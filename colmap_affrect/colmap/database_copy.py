@@ -24,23 +24,11 @@ from colmap_affrect.project.outputs import remove_database
 
 logger = logging.getLogger(__name__)
 
-FIRST_TYPED_SCHEMA = 4_000_000  # descriptors have a type since COLMAP 4.0
-
 
 def schema_version(path: Path) -> int:
     """Return the version of the tables, e.g. 4020100 for COLMAP 4.2.1; OptionError if no file."""
     with open_read_only(path) as connection:
         return int(connection.execute("PRAGMA user_version").fetchone()[0])
-
-
-def is_stamped(path: Path) -> bool:
-    """Tell whether an older COLMAP has put its own version on a database of COLMAP 4.
-
-    It does so when it opens one, before it fails at the tables, and changes nothing else.
-    """
-    with open_read_only(path) as connection:
-        columns = columns_of(connection, "descriptors")
-    return schema_version(path) < FIRST_TYPED_SCHEMA and "type" in columns
 
 
 @cache
@@ -53,18 +41,24 @@ def newest_schema_version() -> int:
         return schema_version(path)
 
 
+def refuse_newer(path: Path) -> int:
+    """Return the version of the tables; DatabaseError if pycolmap does not know it."""
+    version, newest = schema_version(path), newest_schema_version()
+    if version > newest:
+        raise DatabaseError(
+            f"{path}: was made by a newer COLMAP (schema {version}, pycolmap "
+            f"{pycolmap.__version__} knows {newest}); update pycolmap"
+        )
+    return version
+
+
 def copy_as_it_is(source: Path, target: Path) -> None:
     """Copy a database as it is now, including its write-ahead log, with the schema that it has.
 
     Raises OptionError when there is none, DatabaseError unless it is an intact one of a COLMAP that
     is not newer than pycolmap.
     """
-    version, newest = schema_version(source), newest_schema_version()
-    if version > newest:
-        raise DatabaseError(
-            f"{source}: was made by a newer COLMAP (schema {version}, pycolmap "
-            f"{pycolmap.__version__} knows {newest}); update pycolmap"
-        )
+    refuse_newer(source)
     try:
         with open_read_only(source) as original, closing(sqlite3.connect(target)) as copy:
             original.backup(copy)
@@ -94,11 +88,11 @@ def copy_database(
     remove_database(new)
     try:
         copy_as_it_is(source, new)
-        left_out = leave_out_useless(new) if has_useless else ""
-        if left_out:
-            logger.warning("%s: %s", source, left_out)
         positions = _old_positions(new)
         with open_database(new) as database:  # COLMAP migrates it
+            left_out = leave_out_useless(database) if has_useless else ""
+            if left_out:
+                logger.warning("%s: %s", source, left_out)
             _add_positions(database, positions)
             if change:
                 change(database)

@@ -15,13 +15,16 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import (
+from colmap_affrect.colmap.cameras import (
     TRUSTED,
     CameraRecord,
     Given,
+    GivenCamera,
     Source,
     notable_lines,
     read_camera_records,
+    read_given_cameras,
+    unknown_names,
     write_camera_records,
 )
 from colmap_affrect.colmap.cancellable import run_leavable
@@ -33,7 +36,6 @@ from colmap_affrect.colmap.database import (
     require_database_space,
     write_frame,
 )
-from colmap_affrect.colmap.given_cameras import GivenCamera, read_given_cameras, unknown_names
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.geometry.arrays import Array
 from colmap_affrect.images.exif import (

@@ -210,15 +210,13 @@ def require_intact(folder: Path) -> None:
     Text files are left to pycolmap.
     """
     known, now = kept_digests(folder), file_digests(folder)
-    if isinstance(known, str):  # of an older version: one for all files
-        known, now = {"": known}, {"": _digest_of(now)}
     if not known and _is_binary(folder):
         names = [name for name in RECORDS if name in OLD_RECORDS or (folder / name).exists()]
         records = {name: _read_records(folder / name) for name in names}
         with damage(folder / "points3D.bin", _mend(folder)):
             _require_tracks(*records["points3D.bin"], records["images.bin"][1])
-    changed = [name for name in ("", *RECORDS) if known and known.get(name) != now.get(name)]
-    for name in filter(None, changed):
+    changed = [name for name in RECORDS if known and known.get(name) != now.get(name)]
+    for name in changed:
         _read_records(folder / name)  # says what is wrong where it can
     if changed:
         raise StoreError(
@@ -232,13 +230,13 @@ def _is_binary(folder: Path) -> bool:
     return all((folder / name).exists() for name in OLD_RECORDS)
 
 
-def kept_digests(folder: Path) -> dict[str, str] | str:
+def kept_digests(folder: Path) -> dict[str, str]:
     """Return the digests of the files of a model of ours when they were written, else nothing."""
     try:
         known = json.loads(without_checksum((folder / SUMMARY).read_bytes()))["model"]
     except (OSError, ValueError, TypeError, KeyError):
         return {}
-    return known if isinstance(known, dict | str) else {}
+    return known if isinstance(known, dict) else {}
 
 
 def file_digests(folder: Path) -> dict[str, str]:
@@ -248,11 +246,6 @@ def file_digests(folder: Path) -> dict[str, str]:
         with suppress(OSError), (folder / name).open("rb") as file:
             found[name] = hashlib.file_digest(file, "sha256").hexdigest()
     return found
-
-
-def _digest_of(files: Mapping[str, str]) -> str:
-    parts = [bytes.fromhex(files[name]) for name in sorted(files)]
-    return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:

@@ -6,18 +6,18 @@ another process gets its options. Lists, sets and arrays cannot be given so and 
 """
 
 import difflib
-import math
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import reduce
 from pathlib import Path
 from typing import Any
 
+from pydantic import FiniteFloat, TypeAdapter, ValidationError
+
 from colmap_affrect.errors import OptionError
 from colmap_affrect.options import flat
 
 Plain = bool | int | float | str
-TRUTH_VALUES = {"true": True, "1": True, "false": False, "0": False}
 
 OWNED = {"image_path": "it is the one that extract was given", "random_seed": "use --random-seed"}
 """Options, in any section, that are set by other means."""
@@ -45,8 +45,8 @@ def resolve(options: Any, given: Mapping[str, Any], flag: str) -> dict[str, Plai
     """Check values against the type of pycolmap's and return them by full dotted key.
 
     ``options``, of the class that the values are for, are changed. Of keys sections may be left out
-    where a name exists once. Values may be text: ``true``, ``false``, ``1`` or ``0`` for truth
-    values, a name for enumerations. OptionError begins with ``flag``, how a user gives them, and
+    where a name exists once. Values may be text: ``true`` or ``false`` for truth values,
+    a name for enumerations. OptionError begins with ``flag``, how a user gives them, and
     names a key that is unknown or ambiguous, or whose value is of a wrong type.
     """
     known = flat_values(options)
@@ -99,10 +99,13 @@ def _full_key(text: str, known: Mapping[str, Any], flag: str) -> str:
     raise OptionError(f"{flag} {text}: pycolmap has no such option{hint}")
 
 
-EXPECTED = {
-    bool: "true or false", int: "a whole number", float: "a finite number", Path: "a path",
-    str: "text",
-}  # fmt: skip
+EXPECTED: dict[type, tuple[str, Any]] = {
+    bool: ("true or false", TypeAdapter(bool)),
+    int: ("a whole number", TypeAdapter(int)),
+    float: ("a finite number", TypeAdapter(FiniteFloat)),
+    Path: ("a path", TypeAdapter(Path)),
+    str: ("text", TypeAdapter(str)),
+}
 """What may be given for options of each type; the order matters, as bool is an int."""
 
 
@@ -116,24 +119,9 @@ def _converted(value: Any, example: Any, where: str) -> Plain:
     kind = next((kind for kind in EXPECTED if isinstance(example, kind)), None)
     if kind is None:
         raise OptionError(f"{where}: cannot be given, it is of type {type(example).__name__}")
-    with suppress(ValueError, OverflowError):
-        if (converted := _convert(value, kind)) is not None:
-            return converted
-    raise OptionError(f"{where}={value}: expected {kind.__name__.lower()} ({EXPECTED[kind]})")
-
-
-def _convert(value: Any, kind: type) -> Plain | None:
-    """Return a value as one of the types of ``EXPECTED``, None if it is of another type."""
-    is_text, is_truth = isinstance(value, str), isinstance(value, bool)
-    if kind is bool and is_text:
-        return TRUTH_VALUES.get(value.lower())
-    if kind is bool:
-        return value if is_truth else None
-    if kind is int and (is_text or isinstance(value, int)) and not is_truth:
-        return int(value)
-    if kind is float and (is_text or isinstance(value, int | float)) and not is_truth:
-        number = float(value)
-        return number if math.isfinite(number) else None
-    if kind is Path and isinstance(value, str | Path):
-        return str(Path(value))
-    return value if kind is str and is_text else None
+    expected, adapter = EXPECTED[kind]
+    if isinstance(value, bool) == (kind is bool) or isinstance(value, str):
+        with suppress(ValidationError):
+            converted: Plain | Path = adapter.validate_python(value)
+            return str(converted) if isinstance(converted, Path) else converted
+    raise OptionError(f"{where}={value}: expected {kind.__name__.lower()} ({expected})")

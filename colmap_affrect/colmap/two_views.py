@@ -1,7 +1,9 @@
-"""Two-view geometries of a COLMAP database as plain arrays.
+"""Two-view geometries of a COLMAP database as plain arrays, and how significant they are.
 
 All points here are in COLMAP's pixels, the corner of the image being (0, 0).
 """
+
+import math
 
 import cv2
 import numpy as np
@@ -10,7 +12,16 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Pose
 from colmap_affrect.geometry.affine import project
 from colmap_affrect.geometry.arrays import Array, Floats
-from colmap_affrect.geometry.epipolar import EpipolarModel
+from colmap_affrect.geometry.epipolar import (
+    EpipolarModel,
+    HomographyModel,
+    PairModel,
+    Points,
+    Rows,
+    common_sign,
+)
+from colmap_affrect.geometry.shapes import of_unit_area, vary_singly
+from colmap_affrect.geometry.significance import log10_bayes_factor, log10_false_alarms, shuffled
 
 PLANAR = (
     pycolmap.TwoViewGeometryConfiguration.PLANAR,
@@ -20,6 +31,10 @@ PLANAR = (
 """Pairs that a homography explains: their epipolar geometry is arbitrary."""
 
 CALIBRATED = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+MAX_FRAME_ANGLE_DEG = 20.0  # frames of right matches are off by 5 to 10 degrees
+CHANCE_OF_AGREEMENT = MAX_FRAME_ANGLE_DEG / 180.0  # of frames that are turned at random
+MAX_CHANCE = 0.99  # frames that agree by chance nearly always, upright ones for one, say nothing
+MIN_VARIETY = 0.05  # of elements of shapes of area one; below they have no direction
 MIN_TRANSLATION = 1e-9  # of a decomposed homography, in units of the distance of its plane
 
 
@@ -59,7 +74,7 @@ def undistorted(camera: pycolmap.Camera, points: Array) -> Array:
     return np.asarray(rays @ matrix[:2, :2].T + matrix[:2, 2])
 
 
-def keypoint_shapes(keypoints: Floats) -> Array | None:
+def _keypoint_shapes(keypoints: Floats) -> Array | None:
     """Return the (N, 2, 2) linear parts of a database's keypoints, up to a factor.
 
     Of 6 columns (x, y, a11, a12, a21, a22) they are affine; of 4 (x, y, scale, orientation in
@@ -120,3 +135,71 @@ def homography_of(
     if geometry.config in PLANAR or (errors > tolerance_px).sum() < min_off_plane:
         return homography
     return None
+
+
+def significance(
+    geometry: pycolmap.TwoViewGeometry,
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
+    keypoints: tuple[Floats, Floats],
+    max_error_px: float,
+) -> float:
+    """Return the decimal logarithm of how many pairs chance needs to have one that looks as good.
+
+    It is infinite for a geometry that there is nothing to test in (a watermark). ``keypoints`` are
+    those of the raw matches, from which COLMAP estimated the geometry: twice (M, 2, 4 or 6), with
+    columns as in the database; without shapes, in 2 columns, positions count alone.
+    """
+    with np.errstate(all="ignore"):  # points that a camera cannot undistort are no inliers
+        model = pair_model(geometry, cameras, keypoints)
+        if model is None:
+            return math.inf
+        rows = np.arange(len(keypoints[0]))
+        inliers = rows[model.errors(rows, rows) <= max_error_px]
+        hits = model.errors(*shuffled(len(rows))) <= max_error_px
+        chance = max(float(hits.mean()), 1.0 / len(hits))
+        alarms = log10_false_alarms(len(rows), len(inliers), model.sample_size, chance)
+        shapes = (telling_shapes(keypoints[0]), telling_shapes(keypoints[1]))
+        if math.isinf(alarms) or shapes[0] is None or shapes[1] is None:
+            return -alarms
+        return _frame_evidence(model, inliers, (shapes[0], shapes[1])) - alarms
+
+
+def telling_shapes(keypoints: Floats) -> Points | None:
+    """Return the shapes of keypoints; None if they tell nothing.
+
+    That is without any, of circles, if all are alike, or only differ from view to view.
+    """
+    shapes = _keypoint_shapes(keypoints)
+    if shapes is None or not len(shapes):
+        return None
+    alike = np.ptp(of_unit_area(shapes), axis=0).max() < MIN_VARIETY
+    return None if alike or not vary_singly(shapes) else shapes
+
+
+def pair_model(
+    geometry: pycolmap.TwoViewGeometry,
+    cameras: tuple[pycolmap.Camera, pycolmap.Camera],
+    keypoints: tuple[Floats, Floats],
+) -> PairModel | None:
+    """Return what (M, 2 or more) matched keypoints can be tested with; None of a watermark."""
+    if geometry.config in PLANAR and geometry.H is not None:
+        points1, points2 = (np.asarray(points[:, :2], np.float64) for points in keypoints)
+        return HomographyModel(np.asarray(geometry.H, np.float64), (points1, points2))
+    if geometry.config == pycolmap.TwoViewGeometryConfiguration.WATERMARK:
+        return None
+    return epipolar_pair(geometry, cameras, keypoints)
+
+
+def _frame_evidence(model: PairModel, inliers: Rows, shapes: tuple[Points, Points]) -> float:
+    """Return the Bayes factor of the agreement of frames, as a decimal logarithm."""
+    cosines = model.cosines(inliers, inliers, shapes)
+    first, second = shuffled(len(inliers))
+    by_chance = model.cosines(inliers[first], inliers[second], shapes)
+    limit = math.cos(math.radians(MAX_FRAME_ANGLE_DEG))
+    signs = (1.0, -1.0) if model.has_sign else (1.0,)
+    chance = max(float((by_chance * sign >= limit).mean()) for sign in signs)
+    chance = min(max(chance, CHANCE_OF_AGREEMENT), MAX_CHANCE)
+    sign = common_sign(cosines) if model.has_sign else 1.0
+    num_agreeing = int(np.count_nonzero(cosines * sign >= limit))
+    # The better of two signs: chance has two tries.
+    return log10_bayes_factor(len(inliers), num_agreeing, chance) - math.log10(len(signs))

@@ -4,14 +4,13 @@ COLMAP fails at those that are not finite, and may never end where those of an i
 place. They keep their indices, which models refer to; matches of them are taken away.
 """
 
-import sqlite3
-from collections.abc import Iterable, Mapping
-from contextlib import closing
-from pathlib import Path
+from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
-from colmap_affrect.colmap.tables import pair_images, rows_of
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.database import cameras_of_images
 from colmap_affrect.errors import such_as
 from colmap_affrect.geometry.arrays import Bools, Singles
 
@@ -47,88 +46,63 @@ def _are_finite(keypoints: Singles) -> Bools:
     return np.asarray((np.abs(keypoints) <= MAX_SIDE_PX).all(axis=1))
 
 
-def with_places(keypoints: Singles) -> Singles:
+def _with_places(keypoints: Singles) -> Singles:
     """Return (N, columns) keypoints with a place in the image for those that are nowhere."""
     finite = _are_finite(keypoints)[:, None]
     return np.where(finite, keypoints, PLACEHOLDER[: keypoints.shape[1]]).astype(np.float32)
 
 
-def leave_out_useless(path: Path) -> str:
-    """Leave useless keypoints out of an intact database that COLMAP has not open.
+def leave_out_useless(database: pycolmap.Database) -> str:
+    """Leave useless keypoints out of an intact database, and geometries that keep few inliers.
 
     Returns what is left out, empty if nothing is.
     """
-    with closing(sqlite3.connect(path)) as connection, connection:
-        masks = _masks(connection)
-        if not masks:
-            return ""
-        _give_places(connection, masks)
-        num_matches = _leave_out_matches(connection, "matches", masks, 0)
-        _leave_out_matches(connection, "two_view_geometries", masks, MIN_NUM_INLIERS)
-        images = connection.execute("SELECT image_id, name FROM images ORDER BY name").fetchall()
-    return left_out({name: masks[key] for key, name in images if key in masks}, num_matches)
-
-
-def left_out(masks: Mapping[str, Bools], num_matches: int) -> str:
-    """Say which keypoints are left out, by image name, empty if there are none."""
+    cameras, masks, names = cameras_of_images(database), dict[int, Bools](), list[str]()
+    with pycolmap.DatabaseTransaction(database):
+        for image in sorted(database.read_all_images(), key=lambda image: str(image.name)):
+            key, camera = image.image_id, cameras[image.image_id]
+            if not database.num_keypoints_for_image(key):
+                continue
+            keypoints = np.asarray(database.read_keypoints(key), np.float32)
+            if found := useless(keypoints, (camera.width, camera.height)):
+                masks[key] = np.asarray(np.logical_or.reduce(list(found.values())))
+                names.append(image.name)
+                database.update_keypoints(key, _with_places(keypoints))
+        num_matches = _leave_out_matches(database, masks)
     count = sum(int(mask.sum()) for mask in masks.values())
     if not count:
         return ""
     return (
-        f"{count} keypoints of {such_as(masks)} are left out, with {num_matches} matches: they are "
-        "not finite, outside of the image, or most of it at one place"
+        f"{count} keypoints of {such_as(names)} are left out, with {num_matches} matches: "
+        "they are not finite, outside of the image, or most of it at one place"
     )
 
 
-def _masks(connection: sqlite3.Connection) -> dict[int, Bools]:
-    """Return for each image that has useless keypoints which ones they are."""
-    masks = {}
-    rows = connection.execute(
-        "SELECT image_id, rows, cols, data, width, height FROM keypoints "
-        "NATURAL JOIN (SELECT image_id, camera_id FROM images) "
-        "NATURAL JOIN (SELECT camera_id, width, height FROM cameras) WHERE rows > 0"
-    )
-    for image_id, count, columns, data, *size in rows:
-        keypoints = np.frombuffer(data, "<f4").reshape(count, columns)
-        if found := useless(keypoints, (size[0], size[1])):
-            masks[int(image_id)] = np.asarray(np.logical_or.reduce(list(found.values())))
-    return masks
+def _leave_out_matches(database: pycolmap.Database, masks: Mapping[int, Bools]) -> int:
+    """Leave out matches and inliers of useless keypoints; return how many matches."""
+    num_matches = 0
+    for pair in map(pycolmap.pair_id_to_image_pair, database.read_num_matches()[0]):
+        indices = np.asarray(database.read_matches(*pair), np.uint32)
+        if (lost := _lost(indices, pair, masks)).any():
+            database.delete_matches(*pair)
+            database.write_matches(*pair, indices[~lost])
+            num_matches += int(lost.sum())
+    for pair_id in database.read_two_view_geometry_num_inliers()[0]:
+        pair = pycolmap.pair_id_to_image_pair(pair_id)
+        geometry = database.read_two_view_geometry(*pair)
+        indices = np.asarray(geometry.inlier_matches, np.uint32).reshape(-1, 2)
+        if (lost := _lost(indices, pair, masks)).any():
+            database.delete_two_view_geometry(*pair)
+            geometry.inlier_matches = indices[~lost]
+            if len(geometry.inlier_matches) >= MIN_NUM_INLIERS:
+                database.write_two_view_geometry(*pair, geometry)
+    return num_matches
 
 
-def _give_places(connection: sqlite3.Connection, images: Iterable[int]) -> None:
-    for image_id in images:
-        row = connection.execute("SELECT rows, cols, data FROM keypoints WHERE image_id = ?",
-                                 [image_id])  # fmt: skip
-        count, columns, data = row.fetchone()
-        placed = with_places(np.frombuffer(data, "<f4").reshape(count, columns))
-        connection.execute("UPDATE keypoints SET data = ? WHERE image_id = ?",
-                           [placed.tobytes(), image_id])  # fmt: skip
-
-
-def _leave_out_matches(
-    connection: sqlite3.Connection, table: str, masks: Mapping[int, Bools], least: int
-) -> int:
-    """Leave out matches of useless keypoints, and rows that keep fewer than ``least``.
-
-    Returns how many were left out.
-    """
-    num_lost = 0
-    pairs = [row[0] for row in rows_of(connection, "pair_id", table)]
-    for pair_id in [pair for pair in pairs if not masks.keys().isdisjoint(pair_images(pair))]:
-        # Names of tables are those of COLMAP, written down in this module.
-        row = connection.execute(f"SELECT data FROM {table} WHERE pair_id = ?", [pair_id])  # noqa: S608
-        indices = np.frombuffer(row.fetchone()[0] or b"", "<u4").reshape(-1, 2)
-        lost = np.zeros(len(indices), np.bool_)
-        for side, image_id in enumerate(pair_images(pair_id)):
-            if image_id in masks:
-                lost |= masks[image_id][indices[:, side]]
-        kept = indices[~lost]
-        if lost.any() and len(kept) < least:
-            connection.execute(f"DELETE FROM {table} WHERE pair_id = ?", [pair_id])  # noqa: S608
-        elif lost.any():
-            connection.execute(
-                f"UPDATE {table} SET rows = ?, data = ? WHERE pair_id = ?",  # noqa: S608
-                [len(kept), kept.tobytes(), pair_id],
-            )
-        num_lost += int(lost.sum())
-    return num_lost
+def _lost(indices: NDArray[np.uint32], pair: tuple[int, int], masks: Mapping[int, Bools]) -> Bools:
+    """Tell which of (M, 2) matches are of a useless keypoint."""
+    lost = np.zeros(len(indices), np.bool_)
+    for column, image_id in zip(indices.T, pair, strict=True):
+        if image_id in masks:
+            lost |= masks[image_id][column]
+    return lost

@@ -16,19 +16,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
-from colmap_affrect.colmap.camera_records import read_camera_records
+from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import image_ids
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.colmap.poses import Poses, read_poses
-from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
-from colmap_affrect.comparison.methods import SIFT_COLMAP, Method, parse_methods, without_weights
+from colmap_affrect.comparison.methods import Method, parse_methods, without_weights
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.pose_scores import disagreeing_images, pose_scores
-from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
+from colmap_affrect.comparison.results import Comparison, MethodResult
 from colmap_affrect.comparison.tables import to_json
-from colmap_affrect.comparison.task import Layout, MethodTask
+from colmap_affrect.comparison.task import CompareOptions, Layout, MethodTask
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
 from colmap_affrect.features.weights import install_hint, resolve
 from colmap_affrect.mappers.base import MAPPERS
@@ -36,7 +35,6 @@ from colmap_affrect.options import Options
 from colmap_affrect.pairs.base import Pair, PairOptions
 from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs, write_pairs
 from colmap_affrect.parallel.subprocesses import child
-from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.progress import SILENT, Advance, Progress
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.contents import content_of
@@ -44,28 +42,8 @@ from colmap_affrect.project.outputs import new_results, remove_own
 from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.report import installed_versions
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.recipes import DEFAULT_MAPPERS
 
-DEFAULT_SEEDS = (0, 1, 2)
 NUM_DIGITS = 16  # of the digests of photographs on record: messages name them
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareOptions(InputOptions):
-    """Everything a comparison depends on beside its images and its output folder.
-
-    The other attributes are those of :class:`~colmap_affrect.pipeline.InputOptions`.
-
-    Attributes:
-        methods: names of methods as the command line takes them, or methods; None for those that
-            need no weights, and learned ones whose weights are there.
-        seeds: of verification and mapping, which run once for each.
-        ground_truth_path: folder of a COLMAP model with true poses, in any frame; None for none.
-    """
-
-    methods: Sequence[str | Method] | None = None
-    seeds: Sequence[int] = DEFAULT_SEEDS
-    ground_truth_path: Path | None = None
 
 
 def compare(
@@ -86,7 +64,10 @@ def compare(
     options = options or CompareOptions()
     Workspace(output_path).require_own(image_path)
     plan = _Plan.checked(image_path, Layout(output_path), options)
-    tasks = plan.tasks()
+    tasks = [
+        MethodTask(method, output_path.resolve(), image_path.resolve(), plan.options)
+        for method in plan.methods
+    ]
     todo = [item.method.recipe for item in tasks if overwrite or not item.finished()]
     keys = {key for recipe in todo if recipe for key in recipe.weights}
     resolve(sorted(keys), options.resources.weights_path, progress=progress)
@@ -109,7 +90,7 @@ def compare(
             versions=installed_versions(),
         )
         replace_text(output_path / "comparison.json", to_json(comparison))
-        write_page(comparison, output_path, progress, options.resources)
+        write_page(comparison, output_path, progress)
     return comparison
 
 
@@ -191,30 +172,6 @@ class _Plan:
             "verification": self.inputs["verification"],
             "mapping": self.inputs["mapping"],
         }
-
-    def tasks(self) -> list[MethodTask]:
-        """Return what is to be done for each method."""
-        options = self.options
-        mapper = MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset("colmap")
-        colmaps = VerificationOptions.preset("colmap"), mapper, False
-        ours = options.verification, options.mapping, options.holds_vote
-        tasks = []
-        for method in self.methods:
-            verification, mapping, focal_vote = colmaps if method.label == SIFT_COLMAP else ours
-            task = MethodTask(
-                method=method,
-                output_path=self.layout.path.resolve(),
-                image_path=self.image_path.resolve(),
-                masks=options.masks,
-                verification=verification,
-                mapping=mapping,
-                focal_vote=focal_vote,
-                may_share=options.cameras.mode == "auto",
-                seeds=tuple(options.seeds),
-                resources=options.resources,
-            )
-            tasks.append(task)
-        return tasks
 
 
 def _without_seed(options: Options) -> dict[str, Any]:
@@ -324,34 +281,34 @@ def _run(task: MethodTask, progress: Progress, title: str) -> MethodResult:
 
 def _measured(results: Sequence[MethodResult], plan: _Plan) -> tuple[MethodResult, ...]:
     """Add what needs the models: scores against ground truth, and where models contradict."""
-
-    def poses_of(seed: SeedResult) -> Poses:
-        return read_poses(plan.layout.path / seed.model_path) if seed.model_path else {}
-
-    def scored(seed: SeedResult, poses: Poses) -> SeedResult:
-        truth = plan.truth
-        return (
-            seed if truth is None else replace(seed, scores=pose_scores(poses, truth, plan.names))
-        )
-
-    all_poses = {result.name: [poses_of(seed) for seed in result.seeds] for result in results}
-    measured = []
+    folder, truth, measured = plan.layout.path, plan.truth, []
+    all_poses = {
+        result.name: [
+            read_poses(folder / seed.model_path) if seed.model_path else {} for seed in result.seeds
+        ]
+        for result in results
+    }
     for result in results:
-        poses = all_poses[result.name]
+        poses, seeds = all_poses[result.name], result.seeds
         first, *later = poses or [{}]
+        if truth is not None:
+            seeds = tuple(
+                replace(seed, scores=pose_scores(found, truth, plan.names))
+                for seed, found in zip(seeds, poses, strict=True)
+            )
+        unstable = {image for other in later for image in disagreeing_images(first, other)}
         others = {
             name: disagreeing_images(first, other[0])
             for name, other in all_poses.items()
             if other and name != result.name
         }
+        contradicted = {other: images for other, images in others.items() if images}
         measured.append(
             replace(
                 result,
-                seeds=tuple(map(scored, result.seeds, poses)),
-                unstable_names=tuple(
-                    sorted({image for other in later for image in disagreeing_images(first, other)})
-                ),
-                disagreements={other: images for other, images in others.items() if images},
+                seeds=seeds,
+                unstable_names=tuple(sorted(unstable)),
+                disagreements=contradicted,
             )
         )
     return tuple(measured)

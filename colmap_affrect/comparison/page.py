@@ -7,17 +7,16 @@ from math import log
 from pathlib import Path
 from typing import Any
 
-from colmap_affrect.comparison.method_table import (
+from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, MAX_CORRECT_ERROR_DEG
+from colmap_affrect.comparison.results import Comparison, MethodResult
+from colmap_affrect.comparison.tables import (
     Column,
     columns_of,
     digits_of,
     span_text,
     summary_rows,
 )
-from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, MAX_CORRECT_ERROR_DEG
-from colmap_affrect.comparison.results import Comparison, MethodResult
-from colmap_affrect.comparison.verdict import cautions, changes, headline, wrong_poses
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.comparison.verdict import cautions, changes, headline, is_rectified, wrong_poses
 from colmap_affrect.options import flat
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.progress import SILENT, Progress
@@ -27,37 +26,25 @@ from colmap_affrect.report.match_plots import MatchPlot, SideBySide, plot_inlier
 from colmap_affrect.report.pictures import Picture, photograph_pictures, thumbnails
 from colmap_affrect.report.scene import read_scene
 from colmap_affrect.report.view_graph import Node
-from colmap_affrect.report.warp_views import rectifies, warped_photographs
-from colmap_affrect.stages.context import Resources
 
 TEMPLATE = Path(__file__).parent / "templates" / "comparison.html"
 FILE_NAME = "report.html"
 
 MATCH_PICTURE_PX = 560
-MAX_NUM_WARPED_PHOTOGRAPHS = 3
 MAX_NUM_TABLE_PAIRS = 200
 
 
-def write_page(
-    comparison: Comparison,
-    output_path: Path,
-    progress: Progress = SILENT,
-    resources: Resources | None = None,
-) -> Path:
+def write_page(comparison: Comparison, output_path: Path, progress: Progress = SILENT) -> Path:
     """Write ``report.html`` into the folder of a comparison, and return its path.
 
     It is one file that loads nothing. Whatever is missing, such as a photograph that cannot be read
-    or a model that is not there, is said in its place. ``resources`` are those of methods with
-    networks, to draw their warps. Raises WorkspaceError when it cannot be written.
+    or a model that is not there, is said in its place. Raises WorkspaceError when it cannot be
+    written.
     """
     columns = columns_of(comparison)
     methods = [column.method for column in columns]
     folder = Path(comparison.image_path)
-    rectifying = [
-        method.name
-        for method in methods
-        if method.folder and rectifies(Workspace(output_path / method.folder))
-    ]
+    rectifying = [method.name for method in methods if is_rectified(method)]
     chosen = choose_pairs(methods, rectifying)
     of_pairs = list(dict.fromkeys(name for pair in chosen for name in pair))
     pair_pictures = photograph_pictures(folder, sorted(of_pairs), MATCH_PICTURE_PX)
@@ -85,7 +72,6 @@ def write_page(
         "auc_thresholds_deg": AUC_THRESHOLDS_DEG,
         "settings": flat(comparison.settings),
         "method_options": {method.name: flat(method.options) for method in methods},
-        **_warps(comparison, rectifying, of_pairs, output_path, resources),
         **_graphs_and_models(columns, comparison, output_path),
     }
     folders = [folder, output_path.resolve()]
@@ -138,32 +124,6 @@ def _graphs_and_models(
             ],
         },
     }
-
-
-def _warps(
-    comparison: Comparison,
-    rectifying: Sequence[str],
-    of_pairs: Sequence[str],
-    output_path: Path,
-    resources: Resources | None,
-) -> dict[str, Any]:
-    """Return the method whose warps are shown, those of a few photographs, or why there are none.
-
-    It is the method with most registered images of those that rectify; its photographs are
-    those of the pairs that are drawn.
-    """
-    methods = [method for method in comparison.finished if method.name in rectifying]
-    if not methods:
-        return {"warped_method": "", "warped": [], "warped_error": ""}
-    best = max(methods, key=lambda method: method.registered.mean)
-    names = dict.fromkeys([*of_pairs, *comparison.image_names])
-    shown = [name for name in names if name in best.num_keypoints][:MAX_NUM_WARPED_PHOTOGRAPHS]
-    warped, why = [], ""
-    try:
-        warped = warped_photographs(Workspace(output_path / best.folder), shown, resources)
-    except AffrectError as error:
-        why = str(error)
-    return {"warped_method": best.name, "warped": warped, "warped_error": why}
 
 
 FILTERS = {

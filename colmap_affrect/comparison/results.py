@@ -49,10 +49,6 @@ class Span:
         numbers = [float(value) for value in values]
         return cls(sum(numbers) / len(numbers), min(numbers), max(numbers))
 
-    def text(self, varying: str) -> str:
-        """Write the one value, or a mean and a range as ``{0.mean}``, ``{0.min}``, ``{0.max}``."""
-        return f"{self.mean:g}" if self.min == self.max else varying.format(self)
-
 
 @dataclass(frozen=True)
 class SeedResult:

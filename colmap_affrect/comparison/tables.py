@@ -1,22 +1,209 @@
-"""A comparison as a table for the terminal and as JSON."""
+"""The table of methods that finished, on the page and in the terminal; and JSON."""
 
+import itertools
 import json
+import string
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import zip_longest
+from statistics import fmean
+from typing import Any
 
+from colmap_affrect.comparison.pose_scores import AUC_THRESHOLDS_DEG, PoseScores
 from colmap_affrect.comparison.results import Comparison, MethodResult, Span
-from colmap_affrect.comparison.verdict import verdict
+from colmap_affrect.comparison.verdict import ranked, verdict
+from colmap_affrect.project.record import STAGES
+
+METHOD_COLORS = (
+    "#0b62a8", "#a34700", "#00714f", "#9b2d79", "#5d4bb0", "#7a5c00", "#a3213b", "#46606e",
+)  # fmt: skip
+"""Of the marks of methods; white text on them is readable."""
+
+MAIN_ROWS = {
+    "registered", "correct", "models", "verified_pairs", "points3D", "mean_track_length", "total_s",
+}  # fmt: skip
+"""Rows that decide; the others are folded away."""
+
+BYTES_PER_MB = 1_000_000
+NOTHING = "-"  # where there is no number
+
+
+@dataclass(frozen=True)
+class Column:
+    """A method that finished, as it is marked everywhere on the page."""
+
+    letter: str
+    color: str
+    method: MethodResult
+
+    @property
+    def name(self) -> str:
+        """Of the method."""
+        return self.method.name
+
+
+def columns_of(comparison: Comparison) -> list[Column]:
+    """Give each method that finished a letter and a colour, the best first."""
+    letters = [*string.ascii_uppercase, *map(str, range(27, len(comparison.finished) + 1))]
+    marks = zip(letters, itertools.cycle(METHOD_COLORS), ranked(comparison.finished), strict=False)
+    return [Column(*mark) for mark in marks]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table of methods, and which cells have the best value, where methods differ."""
+
+    key: str
+    title: str
+    cells: list[str]
+    best: tuple[bool, ...]
+
+    @property
+    def is_main(self) -> bool:
+        """Whether it is one of those that decide."""
+        return self.key in MAIN_ROWS
+
+
+Better = Callable[[Iterable[float]], float] | None  # which of the means is best, if any
+Figure = tuple[str, str, int, Better, Callable[[MethodResult], Span | None]]
+"""Key and title of a line, decimals, what is best, and the value of a method."""
+
+
+def summary_rows(columns: Sequence[Column], comparison: Comparison) -> list[Row]:
+    """Return the table of methods, without the lines that say nothing of any of them."""
+    methods = [column.method for column in columns]
+    rows = [_row(figure, methods) for figure in _figures(comparison, methods)]
+    splits = [_splits(method) for method in methods]
+    rows.insert(2, Row("models", "Images in each model", splits, (False,) * len(splits)))
+    return [row for row in rows if any(cell != NOTHING for cell in row.cells)]
+
+
+def _figures(comparison: Comparison, methods: Sequence[MethodResult]) -> list[Figure]:
+    given = len(comparison.image_names)
+
+    def measured(key: str, title: str, digits: int = 1, better: Better = None) -> Figure:
+        return key, title, digits, better, lambda method: method.span(key)
+
+    def scored(
+        key: str, title: str, digits: int, better: Better, value: Callable[[PoseScores], Any]
+    ) -> Figure:
+        def span(method: MethodResult) -> Span | None:
+            values = [value(seed.scores) for seed in method.seeds if seed.scores is not None]
+            return _span(number for number in values if number is not None)
+
+        return key, title, digits, better, span
+
+    def area(limit: float) -> Figure:
+        title = f"AUC of relative poses at {limit:g}°"
+        return scored(f"auc_{limit:g}", title, 3, max, lambda scores: scores.auc[limit])
+
+    def median(key: str, title: str, digits: int) -> Figure:
+        return scored(key, f"Median {title}", digits, min, lambda scores: getattr(scores, key))
+
+    def seconds(stage: str) -> Figure:
+        def span(method: MethodResult) -> Span | None:
+            return _span(s for name, s in method.stage_seconds.items() if name == stage)
+
+        return f"{stage}_s", f"Seconds to {stage}", 1, min, span
+
+    def keypoints(method: MethodResult) -> Span | None:
+        return _span([fmean(method.num_keypoints.values())] if method.num_keypoints else [])
+
+    def memory_mb(method: MethodResult) -> Span:
+        return Span.of([method.peak_memory_bytes / BYTES_PER_MB])
+
+    stages = {stage for method in methods for stage in method.stage_seconds}
+    return [
+        measured("registered", f"Registered, of {given}", better=max),
+        ("correct", f"Registered correctly, of {given}", 1, max, lambda method: method.correct),
+        measured("verified_pairs", f"Verified pairs, of {comparison.num_pairs:,}"),
+        measured("points3D", "3D points", 0, max),
+        measured("mean_track_length", "Images per 3D point", 2),
+        ("num_keypoints", "Keypoints per image", 0, None, keypoints),
+        measured("inliers", "Inliers in all pairs", 0),
+        measured("mean_observations", "3D points seen by an image", 0),
+        measured("mean_reprojection_error_px", "Reprojection error, px", 2),
+        *map(area, AUC_THRESHOLDS_DEG),
+        median("median_rotation_error_deg", "rotation error, °", 2),
+        median("median_direction_error_deg", "error of translation direction, °", 2),
+        median("median_position_error", "position error, units of the ground truth", 4),
+        *map(seconds, sorted(stages, key=STAGES.index)),
+        ("total_s", "Seconds in all", 1, min, lambda method: Span.of([method.total_s])),
+        ("peak_memory_bytes", "Peak memory, MB", 0, min, memory_mb),
+    ]
+
+
+def _span(values: Iterable[float]) -> Span | None:
+    known = list(values)
+    return Span.of(known) if known else None
+
+
+def _row(figure: Figure, methods: Sequence[MethodResult]) -> Row:
+    """Write means and, in brackets, ranges with as many decimals in all cells as any needs."""
+    key, title, digits, better, value = figure
+    spans = [value(method) for method in methods]
+    known = [span for span in spans if span]
+    means = {round(span.mean, digits) for span in known}
+    best = better(means) if better and len(means) > 1 else None
+    digits_of_mean = digits_of((span.mean for span in known), digits)
+    digits_of_ends = digits_of((end for span in known for end in (span.min, span.max)), digits)
+    cells = [span_text(span, digits_of_mean, digits_of_ends) for span in spans]
+    is_best = [span is not None and round(span.mean, digits) == best for span in spans]
+    return Row(key, title, cells, tuple(is_best))
+
+
+def digits_of(values: Iterable[float], digits: int) -> int:
+    """Return so many digits after the point, none where all values are whole."""
+    return 0 if all(value == round(value) for value in values) else digits
+
+
+def span_text(span: Span | None, digits: int = 1, digits_of_ends: int = 0) -> str:
+    """Write a mean, and the range where its ends differ as they are written.
+
+    >>> span_text(Span.of([7, 8])), span_text(Span.of([8, 8])), span_text(None)
+    ('7.5 (7-8)', '8.0', '-')
+    """
+    if span is None:
+        return NOTHING
+    mean = f"{span.mean:,.{digits}f}"
+    low, high = (f"{end:,.{digits_of_ends}f}" for end in (span.min, span.max))
+    return mean if low == high else f"{mean} ({low}-{high})"
+
+
+def _splits(method: MethodResult) -> str:
+    """Write the sizes of the models, once where all seeds agree."""
+    splits = [" + ".join(str(len(m)) for m in s.model_names) or "none" for s in method.seeds]
+    if len(set(splits)) == 1:
+        return splits[0]
+    pairs = zip(method.seeds, splits, strict=True)
+    return "; ".join(f"seed {seed.seed}: {split}" for seed, split in pairs)
+
 
 WIDTH = 88
 
 
+SHOWN = {
+    "registered": "registered", "correct": "correct", "verified_pairs": "verified",
+    "points3D": "points", "mean_track_length": "track", "mean_reprojection_error_px": "px",
+    "total_s": "seconds", "peak_memory_bytes": "MB",
+}  # fmt: skip
+"""Lines of the table of methods that the terminal shows, as columns, and their short titles."""
+
+
 def summary(comparison: Comparison) -> str:
     """Return the verdict under a table of methods."""
-    columns = ["method", "registered", "verified", "points", "track", "px", "seconds", "MB"]
-    if comparison.has_ground_truth:
-        columns.insert(2, "correct")
-    lines = [aligned([columns, *(_row(method, comparison) for method in comparison.methods)])]
+    columns = columns_of(comparison)
+    rows = [row for row in summary_rows(columns, comparison) if row.key in SHOWN]
+    cells = {
+        column.name: [
+            f"{row.cells[index]}{f' of {len(comparison.image_names)}' * (row.key == 'registered')}"
+            for row in rows
+        ]
+        for index, column in enumerate(columns)
+    }
+    table = [[method.name, *cells.get(method.name, ["failed"])] for method in comparison.methods]
+    lines = [aligned([["method", *(SHOWN[row.key] for row in rows)], *table])]
     only = comparison.only_registered_by if len(comparison.finished) > 1 else {}
     lines += [""] * bool(only)
     lines += [f"only {method} registers {name}" for name, method in only.items()]
@@ -40,30 +227,6 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
         ).rstrip()
         for row in rows
     )
-
-
-def _row(method: MethodResult, comparison: Comparison) -> list[str]:
-    if method.failed:
-        return [method.name, "failed"]
-    return [
-        method.name,
-        f"{_span(method.registered)} of {len(comparison.image_names)}",
-        *([_span(method.correct)] if comparison.has_ground_truth else []),
-        _span(method.span("verified_pairs")),
-        _mean(method.span("points3D"), 0),
-        _mean(method.span("mean_track_length"), 2),
-        _mean(method.span("mean_reprojection_error_px"), 2),
-        f"{method.total_s:.1f}",
-        f"{method.peak_memory_bytes / 1e6:.0f}",
-    ]
-
-
-def _mean(span: Span | None, digits: int) -> str:
-    return f"{span.mean:.{digits}f}" if span else "-"
-
-
-def _span(span: Span | None) -> str:
-    return span.text("{0.mean:.1f} [{0.min:g}-{0.max:g}]") if span else "-"
 
 
 def to_json(comparison: Comparison) -> str:

@@ -6,21 +6,42 @@ and ``methods/NAME/seed-K/`` has the two-view geometries and models of one seed.
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from colmap_affrect.colmap.verification import VerificationOptions
-from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP, Method
+from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP, SIFT_COLMAP, Method
 from colmap_affrect.comparison.results import MethodResult
 from colmap_affrect.comparison.sift import describe_options
 from colmap_affrect.errors import StaleStoreError
-from colmap_affrect.images.photographs import MaskOptions
-from colmap_affrect.mappers.base import MapperOptions
+from colmap_affrect.mappers.base import MAPPERS, MapperOptions
+from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.record import first_difference
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Resources
+from colmap_affrect.recipes import DEFAULT_MAPPERS
+
+DEFAULT_SEEDS = (0, 1, 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions(InputOptions):
+    """Everything a comparison depends on beside its images and its output folder.
+
+    The other attributes are those of :class:`~colmap_affrect.pipeline.InputOptions`.
+
+    Attributes:
+        methods: names of methods as the command line takes them, or methods; None for those that
+            need no weights, and learned ones whose weights are there.
+        seeds: of verification and mapping, which run once for each.
+        ground_truth_path: folder of a COLMAP model with true poses, in any frame; None for none.
+    """
+
+    methods: Sequence[str | Method] | None = None
+    seeds: Sequence[int] = DEFAULT_SEEDS
+    ground_truth_path: Path | None = None
 
 
 class Layout:
@@ -50,13 +71,29 @@ class MethodTask:
     method: Method
     output_path: Path
     image_path: Path
-    masks: MaskOptions
-    verification: VerificationOptions
-    mapping: MapperOptions
-    focal_vote: bool  # whether verified pairs vote on cameras that nobody knows
-    may_share: bool  # whether images of one size may then turn out to share a camera
-    seeds: tuple[int, ...]  # of verification and mapping; escalation has the first
-    resources: Resources
+    all_options: CompareOptions
+
+    @property
+    def is_colmaps(self) -> bool:
+        """Whether verification and mapping are COLMAP's, too."""
+        return self.method.label == SIFT_COLMAP
+
+    @property
+    def verification(self) -> VerificationOptions:
+        """How pairs are verified."""
+        colmaps = VerificationOptions.preset("colmap")
+        return colmaps if self.is_colmaps else self.all_options.verification
+
+    @property
+    def mapping(self) -> MapperOptions:
+        """Mapper and its options."""
+        colmaps = MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset("colmap")
+        return colmaps if self.is_colmaps else self.all_options.mapping
+
+    @property
+    def focal_vote(self) -> bool:
+        """Whether verified pairs vote on cameras that nobody knows."""
+        return not self.is_colmaps and self.all_options.holds_vote
 
     @property
     def layout(self) -> Layout:
@@ -90,7 +127,7 @@ class MethodTask:
         """Return the result of the method if it has been run with the same seeds."""
         if self.result.exists():
             content = json.loads(self.result.read_text(encoding="utf-8"))
-            if content["seeds"] == list(self.seeds):
+            if content["seeds"] == list(self.all_options.seeds):
                 return MethodResult.from_mapping(self.method.label, content["result"])
         return None
 
@@ -102,7 +139,7 @@ class MethodTask:
             content = json.loads(self.result.read_text(encoding="utf-8"))
             known, now = content["result"]["options"], json.loads(json.dumps(self.options))
             if self.method.climbs:
-                known["seed"], now["seed"] = content["seeds"][0], self.seeds[0]
+                known["seed"], now["seed"] = content["seeds"][0], self.all_options.seeds[0]
             if difference := first_difference(known, now):
                 raise StaleStoreError(
                     f"{self.folder}: {self.method.label} was run there with {difference}; use "

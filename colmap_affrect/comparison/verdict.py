@@ -209,7 +209,9 @@ def _count(method: MethodResult) -> Span:
 
 
 def _number(span: Span) -> str:
-    return span.text("{0.mean:.1f} on average ({0.min:g} to {0.max:g})")
+    if span.min == span.max:
+        return f"{span.mean:g}"
+    return f"{span.mean:.1f} on average ({span.min:g} to {span.max:g})"
 
 
 def _seconds(value: float) -> str:

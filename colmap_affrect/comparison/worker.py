@@ -22,7 +22,7 @@ from typing import Any, TextIO
 from pydantic import TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import read_camera_records
+from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import (
     image_ids,
     keypoint_counts,
@@ -32,7 +32,6 @@ from colmap_affrect.colmap.database import (
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import (
     ExtractedPx,
-    VerificationOptions,
     verified_pairs,
     verify,
 )
@@ -93,7 +92,7 @@ def compute(task: MethodTask, progress: "_Reported") -> None:
     else:
         _match_sift(task, costs, progress)
     num_keypoints, raw_matches = _count_features(task.folder / "database.db")
-    seeds = tuple(_run_seed(task, seed, progress) for seed in task.seeds)
+    seeds = tuple(_run_seed(task, seed, progress) for seed in task.all_options.seeds)
     costs.save()
     result = MethodResult(
         name=task.method.label,
@@ -107,7 +106,7 @@ def compute(task: MethodTask, progress: "_Reported") -> None:
         options=task.options,
         folder=task.shown_folder,
     )
-    content = {"seeds": task.seeds, "result": result.to_mapping()}
+    content = {"seeds": task.all_options.seeds, "result": result.to_mapping()}
     replace_text(task.result, json.dumps(content, indent=1, ensure_ascii=False))
 
 
@@ -122,7 +121,7 @@ def _match_sift(task: MethodTask, costs: "_Costs", progress: "_Reported") -> Non
 
     def extract_all() -> None:
         with progress.stage("extract", len(names), "images") as advance:
-            images = task.image_path, names, task.masks
+            images = task.image_path, names, task.all_options.masks
             costs.failures = extract_sift(path, *images, affine=affine)
             advance(len(names))
 
@@ -136,12 +135,12 @@ def _match_sift(task: MethodTask, costs: "_Costs", progress: "_Reported") -> Non
 
 
 def _match_recipe(task: MethodTask, recipe: Recipe, costs: "_Costs", progress: "_Reported") -> None:
-    context = Context(Workspace(task.folder), task.resources, progress=progress)
+    context = Context(Workspace(task.folder), task.all_options.resources, progress=progress)
     inputs = Inputs.of(
         task.image_path,
         image_list_path=task.layout.images,
         from_database=task.layout.database,
-        masks=task.masks,
+        masks=task.all_options.masks,
     )
 
     def extract_all() -> None:
@@ -151,7 +150,7 @@ def _match_recipe(task: MethodTask, recipe: Recipe, costs: "_Costs", progress: "
     choose_pairs(context, PairOptions(match_list_path=str(task.layout.pairs.resolve())))
     costs.stage("match", lambda: match(context))
     if task.method.climbs:
-        verification = task.verification.changed(random_seed=task.seeds[0])
+        verification = task.verification.changed(random_seed=task.all_options.seeds[0])
         verify_matches(replace(context, progress=SILENT), verification)
         costs.stage("escalate", lambda: escalate(context))
 
@@ -196,15 +195,27 @@ def _seed_result(task: MethodTask, seed: int, folder: Path, progress: "_Reported
     watch, told = Stopwatch(), progress.of_seed(seed)
     options = task.verification.changed(random_seed=seed)
     mapper = MAPPERS.make(task.mapping.changed(random_seed=seed))
-    if task.method.recipe:
-        workspace = Workspace(task.folder).branch(folder)
-        context = Context(workspace, task.resources, progress=told)
-        with watch.step("verify"):
+    workspace = Workspace(task.folder).branch(folder) if task.method.recipe else Workspace(folder)
+    context = Context(workspace, task.all_options.resources, progress=told)
+    size_px: ExtractedPx = None
+    silent: Collection[Pair] = ()
+    with watch.step("verify"):
+        if task.method.recipe:
             verify_matches(context, options)
-            silent = unmeasured_pairs(context)
-            _vote(task, workspace, options, extracted_px(context), silent)
-        with watch.step("map"):
+            size_px, silent = extracted_px(context), unmeasured_pairs(context)
+        else:
+            num_pairs = len(unverified_pairs(database_path))
+            with told.stage("verify", num_pairs, "pairs") as advance:
+                verify(database_path, options, advance=advance)
+            shutil.copy(task.layout.cameras, workspace.cameras)
+        if task.focal_vote:
+            may_share = task.all_options.cameras.mode == "auto"
+            files = database_path, workspace.cameras
+            hold_vote(*files, options, size_px, may_share=may_share, silent=silent)
+    with watch.step("map"):
+        if task.method.recipe:
             guide(context)
+<<<<<<< HEAD
             _, models = map_images(context, mapper)
     else:
         num_pairs = len(unverified_pairs(database_path))
@@ -217,6 +228,14 @@ def _seed_result(task: MethodTask, seed: int, folder: Path, progress: "_Reported
             records = read_camera_records(workspace.cameras)
             mapping = MappingTask(database_path, task.image_path, cameras=records)
             models = map_database(mapper, mapping, folder / "sparse", advance)
+=======
+            _, models = map_guided(context, mapper)
+        else:
+            with told.stage("map", len(names), "images") as advance:
+                records = read_camera_records(workspace.cameras)
+                mapping = MappingTask(database_path, task.image_path, cameras=records)
+                models = map_database(mapper, mapping, folder / "sparse", advance)
+>>>>>>> col-rec
     largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
     model_path = folder / "sparse" / "0" if models else None
     model = pycolmap.Reconstruction(model_path) if model_path else pycolmap.Reconstruction()
@@ -239,18 +258,6 @@ def _seed_result(task: MethodTask, seed: int, folder: Path, progress: "_Reported
         doubtful=largest.doubtful,
         doubts=largest.doubts,
     )
-
-
-def _vote(
-    task: MethodTask,
-    workspace: Workspace,
-    verification: VerificationOptions,
-    size_px: ExtractedPx = None,
-    silent: Collection[Pair] = (),
-) -> None:
-    if task.focal_vote:
-        paths, may_share = (workspace.database, workspace.cameras), task.may_share
-        hold_vote(*paths, verification, size_px, may_share=may_share, silent=silent)
 
 
 class _Costs:

@@ -5,12 +5,10 @@ Nothing is changed: databases are examined in a copy. No run can begin in a fold
 
 import shutil
 import sys
-from itertools import groupby
 from pathlib import Path
 
-from colmap_affrect.doctor.database import examine_database
 from colmap_affrect.doctor.findings import Diagnosis, Finding, Findings
-from colmap_affrect.doctor.folder import examine_folder
+from colmap_affrect.doctor.folder import examine_database, examine_folder
 from colmap_affrect.errors import OptionError
 from colmap_affrect.features.weights import describe_weights, remedy
 from colmap_affrect.progress import SILENT, Progress
@@ -72,12 +70,8 @@ def _examine_networks(findings: Findings, weights_path: Path | None) -> None:
     if device.type == "cpu":
         findings.add("no-gpu", "networks")
     rows = describe_weights(weights_path)
-    files = sorted(row.path for row in rows if row.path)
-    for folder, paths in groupby(files, lambda path: path.parent):
-        names = ", ".join(path.name for path in paths)
-        findings.checked.append(f"weights: in {folder}: {names}")
-    if not files:
-        findings.checked.append("weights: none found")
+    files = ", ".join(sorted(str(row.path) for row in rows if row.path))
+    findings.checked.append(f"weights: {files or 'none found'}")
     for row in rows:
         if row.path and row.verified is False:
             findings.add("other-weights", row.path, key=row.key, remedy=remedy(row.path))

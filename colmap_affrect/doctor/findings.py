@@ -48,10 +48,6 @@ TEXTS: dict[str, Check] = CHECKS | {
         "has the tables of an older COLMAP (schema {version}, now {newest}); COLMAP 4 and pycolmap "
         "change them as soon as they open it, and an older COLMAP cannot read it any more",
         "keep a copy: cp {path} {copy}"),
-    "stamped": ("note",
-        "is of COLMAP 4, and an older COLMAP that failed to open it has put its own version on it "
-        "(schema {version}); nothing is lost, and COLMAP 4 or pycolmap puts it right",
-        "for an older COLMAP: colmap-affrect export-database {path} {copy}"),
     "database-damaged": ("error", "{error}", f"{RECOVER} of it; else make it anew"),
     # an output folder
     "foreign-folder": ("note",
@@ -66,7 +62,6 @@ TEXTS: dict[str, Check] = CHECKS | {
     "leftover": ("note", "left behind by a run that was killed", "remove it: rm -r {path}"),
     "damaged": ("error", "{error}", "restore it, or use another --output-path than {folder}"),
     "stages-missing": ("note", "not run yet: {stages}", "run the same 'run' again"),
-    "features-missing": ("error", "is missing", SAME_RUN),
     "photographs-gone": ("warning", "its photographs are not there ({error})",
         "put them back before running another stage"),
     "no-features": ("warning",
@@ -76,7 +71,7 @@ TEXTS: dict[str, Check] = CHECKS | {
     "photographs-changed": ("warning",
         "images that have changed since their features were extracted, or their masks or depth "
         "maps", SAME_RUN),
-    "database-missing": ("error", "is missing", f"{SAME_RUN} to make it anew"),
+    "missing": ("error", "is missing", f"{SAME_RUN} to make it anew"),
     "database-changed": ("warning", "was changed since the last run: {edits}",
         f"{SAME_RUN}, or any stage: what features.h5 and matches.h5 hold is made again from these"),
     "pairs-changed": ("error", "is not the list whose pairs were matched",
@@ -94,11 +89,10 @@ TEXTS: dict[str, Check] = CHECKS | {
 
 OWN_ADVICE: dict[str, str] = {
     **dict.fromkeys(
-        ("no-images", "no-camera", "no-frame", "keypoint-columns", "keypoint-data",
-         "keypoints-not-finite", "keypoints-outside", "descriptor-count", "descriptor-types"),
-        EXTRACT_AGAIN,
+        ("no-images", "no-parent", "no-frame", "keypoint-data", "keypoints-not-finite",
+         "keypoints-outside", "descriptor-data"), EXTRACT_AGAIN,
     ),
-    **dict.fromkeys(("self-pair", "unknown-pair", "match-data", "match-range"), MATCH_AGAIN),
+    "match-data": MATCH_AGAIN,
     "no-matches": MATCH,
     "no-geometry": "run 'colmap-affrect verify --output-path {folder}' and map",
     "undefined-geometry": VERIFY_AGAIN,

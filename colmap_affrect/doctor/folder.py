@@ -1,15 +1,18 @@
-"""Examines an output folder."""
+"""Examines output folders and COLMAP databases, which are only read."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any, TypeVar
 
-from colmap_affrect.colmap.camera_records import read_camera_records
+from colmap_affrect.colmap.cameras import read_camera_records
+from colmap_affrect.colmap.checks import CHECKS, check_database, check_image_files
 from colmap_affrect.colmap.database import geometry_digest
+from colmap_affrect.colmap.database_copy import copy_as_it_is, newest_schema_version, refuse_newer
 from colmap_affrect.colmap.model_files import SUMMARY, registered_names
-from colmap_affrect.doctor.database import examine_database, examined_copy
 from colmap_affrect.doctor.findings import (
     MATCH_AGAIN,
     OWN_ADVICE,
@@ -18,15 +21,19 @@ from colmap_affrect.doctor.findings import (
     Findings,
     without_path,
 )
-from colmap_affrect.errors import AffrectError, OptionError, WorkspaceError
+from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError
+from colmap_affrect.images.reading import readable_size
 from colmap_affrect.mappers.summaries import (
     model_folders,
     read_summary,
 )
 from colmap_affrect.pairs.base import PairList
 from colmap_affrect.pairs.lists import read_pairs
+from colmap_affrect.parallel.executor import available_cores, map_ordered
+from colmap_affrect.progress import Progress
 from colmap_affrect.project.atomic_files import NEW_SUFFIX
 from colmap_affrect.project.contents import file_sha256
+from colmap_affrect.project.outputs import leads_outside
 from colmap_affrect.project.record import COPY_STAGES, STAGES
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.stages.context import Context
@@ -38,6 +45,56 @@ from colmap_affrect.stages.pairs import without_deleted
 Read = TypeVar("Read")
 
 LEFTOVERS = ("*.new", "*.partial", f"*{NEW_SUFFIX}")
+
+
+def examine_database(
+    findings: Findings,
+    path: Path,
+    image_path: Path | None,
+    own_advice: Mapping[str, str] = MappingProxyType({}),
+) -> bool:
+    """Examine a COLMAP database, and the sizes of its photographs if their folder is given.
+
+    ``own_advice`` says what to do about a problem by its kind, where it is not what ``TEXTS`` says.
+    Returns whether the database can be used.
+    """
+    try:
+        version, newest = refuse_newer(path), newest_schema_version()
+    except DatabaseError as error:
+        findings.add("no-database", path, error=without_path(path, error))
+        return False
+    if version < newest:
+        kept = path.with_suffix(".old.db")
+        findings.add("old-schema", path, version=version, newest=newest, path=path, copy=kept)
+    try:
+        tables, problems = check_database(path)
+    except DatabaseError as error:
+        findings.add("database-damaged", path, error=without_path(path, error))
+        return False
+    findings.checked.append(f"{path}: {tables.summary()}")
+    if image_path is not None:
+        sizes = _file_sizes(image_path, tables.names.values(), findings.progress)
+        problems |= check_image_files(tables, image_path, sizes)
+        findings.checked.append(f"{image_path}: sizes of {len(sizes)} photographs")
+    for kind in sorted(problems, key=list(CHECKS).index):
+        advice = own_advice.get(kind, "")
+        findings.add(kind, path, problems[kind], advice=advice, path=path, folder=path.parent)
+    return True
+
+
+def _file_sizes(
+    image_path: Path, names: Iterable[str], progress: Progress
+) -> dict[str, tuple[int, int] | None]:
+    """Read photographs for their (width, height), None for those that cannot be read."""
+    present = [n for n in names if not leads_outside(n) and (image_path / n).is_file()]
+    sizes = {}
+    with progress.stage("read", len(present), "images") as advance:
+        paths = (image_path / name for name in present)
+        found = map_ordered(readable_size, paths, available_cores())
+        for name, size in zip(present, found, strict=True):
+            sizes[name] = size
+            advance(1)
+    return sizes
 
 
 def examine_folder(findings: Findings, path: Path, image_path: Path | None) -> None:
@@ -84,19 +141,21 @@ class _FolderExamination:
         images = self._photographs(features) if "extract" in done else set()
         inputs = self._models() if "map" in done else ""
         if not database.exists():
-            self._add("database-missing", database)
+            self._add("missing", database)
             return
         own_advice = {} if self.workspace.users_database else OWN_ADVICE
         edits = None if self.workspace.users_database else edits_of(database)
-        with examined_copy(self.found, database, image_path, own_advice) as copy:
-            if copy is None:
-                return
-            if edits and str(edits):
-                self._add("database-changed", database, edits=edits)
-            elif features is not None and "match" in done:
-                self._matches(sorted(images.union(features)))
-            if inputs and not inputs.startswith(geometry_digest(copy)):
-                self._add("map-stale", self.workspace.sparse)
+        if not examine_database(self.found, database, image_path, own_advice):
+            return
+        if edits and str(edits):
+            self._add("database-changed", database, edits=edits)
+        elif features is not None and "match" in done:
+            self._matches(sorted(images.union(features)))
+        if inputs:
+            with TemporaryDirectory() as folder:  # COLMAP would change the original
+                copy_as_it_is(database, copy := Path(folder) / database.name)
+                if not inputs.startswith(geometry_digest(copy)):
+                    self._add("map-stale", self.workspace.sparse)
 
     def _add(self, kind: str, where: Path, **values: Any) -> None:
         self.found.add(kind, where, folder=self.workspace.path, **values)
@@ -151,7 +210,7 @@ class _FolderExamination:
         """Return the number of features by image name, None if the file cannot be used."""
         path, store = self.workspace.features, Context(self.workspace).features
         if not path.exists():
-            self._add("features-missing", path)
+            self._add("missing", path)
             return None
         counts = self._read(path, store.num_keypoints)
         if counts is None or self._read(path, store.check_all) is None:

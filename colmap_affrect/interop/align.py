@@ -1,23 +1,30 @@
-"""Give a COLMAP model its scale and place: by positions, control points, or known distances."""
+"""Give a COLMAP model its scale and place: by positions, control points, or known distances.
+
+Where on earth it is, a file beside those of COLMAP says, which have no place for it.
+"""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from statistics import median
+from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import open_copy
 from colmap_affrect.colmap.model_files import read_given_model, write_model
-from colmap_affrect.errors import DatabaseError, OptionError
+from colmap_affrect.errors import DatabaseError, OptionError, damage
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.interop.georeference import Georeference
+from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.tables import read_table
 from colmap_affrect.project.workspace import Workspace
 
+GEOREFERENCE = "georeference.json"  # beside a model
 # of positions across the line that fits them best, in units of the length along it; with less the
 # model can be turned about that line
 MIN_WIDTH = 0.01
@@ -25,6 +32,49 @@ METRIC, ON_EARTH = ("x", "y", "z"), ("latitude", "longitude", "altitude")
 SHOWN = 12  # residuals in the summary, the largest first
 
 Places = dict[str, Array]  # (3,) by the name of a photograph or a marked point
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """A model in metres whose x, y, z point east, north and up, and where its origin is (WGS 84).
+
+    Attributes:
+        latitude: of the origin, degrees.
+        longitude: of the origin, degrees.
+        altitude: of the origin, metres above the ellipsoid, or as GPS has it.
+    """
+
+    latitude: float
+    longitude: float
+    altitude: float
+
+    @classmethod
+    def read(cls, model_path: Path) -> Self | None:
+        """Return what is on record beside a model, None if there is nothing."""
+        path = model_path / GEOREFERENCE
+        if not path.exists():
+            return None
+        with damage(path, "align the model again"):
+            return TypeAdapter(cls).validate_json(path.read_bytes())
+
+    def write(self, model_path: Path) -> None:
+        """Put it on record beside a model."""
+        text = TypeAdapter(Georeference).dump_json(self, indent=1).decode()
+        replace_text(model_path / GEOREFERENCE, text + "\n")
+
+    def in_metres(self, positions: ArrayLike) -> Array:
+        """Return metres east, north and up of the origin for latitudes, longitudes, altitudes."""
+        return np.asarray(_transform().ellipsoid_to_enu(positions, *astuple(self)))
+
+    def on_earth(self, point: ArrayLike) -> tuple[float, float, float]:
+        """Return latitude, longitude and altitude of a point of the model."""
+        places = _transform().enu_to_ellipsoid(np.asarray(point, float)[None], *astuple(self))
+        latitude, longitude, altitude = places[0].tolist()
+        return latitude, longitude, altitude
+
+
+def _transform() -> pycolmap.GPSTransform:
+    return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
 
 
 @dataclass(frozen=True, kw_only=True)

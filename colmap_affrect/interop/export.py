@@ -17,7 +17,7 @@ from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.model_files import read_given_model
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.geometry.arrays import Array
-from colmap_affrect.interop.georeference import Georeference
+from colmap_affrect.interop.align import Georeference
 from colmap_affrect.options import suggestion
 from colmap_affrect.project.atomic_files import replace_text
 from colmap_affrect.project.outputs import leads_outside, new_results

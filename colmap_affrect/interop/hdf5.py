@@ -106,8 +106,7 @@ def import_h5(
 
     ``layout`` is ``hloc``, ``dim``, or ``auto``: as the matches are stored. ``pixel_origin`` is
     where (0, 0) is, the ``center`` of the first pixel (both programs) or its ``corner``, which is
-    COLMAP's. Pairs are verified by :func:`colmap_affrect.colmap.verification.verify` with
-    ``random_seed``.
+    COLMAP's. ``random_seed`` is that of verification.
     """
     _check_choice("layout", layout, ("auto", *LAYOUTS))
     _check_choice("pixel_origin", pixel_origin, PIXEL_ORIGINS)
@@ -126,27 +125,31 @@ def import_h5(
                 f"mode {cameras.mode} allows): {listed(lost)}"
             )
         _fill_database(new, files, pixel_origin, progress)
-        useless = leave_out_useless(new)
         with open_database(new) as database:
-            num_keypoints, num_matches = database.num_keypoints(), database.num_matches()
+            useless = leave_out_useless(database)
+            counts = database.num_keypoints(), len(files.pairs), database.num_matches()
         without = sorted(set(names) - set(rejected) - files.keys.keys())
         notes = [
             *files.notes,
             *_rounded(files),
-            *([useless] if useless else []),
+            *filter(None, [useless]),
             *noted("images without features are there without keypoints", without),
             *noted("images that COLMAP does not take are left out", rejected),
         ]
         num_verified = None
         if not skip_verification:
-            options = VerificationOptions(random_seed=random_seed)
-            with progress.stage("verify", len(files.pairs), "pairs") as advance:
-                verify(new, options, advance=advance)
-            num_verified = len(verified_pairs(new, options.min_num_inliers))
+            num_verified = _verify(new, len(files.pairs), random_seed, progress)
+    num_images = len(names) - len(rejected)
     return InterchangeReport(
-        "imported", files.layout.name, len(names) - len(rejected), num_keypoints,
-        len(files.pairs), num_matches, num_verified, tuple(notes),
-    )  # fmt: skip
+        "imported", files.layout.name, num_images, *counts, num_verified, tuple(notes)
+    )
+
+
+def _verify(path: Path, num_pairs: int, random_seed: int, progress: Progress) -> int:
+    options = VerificationOptions(random_seed=random_seed)
+    with progress.stage("verify", num_pairs, "pairs") as advance:
+        verify(path, options, advance=advance)
+    return len(verified_pairs(path, options.min_num_inliers))
 
 
 def _rounded(files: ForeignFiles) -> list[str]:
@@ -223,15 +226,13 @@ def export_h5(
     half: bool = False,
     progress: Progress = SILENT,
 ) -> InterchangeReport:
-    """Write features and raw matches of an output folder of ours or a database.
+    """Write features and raw matches of an output folder of ours or a database, which stay so.
 
     Features keep their indices. ``scales`` and ``oris`` are those of hloc: sigma in px, and degrees
-    from x towards y. Descriptors are of unit length. Scores, which a database does not have, are 1
-    then. The database is copied first and stays as it is.
+    from x towards y. Descriptors are of unit length. Scores, which a database does not have, are 1.
 
     ``layout`` is ``hloc`` or ``dim``; with ``half`` all real numbers are float16, coordinates too.
-    Raises OptionError when a file exists, WorkspaceError when it cannot be written, StoreError when
-    the layout cannot hold the content, DatabaseError when the database cannot be used.
+    Raises OptionError when a file exists, StoreError when the layout cannot hold the content.
     """
     _check_choice("layout", layout, tuple(LAYOUTS))
     if features_path.resolve() == matches_path.resolve():

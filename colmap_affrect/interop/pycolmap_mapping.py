@@ -59,24 +59,27 @@ def incremental_mapping(
             extend=existing,
             cancellation=cancellation_token,
         )
-        callbacks = _Callbacks(
-            initial_image_pair_callback, next_image_callback, existing is not None
-        )
-        found = folder / "sparse"
+        extends = existing is not None
+        show = _Callbacks(initial_image_pair_callback, next_image_callback, extends).show
         try:
-            map_database(mapper, task, found, callbacks.show)
+            map_database(mapper, task, folder / "sparse", show)
         except KeyboardInterrupt as error:
             if cancellation_token and cancellation_token.is_cancelled:
                 raise InterruptedError(CANCELLED) from error
             raise
-        models = {int(path.name): pycolmap.Reconstruction(path) for path in found.iterdir()}
-        files = {
-            path: (output if existing else output / path.parent.name) / path.name
-            for path in found.glob("*/*")
-        }
-        with new_results(*files.values(), replaces=True) as made:
-            for path, new in zip(files, made, strict=True):
-                path.replace(new)
+        return _written(folder / "sparse", output, extends=extends)
+
+
+def _written(found: Path, output: Path, *, extends: bool) -> dict[int, pycolmap.Reconstruction]:
+    """Read models and move their files to where pycolmap writes them."""
+    models = {int(path.name): pycolmap.Reconstruction(path) for path in found.iterdir()}
+    files = {
+        path: (output if extends else output / path.parent.name) / path.name
+        for path in found.glob("*/*")
+    }
+    with new_results(*files.values(), replaces=True) as made:
+        for path, new in zip(files, made, strict=True):
+            path.replace(new)
     return dict(sorted(models.items()))
 
 

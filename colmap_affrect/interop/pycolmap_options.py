@@ -7,7 +7,7 @@ where :data:`HONOURED` has it, and refused by its name elsewhere.
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar, cast
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.native_options import differences, flat_values
@@ -19,15 +19,7 @@ from colmap_affrect.matchers.base import MATCHERS, MatcherOptions
 from colmap_affrect.options import CUSTOM, Options, flat, suggestion
 from colmap_affrect.recipes import ExtractionOptions, Recipe, RecipeOptions, load_recipe
 
-
-class NativeOptions(Protocol):
-    """What all option classes of pycolmap have."""
-
-    def mergedict(self, kwargs: dict[str, Any], /) -> None:
-        """Take the values of a nested dictionary."""
-
-
-Native = TypeVar("Native", bound=NativeOptions)
+Native = TypeVar("Native")  # an option class of pycolmap
 
 VERIFICATION_NAMES = {
     "min_num_inliers": "min_num_inliers",
@@ -75,12 +67,12 @@ def native(given: object, kind: type[Native], argument: str) -> Native:
     for key in flat(given or {}):
         if key not in known and key not in sections:
             raise OptionError(f"{argument}: unknown option '{key}'{suggestion(key, known)}")
-    options = kind()
+    options: Any = kind()
     try:
         options.mergedict(dict(given or {}))
     except (AttributeError, TypeError, ValueError, RuntimeError) as error:
         raise OptionError(f"{argument}: {' '.join(str(error).split())}") from error
-    return options
+    return cast("Native", options)
 
 
 def changes(given: object, kind: type, argument: str) -> dict[str, Any]:

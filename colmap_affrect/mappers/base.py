@@ -19,7 +19,7 @@ from colmap_affrect.options import MAX_SEED, PartOptions, PresetOptions, Registr
 
 if TYPE_CHECKING:
     from colmap_affrect.colmap import pycolmap
-    from colmap_affrect.colmap.camera_records import CameraRecord
+    from colmap_affrect.colmap.cameras import CameraRecord
     from colmap_affrect.mappers.existing import ExistingModel
 
 

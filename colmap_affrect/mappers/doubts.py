@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.geometry.parallax import Size, mirrored_share, rotation_share
 from colmap_affrect.mappers.arrivals import MIN_THREE_VIEW_POINTS
 from colmap_affrect.mappers.base import Bridge, MappedModel, MappingTask

@@ -6,11 +6,6 @@ from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
-from colmap_affrect.colmap.camera_records import (
-    notable_lines,
-    read_camera_records,
-    write_camera_records,
-)
 from colmap_affrect.colmap.camera_vote import (
     CameraVote,
     apply_records,
@@ -18,6 +13,11 @@ from colmap_affrect.colmap.camera_vote import (
     forget_votes,
     needs_vote,
     voting_pairs,
+)
+from colmap_affrect.colmap.cameras import (
+    notable_lines,
+    read_camera_records,
+    write_camera_records,
 )
 from colmap_affrect.colmap.verification import ExtractedPx, VerificationOptions, verify
 from colmap_affrect.pairs.base import Pair

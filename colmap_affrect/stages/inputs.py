@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from colmap_affrect.colmap.cameras import read_given_cameras
 from colmap_affrect.colmap.database_copy import read_names
-from colmap_affrect.colmap.given_cameras import read_given_cameras
 from colmap_affrect.colmap.initial_cameras import InitialCameras
 from colmap_affrect.errors import ImageError, OptionError
 from colmap_affrect.images.photographs import (

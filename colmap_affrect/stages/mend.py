@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_affrect.colmap.camera_records import read_camera_records, write_camera_records
+from colmap_affrect.colmap.cameras import read_camera_records, write_camera_records
 from colmap_affrect.colmap.checks import FATAL, refuse_unusable
 from colmap_affrect.colmap.database import all_cameras
 from colmap_affrect.colmap.seal import (

@@ -14,11 +14,6 @@ from command import Call
 from matched_scenes import in_a_box, on_a_plane, views_around, write_views
 
 from colmap_affrect.colmap import camera_vote, pycolmap
-from colmap_affrect.colmap.camera_records import (
-    CameraRecord,
-    read_camera_records,
-    write_camera_records,
-)
 from colmap_affrect.colmap.camera_vote import (
     MAX_SPREAD,
     CameraVote,
@@ -27,6 +22,11 @@ from colmap_affrect.colmap.camera_vote import (
     forget_votes,
     needs_vote,
     voting_pairs,
+)
+from colmap_affrect.colmap.cameras import (
+    CameraRecord,
+    read_camera_records,
+    write_camera_records,
 )
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.initial_cameras import record_cameras

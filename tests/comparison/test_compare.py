@@ -7,7 +7,6 @@ import shutil
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -31,16 +30,12 @@ from colmap_affrect.errors import (
     DeviceError,
     OptionError,
     StaleStoreError,
-    WeightsError,
 )
 from colmap_affrect.features.weights import WEIGHT_FILES
 from colmap_affrect.images.photographs import CameraOptions
 from colmap_affrect.mappers.sparse import SparseOptions
 from colmap_affrect.pairs.base import PairOptions
-from colmap_affrect.progress import Advance, Progress
-from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context, Resources
-from colmap_affrect.stages.guide import guided_counts
+from colmap_affrect.stages.context import Resources
 
 CAMERAS = CameraOptions(mode="per-image", model="PINHOLE", params=INTRINSICS)
 NUM_IMAGES = 3
@@ -132,39 +127,6 @@ def test_methods_register_the_scene_and_one_fails_with_its_reason(compared) -> N
     assert comparison.registered_by_none == ("broken.png",)
     assert verdict(comparison)[0].startswith("No benefit on this set")
     assert any(text.startswith("depth-planes-recommended failed: ") for text in verdict(comparison))
-
-
-def test_poses_are_measured_against_ground_truth(compared) -> None:
-    """Of 3 pairs of images with ground truth all count, those of the broken image not."""
-    for method in compared[0].finished:
-        for seed in method.seeds:
-            assert seed.scores.num_pairs == len(seed.scores.pair_errors_deg) == 3
-            assert 1e-4 < seed.scores.median_rotation_error_deg < 0.5
-            assert 0.9 < seed.scores.auc[10.0] <= 1
-            assert seed.scores.auc[1.0] < seed.scores.auc[10.0]
-            assert seed.scores.median_position_error is None  # the cameras are on one line
-
-
-def test_figures_equal_those_of_the_models_on_disk(compared) -> None:
-    comparison, out = compared
-    for method in comparison.finished:
-        for seed in method.seeds:
-            model = pycolmap.Reconstruction(out / seed.model_path)
-            images = [model.images[image_id] for image_id in model.reg_image_ids()]
-            assert seed.registered_names == tuple(sorted(image.name for image in images))
-            lengths = [len(point.track.elements) for point in model.points3D.values()]
-            assert seed.num_points3D == len(lengths)
-            assert seed.mean_track_length == pytest.approx(fmean(lengths))
-            assert seed.mean_observations == pytest.approx(sum(lengths) / len(images))
-            assert sum(seed.num_observations.values()) == sum(lengths)
-            errors = [point.error for point in model.points3D.values()]
-            assert seed.mean_reprojection_error_px == pytest.approx(fmean(errors))
-            assert all(count >= 20 for count in seed.pair_inliers.values())
-            with open_copy(out / method.folder / f"seed-{seed.seed}" / "database.db") as database:
-                ids = {image.name: image.image_id for image in database.read_all_images()}
-                for (first, second), count in seed.pair_inliers.items():
-                    geometry = database.read_two_view_geometry(ids[first], ids[second])
-                    assert count == len(geometry.inlier_matches)
 
 
 def test_methods_had_the_same_cameras_images_and_pairs(compared) -> None:
@@ -286,41 +248,6 @@ def test_all_methods_take_the_cameras_of_a_database(scene, compared, tmp_path) -
         assert camera.model_name == "PINHOLE"
 
 
-class Names(Progress):
-    """Keeps the names of the stages."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.told: list[str] = []
-
-    @contextmanager
-    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        self.told.append(name)
-        with super().stage(name, total, unit) as advance:
-            yield advance
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("no_page")
-def test_recipes_are_guided_seed_by_seed(scene, options, compared, tmp_path) -> None:
-    """Each seed has geometries of its own; features and raw matches stay those of the method."""
-    out, names = tmp_path / "out", Names()
-    options = replace(options, methods=["guided=unrectified-rootsift:guided.enabled=always"])
-    (method,) = compare(scene / "images", out, options, progress=names).methods
-    plain = compared[0].methods[1]
-    assert method.raw_matches == plain.raw_matches
-    for seed, found, before in zip((0, 1), method.seeds, plain.seeds, strict=True):
-        stages = [name for name in names.told if name.endswith(f", seed {seed}")]
-        title = "method 1 of 1, guided:"
-        assert stages[:2] == [f"{title} verify, seed {seed}", f"{title} guide, seed {seed}"]
-        assert f"{title} map, seed {seed}" in stages
-        guided = Workspace(out / method.folder / f"seed-{seed}")
-        assert guided_counts(Context(guided))["pairs"] > 0
-        assert sum(found.pair_inliers.values()) > sum(before.pair_inliers.values())
-        assert found.registered_names == before.registered_names
-    assert not Workspace(out / method.folder).guided.exists()
-
-
 DYING = """
 import os, signal
 print('{"stage": "extract", "total": 4, "unit": "images"}', flush=True)
@@ -413,20 +340,6 @@ def test_learned_methods_are_compared_where_their_weights_are(
     assert comparison.settings["not_compared"] == text
     given = compare(scene / "images", tmp_path, CompareOptions(methods=["sift"]))
     assert given.settings["not_compared"] == ""
-
-
-def test_missing_weights_of_any_method_are_told_before_the_first(
-    scene, tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def missing(keys: list[str], *_: object, **__: object) -> None:
-        assert keys == ["affnet", "hardnet", "orinet"]
-        raise WeightsError("no AffNet.pth")
-
-    monkeypatch.setattr(module, "resolve", missing)
-    chosen = CompareOptions(methods=["sift", "default", "asift-recommended"])
-    with pytest.raises(WeightsError, match=r"no AffNet\.pth"):
-        compare(scene / "images", tmp_path / "out", chosen)
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.usefixtures("no_page")

@@ -11,7 +11,6 @@ from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.initial_cameras import import_images
 from colmap_affrect.comparison.methods import parse_methods
 from colmap_affrect.comparison.sift import (
-    describe_options,
     extract_sift,
     match_sift,
 )
@@ -54,14 +53,6 @@ def test_folders_of_methods_differ_and_stay_inside():
 def test_wrong_methods_are_refused(texts, message):
     with pytest.raises(OptionError, match=message):
         parse_methods(texts)
-
-
-def test_affine_sift_differs_from_colmaps_default_as_its_name_says():
-    assert describe_options(affine=False)["extraction"] == {}
-    assert describe_options(affine=True)["extraction"] == {
-        "sift.estimate_affine_shape": True,
-        "sift.domain_size_pooling": True,
-    }
 
 
 def test_sift_looks_at_the_masks_and_matches_the_pairs_of_the_list(tmp_path):

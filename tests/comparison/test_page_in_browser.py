@@ -92,13 +92,3 @@ def test_page_fits_and_is_readable(browser: Browser, scheme: str, width: int) ->
     assert_fits_and_is_readable(browser, scheme, width)
     ground = browser.run("return getComputedStyle(document.body).backgroundColor")
     assert (ground == "rgb(255, 255, 255)") == (scheme == "light")
-
-
-def test_models_are_printed(browser: Browser) -> None:
-    browser.command("Emulation.setEmulatedMedia", media="print")
-    shown = "return document.querySelector(arguments[0]).getClientRects().length"
-    try:
-        assert browser.run(shown, "canvas") == 1
-        assert browser.run(shown, "nav") == 0
-    finally:
-        browser.command("Emulation.setEmulatedMedia", media="")

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.poses import Poses, read_poses
 from colmap_affrect.comparison.pose_scores import (
     correct_images,
@@ -114,19 +113,6 @@ def test_models_disagree_about_the_camera_that_differs(truth: Poses) -> None:
     del other["4.jpg"]
     assert disagreeing_images(truth, other) == ("2.jpg",)
     assert disagreeing_images(truth, {"0.jpg": truth["1.jpg"]}) == ()
-
-
-def test_poses_are_read_from_text_and_binary_models(tmp_path: Path) -> None:
-    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1)
-    model = pycolmap.synthesize_dataset(options)
-    (tmp_path / "text").mkdir()
-    model.write(tmp_path)
-    model.write_text(tmp_path / "text")
-    for poses in (read_poses(tmp_path), read_poses(tmp_path / "text")):
-        assert len(poses) == model.num_images()
-        for image in model.images.values():
-            expected = image.cam_from_world().matrix()
-            np.testing.assert_allclose(np.column_stack(poses[image.name]), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("content", [None, "nothing of COLMAP\n"])

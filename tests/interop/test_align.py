@@ -11,8 +11,7 @@ from exported_model import write_model
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import AffrectError, OptionError, StoreError
-from colmap_affrect.interop.align import Reference, align
-from colmap_affrect.interop.georeference import Georeference
+from colmap_affrect.interop.align import Georeference, Reference, align
 
 ORIGIN = Georeference(49.5, 15.25, 300.0)
 TRUE_FROM_OLD = pycolmap.Sim3d(
@@ -106,18 +105,6 @@ def test_distances_of_photographs_and_marked_points_give_the_scale(
     assert done.stdout.startswith("scale       2.5 metres")
     new = centers(pycolmap.Reconstruction(tmp_path / "new"))
     assert np.linalg.norm(new["a.png"] - new["d.png"]) == pytest.approx(length)
-
-
-def test_single_distance_has_no_error_and_must_be_positive(tmp_path: Path) -> None:
-    write_model(tmp_path / "model")
-    for length in (0.0, -1.0, float("nan"), float("inf")):
-        wrong = Reference(distances=(("a.png", "d.png", length),))
-        with pytest.raises(OptionError, match=r"a\.png,d\.png: must be of two places, and"):
-            align(tmp_path / "model", tmp_path / "new", wrong)
-    assert not (tmp_path / "new").exists()
-    reference = Reference(distances=(("a.png", "d.png", 2.0),))
-    done = align(tmp_path / "model", tmp_path / "new", reference)
-    assert done.summary() == f"scale       {done.scale:.6g} metres for a unit of the old model"
 
 
 @pytest.mark.parametrize(

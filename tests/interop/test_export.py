@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +13,8 @@ from exported_model import NAMES, write_model, write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.errors import ImageError, OptionError
+from colmap_affrect.interop.align import Georeference
 from colmap_affrect.interop.export import FORMATS, export
-from colmap_affrect.interop.georeference import Georeference
 
 
 @pytest.fixture
@@ -37,16 +35,6 @@ def test_points_and_text_hold_the_model(tmp_path: Path) -> None:
     ply = (tmp_path / "out" / "points3D.ply").read_bytes()
     assert ply.startswith(b"ply")
     assert b"element vertex 60" in ply
-
-
-@pytest.mark.skipif(not shutil.which("colmap"), reason="COLMAP's command is not installed")
-@pytest.mark.usefixtures("model")
-def test_another_colmap_reads_the_text(tmp_path: Path) -> None:
-    export(tmp_path / "model", tmp_path / "out", ["text"])
-    command = ["colmap", "model_analyzer", "--path", str(tmp_path / "out" / "text")]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "Registered images: 4" in done.stdout + done.stderr
-    assert "Points: 60" in done.stdout + done.stderr
 
 
 @pytest.mark.usefixtures("model")

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import errno
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from command import Call
-from filelock import FileLock
 from h5_files import (
     PINHOLE,
     hloc_matches,
@@ -97,23 +94,6 @@ def test_export_and_import_give_the_same_database(
     assert new_keypoints.keys() == keypoints.keys()
     for name, columns in keypoints.items():
         assert_allclose(new_keypoints[name], columns, rtol=1e-6, atol=1e-6)
-
-
-def test_exported_folder_has_real_descriptors_of_32_bits_and_scales(
-    finished: tuple[Path, Path], targets: tuple[Path, Path]
-) -> None:
-    _, out = finished
-    export_h5(*targets, output_path=out)
-    with h5py.File(targets[0], "r") as new, h5py.File(out / "features.h5", "r") as own:
-        group, ours = new["side/č.png"], own["side/č.png"]
-        assert set(group) == {
-            "keypoints", "descriptors", "scores", "image_size", "lafs", "scales", "oris"
-        }  # fmt: skip
-        for name in ("keypoints", "descriptors", "scores", "lafs", "scales", "oris"):
-            assert group[name].dtype == np.float32
-            assert_array_equal(group[name][()], ours[name][()].astype(np.float32))
-        assert group["image_size"].dtype.kind == "i"
-    assert targets[0].read_bytes()[8] == 0  # libver "latest" would not be 0
 
 
 @pytest.mark.parametrize(("count", "dtype"), [(32_767, np.int16), (40_000, np.int32)])
@@ -210,7 +190,7 @@ def test_wrong_database_is_refused_and_no_half_file_stays(
     with pytest.raises(DatabaseError, match=r"range\.db: pairs with matches of keypoints that do"):
         export_h5(*targets, database_path=tmp_path / "range.db")
     make_database(tmp_path / "three.db", {"a.png": np.zeros((2, 3))}, {}).close()
-    with pytest.raises(DatabaseError, match=r"do not have 2, 4 or 6 columns \(a\.png"):
+    with pytest.raises(DatabaseError, match=r"do not have 2, 4 or 6 columns.* \(a\.png"):
         export_h5(*targets, database_path=tmp_path / "three.db")
     database = make_database(tmp_path / "rows.db", {"a.png": points(2)}, {})
     data = np.zeros((3, 128), np.uint8)
@@ -242,21 +222,6 @@ def test_export_overwrites_nothing_and_needs_one_source(
     made = export_h5(features.parent / "new" / "f.h5", matches, output_path=out)
     assert (features.parent / "new" / "f.h5").is_file()
     assert made.num_images == 4
-
-
-def test_folder_that_cannot_be_written_is_exported(
-    finished: tuple[Path, Path], targets: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, out = finished
-    acquire = FileLock.acquire
-
-    def refuse(lock: FileLock, *arguments: Any, **options: Any) -> Any:
-        if Path(lock.lock_file).parent == out:
-            raise OSError(errno.EROFS, "Read-only file system")
-        return acquire(lock, *arguments, **options)
-
-    monkeypatch.setattr(FileLock, "acquire", refuse)
-    assert export_h5(*targets, output_path=out).num_pairs == 6
 
 
 FULL_DISK = """

@@ -177,43 +177,6 @@ def test_database_of_any_program_is_mapped_in_a_copy(
     assert again.stages[0].num_done == 15
 
 
-def test_images_that_a_database_leaves_out_are_named_with_advice(tmp_path: Path) -> None:
-    synthesize(tmp_path / "any.db")
-    with open_database(tmp_path / "any.db") as database:
-        first = database.read_all_images()[0]
-        for other in database.read_all_images()[1:]:
-            database.delete_matches(first.image_id, other.image_id)
-            database.delete_inlier_matches(first.image_id, other.image_id)
-    report = colmap_affrect.map_from_database(tmp_path / "any.db", tmp_path / "out")
-    assert report.unregistered == {first.name: "no verified pair"}
-    assert report.advice[0].startswith("run --from-database, with --image-path")
-    assert report.advice[-1] == "more photographs that show the missing places"
-
-
-@pytest.mark.long
-def test_map_from_database_extends(tmp_path: Path) -> None:
-    names = synthesize(tmp_path / "any.db")
-    report = colmap_affrect.map_from_database(tmp_path / "any.db", tmp_path / "out")
-    model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
-    for frame_id in model.reg_frame_ids()[4:]:
-        model.deregister_frame(frame_id)
-    (tmp_path / "old").mkdir()
-    model.write(tmp_path / "old")
-    extend = colmap_affrect.Extension(tmp_path / "old")
-    report = colmap_affrect.map_from_database(tmp_path / "any.db", tmp_path / "e", extend=extend)
-    assert report.extended == tuple(registered(model))
-    assert report.added == tuple(sorted(set(names) - set(report.extended)))
-    assert "extended    4 were there, 2 came in" in report.summary()
-    assert report.to_mapping()["added"] == list(report.added)
-    own = colmap_affrect.Extension(tmp_path / "e" / "sparse" / "0")
-    with pytest.raises(OptionError, match="--overwrite would discard it"):
-        colmap_affrect.map_from_database(
-            tmp_path / "any.db", tmp_path / "e", extend=own, overwrite=True
-        )
-    again = colmap_affrect.map_from_database(tmp_path / "any.db", tmp_path / "e", extend=own)
-    assert (len(again.extended), again.added) == (len(names), ())
-
-
 def test_databases_that_cannot_be_mapped_are_one_clear_line(tmp_path: Path) -> None:
     path = tmp_path / "any.db"
     synthesize(path)

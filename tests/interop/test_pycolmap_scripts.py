@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
-import itertools
 import shutil
 import sys
 from pathlib import Path
@@ -20,8 +19,7 @@ import colmap_affrect
 from colmap_affrect import pycolmap as replaced
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import image_ids, open_database
-from colmap_affrect.errors import AffrectError, DeviceError, OptionError
-from colmap_affrect.interop import pycolmap_api
+from colmap_affrect.errors import AffrectError, OptionError
 from colmap_affrect.interop.pycolmap_options import (
     HONOURED,
     changes,
@@ -76,28 +74,6 @@ def test_panorama_script_of_pycolmap_registers_all_images(tmp_path: Path, matche
     assert models[0].num_reg_frames() == 3
     equirectangular = pycolmap.Reconstruction(tmp_path / "out/sparse_equirectangular/0")
     assert equirectangular.num_reg_images() == 3
-
-
-@pytest.mark.long
-def test_script_with_callbacks_runs_on(photos: Path, tmp_path: Path) -> None:
-    database_path, sfm_path = tmp_path / "database.db", tmp_path / "sfm"
-    from colmap_affrect.pycolmap import logging
-
-    assert logging is pycolmap.logging
-    replaced.set_random_seed(0)
-    replaced.extract_features(str(database_path), str(photos))
-    replaced.match_exhaustive(str(database_path))
-    with replaced.Database.open(str(database_path)) as database:
-        assert database.num_images() == len(NAMES)
-    sfm_path.mkdir()
-    steps: list[int] = []
-    models = replaced.incremental_mapping(
-        str(database_path), str(photos), str(sfm_path),
-        initial_image_pair_callback=lambda: steps.append(2),
-        next_image_callback=lambda: steps.append(1),
-    )  # fmt: skip
-    assert sum(steps) == len(NAMES)
-    assert models[0].num_reg_images() == len(NAMES)
 
 
 @pytest.mark.parametrize(
@@ -217,27 +193,6 @@ def test_pairs_of_a_list_are_verified(extracted: Path, tmp_path: Path) -> None:
         replaced.verify_matches(extracted, listed, None, token)
 
 
-def test_frames_of_a_rig_are_verified_together_and_not_matched_within(tmp_path: Path) -> None:
-    path = tmp_path / "a.db"
-    pycolmap.set_random_seed(5)
-    options = pycolmap.SyntheticDatasetOptions(
-        num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=2, num_points3D=100,
-        camera_has_prior_focal_length=True,
-    )  # fmt: skip
-    with open_database(path) as database:
-        pycolmap.synthesize_dataset(options, database)
-        frames = {image.name: image.frame_id for image in database.read_all_images()}
-    pairs = list(itertools.combinations(frames, 2))
-    kept = pycolmap_api._of_different_frames(path, pairs)
-    assert len(pairs) == 6
-    assert kept == [pair for pair in pairs if frames[pair[0]] != frames[pair[1]]]
-    pycolmap_api._verify_rigs(path, colmap_affrect.VerificationOptions(), None)
-    of_rig = int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED_RIG)
-    with open_database(path) as database:
-        found = [int(geometry.config) for geometry in database.read_two_view_geometries()[1]]
-    assert found.count(of_rig) == len(kept) == 4
-
-
 @pytest.mark.long
 def test_cancelled_token_stops_and_what_is_done_is_kept(photos: Path, tmp_path: Path) -> None:
     class Cancelling(Progress):
@@ -257,26 +212,6 @@ def test_cancelled_token_stops_and_what_is_done_is_kept(photos: Path, tmp_path: 
     assert (report.num_done, report.num_kept) == (len(NAMES) - 1, 1)
     with pytest.raises(InterruptedError):
         replaced.match_exhaustive(path, cancellation_token=token)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("options", "device", "message"),
-    [
-        ({}, "cuda", "finds no CUDA device"),
-        ({"gpu_index": "0"}, pycolmap.Device.cuda, "--device cuda:0: torch finds no CUDA device"),
-        ({"gpu_index": "0,1"}, "cuda", "gpu_index=0,1: give the number of one GPU"),
-    ],
-)
-def test_gpu_that_is_not_there_is_refused(
-    extracted: Path, options: dict[str, Any], device: Any, message: str
-) -> None:
-    import torch
-
-    if torch.cuda.is_available():
-        pytest.skip("there is a GPU")
-    with pytest.raises((DeviceError, OptionError), match=message):
-        replaced.match_exhaustive(extracted, options, device=device)
 
 
 def test_names_of_pycolmap_say_what_replaces_them() -> None:

@@ -10,7 +10,7 @@ import pytest
 from mapping_tasks import task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.verification import inlier_matches
 from colmap_affrect.geometry.parallax import mirrored_share

@@ -12,7 +12,7 @@ import pytest
 from mapping_tasks import WHOLE, task_with_given_cameras
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import CameraRecord
+from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.mappers import adjustment
 from colmap_affrect.mappers.adjustment import (

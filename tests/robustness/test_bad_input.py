@@ -10,7 +10,7 @@ from command import FAST, Call
 from small_scene import photograph, write_photographs
 from synthetic import write_image
 
-from colmap_affrect.colmap.given_cameras import read_given_cameras
+from colmap_affrect.colmap.cameras import read_given_cameras
 from colmap_affrect.errors import OptionError, StoreError
 from colmap_affrect.images.photographs import CameraOptions, list_images
 from colmap_affrect.pairs.lists import read_pairs

@@ -15,8 +15,8 @@ from small_scene import write_photographs
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database_copy import read_names
-from colmap_affrect.doctor.database import examine_database
 from colmap_affrect.doctor.findings import Findings
+from colmap_affrect.doctor.folder import examine_database
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.interop.pycolmap_api import extract_features
 from colmap_affrect.progress import SILENT

@@ -17,7 +17,7 @@ from results import database_content, hdf5_content
 from small_scene import IMAGE_SIZE, INTRINSICS, NAMES
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.camera_records import read_camera_records
+from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import image_ids, open_database
 from colmap_affrect.colmap.verification import VerificationOptions
 from colmap_affrect.errors import DatabaseError

@@ -1,15 +1,132 @@
-"""Cameras that the user gives: by options, in a COLMAP model, or in a table by image name."""
+"""Cameras: what the user gives, and what is known of them and from where.
+
+They are given by options, in a COLMAP model, or in a table by image name. COLMAP's database has one
+flag for a focal length, that somebody knows it; ``cameras.json`` beside it says who.
+"""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import TypeAdapter
 
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.model_files import camera_like, read_given_model
-from colmap_affrect.errors import OptionError
+from colmap_affrect.errors import OptionError, WorkspaceError, damage, made_again, such_as
 from colmap_affrect.images.photographs import CameraOptions
+from colmap_affrect.project.atomic_files import replace_text
+from colmap_affrect.project.checked_json import with_checksum, without_checksum
+from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.tables import read_lines, read_table
+
+Source = Literal["given", "exif", "exif-rescaled", "pairs", "guess"]
+"""By the user; by EXIF as it is, or scaled to a photograph that was shrunk; by the votes of
+verified pairs; or COLMAP's usual guess."""
+
+Given = Literal["focal", "principal-point", "distortion"]
+"""Parts of intrinsics; a model without distortion counts as given once its focal length is."""
+
+TRUSTED: tuple[Source, ...] = ("given", "exif", "exif-rescaled")
+"""Sources whose focal lengths are priors before any pair has been verified."""
+
+MAX_LINES = 5  # groups of cameras that are logged
+
+
+@dataclass(frozen=True)
+class CameraRecord:
+    """One camera of the database.
+
+    Attributes:
+        names: of its images, sorted.
+        source: of the focal length.
+        focal_px: in px of the stored file; the mean of two.
+        low_px: lower end of what the focal length may be, None where nothing says so.
+        high_px: upper end.
+        why: what was decided and for what reason, one clause.
+        size: (width, height) of its images in px.
+        given: what of the intrinsics is the user's, to be left as it is.
+        may_be_shared: the pairs do not tell whether other such images of this size have the same
+            camera.
+        is_contradicted: whether the verified pairs contradict a focal length that the user gave;
+            None before they have been asked.
+    """
+
+    names: tuple[str, ...]
+    source: Source
+    focal_px: float
+    low_px: float | None = None
+    high_px: float | None = None
+    why: str = ""
+    size: tuple[int, int] = (0, 0)
+    given: tuple[Given, ...] = ()
+    may_be_shared: bool = False
+    is_contradicted: bool | None = None
+
+    def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
+        """Return the entry of ``report.json``, with the focal length that a model ended with."""
+        longer = max(self.size)
+        used = next((name for name in self.names if model and name in model.focals_px), None)
+        has_spread = self.low_px is not None and self.high_px is not None
+        return {
+            "id": camera_id,
+            "num_images": len(self.names),
+            "names": list(self.names),
+            "source": self.source,
+            "focal_px": self.focal_px,
+            "focal_longer_sides": self.focal_px / longer if longer else None,
+            "refined_px": model.focals_px[used] if model and used else None,
+            "rival_px": model.rival_focals_px.get(used) if model and used else None,
+            "spread_px": [self.low_px, self.high_px] if has_spread else None,
+            "why": self.why,
+        }
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether nothing of the intrinsics that mapping would refine is free."""
+        return {"focal", "distortion"} <= set(self.given)
+
+
+_RECORDS = TypeAdapter(dict[int, CameraRecord])
+
+
+def read_camera_records(path: Path) -> dict[int, CameraRecord]:
+    """Return the records by camera id; none without the file, WorkspaceError if it is damaged."""
+    with damage(path, made_again("verify", path.parent), WorkspaceError):
+        if not path.exists():
+            return {}
+        return _RECORDS.validate_json(without_checksum(path.read_bytes()))
+
+
+def write_camera_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
+    """Replace the file as a whole."""
+    content = _RECORDS.dump_json(dict(sorted(records.items())), indent=1)
+    replace_text(path, with_checksum(content.decode()))
+
+
+def notable_lines(records: Iterable[CameraRecord]) -> list[str]:
+    """Return a line for cameras of one source and story, at most a few; none for those without."""
+    groups = defaultdict(list)
+    for record in records:
+        if record.why:
+            groups[record.source, record.why].append(record)
+    lines = [_line(same) for same in groups.values()]
+    more = len(lines) - MAX_LINES
+    return lines if more <= 1 else [*lines[:MAX_LINES], f"and {more} more, see report.json"]
+
+
+def _line(records: Sequence[CameraRecord]) -> str:
+    """Say what was decided for cameras of one source and story."""
+    names = [name for record in records for name in record.names]
+    first, spread = records[0], ""
+    if len(records) == 1 and first.low_px and first.high_px:
+        spread = f" ({first.low_px:.0f} to {first.high_px:.0f})"
+    focals = sorted({round(record.focal_px) for record in records})
+    focal = f"{focals[0]}" if len(focals) == 1 else f"{focals[0]} to {focals[-1]}"
+    return f"{such_as(names)}: focal length {focal} px{spread}, {first.source}: {first.why}"
+
 
 WIDTHS = ("sensor_width_mm", "plate_width_mm")
 CENTER = ("cx", "cy")
@@ -175,8 +292,8 @@ def _read_table(path: Path, others: GivenCamera) -> dict[str, GivenCamera]:
 def _read_row(row: Mapping[str, str], others: GivenCamera, where: str) -> GivenCamera:
     """Return the camera of a row; what it says nothing of is as in the options."""
     _refuse_contradictions(row, where)
-    focal_px, focal_mm, *widths = (_positive(row, column, where) for column in COLUMNS[4:8])
-    center = tuple(_coordinate(row, column, where) for column in CENTER if column in row)
+    focal_px, focal_mm, *widths = (_number(row, column, where) for column in COLUMNS[4:8])
+    center = tuple(_number(row, column, where) for column in CENTER if column in row)
     model = row.get("model", others.model)
     _require_model(model, f"{where}: model")
     params = _numbers(row.get("params", ""), f"{where}: params")
@@ -211,17 +328,14 @@ def _refuse_contradictions(row: Mapping[str, str], where: str) -> None:
         raise OptionError(f"{where}: give both cx and cy, or none")
 
 
-def _positive(row: Mapping[str, str], column: str, where: str) -> float:
-    values = _numbers(row.get(column, ""), f"{where}: {column}")
-    if column in row and (len(values) != 1 or values[0] <= 0.0):
-        raise OptionError(f"{where}: {column} {row[column]}: not a positive number")
-    return values[0] if values else 0.0
-
-
-def _coordinate(row: Mapping[str, str], column: str, where: str) -> float:
+def _number(row: Mapping[str, str], column: str, where: str) -> float:
+    """Return a number, which is positive unless it is a coordinate; 0 where there is none."""
+    if column not in row:
+        return 0.0
     values = _numbers(row[column], f"{where}: {column}")
-    if len(values) != 1:
-        raise OptionError(f"{where}: cx and cy must be one number each")
+    if len(values) != 1 or (values[0] <= 0.0 and column not in CENTER):
+        kind = "number" if column in CENTER else "positive number"
+        raise OptionError(f"{where}: {column} {row[column]}: not a {kind}")
     return values[0]
 
 
