@@ -189,16 +189,9 @@ def remedy(path: Path) -> str:
     return f"{first}run: colmap-affrect weights fetch {key}{folder}"
 
 
-def digests(files: Mapping[str, Path], recorded: Iterable[str] | None = None) -> dict[str, str]:
-    """Return the sha256 of files by key, for records.
-
-    Of what a record already has digests of (``recorded``) only these are returned; where an older
-    version recorded a file by its name, by that name.
-    """
-    names = {key: key for key in files}
-    if recorded is not None:
-        names = {_key_of(name): name for name in recorded}
-    return {names[key]: file_sha256(path) for key, path in files.items() if key in names}
+def digests(files: Mapping[str, Path]) -> dict[str, str]:
+    """Return the sha256 of files by key, for records."""
+    return {key: file_sha256(path) for key, path in files.items()}
 
 
 def file_sha256(path: Path) -> str:

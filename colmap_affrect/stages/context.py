@@ -5,10 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from colmap_affrect.errors import WeightsError
-from colmap_affrect.features.weights import digests, file_sha256
+from colmap_affrect.features.weights import file_sha256
 from colmap_affrect.parallel.executor import Executor
 from colmap_affrect.progress import SILENT, Progress
-from colmap_affrect.project.differences import WEIGHTS
 from colmap_affrect.project.stores import FeatureStore, GuidedStore, MatchStore
 from colmap_affrect.project.workspace import Workspace
 
@@ -44,19 +43,6 @@ def require_same_files(weights: Mapping[str, Path], digests: Mapping[str, str]) 
                 f"{path}: is another file than {key} on the machine that leads the work; give "
                 "both the same"
             )
-
-
-def digests_to_record(
-    workspace: Workspace, stage: str, weights: Mapping[str, Path], *, overwrite: bool
-) -> dict[str, str]:
-    """Return the sha256 of weights by key, for the record of a stage.
-
-    Those of a stage that has begun are named as there, where older versions had names of files and,
-    of recipes that escalate, no matchers but the first.
-    """
-    record = workspace.recorded()
-    has_begun = stage in record.get("begun", []) and not overwrite
-    return digests(weights, record[stage].get(WEIGHTS, {}) if has_begun else None)
 
 
 @dataclass(frozen=True)

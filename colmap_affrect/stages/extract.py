@@ -13,6 +13,7 @@ from colmap_affrect.colmap.checks import FATAL_FOR_IMAGES, refuse_unusable
 from colmap_affrect.colmap.database_copy import copy_without_features
 from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.errors import ClusterError, DatabaseError, ImageError, OptionError
+from colmap_affrect.features.weights import digests as digests_of
 from colmap_affrect.images.photographs import checked_names, left_out, not_named
 from colmap_affrect.options import Options
 from colmap_affrect.parallel.executor import Threads
@@ -27,7 +28,7 @@ from colmap_affrect.stages.changes import (
     refuse_changed,
     refuse_other_photographs,
 )
-from colmap_affrect.stages.context import Context, digests_to_record
+from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.one_image import (
     ExtractedImage,
@@ -123,7 +124,7 @@ def _record(
     *,
     overwrite: bool,
 ) -> None:
-    weights = digests_to_record(workspace, "extract", extractor.weights, overwrite=overwrite)
+    weights = digests_of(extractor.weights)
     planned: dict[str, Options] = {"match": recipe.matching, "guide": recipe.guided}
     if recipe.extraction.escalation:
         planned["escalate"] = recipe.escalate

@@ -10,7 +10,7 @@ import numpy as np
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.errors import OptionError
-from colmap_affrect.features.weights import resolve
+from colmap_affrect.features.weights import digests, resolve
 from colmap_affrect.matchers.base import MATCHERS, MatcherContext, MatcherOptions
 from colmap_affrect.pairs.base import Pair, PairList
 from colmap_affrect.project.contents import sha256_of
@@ -18,7 +18,7 @@ from colmap_affrect.project.differences import WEIGHTS
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.stores import PairMatches
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.context import Context, digests_to_record
+from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.extract import write_images_and_keypoints
 from colmap_affrect.stages.inputs import recorded_extraction
 from colmap_affrect.stages.one_pair import Matching, iterate_matches
@@ -56,8 +56,7 @@ def match(
         other = "other features than those here take 'run' with another --output-path"
         raise OptionError(f"{error}; {other}") from error
     weights = load_matchers(context, extraction.matchers(options))
-    digests = digests_to_record(workspace, "match", weights, overwrite=overwrite)
-    record = options.to_mapping() | ({WEIGHTS: digests} if digests else {})
+    record = options.to_mapping() | ({WEIGHTS: digests(weights)} if weights else {})
     workspace.record_options("match", record, overwrite=overwrite)
     matches, digest = context.matches, sha256_of(context.workspace.pairs)
     finished = matches.finished_list()

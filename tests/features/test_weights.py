@@ -25,7 +25,6 @@ from colmap_affrect.features.weights import (
     WEIGHT_FILES,
     cache_folder,
     describe_weights,
-    digests,
     fetch,
     load_state_dict,
     resolve,
@@ -296,17 +295,6 @@ def test_file_that_is_not_the_published_one_is_used_and_told_of_once(
     assert [line.split()[0] for line in shown.splitlines() if line[0] != " "] == ["affnet", "mkd"]
     result = call("weights", "list", "afnet")
     assert (result.code, "unknown weights 'afnet'" in result.stderr[-1]) == (2, True)
-
-
-def test_digests_are_named_as_in_the_record_that_they_continue(tmp_path: Path) -> None:
-    files = {key: tmp_path / key for key in ("disk", "xfeat")}
-    for key, path in files.items():
-        path.write_bytes(key.encode())
-    disk, xfeat = (hashlib.sha256(key.encode()).hexdigest() for key in files)
-    assert digests(files) == {"disk": disk, "xfeat": xfeat}
-    assert digests(files, ["depth-save.pth"]) == {"depth-save.pth": disk}  # of older versions
-    assert digests(files, ["xfeat", "disk"]) == {"disk": disk, "xfeat": xfeat}
-    assert digests(files, {}) == {}
 
 
 @pytest.mark.parametrize(

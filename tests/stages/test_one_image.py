@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import pickle
 import re
 import shutil
@@ -27,7 +26,7 @@ from colmap_affrect.project.stores import FeatureStore
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions, load_recipe
 from colmap_affrect.stages import one_image
-from colmap_affrect.stages.context import Context, Resources, digests_to_record
+from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.one_image import num_images_at_once, prepare
@@ -226,22 +225,6 @@ def test_extractor_in_another_process_refuses_other_weights(
     found["affnet"].write_bytes(b"of another release")
     with pytest.raises(WeightsError, match=r"AffNet\.pth: is another file than affnet on the"):
         pickle.loads(pickled)
-
-
-def test_digests_continue_the_record_of_an_older_version(tmp_path: Path) -> None:
-    here = tmp_path / "here"
-    workspace, files = Workspace(tmp_path / "out"), {"affnet": here, "disk": here}
-    files["disk"].write_bytes(b"content")
-    digest = hashlib.sha256(b"content").hexdigest()
-    assert digests_to_record(workspace, "extract", files, overwrite=False) == {
-        "affnet": digest,
-        "disk": digest,
-    }
-    old = {"AffNet.pth": digest}  # names of files, and not all
-    with workspace.locked():
-        workspace.record_options("extract", {"weights": old})
-    assert digests_to_record(workspace, "extract", files, overwrite=False) == old
-    assert list(digests_to_record(workspace, "extract", files, overwrite=True)) == list(files)
 
 
 class ColorOptions(FeatureOptions):
