@@ -74,14 +74,6 @@ def centered_network(seed: int = 0) -> LAFAffNetShapeEstimator:
     return calibrated(network)
 
 
-def constant_network(outputs: list[float]) -> LAFAffNetShapeEstimator:
-    """A network that has the same three outputs everywhere."""
-    network = random_network()
-    network.features[-3].weight.data.zero_()
-    network.features[-3].bias.data = torch.tensor(outputs).atanh()
-    return network
-
-
 def source(
     network: LAFAffNetShapeEstimator,
     detect: Callable[[GrayImage], LocalFeatures] = no_keypoints,
@@ -178,20 +170,6 @@ def test_paper_grid_has_global_normalisation_and_replicated_borders(
     assert_array_equal(grid.metrics[:4], np.broadcast_to(grid.metrics[4], grid.metrics[:4].shape))
     last = grid.metrics[:, -4:]
     assert_array_equal(last[:, 1:], np.broadcast_to(last[:, :1], last[:, 1:].shape))
-
-
-def test_shapes_of_known_outputs_are_those_of_the_formula(image: GrayImage) -> None:
-    o0, o1, o2 = 0.4, -0.3, -0.2
-    a, c, d = 1 + o0, o1, 1 + o2
-    cosh = (a**2 + c**2 + d**2) / (2 * a * d)
-    expected_tilt = cosh + np.sqrt(cosh**2 - 1)
-    expected_angle = np.mod(0.5 * np.arctan2(2 * a * c, c**2 + d**2 - a**2), np.pi)
-    for options in ({"min_deviation": 0.0}, {"paper": True}):
-        tilts, angles = tilts_from_metrics(
-            source(constant_network([o0, o1, o2]), **options).grid(image).metrics
-        )
-        assert_allclose(tilts, expected_tilt, rtol=SINGLE)
-        assert_allclose(angles, expected_angle, rtol=SINGLE)
 
 
 @pytest.mark.parametrize("paper", [False, True])

@@ -96,13 +96,6 @@ def test_dog_of_a_round_blob_gives_one_upright_circle_of_six_sigma() -> None:
     assert_allclose(found.lafs[0, :, :2], found.scales[0] * np.eye(2), rtol=1e-12)
 
 
-def test_rootsift_keeps_every_orientation_of_one_location() -> None:
-    # A round blob has a flat histogram of directions, hence several peaks.
-    features = rootsift(blobs((121, 101), [[60.0, 50.0]], 6.0 * np.eye(2)))
-    near = np.linalg.norm(features.keypoints - [60.0, 50.0], axis=1) < 0.5
-    assert np.count_nonzero(near) >= 2
-
-
 def test_descriptors_are_roots_of_shares_of_those_of_opencv(image: GrayImage) -> None:
     sift = cv2.SIFT.create(contrastThreshold=0.013, enable_precise_upscale=True)
     keypoints, rows = sift.detectAndCompute(image, None)
