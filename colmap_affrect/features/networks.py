@@ -26,7 +26,6 @@ from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
 from colmap_affrect.geometry.arrays import Array, Floats, Indices, Singles
 from colmap_affrect.images.warping import halved
-from colmap_affrect.shown import such_as
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -210,7 +209,8 @@ def _with_state(network: Network, state: Mapping[str, Any], path: Path, name: st
         if given.get(key, kind) != kind
     ]
     if problems:
-        raise unusable(path, f"not the weights of {name} ({such_as(problems, 1)})")
+        more = f" and {len(problems) - 1} more" * (len(problems) > 1)
+        raise unusable(path, f"not the weights of {name} ({problems[0]}{more})")
     network.load_state_dict(state, strict=False)
     return network
 
