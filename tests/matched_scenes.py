@@ -57,15 +57,6 @@ def views_around(focals: Iterable[float], rng: np.random.Generator) -> list[View
     return views
 
 
-def views_from_one_place(focals: Iterable[float], rng: np.random.Generator) -> list[View]:
-    """Return views that a panorama is made of."""
-    target = np.array([0.0, 0.0, 4.0])
-    return [
-        looking(focal, np.zeros(3), target + rng.uniform(-0.5, 0.5, 3), rng.uniform(-0.2, 0.2))
-        for focal in focals
-    ]
-
-
 def in_a_box(num: int, rng: np.random.Generator) -> Array:
     """Return (N, 3) points about the origin."""
     return rng.uniform(-1.0, 1.0, (num, 3)) * [1.0, 0.8, 0.9]

@@ -76,11 +76,3 @@ def png_of_size(width: int, height: int) -> bytes:
     """A PNG that claims to have a size; what follows the header is missing."""
     header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", 0)
-
-
-def jpeg_with_orientation(image: GrayImage, orientation: int) -> bytes:
-    """JPEG whose EXIF segment holds nothing but the orientation tag."""
-    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
-    entry = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
-    segment = b"Exif\x00\x00II*\x00" + struct.pack("<IH", 8, 1) + entry + bytes(4)
-    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]

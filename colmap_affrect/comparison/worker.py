@@ -215,27 +215,12 @@ def _seed_result(task: MethodTask, seed: int, folder: Path, progress: "_Reported
     with watch.step("map"):
         if task.method.recipe:
             guide(context)
-<<<<<<< HEAD
             _, models = map_images(context, mapper)
-    else:
-        num_pairs = len(unverified_pairs(database_path))
-        with watch.step("verify"), told.stage("verify", num_pairs, "pairs") as advance:
-            verify(database_path, options, advance=advance)
-            workspace = Workspace(folder)
-            shutil.copy(task.layout.cameras, workspace.cameras)
-            _vote(task, workspace, options)
-        with watch.step("map"), told.stage("map", len(names), "images") as advance:
-            records = read_camera_records(workspace.cameras)
-            mapping = MappingTask(database_path, task.image_path, cameras=records)
-            models = map_database(mapper, mapping, folder / "sparse", advance)
-=======
-            _, models = map_guided(context, mapper)
         else:
             with told.stage("map", len(names), "images") as advance:
                 records = read_camera_records(workspace.cameras)
                 mapping = MappingTask(database_path, task.image_path, cameras=records)
                 models = map_database(mapper, mapping, folder / "sparse", advance)
->>>>>>> col-rec
     largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
     model_path = folder / "sparse" / "0" if models else None
     model = pycolmap.Reconstruction(model_path) if model_path else pycolmap.Reconstruction()

@@ -1,43 +1,4 @@
-"""Layouts of datasets: EVD, SVP and IMC as the paper has them, and any pairs.
-
-``evd``: ``1/NAME.png``, ``2/NAME.png``, ``h/NAME.txt`` (any image suffix), or Oxford's sequences,
-``NAME_1.png``, ``NAME_2.png``, ``H_NAME_1_2.txt``, ... with homographies of pixel-centre px.
-
-``svp`` (Strong ViewPoint Changes, Toft et al., 2020), a scene or a folder of scenes::
-
-    images/                   photographs
-    <scene>_image_pairs.txt   lines "IMAGE1 IMAGE2 DIFFICULTY", the last from the poses, not read
-    0/images.txt              poses, COLMAP's text, with or without the lines of points
-    0/cameras.txt             cameras, COLMAP's text
-
-``imc`` (Image Matching Challenge), a folder ``set_100/`` in a scene or in a folder of scenes::
-
-    images/<image>.jpg
-    calibration/calibration_<image>.h5   K (3 x 3), R (3 x 3), T (3): x_camera = R x + T
-    new-vis-pairs/keys-th-0.<k>.npy      names "<image 1>-<image 2>" with covisibility >= 0.<k>
-
-Its lists are cumulative; the categories are their differences, from 0.1 on, as in the paper, or
-from 0.0 where there is such a list. K is COLMAP's: the origin is the corner of the image. Images of
-scenes, and their depth maps, are known by ``<scene>/<name as its file>``.
-
-``pairs``, ``pairs.json`` beside the images::
-
-    {"pixel_origin": "center",
-     "pairs": [
-       {"image1": "a.png", "image2": "b.png", "homography": [[1, 0, 5], [0, 1, 0], [0, 0, 1]]},
-       {"image1": "c.png", "image2": "d.png", "correspondences": [[490.7, 39.2, 462.2, 18.7]],
-        "name": "cafe", "category": "indoors"},
-       {"image1": "e.png", "image2": "f.png",
-        "relative_pose": {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "translation": [1, 0, 0],
-                          "intrinsics1": [[500, 0, 320], [0, 500, 240], [0, 0, 1]],
-                          "intrinsics2": [[500, 0, 320], [0, 500, 240], [0, 0, 1]]}}]}
-
-Each pair has one of the three: a homography, image2_from_image1; correspondences, rows x1, y1, x2,
-y2 (both may also be the name of a text file of numbers); or a relative pose of undistorted images,
-x_camera2 = R x_camera1 + t. ``name`` (by default that of the images), ``category`` and
-``pixel_origin`` may be left out: ``center`` when (0, 0) is the centre of the first pixel (default),
-``corner`` when it is its corner.
-"""
+"""Layouts of datasets, as docs/own-evaluation-set.md has them: EVD, SVP, IMC, and any pairs."""
 
 import json
 import re
@@ -305,7 +266,7 @@ def load_pairs(folder: Path) -> Dataset:
         raise EvaluationError(str(error)) from error
     except (OSError, ValueError, RecursionError, LookupError, TypeError) as error:
         raise EvaluationError(
-            f"{path}: cannot be read ({error!r}); its format is that of the module {__name__}"
+            f"{path}: cannot be read ({error!r}); its format is in docs/own-evaluation-set.md"
         ) from error
     names = [entry.name for entry in entries]
     if twice := [name for name in names if names.count(name) > 1]:

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import affine_grid, grid_sample
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from colmap_affrect.errors import DeviceError, OptionError, such_as
+from colmap_affrect.errors import DeviceError, OptionError
 from colmap_affrect.features.base import PATCH_SIZE_PX
 from colmap_affrect.features.weights import load_state_dict, unusable
 from colmap_affrect.geometry.affine import determinants
@@ -209,7 +209,8 @@ def _with_state(network: Network, state: Mapping[str, Any], path: Path, name: st
         if given.get(key, kind) != kind
     ]
     if problems:
-        raise unusable(path, f"not the weights of {name} ({such_as(problems, 1)})")
+        more = f" and {len(problems) - 1} more" * (len(problems) > 1)
+        raise unusable(path, f"not the weights of {name} ({problems[0]}{more})")
     network.load_state_dict(state, strict=False)
     return network
 

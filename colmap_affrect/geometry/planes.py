@@ -21,7 +21,6 @@ MIN_WEIGHT_FRAC = 0.5
 cannot carry a plane, a corner of the map 0.562."""
 
 MAX_SLANT_COS = np.cos(np.deg2rad(85.0))  # steeper neighbours are on another surface
-SAME_AXIS_COS = np.cos(np.deg2rad(45.0))  # normals so near to a line have one axis
 
 SPIRAL_STEP = 3.6
 
@@ -121,8 +120,6 @@ def cluster_normals(
     min_separation_rad: float,
     max_num_planes: int,
     min_votes_frac: float,
-    orthogonal: bool = False,
-    antipodal: bool = False,
 ) -> PlaneClusters:
     """Choose directions that most (h, w, 3) normals share, then give each normal to the nearest.
 
@@ -132,58 +129,27 @@ def cluster_normals(
     taken away, and the others vote again (the authors counted once).
 
     Normals (unit, NaN where unknown) at most ``bin_angle_rad`` from a direction belong to it, which
-    needs ``min_votes_frac`` of all h w pixels; ``orthogonal`` ones are :func:`orthogonalized`.
-    ``antipodal`` counts opposite normals as one direction, with the sign of the most of them.
+    needs ``min_votes_frac`` of all h w pixels.
     """
     known = ~np.isnan(normals).any(axis=-1)
     waiting = np.asarray(normals[known], dtype=np.float32)
     candidates = spiral_points(num_candidates)
     bin_cos, separation_cos = float(np.cos(bin_angle_rad)), float(np.cos(min_separation_rad))
-    votes = _votes(candidates, waiting, bin_cos, antipodal)
+    votes = _votes(candidates, waiting, bin_cos)
     centers = np.zeros((0, 3))
     while len(centers) < max_num_planes:
-        far = _cosines(candidates, centers, antipodal).max(axis=1, initial=-1.0) <= separation_cos
+        far = (candidates @ centers.T).max(axis=1, initial=-1.0) <= separation_cos
         best = int(np.argmax(np.where(far, votes, 0)))
         if not far[best] or votes[best] < max(min_votes_frac * known.size, 1):
             break
-        center = _mean_near(candidates[best], waiting, bin_cos, antipodal)
+        center = _mean_near(candidates[best], waiting, bin_cos)
         centers = np.concatenate([centers, center[None]])
-        taken = _cosines(waiting, center[None], antipodal)[:, 0] >= bin_cos
-        votes -= _votes(candidates, waiting[taken], bin_cos, antipodal)
+        taken = _cosines(waiting, center[None])[:, 0] >= bin_cos
+        votes -= _votes(candidates, waiting[taken], bin_cos)
         waiting = waiting[~taken]
-    if orthogonal:
-        centers = orthogonalized(centers)
     labels = np.full(known.shape, -1, dtype=np.int32)
-    labels[known] = _nearest(normals[known], centers, bin_cos, antipodal)
+    labels[known] = _nearest(normals[known], centers, bin_cos)
     return PlaneClusters(centers, labels)
-
-
-def orthogonalized(normals: Floats) -> Array:
-    """Return the nearest set of unit normals that are pairwise orthogonal or opposite.
-
-    Nearest in the sum of squared differences: the polar factor of the matrix of axes. Normals, all
-    (K, 3), within 45 degrees of one line share its axis, as the two sides of a street do. In three
-    dimensions there are three axes: later normals that fit to none are returned as they are.
-    """
-    result = np.array(normals, dtype=np.float64)
-    axes = np.zeros((0, 3))
-    members: list[tuple[int, int, float]] = []
-    for index, normal in enumerate(result):
-        cosines = axes @ normal / np.linalg.norm(axes, axis=1)
-        axis = int(np.argmax(np.abs(cosines))) if len(axes) else 0
-        if len(axes) and abs(cosines[axis]) >= SAME_AXIS_COS:
-            sign = float(np.sign(cosines[axis]))
-            axes[axis] += sign * normal
-        elif len(axes) < 3:
-            axis, sign = len(axes), 1.0
-            axes = np.concatenate([axes, normal[None]])
-        else:
-            continue
-        members.append((index, axis, sign))
-    left, _, right = np.linalg.svd(axes, full_matrices=False)
-    for index, axis, sign in members:
-        result[index] = sign * (left @ right)[axis]
-    return result
 
 
 def fronto_parallel_homography(normal: Floats, camera_matrix: Floats) -> Array:
@@ -210,34 +176,26 @@ def viewing_cosines(normal: Floats, camera_matrix: Floats, size: tuple[int, int]
     return np.asarray(towards / np.sqrt(x * x + y * y + z * z))
 
 
-def _cosines(directions: Floats, centers: Floats, antipodal: bool) -> Floats:
-    """Return (N, K) cosines of the angles between directions, or between lines."""
-    cosines = directions @ centers.T.astype(directions.dtype)
-    return np.asarray(np.abs(cosines) if antipodal else cosines)
+def _cosines(directions: Floats, centers: Floats) -> Floats:
+    return np.asarray(directions @ centers.T.astype(directions.dtype))
 
 
-def _votes(candidates: Array, normals: Floats, bin_cos: float, antipodal: bool) -> Indices:
+def _votes(candidates: Array, normals: Floats, bin_cos: float) -> Indices:
     by_axis = np.asfortranarray(normals)  # several times faster than rows of three
-    return np.array(
-        [
-            np.count_nonzero(_cosines(by_axis, candidate[None], antipodal) >= bin_cos)
-            for candidate in candidates
-        ]
-    )
+    counts = [np.count_nonzero(_cosines(by_axis, each[None]) >= bin_cos) for each in candidates]
+    return np.array(counts)
 
 
-def _mean_near(center: Array, normals: Floats, bin_cos: float, antipodal: bool) -> Array:
-    """Return the unit mean of the normals near a direction, with the sign of the most of them."""
-    cosines = normals @ center.astype(normals.dtype)
-    near = (np.abs(cosines) if antipodal else cosines) >= bin_cos
-    signs = np.sign(cosines[near])
-    mean = signs @ normals[near].astype(np.float64) * (1.0 if signs.sum() >= 0 else -1.0)
+def _mean_near(center: Array, normals: Floats, bin_cos: float) -> Array:
+    """Return the unit mean of the normals near a direction."""
+    near = normals @ center.astype(normals.dtype) >= bin_cos
+    mean = np.ones(near.sum()) @ normals[near].astype(np.float64)
     return np.asarray(mean / np.linalg.norm(mean))
 
 
-def _nearest(normals: Floats, centers: Array, bin_cos: float, antipodal: bool) -> NDArray[np.int32]:
+def _nearest(normals: Floats, centers: Array, bin_cos: float) -> NDArray[np.int32]:
     if not len(centers):
         return np.full(len(normals), -1, dtype=np.int32)
-    cosines = _cosines(normals, centers, antipodal)
+    cosines = _cosines(normals, centers)
     near = cosines.max(axis=1) >= bin_cos
     return np.where(near, cosines.argmax(axis=1), -1).astype(np.int32)

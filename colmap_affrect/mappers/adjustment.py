@@ -13,12 +13,8 @@ from typing import Any
 import numpy as np
 
 from colmap_affrect.colmap import pycolmap
-<<<<<<< HEAD
 from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
 from colmap_affrect.colmap.model_files import num_long_tracks
-=======
-from colmap_affrect.colmap.cameras import TRUSTED, CameraRecord
->>>>>>> col-rec
 from colmap_affrect.errors import MappingError
 
 USUAL_FOCAL = 1.15  # longer sides: the median of usual lenses, which are of 25 to 70 mm on film

@@ -28,7 +28,6 @@ CODE_STEP = 1.0 / 250  # of 8-bit similarities: negative ones become 0, errors e
 SIZE_MULTIPLE = 256
 """Both factors of a product are padded to a multiple of it: oneDNN prepares and keeps a program
 for every size, and many sizes take memory and time."""
-FOLD = 8  # similarities that share a maximum
 HALF_ERROR = 2.0**-11  # standard deviation, rounded up, of similarities in 16 bits
 TAKEN_OUT = -4.0  # less than any similarity
 
@@ -44,39 +43,32 @@ class ShortList:
     entry_columns: Indices  # (E,) int64 features of the second image, rising in each row
 
 
-class FoldedSimilarities:
-    """(R, N) similarities as 8-bit codes; large ones are looked for among maxima of a few."""
+class ByteSimilarities:
+    """(R, N) similarities as 8-bit codes, on the CPU."""
 
     def __init__(self, codes: Bytes) -> None:
-        # (R, FOLD, G): columns g, g + G, g + 2 G, ... are group g
-        self.groups = codes.reshape(len(codes), FOLD, -1)
-        self.maxima = self.groups.max(axis=1)
+        self.codes = codes
 
     def largest(self) -> tuple[Indices, Indices]:
         """Return the column of a largest similarity of each row, and its code."""
-        every, group = np.arange(len(self.maxima)), self.maxima.argmax(axis=1)
-        member = self.groups[every, :, group].argmax(axis=1)
-        return member * self.maxima.shape[1] + group, self.maxima[every, group].astype(np.int64)
+        columns = self.codes.argmax(axis=1)
+        return columns, self.codes[np.arange(len(columns)), columns].astype(np.int64)
 
     def take_out(self, rows: Indices, columns: Indices) -> Bytes:
         """Make some similarities 0; return what they were."""
-        member, group = np.divmod(columns, self.maxima.shape[1])
-        before = self.groups[rows, member, group]
-        self.groups[rows, member, group] = 0
-        self.maxima[rows, group] = self.groups[rows, :, group].max(axis=1)
+        before = self.codes[rows, columns]
+        self.codes[rows, columns] = 0
         return before
 
     def at_least(self, rows: Indices, least: Singles) -> tuple[Indices, Indices]:
         """Return where some rows reach a limit each: indices into ``rows``, and columns."""
-        codes = np.maximum(least, 1).astype(np.uint8)[:, None]
-        above = self.maxima[rows] >= codes
-        index, group = np.divmod(np.flatnonzero(above), above.shape[1])
-        found, member = np.nonzero(self.groups[rows[index], :, group] >= codes[index])
-        return index[found], member * self.maxima.shape[1] + group[found]
+        above = self.codes[rows] >= np.maximum(least, 1).astype(np.uint8)[:, None]
+        index, columns = np.divmod(np.flatnonzero(above), above.shape[1])
+        return index, columns
 
 
 class HalfSimilarities:
-    """(R, N) similarities in 16 bits on a GPU; methods as those of :class:`FoldedSimilarities`."""
+    """(R, N) similarities in 16 bits on a GPU; methods as those of :class:`ByteSimilarities`."""
 
     def __init__(self, values: Any) -> None:
         self.values = values
@@ -87,19 +79,19 @@ class HalfSimilarities:
         return torch.from_numpy(array).to(self.values.device)
 
     def largest(self) -> tuple[Indices, Singles]:
-        """See :class:`FoldedSimilarities`."""
+        """See :class:`ByteSimilarities`."""
         values, columns = self.values.max(dim=1)
         return columns.cpu().numpy(), values.float().cpu().numpy()
 
     def take_out(self, rows: Indices, columns: Indices) -> Singles:
-        """See :class:`FoldedSimilarities`."""
+        """See :class:`ByteSimilarities`."""
         places = self._there(rows), self._there(columns)
         before = self.values[places].float().cpu().numpy()
         self.values[places] = TAKEN_OUT
         return np.asarray(before)
 
     def at_least(self, rows: Indices, least: Singles) -> tuple[Indices, Indices]:
-        """See :class:`FoldedSimilarities`."""
+        """See :class:`ByteSimilarities`."""
         above = self.values[self._there(rows)] >= self._there(least.astype(np.float32))[:, None]
         index, columns = (found.cpu().numpy() for found in above.nonzero(as_tuple=True))
         return index, columns
@@ -133,10 +125,10 @@ class EightBitDescriptors:
         # A rounding error is uniform: its standard deviation is a step over the root of 12.
         return ERROR_SIGMAS * math.hypot(self.step, other.step, CODE_STEP) / math.sqrt(12)
 
-    def similarities(self, rows: Indices, other: Self) -> FoldedSimilarities:
+    def similarities(self, rows: Indices, other: Self) -> ByteSimilarities:
         """Compare some features with all of another image."""
         unit = self.step * other.step
-        return FoldedSimilarities(_similarity_codes(self.codes[rows], other.packed, unit))
+        return ByteSimilarities(_similarity_codes(self.codes[rows], other.packed, unit))
 
 
 @dataclass(frozen=True)

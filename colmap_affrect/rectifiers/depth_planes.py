@@ -55,10 +55,6 @@ class PlaneOptions(Options):
     """Planes seen at a larger angle are not rectified."""
     min_region_frac: Annotated[float, within(0.0, 1.0)] = 0.03
     """Connected regions of a smaller share of the image are not rectified."""
-    orthogonal: bool = False
-    """Turn the normals of up to three planes into exactly orthogonal ones."""
-    antipodal: bool = False
-    """Count opposite normals as one plane."""
 
 
 class DepthPlanesOptions(RectifierOptions):
@@ -116,18 +112,15 @@ def planar_segments(
         min_separation_rad=np.deg2rad(options.min_separation_deg),
         max_num_planes=options.max_num_planes,
         min_votes_frac=options.min_votes_frac,
-        orthogonal=options.orthogonal,
-        antipodal=options.antipodal,
     )
     labels = _resampled(planes.labels, depth_from_image, photograph.size)
     min_cos = np.cos(np.deg2rad(options.max_angle_deg))
     min_area_px = options.min_region_frac * labels.size
     segments = []
     for label, normal in enumerate(planes.normals):
-        for facing in (normal, -normal) if options.antipodal else (normal,):
-            cosines = viewing_cosines(facing, photograph.camera_matrix, photograph.size)
-            found = connected_regions((labels == label) & (cosines >= min_cos), min_area_px)
-            segments += [PlanarSegment(Region(*region), facing) for region in found]
+        cosines = viewing_cosines(normal, photograph.camera_matrix, photograph.size)
+        found = connected_regions((labels == label) & (cosines >= min_cos), min_area_px)
+        segments += [PlanarSegment(Region(*region), normal) for region in found]
     return segments
 
 

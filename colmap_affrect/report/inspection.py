@@ -37,7 +37,7 @@ def inspect_image(
         for number, (photograph, _) in enumerate(read):
             level = inspect_level(extractor, photograph, number)
             draw_sheet(level, stored_size, new_sheets[number])
-            lines.append(f"level {number}, {level.options.name}: {summary(level)}")
+            lines.append(f"level {number}, {level.rectifier}: {summary(level)}")
             descriptions.append(describe_level(level))
         description = {
             "image": path.name,

@@ -16,7 +16,6 @@ from colmap_affrect.data import (
 )
 from colmap_affrect.features.base import FeatureExtractor
 from colmap_affrect.progress import Stopwatch
-from colmap_affrect.rectifiers.base import RectifierOptions
 from colmap_affrect.report.regions import bounding_box, region_area_px
 from colmap_affrect.stages.one_image import ImageExtractor
 
@@ -28,8 +27,8 @@ class InspectedLevel:
     """One level of a recipe, carried out on one photograph."""
 
     number: int  # 0 for the level that every image gets
-    options: RectifierOptions
-    extractor_name: str
+    rectifier: str  # names of both parts
+    extractor: str
     # at the size of processing; coordinates are px of it where nothing else is said
     photograph: Photograph
     plan: RectificationPlan
@@ -64,7 +63,7 @@ def inspect_level(extractor: ImageExtractor, photograph: Photograph, number: int
     first_id = 0 if level.base == number else 1
     return InspectedLevel(
         number,
-        level.rectifier,
+        level.rectifier.name,
         level.features.name,
         photograph,
         plan,
@@ -108,8 +107,8 @@ def describe_level(level: InspectedLevel) -> dict[str, Any]:
     regions = plan.num_regions
     return {
         "level": level.number,
-        "rectifier": level.options.name,
-        "features": level.extractor_name,
+        "rectifier": level.rectifier,
+        "features": level.extractor,
         "size": list(level.photograph.size),
         "warning": level.warning,
         "original": {

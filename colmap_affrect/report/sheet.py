@@ -98,7 +98,7 @@ def _title(level: InspectedLevel, stored_size: Size) -> Iterator[str]:
     yield from wrap(level.photograph.name, TITLE_CHARS)
     yield (
         f"{width} x {height} px{stored * (level.photograph.size != stored_size)}; {which}: "
-        f"rectifier {level.options.name}, features {level.extractor_name}"
+        f"rectifier {level.rectifier}, features {level.extractor}"
     )
     yield f"{summary(level)}: {steps}" + "; contrast stretched" * level.photograph.stretched
     yield from wrap(level.warning, TITLE_CHARS)

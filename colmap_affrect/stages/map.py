@@ -8,14 +8,8 @@ from pathlib import Path
 
 from colmap_affrect.colmap import database as colmap_database
 from colmap_affrect.colmap import pycolmap
-<<<<<<< HEAD
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.verification import verified_pairs
-=======
-from colmap_affrect.colmap.cameras import read_camera_records
-from colmap_affrect.colmap.model_files import num_long_tracks
-from colmap_affrect.colmap.verification import num_tied, verified_pairs
->>>>>>> col-rec
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.features.weights import install_hint
 from colmap_affrect.features.weights import missing as missing_weights

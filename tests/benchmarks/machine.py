@@ -10,9 +10,6 @@ from pathlib import Path
 from colmap_affrect.parallel.executor import available_cores
 from colmap_affrect.project.report import installed_versions
 
-MATRIX_SIZE = 2048
-NUM_PRODUCTS = 5
-
 
 def describe_machine() -> str:
     """Return processor, cores, memory, load and versions."""

@@ -18,12 +18,10 @@ from small_scene import FOCAL_PX
 
 from colmap_affrect.colmap.poses import relative_pose
 from colmap_affrect.errors import EvaluationError
-from colmap_affrect.evaluation import datasets
 from colmap_affrect.evaluation.data import Dataset
-from colmap_affrect.evaluation.datasets import load_evd, load_imc, load_pairs, load_svp, stem
+from colmap_affrect.evaluation.datasets import load_evd, load_imc, load_pairs, load_svp
 
 SCRIPT = Path(__file__).parents[2] / "recipes" / "own-evaluation-set" / "imc_from_model.py"
-SVP_SAMPLE = Path(__file__).parents[3] / "shared" / "pairs" / "svp_sample"
 Entry = dict[str, Any]
 INTRINSICS = [[FOCAL_PX, 0, 159.5], [0, FOCAL_PX, 119.5], [0, 0, 1]]
 """Of the photographs of the small scene, in pixel-centre px."""
@@ -140,20 +138,6 @@ def test_category_is_that_of_the_poses_and_bad_lines_are_refused(svp: Path) -> N
     path.write_text("a.png b.png 0\nb.png\n")
     with pytest.raises(EvaluationError, match=r"scene4_image_pairs\.txt: 'b\.png' is no pair"):
         load_svp(svp)
-
-
-@pytest.mark.shared
-@pytest.mark.skipif(not SVP_SAMPLE.is_dir(), reason="the sample is not here")
-def test_difficulties_of_the_real_list_are_those_of_the_real_poses() -> None:
-    scene = SVP_SAMPLE / "scene1"
-    views = datasets.read_views(scene / "0")
-    lines = (scene / "scene1_image_pairs.txt").read_text().splitlines()
-    listed = [line.split() for line in lines if line.strip() and line[0] != "#"]
-    found = [datasets.difficulty(views[stem(a)][1], views[stem(b)][1]) for a, b, _ in listed]
-    assert found == [int(tens) for *_, tens in listed]
-    assert [pair.name for pair in load_svp(SVP_SAMPLE).pairs] == [
-        "scene1/frame_0000001535_4.jpg scene1/frame_0000000305_1.jpg"
-    ]
 
 
 @pytest.fixture

@@ -173,24 +173,6 @@ def test_describe_leaves_out_degenerate_shapes(
     assert_allclose(described.keypoints, detected.keypoints[described.rectification_ids])
 
 
-# Batches.
-
-
-# Odd images.
-
-
-@pytest.mark.parametrize("size", [(1, 1), (50, 1), (1, 50), (9, 300), (20, 20), (33, 40)])
-def test_describe_in_images_smaller_than_the_patch_gives_finite_descriptors(
-    weights: dict[str, Path], size: tuple[int, int]
-) -> None:
-    small = texture(size, seed=4)
-    middle = [(size[0] - 1) / 2, (size[1] - 1) / 2]
-    profile = make(weights, descriptor="hardnet")
-    described = describe_one(profile, small, circles([middle, [0.0, 0.0]], [5.0, 40.0]))
-    assert np.isfinite(described.descriptors).all()
-    assert len(described) == 2
-
-
 @pytest.mark.parametrize("detector", ["dog", "hessian", "keynet"])
 def test_detect_keeps_to_the_mask_the_cap_and_the_order(
     weights: dict[str, Path], image: GrayImage, detector: str

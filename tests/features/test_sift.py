@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -27,8 +26,6 @@ of an octave apart, the middle answers to a blob of its size."""
 SCALE_BAND = 0.03
 """Relative: scales are interpolated between levels a third of an octave apart."""
 
-Detect = Callable[..., LocalFeatures]
-
 
 def rootsift(image: GrayImage, mask: np.ndarray | None = None, **options: Any) -> LocalFeatures:
     return RootSift(SiftOptions(**options)).detect((image, mask))
@@ -38,25 +35,10 @@ def dog(image: GrayImage, mask: np.ndarray | None = None, **options: Any) -> Loc
     return detect_dog(image, DogOptions(**options), mask)
 
 
-both = pytest.mark.parametrize(("detect", "descriptor_size"), [(rootsift, 128), (dog, 0)])
-
-
 @pytest.fixture(scope="module")
 def image() -> GrayImage:
     """A textured image that is not square."""
     return texture((210, 140), seed=7)
-
-
-@both
-@pytest.mark.parametrize("size", [(1, 1), (300, 1), (1, 300), (7, 200), (8, 8), (9, 300), (33, 17)])
-def test_tiny_and_thin_images_do_not_fail(
-    detect: Detect, descriptor_size: int, size: tuple[int, int]
-) -> None:
-    features = detect(texture(size, seed=1)[: size[1], : size[0]])
-    assert features.inside(size).all()
-    assert features.descriptors.shape == (len(features), descriptor_size)
-    if min(size) < 8:
-        assert len(features) == 0
 
 
 def test_rootsift_orders_by_response_and_keeps_the_largest_responses_times_scales(
@@ -94,13 +76,6 @@ def test_dog_of_a_round_blob_gives_one_upright_circle_of_six_sigma() -> None:
     assert_allclose(found.keypoints[0], center, atol=CENTER_PX)
     assert_allclose(found.scales[0], MEASUREMENT_SIGMAS * DOG_SIGMA * sigma_px, rtol=SCALE_BAND)
     assert_allclose(found.lafs[0, :, :2], found.scales[0] * np.eye(2), rtol=1e-12)
-
-
-def test_rootsift_keeps_every_orientation_of_one_location() -> None:
-    # A round blob has a flat histogram of directions, hence several peaks.
-    features = rootsift(blobs((121, 101), [[60.0, 50.0]], 6.0 * np.eye(2)))
-    near = np.linalg.norm(features.keypoints - [60.0, 50.0], axis=1) < 0.5
-    assert np.count_nonzero(near) >= 2
 
 
 def test_descriptors_are_roots_of_shares_of_those_of_opencv(image: GrayImage) -> None:

@@ -25,7 +25,6 @@ from colmap_affrect.features.weights import (
     WEIGHT_FILES,
     cache_folder,
     describe_weights,
-    digests,
     fetch,
     load_state_dict,
     resolve,
@@ -40,10 +39,14 @@ NAME = WEIGHT_FILES["hardnet"].file_name
 Publish = Callable[..., Path]
 
 
-def some_weights(size: int = 2) -> bytes:
+def saved(content: object) -> bytes:
     file = io.BytesIO()
-    torch.save({"a": torch.ones(size)}, file)
+    torch.save(content, file)
     return file.getvalue()
+
+
+def some_weights(size: int = 2) -> bytes:
+    return saved({"a": torch.ones(size)})
 
 
 @pytest.fixture(autouse=True)
@@ -298,14 +301,6 @@ def test_file_that_is_not_the_published_one_is_used_and_told_of_once(
     assert (result.code, "unknown weights 'afnet'" in result.stderr[-1]) == (2, True)
 
 
-def test_digests_are_named_by_keys(tmp_path: Path) -> None:
-    files = {key: tmp_path / key for key in ("disk", "xfeat")}
-    for key, path in files.items():
-        path.write_bytes(key.encode())
-    disk, xfeat = (hashlib.sha256(key.encode()).hexdigest() for key in files)
-    assert digests(files) == {"disk": disk, "xfeat": xfeat}
-
-
 @pytest.mark.parametrize(
     "variables", [{}, {"TORCH_HOME": "~/here"}, {"XDG_CACHE_HOME": "/there"}, {"TORCH_HOME": "/a"}]
 )
@@ -336,31 +331,29 @@ class Payload:
         return (pytest.fail, ("a pickled object was loaded",))
 
 
-def test_load_state_dict_does_not_load_objects(tmp_path: Path) -> None:
-    torch.save({"state_dict": {"a": Payload()}}, tmp_path / "object.pth")
-    (tmp_path / "pickle.pth").write_bytes(pickle.dumps(Payload(), protocol=2))
+DAMAGED = r"damaged or not a file of weights.*objects inside that are not loaded; remove it and run"
+NAMELESS = "holds no parameters by name"
+
+
+@pytest.mark.parametrize(("content", "message"), [
+    (saved({"state_dict": {"a": Payload()}}), DAMAGED),
+    (pickle.dumps(Payload(), protocol=2), DAMAGED),
+    (b"<html>404</html>", DAMAGED),
+    (b"\x80\x02garbage", DAMAGED),
+    (b"PK\3\4", DAMAGED),
+    (saved(torch.rand(3)), NAMELESS),
+    (saved({1: torch.rand(3)}), NAMELESS),
+    (None, "cannot be read \\(No such file"),
+])  # fmt: skip
+def test_load_state_dict_refuses_anything_else_and_runs_no_code(
+    tmp_path: Path, content: bytes | None, message: str
+) -> None:
+    if content is not None:
+        (tmp_path / NAME).write_bytes(content)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for name in ("object.pth", "pickle.pth"):
-            with pytest.raises(WeightsError, match=rf"{name}: .* objects inside that are not load"):
-                load_state_dict(tmp_path / name)
-
-
-@pytest.mark.parametrize("content", [b"<html>404</html>", b"\x80\x02garbage", b"PK\3\4"])
-def test_load_state_dict_of_something_else_names_it(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / NAME).write_bytes(content)
-    match = rf"{NAME}: damaged or not a file of weights.* remove it and run: .* fetch hardnet"
-    with pytest.raises(WeightsError, match=match):
-        load_state_dict(tmp_path / NAME)
-
-
-def test_load_state_dict_of_a_tensor_or_of_no_file_is_refused(tmp_path: Path) -> None:
-    for name, content in (("tensor.pth", torch.rand(3)), ("numbered.pth", {1: torch.rand(3)})):
-        torch.save(content, tmp_path / name)
-        with pytest.raises(WeightsError, match=rf"{name}: holds no parameters by name"):
-            load_state_dict(tmp_path / name)
-    with pytest.raises(WeightsError, match=r"gone\.pth: cannot be read \(No such file"):
-        load_state_dict(tmp_path / "gone.pth")
+        with pytest.raises(WeightsError, match=rf"{NAME}: {message}"):
+            load_state_dict(tmp_path / NAME)
 
 
 @pytest.mark.shared

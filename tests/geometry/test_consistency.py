@@ -117,15 +117,3 @@ def test_neighbors_within_equals_all_distances(points: Array, radius: float) -> 
         for begin, end in zip(lists.starts[:-1], lists.starts[1:], strict=True)
     ]
     assert actual == all_neighbors(points, radius)
-
-
-@given(point_sets.filter(len), st.data())
-def test_of_lists_the_neighbors_of_the_points_asked_for_in_order(
-    points: Array, data: st.DataObject
-) -> None:
-    asked = np.array(data.draw(st.lists(st.integers(0, len(points) - 1), max_size=10)), dtype=int)
-    rows, neighbors = neighbors_within(points, 5.0).of(asked)
-    expected = all_neighbors(points, 5.0)
-    assert (np.diff(rows) >= 0).all()
-    for position, point in enumerate(asked):
-        assert sorted(neighbors[rows == position].tolist()) == expected[point]

@@ -62,11 +62,6 @@ def test_tilt_distance_is_the_log_of_the_transition_tilt_by_svd(
     assert_allclose(np.exp(tilt_distance(*class1, *class2)), expected, rtol=ARCCOSH_ROUNDING)
 
 
-def test_tilt_distance_has_the_closed_form_that_the_authors_program_misses() -> None:
-    # The program has t1 / t2 for 1 / (t1 t2): cosh d = 1.78 where the identity is at log 2.
-    assert_allclose(tilt_distance(2.0, 1.0, 1.0, 0.0), np.log(2.0), atol=ARCCOSH_ROUNDING)
-
-
 def test_unit_metrics_hold_s11_s22_s12_of_the_gram_matrix() -> None:
     matrix = np.array([[2.0, 1.0], [0.0, 3.0]])
     # M^T M = [[4, 2], [2, 10]], det M = 6.
@@ -108,13 +103,6 @@ def test_covering_grid_and_identity_cover_the_disc_up_to_5_8() -> None:
         metrics_from_tilts(tilts.ravel(), angles.ravel()), covering_grid(), RADIUS
     )
     assert np.count_nonzero(labels == UNCOVERED_LABEL) == 0
-
-
-def test_nearest_centers_choose_by_distance_and_within_the_ball() -> None:
-    centers = np.array([[2.0, 0.3], [4.0, 0.3], [4.0, 1.8]])
-    metrics = metrics_from_tilts([1.2, 2.1, 3.5, 4.2, 4.0], [2.5, 0.35, 0.3, 1.75, 1.05])
-    labels = nearest_centers(metrics, centers, RADIUS)
-    assert labels.tolist() == [IDENTITY_LABEL, 0, 1, 2, UNCOVERED_LABEL]
 
 
 @given(

@@ -5,26 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from depth_photographs import (
-    COURTYARD,
     FLOAT32_RTOL,
-    courtyard_photograph,
     photograph,
     slanted_plane,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from synthetic import write_image
 
-from colmap_affrect.colmap.poses import read_poses
 from colmap_affrect.errors import DepthError, OptionError
 from colmap_affrect.images.depth import DepthFiles, DepthFilesOptions
-
-PNG_METRES = 0.002
-"""One step of the courtyard's depth maps."""
-
-
-PAVING_TOLERANCE_M = 0.5 * PNG_METRES
-"""Rounding of the courtyard's maps. It moves a point along its ray, which meets the paving at
-less than 90 degrees: the height changes by less."""
 
 
 def asymmetric_map(size=(6, 4)):
@@ -205,34 +194,3 @@ def test_require_some_needs_a_map_of_one_image(tmp_path):
     with pytest.raises(DepthError, match=r"any of the 2 images; looked for a\.jpg\.\* and a\.\*"):
         source(tmp_path).require_some(["a.jpg", "side/b.jpg"])
     source(tmp_path).require_some(["a.jpg", "side/č d.png"])
-
-
-# --- files: real and rendered maps
-
-
-def world_points(depth, camera_matrix, pose):
-    """(h, w, 3) points of a depth map at the resolution of its photograph."""
-    columns, rows = np.meshgrid(np.arange(depth.shape[1]), np.arange(depth.shape[0]))
-    pixels = np.stack([columns, rows, np.ones(depth.shape)], axis=-1)
-    points = depth[..., None] * (pixels @ np.linalg.inv(camera_matrix).T)
-    rotation, translation = pose
-    return (points - translation) @ rotation
-
-
-def test_paving_of_the_courtyard_is_the_plane_z_0_of_the_world():
-    name = "court_5.jpg"
-    image = courtyard_photograph(name)
-    pose = read_poses(COURTYARD / "ground_truth")[name]
-    options = {"path": COURTYARD / "depth", "png_scale": PNG_METRES}
-    depth = source(**options).depth(image)
-    assert depth.shape == (540, 720)
-    assert 2.0 < np.nanmin(depth) < np.nanmax(depth) < 60.0
-
-    def share_on_paving(depth):
-        heights = world_points(depth, image.camera_matrix, pose)[-20:, :, 2]
-        return np.mean(np.abs(heights) < PAVING_TOLERANCE_M)
-
-    # The rest of the lowest rows shows steps and the trough.
-    assert share_on_paving(depth) > 0.3
-    # Read as distances along rays the same map is bent.
-    assert share_on_paving(source(**options, kind="ray").depth(image)) < 0.02

@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 
 from colmap_affrect.colmap import pycolmap
-<<<<<<< HEAD
 from colmap_affrect.colmap.cameras import CameraRecord
-=======
-from colmap_affrect.colmap.cameras import CameraRecord
-from colmap_affrect.mappers.attempts import _sharing_cameras
->>>>>>> col-rec
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.loose_cameras import loose_images
 

@@ -125,30 +125,6 @@ def spread(count: int) -> NDArray[np.float64]:
     return np.stack([100.0 * np.arange(count), np.full(count, 7.0)], axis=1)
 
 
-def by_angles(*angles_deg: float) -> NDArray[np.float32]:
-    """Descriptors in the plane; the angle between two grows with their distance."""
-    angles = np.deg2rad(angles_deg)
-    return np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
-
-
-def chord(degrees: float) -> float:
-    """Distance of unit vectors that are so many degrees apart."""
-    return float(2 * np.sin(np.deg2rad(degrees) / 2))
-
-
-def test_match_features_does_not_count_the_same_place_as_second_neighbour() -> None:
-    first = (by_angles(10.0, 80.0), spread(2))
-    keypoints2 = np.array([[40.0, 40.0], [46.0, 44.0], [300.0, 5.0]])
-    second = (by_angles(12.0, 7.9, 79.0), keypoints2)
-    options = NearestOptions(min_contrast_distance_px=10.0)
-    matches = run(first, second, options)
-    assert matches.indices.tolist() == [[0, 0], [1, 2]]
-    assert_allclose(1 - matches.scores[0], chord(2.0) / chord(68.0), rtol=1e-2)
-    # With a smaller radius the neighbour 7.2 px away is a competitor again.
-    strict = options.changed(min_contrast_distance_px=7.0)
-    assert run(first, second, strict).indices.tolist() == [[1, 2]]
-
-
 def test_match_features_does_not_wrap_indices_of_40000_keypoints() -> None:
     count, dimension = 40_000, 8
     rng = np.random.default_rng(1)

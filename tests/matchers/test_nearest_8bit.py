@@ -148,15 +148,3 @@ def test_torch_without_the_products_matches_exactly(monkeypatch: pytest.MonkeyPa
     has_fast_8_bit_products.cache_clear()
     features = LocalFeatures.empty(128)
     assert matcher.prepare(ImageFeatures(features, (32, 32), "rootsift")).coarse is None
-
-
-def test_product_of_the_library_is_that_of_numbers() -> None:
-    if not has_fast_8_bit_products():
-        pytest.skip("this processor has no fast 8-bit products")
-    codes = np.random.default_rng(0).integers(-127, 128, (37, 128)).astype(np.int8)
-    unit = 1.0 / (128 * 127.0**2)
-    found = coarse._similarity_codes(codes[:20], coarse._packed(codes[10:]), unit)
-    assert found.shape == (20, 256)
-    expected = similarity_codes(codes[:20], codes[10:], unit)
-    np.testing.assert_array_less(np.abs(found[:, :27].astype(int) - expected), 2)
-    assert not found[:, 27:].any()

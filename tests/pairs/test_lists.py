@@ -30,16 +30,6 @@ def pair_list(tmp_path: Path) -> Path:
     return tmp_path / "list of pairs.txt"
 
 
-@pytest.mark.parametrize(
-    ("names", "count"), [([], 0), (["a"], 0), (["b", "a"], 1), (["c", "a", "b", "d"], 6)]
-)
-def test_exhaustive_pairs_are_all_pairs_once(names: list[str], count: int) -> None:
-    pairs = exhaustive_pairs(names)
-    assert len(set(pairs)) == len(pairs) == count
-    assert all(first < second for first, second in pairs)
-    assert pairs == sorted(pairs)
-
-
 def test_sequence_pairs_follow_the_numbers_in_names() -> None:
     names = ["b/1.png", "a/10.png", "a/9.png", "a/8.png"]
     assert sequence_pairs(names, 1) == [

@@ -108,25 +108,6 @@ def test_extract_rectified_rejects_ellipses_that_reach_beyond_the_image() -> Non
     assert np.linalg.norm(keypoint_errors(features, outside), axis=1).min() > 3.0
 
 
-def test_extract_rectified_keeps_centers_in_the_region_of_their_warp() -> None:
-    image = texture(SIZE, seed=22)
-    rows, columns = np.indices(SIZE[::-1])
-    left = columns + 0.5 * rows < 250
-    lower_right = ~left & (rows > 170)
-    first = one_warp(2.5, 0.6, SIZE, left).items[0]
-    second = one_warp(4.0, 2.0, SIZE, lower_right).items[0]
-    plan = RectificationPlan(SIZE, (first, second))
-    features = extract_rectified(image, plan, PROFILE, 5000)
-    ids = features.rectification_ids
-    assert (np.diff(ids) >= 0).all()
-    assert set(ids.tolist()) == {0, 1, 2}
-    x, y = np.rint(features.keypoints).astype(int).T
-    assert left[y[ids == 1], x[ids == 1]].all()
-    assert lower_right[y[ids == 2], x[ids == 2]].all()
-    upper_right = ~left & ~lower_right
-    assert upper_right[y[ids == 0], x[ids == 0]].any()
-
-
 def test_extract_rectified_replaces_features_of_the_image_that_a_warp_found_again() -> None:
     image = texture(SIZE, seed=25, finest_sigma_px=2.5)
     original = PROFILE.detect((image, None))
