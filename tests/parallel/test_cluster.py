@@ -35,7 +35,7 @@ from colmap_affrect.recipes import load_recipe
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.inputs import Inputs
-from colmap_affrect.stages.match import match, recorded_matching
+from colmap_affrect.stages.match import match
 from colmap_affrect.stages.one_pair import CachedMatcher, Matching, iterate_matches
 from colmap_affrect.stages.pairs import choose_pairs, listed_pairs
 
@@ -236,7 +236,7 @@ def test_matches_of_other_weights_are_not_mixed(
     matched(tmp_path / "out", extracted, lightglue, Threads(1))
     workspace = Workspace(tmp_path / "out")
     assert list(workspace.recorded()["match"]["weights"]) == ["lightglue-sift"]
-    assert recorded_matching(workspace) == WITH_NETWORK.matching
+    assert Context(workspace).matching == WITH_NETWORK.matching
     write_comparing_lightglue(tmp_path / "sift_lightglue.pth", sharpness=30.0)
     with pytest.raises(StaleStoreError, match="match stage was run there with weights"):
         matched(tmp_path / "out", extracted, tmp_path, Threads(1))

@@ -160,7 +160,7 @@ CHANGING = {
 }  # fmt: skip
 
 IN_TEMPORARY_FOLDERS = {
-    ("align.py", "align"), ("pycolmap_mapping.py", "incremental_mapping"),
+    ("align.py", "align"), ("pycolmap_mapping.py", "_written"),
     ("export.py", "_points"), ("export.py", "_nerfstudio"), ("export.py", "_text"),
     ("hdf5_layouts.py", "created"),
     ("inspection.py", "inspect_image"), ("sheet.py", "draw_sheet"), ("conversion.py", "_convert"),
