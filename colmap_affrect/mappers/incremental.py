@@ -31,12 +31,15 @@ class PipelineOptions(MapperOptions):
     init_min_tri_angle_deg: Annotated[float, within(0.0, 180.0)] = 8.0
     init_min_num_inliers: Annotated[int, within(1, 1_000_000)] = 50
     abs_pose_min_num_inliers: Annotated[int, within(3, 1_000_000)] = 12
+    max_focal_length_ratio: Annotated[float, within(1.0, 1000.0)] = 30.0
+    """Longer sides; COLMAP's 10 leaves nothing of the photographs of a narrow lens."""
 
     COLMAP: ClassVar[Mapping[str, Any]] = {
         "ignore_two_view_tracks": True,
         "init_min_tri_angle_deg": 16.0,
         "init_min_num_inliers": 100,
         "abs_pose_min_num_inliers": 30,
+        "max_focal_length_ratio": 10.0,
         "min_model_size": 10,
         "keep_given_intrinsics": False,
     }
@@ -90,6 +93,7 @@ class IncrementalMapper:
         distortion = not task.keeps_intrinsics(options)
         native = pycolmap.IncrementalPipelineOptions(
             min_model_size=options.min_model_size,
+            max_focal_length_ratio=options.max_focal_length_ratio,
             random_seed=random_seed,
             num_threads=1,
             ba_refine_focal_length=focals,
