@@ -23,6 +23,7 @@ ZOOMS = 1.0, 1.4, 0.7, 2.0
 SHARED_SIGMA = 0.1
 """Deviation of the logarithm of those that several images share, while models grow: two or three of
 these images do not tell it, and models that are to be joined must agree."""
+SAME_FOCAL = 0.03  # of the logarithm: bridges built with one are right with the other
 FACTORS = 1.25, 0.8  # of a focal length, from which another adjustment starts
 NUM_STARTS = 3  # models that are joined to the others in turn
 MIN_RIVAL = 1.15  # factor between two focal lengths that are told apart
@@ -68,8 +69,9 @@ class Search:
                 continue
             model, evidence = self._with_free_cameras(graph, found[0].reconstruction)
             found = [replace(found[0], reconstruction=model), *found[1:]]
-            rivals.append((evidence, model))
             agrees = self._agrees(adjuster, model)
+            evidence += MIN_GAIN * agrees  # with others, bridges are of the wrong length
+            rivals.append((evidence, model))
             if evidence > most:
                 most, best = evidence, found
                 if adjuster in usual and not agrees:
@@ -137,7 +139,7 @@ class Search:
         """Tell whether unknown focal lengths ended near those with which a model was made."""
         return all(
             abs(math.log(model.cameras[key].mean_focal_length() / adjuster.priors[key].focal_px))
-            <= SHARED_SIGMA
+            <= SAME_FOCAL
             for key in self.unknown.keys() & {c.camera_id for c in cameras_of(model).values()}
         )
 
