@@ -24,7 +24,7 @@ from colmap_affrect.mappers.adjustment import (
     FocalPrior,
 )
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
-from colmap_affrect.mappers.evidence import Evidence, pair_evidence
+from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence, pair_evidence
 from colmap_affrect.mappers.mapping import map_database
 from colmap_affrect.mappers.pair_graph import PairGraph
 
@@ -211,3 +211,71 @@ def test_mapping_that_is_interrupted_leaves_nothing(
     with pytest.raises(KeyboardInterrupt):
         map_database(mapper_of(), task_of(scene, UNKNOWN), tmp_path / "sparse", lambda _: None)
     assert not list(tmp_path.iterdir())
+
+
+def write_shared(path: Path, focal_px: float, num_points: int) -> pycolmap.Reconstruction:
+    """Write verified pairs of four images that share a camera; return the truth."""
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1,
+        num_frames_per_rig=4,
+        num_points3D=num_points,
+        camera_params=[focal_px, SIZE[0] / 2, SIZE[1] / 2, 0.0],
+    )
+    pycolmap.set_random_seed(3)
+    with open_database(path) as database:
+        truth = pycolmap.synthesize_dataset(options, database)
+        noise = pycolmap.SyntheticNoiseOptions(point2D_stddev=NOISE_PX)
+        pycolmap.synthesize_noise(noise, truth, database)
+    return truth
+
+
+@pytest.mark.parametrize("focal_px", [700.0, 2600.0])
+def test_a_camera_that_images_share_is_found_from_wide_to_long(
+    tmp_path: Path, focal_px: float
+) -> None:
+    truth = write_shared(tmp_path / "database.db", focal_px, 600)
+    (camera,) = truth.cameras
+    task = MappingTask(tmp_path / "database.db", None, cameras={camera: UNKNOWN})
+    model, *_ = map_database(mapper_of(), task, tmp_path / "sparse", lambda _: None)
+    assert len(model.registered_names) == 4
+    assert list(model.focals_px.values()) == pytest.approx([focal_px] * 4, rel=0.03)
+
+
+@pytest.mark.parametrize(("options", "num_images"), [({}, 2), ({"max_focal_length_ratio": 10}, 0)])
+def test_a_narrow_lens_makes_a_model_unless_that_is_forbidden(
+    tmp_path: Path, options: dict[str, Any], num_images: int
+) -> None:
+    focal_px = 12.0 * SIZE[0]
+    write_shared(tmp_path / "database.db", focal_px, 20_000)  # two images see the same of them
+    task = MappingTask(
+        tmp_path / "database.db", None, cameras={1: replace(WHOLE, focal_px=focal_px)}
+    )
+    found = map_database(mapper_of(**options), task, tmp_path / "sparse", lambda _: None)
+    assert sum(len(model.registered_names) for model in found) == num_images
+
+
+def test_features_of_three_images_confirm_a_model_until_their_points_are_gone(
+    scene: Scene, model: pycolmap.Reconstruction
+) -> None:
+    evidence = Evidence(PairGraph.read(scene[0]), {})
+    assert evidence.is_confirmed(model)
+    before = evidence.of_three_views(model)
+    last = max(model.reg_image_ids())
+    for index in model.images[last].get_observation_point2D_idxs():
+        model.delete_observation(last, index)
+    assert not evidence.is_confirmed(model)
+    assert evidence.of_three_views(model) < before - 2 * MIN_GAIN
+
+
+def test_a_token_stops_the_search(scene: Scene, tmp_path: Path) -> None:
+    token = pycolmap.CancellationToken()
+    task = replace(task_of(scene, UNKNOWN), cancellation=token)
+    shown: list[int] = []
+
+    def show(number: int) -> None:
+        shown.append(number)
+        token.cancel()
+
+    with pytest.raises(KeyboardInterrupt):
+        map_database(mapper_of(), task, tmp_path / "sparse", show)
+    assert shown == [2]
