@@ -318,21 +318,6 @@ def apply_records(path: Path, records: Mapping[int, CameraRecord]) -> None:
     _delete_unused_cameras(path)
 
 
-def apply_cameras(path: Path, model: pycolmap.Reconstruction) -> set[int]:
-    """Give the registered images of a model, in a database, the cameras that they have in it.
-
-    Returns the ids of these cameras.
-    """
-    images = [model.images[image_id] for image_id in model.reg_image_ids()]
-    keys = {image.camera_id for image in images}
-    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
-        for key in keys:
-            database.update_camera(model.cameras[key])
-        _move_images(database, {image.name: image.camera_id for image in images})
-    _delete_unused_cameras(path)
-    return keys
-
-
 def _move_images(database: pycolmap.Database, camera_of: Mapping[str, int]) -> None:
     """Give images, by name, another camera that is there."""
     rigs = {rig.ref_sensor_id: rig.rig_id for rig in database.read_all_rigs()}

@@ -8,7 +8,7 @@ import errno
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -278,11 +278,6 @@ def replace_matches(
         if database.exists_two_view_geometry(image_id1, image_id2):
             database.delete_two_view_geometry(image_id1, image_id2)
     write_matches(database, image_id1, image_id2, indices)
-
-
-def reject_pairs(path: Path, pairs: Iterable[tuple[str, str]]) -> None:
-    """Let pairs of image names count as verified in vain; their matches stay."""
-    keep_inliers(path, dict.fromkeys(pairs, np.zeros((0, 2), np.int64)))
 
 
 def keep_inliers(path: Path, inliers: Mapping[tuple[str, str], Indices]) -> None:

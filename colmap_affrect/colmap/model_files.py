@@ -11,7 +11,7 @@ import json
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -31,7 +31,7 @@ from colmap_affrect.errors import (
     made_again,
     reason,
 )
-from colmap_affrect.geometry.arrays import Bools, Indices
+from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.project.atomic_files import cannot_write
 from colmap_affrect.project.checked_json import without_checksum
 
@@ -293,29 +293,10 @@ def _require_written(folder: Path) -> None:
         raise cannot_write(folder, error) from error
 
 
-def num_long_tracks(
-    model: pycolmap.Reconstruction, counted: Mapping[int, Bools] | None = None
-) -> Counter[int]:
-    """Return how many points that three images or more see each image sees, by its id.
-
-    Args:
-        model: any.
-        counted: which keypoints count, (N,) by image id; by default all.
-    """
-    return Counter(
-        image_id
-        for point in model.points3D.values()
-        if len(images := _seen_by(point, counted)) > 2
-        for image_id in images
-    )
-
-
-def _seen_by(point: pycolmap.Point3D, counted: Mapping[int, Bools] | None) -> set[int]:
-    return {
-        element.image_id
-        for element in point.track.elements
-        if counted is None or counted[element.image_id][element.point2D_idx]
-    }
+def num_long_tracks(model: pycolmap.Reconstruction) -> Counter[int]:
+    """Return how many points that three images or more see each image sees, by its id."""
+    tracks = ({e.image_id for e in point.track.elements} for point in model.points3D.values())
+    return Counter(image_id for images in tracks if len(images) > 2 for image_id in images)
 
 
 def seen_points(image: pycolmap.Image) -> Indices:

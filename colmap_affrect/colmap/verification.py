@@ -347,11 +347,6 @@ def connected_parts(pairs: Iterable[tuple[T, T]], images: Iterable[T] = ()) -> l
     return sorted(networkx.connected_components(graph), key=lambda part: (-len(part), min(part)))
 
 
-def num_tied(path: Path, min_num_inliers: int) -> int:
-    """Return how many images verified pairs connect at most."""
-    return max(map(len, connected_parts(verified_pairs(path, min_num_inliers))), default=0)
-
-
 def inlier_matches(path: Path, min_num_inliers: int) -> dict[tuple[int, int], Indices]:
     """Return the (M, 2) features of each verified pair of image ids that are inliers."""
     with open_database(path) as database:

@@ -24,7 +24,6 @@ from colmap_affrect.mappers.pair_graph import (
     poses_of,
 )
 from colmap_affrect.mappers.ties import hanging_images
-from colmap_affrect.project.report import ModelSummary
 
 FOCAL_LENGTHS = (0.3, 10.0)
 """Longer sides: 120 and 6 degrees, beyond all lenses of photographs that anybody reconstructs."""
@@ -101,11 +100,6 @@ class Doubts:
     images: Mapping[str, str] = field(default_factory=dict)
     model: tuple[str, ...] = ()
     impossible: tuple[str, ...] = ()
-
-
-def loose_names(model: ModelSummary) -> set[str]:
-    """Return the images of a model whose focal lengths nothing tells, whatever else is doubtful."""
-    return {name for name, why in model.doubtful.items() if FOCAL_DOUBT in why}
 
 
 def find_doubts(model: MappedModel, task: MappingTask, loose: Collection[str] = ()) -> Doubts:

@@ -173,18 +173,6 @@ class PairGraph:
         some = pair.some_matches()
         return float(_agrees(pose, (camera1, camera2), self.points(some))[0].mean())
 
-    def score_of(self, model: pycolmap.Reconstruction) -> float:
-        """Return how well a model agrees with all pairs whose images it has registered.
-
-        Each pair counts by the root of its inliers; one whose inliers mostly disagree counts
-        against the poses. Images without a pose are not counted, so more right images are better.
-        """
-        poses, cameras = poses_of(model), cameras_of(model)
-        return sum(
-            pair.weight * (2.0 * self.agreement(pair, poses, cameras) - 1.0)
-            for pair in self.pairs_inside(poses)
-        )
-
     def supports(self, model: pycolmap.Reconstruction, image_ids: Iterable[int]) -> bool:
         """Tell whether of the pairs of each of some images most agree with a model."""
         poses, cameras = poses_of(model), cameras_of(model)
@@ -194,10 +182,6 @@ class PairGraph:
             if agreeing < MIN_SHARE * sum(pair.weight for pair in pairs):
                 return False
         return True
-
-    def best_score(self, models: Iterable[pycolmap.Reconstruction]) -> float:
-        """Return the best :meth:`score_of` any of some models, 0 without any."""
-        return max(map(self.score_of, models), default=0.0)
 
     def is_explained_by(self, model: pycolmap.Reconstruction) -> bool:
         """Tell whether a model has all images of all pairs, and no pair contradicts it."""

@@ -196,11 +196,6 @@ class ModelSummary:
         return not self.doubts and len(self.registered_names) - len(self.doubtful) > 1
 
     @property
-    def is_consistent(self) -> bool:
-        """Whether two images or more are left that nothing speaks against."""
-        return not self.doubts and len(self.registered_names) - self.num_contradicted > 1
-
-    @property
     def num_contradicted(self) -> int:
         """Number of images that something speaks against."""
         return len(self.doubtful) - len(self.loose)

@@ -67,13 +67,12 @@ def guide(
     return StageReport("guide", time.perf_counter() - start, len(todo), num_done)
 
 
-def restore_exact(context: Context, pairs: Collection[Pair] | None = None) -> None:
-    """Give guided pairs, by default all, their geometry without guided matches again.
+def restore_exact(context: Context) -> None:
+    """Give guided pairs their geometry without guided matches again.
 
     They stay on record as tried, so that :func:`guide` leaves them alone.
     """
     workspace, guided = context.workspace, _gained(context)
-    guided = [pair for pair in guided if pairs is None or pair.names in pairs]
     if not guided:
         return
     ids = colmap_database.image_ids(workspace.database)

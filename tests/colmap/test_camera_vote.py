@@ -17,7 +17,6 @@ from colmap_affrect.colmap import camera_vote, pycolmap
 from colmap_affrect.colmap.camera_vote import (
     MAX_SPREAD,
     CameraVote,
-    apply_cameras,
     apply_records,
     forget_votes,
     needs_vote,
@@ -163,33 +162,6 @@ def test_scans_of_one_camera_get_one_and_its_focal_length(scans: Path, voted: Pa
     assert len(pairs) == 3
     calibrated = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
     assert [config for config, _ in verified] == [calibrated] * 3
-
-
-def test_images_of_a_model_bring_their_cameras_into_a_database(
-    scans: Path, voted: Path, tmp_path: Path
-) -> None:
-    model = pycolmap.Reconstruction()
-    with open_database(voted) as database:
-        shared = {image.name: image.camera_id for image in database.read_all_images()}
-        for camera in database.read_all_cameras():
-            camera.params = [1000.0 + camera.camera_id, 500.0, 375.0, 0.01]
-            model.add_camera_with_trivial_rig(camera)
-    before = content(scans)
-    cameras, images = before[0], before[3]
-    own = {name: (image_id, camera_id) for image_id, (name, camera_id, _) in images.items()}
-    for name in ("0.jpg", "2.jpg"):
-        image = pycolmap.Image(name, camera_id=shared[name], image_id=own[name][0])
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    path = copied(scans, tmp_path)
-    (used,) = apply_cameras(path, model)
-    assert used == shared["0.jpg"] == shared["2.jpg"]
-    after, _, frames, images, *_ = content(path)
-    found = {name: camera_id for name, camera_id, _ in images.values()}
-    assert found["0.jpg"] == found["2.jpg"] == used != found["1.jpg"] == own["1.jpg"][1]
-    assert after.keys() == set(found.values())
-    assert after[used][0] == [1000.0 + used, 500.0, 375.0, 0.01]
-    assert after[found["1.jpg"]] == cameras[found["1.jpg"]]
-    assert len({rig_id for rig_id, _ in frames.values()}) == len(after)
 
 
 def test_a_vote_that_was_held_is_not_held_again(voted: Path, tmp_path: Path) -> None:
