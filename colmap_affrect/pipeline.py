@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 from colmap_affrect.colmap.cameras import read_camera_records
 from colmap_affrect.colmap.database import num_matched_pairs
@@ -27,7 +26,6 @@ from colmap_affrect.project.report import ReconstructionReport, StageReport, ins
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe, load_recipe
 from colmap_affrect.report.run_page import write_run_page
-from colmap_affrect.stages.cameras import choose_cameras
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.copy import copy_verified
 from colmap_affrect.stages.escalate import escalate, pair_levels
@@ -51,18 +49,6 @@ from colmap_affrect.stages.mend import watched
 from colmap_affrect.stages.pairs import choose_pairs, expected_num_pairs, listed_pairs
 from colmap_affrect.stages.verify import verify_matches
 
-FocalVote = Literal["auto", "always", "never"]
-
-
-def holds_vote(focal_vote: FocalVote, mapping: MapperOptions, *, is_others: bool) -> bool:
-    """Tell whether verified pairs vote on cameras that nobody knows.
-
-    By default they do, but not with COLMAP's preset, nor of another program's database.
-    """
-    if focal_vote == "auto":
-        return not is_others and mapping.preset_name != "colmap"
-    return focal_vote == "always"
-
 
 @dataclass(frozen=True, kw_only=True)
 class InputOptions:
@@ -78,7 +64,6 @@ class InputOptions:
         from_database: COLMAP database whose images, cameras, rigs, frames and pose priors are
             used; it stays as it is.
         resources: weights and device of networks.
-        focal_vote: whether verified pairs vote on cameras that nobody knows.
     """
 
     cameras: CameraOptions = field(default_factory=CameraOptions)
@@ -89,12 +74,11 @@ class InputOptions:
     image_list_path: Path | None = None
     from_database: Path | None = None
     resources: Resources = field(default_factory=Resources)
-    focal_vote: FocalVote = "auto"
 
     @property
-    def holds_vote(self) -> bool:
-        """Whether verified pairs vote on cameras."""
-        return holds_vote(self.focal_vote, self.mapping, is_others=bool(self.from_database))
+    def may_share(self) -> bool:
+        """Whether images of one size may turn out to share a camera that nobody knows."""
+        return self.cameras.mode == "auto" and not self.from_database
 
     def inputs(self, image_path: Path) -> Inputs:
         """Return the photographs of a folder, with their cameras and masks."""
@@ -189,8 +173,6 @@ def run(
         ]
         if options.recipe.extraction.escalation:
             reports.append(escalate(context, options.recipe.escalate))
-        if options.holds_vote:
-            reports.append(choose_cameras(context, may_share=not options.extend))
         reports.append(guide(context, options.recipe.guided))
         if options.database_descriptors:
             write_descriptors(context)
@@ -205,7 +187,6 @@ def map_from_database(
     mapping: MapperOptions | None = None,
     verification: VerificationOptions | None = None,
     extend: Extension | None = None,
-    check_cameras: bool = False,
     overwrite: bool = False,
     page: bool = True,
     progress: Progress = SILENT,
@@ -219,7 +200,6 @@ def map_from_database(
         mapping: mapper and its options.
         verification: of pairs that are not verified yet.
         extend: register the images into this model instead of beginning one.
-        check_cameras: let the pairs vote on cameras whose focal length is no prior.
         overwrite: discard results that are there.
         page: also write ``report.html``.
         progress: where to show progress.
@@ -240,8 +220,7 @@ def map_from_database(
     with context.workspace.locked(), watched(context, follows=False, discards=overwrite):
         chosen = verification or VerificationOptions()
         report = copy_verified(context, database_path, image_path, chosen, overwrite=overwrite)
-        reports = [report, choose_cameras(context)] if check_cameras else [report]
-        return map_and_report(context, mapper, extend, earlier=reports, page=page)
+        return map_and_report(context, mapper, extend, earlier=[report], page=page)
 
 
 def map_and_report(

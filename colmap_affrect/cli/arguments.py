@@ -177,10 +177,6 @@ PAIRS = (
         f"gps: largest distance of neighbours (default: {PairOptions().max_distance_m:g})",
         type=float),
 )  # fmt: skip
-FOCAL_VOTE = _choice("--focal-vote", ["auto", "always", "never"],
-    "let verified pairs vote on focal lengths that nobody knows, and on which scans share a camera "
-    "(default: auto, unless cameras are of --from-database or --preset is colmap)",
-    default="auto")  # fmt: skip
 PRESET = _choice("--preset", list(PRESETS),
     "options of two-view geometry and mapping: ours for few photographs, or COLMAP's "
     "defaults (default: sparse)")  # fmt: skip

@@ -124,8 +124,7 @@ def guide(options: argparse.Namespace) -> None:
 
 def map(options: argparse.Namespace) -> int:
     from colmap_affrect.mappers.base import MAPPERS
-    from colmap_affrect.pipeline import holds_vote, map_and_report, map_from_database
-    from colmap_affrect.stages.cameras import choose_cameras
+    from colmap_affrect.pipeline import map_and_report, map_from_database
 
     extend = given.extension(options)
     if options.from_database:
@@ -136,7 +135,6 @@ def map(options: argparse.Namespace) -> int:
             mapping=given.mapping(options),
             verification=given.verification(options),
             extend=extend,
-            check_cameras=options.focal_vote == "always",
             overwrite=options.overwrite,
             page=options.page,
             progress=given.progress(options),
@@ -146,13 +144,10 @@ def map(options: argparse.Namespace) -> int:
         raise OptionError("--image-path: only with --from-database; else that of extract is used")
     with given.context(options) as context:
         mapper = MAPPERS.make(given.mapping(options, known=context.mapping))
-        is_others = context.workspace.is_copy or bool(context.inputs.from_database)
-        votes = holds_vote(options.focal_vote, mapper.options, is_others=is_others)
         report = map_and_report(
             context,
             mapper,
             extend,
-            earlier=[choose_cameras(context, may_share=not extend)] if votes else [],
             overwrite=options.overwrite,
             page=options.page,
         )

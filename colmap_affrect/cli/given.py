@@ -129,7 +129,6 @@ def inputs(
         "image_list_path": options.image_list_path or (Path(listed) if listed else None),
         "from_database": options.from_database or (Path(database) if database else None),
         "resources": resources(options),
-        "focal_vote": options.focal_vote,
     }
 
 

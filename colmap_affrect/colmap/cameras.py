@@ -24,7 +24,7 @@ from colmap_affrect.project.tables import read_lines, read_table
 
 Source = Literal["given", "exif", "exif-rescaled", "pairs", "guess"]
 """By the user; by EXIF as it is, or scaled to a photograph that was shrunk; by the votes of
-verified pairs; or COLMAP's usual guess."""
+verified pairs (older versions); or COLMAP's usual guess."""
 
 Given = Literal["focal", "principal-point", "distortion"]
 """Parts of intrinsics; a model without distortion counts as given once its focal length is."""
@@ -43,33 +43,22 @@ class CameraRecord:
         names: of its images, sorted.
         source: of the focal length.
         focal_px: in px of the stored file; the mean of two.
-        low_px: lower end of what the focal length may be, None where nothing says so.
-        high_px: upper end.
         why: what was decided and for what reason, one clause.
         size: (width, height) of its images in px.
         given: what of the intrinsics is the user's, to be left as it is.
-        may_be_shared: the pairs do not tell whether other such images of this size have the same
-            camera.
-        is_contradicted: whether the verified pairs contradict a focal length that the user gave;
-            None before they have been asked.
     """
 
     names: tuple[str, ...]
     source: Source
     focal_px: float
-    low_px: float | None = None
-    high_px: float | None = None
     why: str = ""
     size: tuple[int, int] = (0, 0)
     given: tuple[Given, ...] = ()
-    may_be_shared: bool = False
-    is_contradicted: bool | None = None
 
     def to_report(self, camera_id: int, model: ModelSummary | None) -> dict[str, Any]:
         """Return the entry of ``report.json``, with the focal length that a model ended with."""
         longer = max(self.size)
         used = next((name for name in self.names if model and name in model.focals_px), None)
-        has_spread = self.low_px is not None and self.high_px is not None
         return {
             "id": camera_id,
             "num_images": len(self.names),
@@ -79,7 +68,6 @@ class CameraRecord:
             "focal_longer_sides": self.focal_px / longer if longer else None,
             "refined_px": model.focals_px[used] if model and used else None,
             "rival_px": model.rival_focals_px.get(used) if model and used else None,
-            "spread_px": [self.low_px, self.high_px] if has_spread else None,
             "why": self.why,
         }
 
@@ -120,12 +108,10 @@ def notable_lines(records: Iterable[CameraRecord]) -> list[str]:
 def _line(records: Sequence[CameraRecord]) -> str:
     """Say what was decided for cameras of one source and story."""
     names = [name for record in records for name in record.names]
-    first, spread = records[0], ""
-    if len(records) == 1 and first.low_px and first.high_px:
-        spread = f" ({first.low_px:.0f} to {first.high_px:.0f})"
+    first = records[0]
     focals = sorted({round(record.focal_px) for record in records})
     focal = f"{focals[0]}" if len(focals) == 1 else f"{focals[0]} to {focals[-1]}"
-    return f"{such_as(names)}: focal length {focal} px{spread}, {first.source}: {first.why}"
+    return f"{such_as(names)}: focal length {focal} px, {first.source}: {first.why}"
 
 
 WIDTHS = ("sensor_width_mm", "plate_width_mm")

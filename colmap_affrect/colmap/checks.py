@@ -50,8 +50,7 @@ CHECKS: dict[str, Check] = {
     "implausible-focal": ("warning",
         "cameras with focal lengths that hardly any photograph has, in px of the image and longer "
         "sides",
-        "give the right ones in a table (--cameras-path), or let the pairs vote on them: "
-        "--ignore-exif for photographs, --focal-vote always for scans"),
+        "give the right ones in a table (--cameras-path), or none: --ignore-exif"),
     "no-prior-focal": ("note", "cameras whose focal length is a guess",
         "if you know the intrinsics, give them: --cameras-path or --focal-length-px here, "
         "--ImageReader.camera_params in COLMAP"),

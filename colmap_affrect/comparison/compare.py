@@ -152,7 +152,7 @@ class _Plan:
             "photographs": digests,
             "images": _fingerprint(self.names),
             "pairs": _fingerprint([f"{first}\n{second}" for first, second in self.pairs]),
-            "camera": {**options.cameras.to_mapping(), "focal_vote": options.holds_vote},
+            "camera": options.cameras.to_mapping(),
             "masks": {key: bool(path) for key, path in options.masks.to_mapping().items()},
             "verification": _without_seed(options.verification),
             "mapping": _without_seed(options.mapping),

@@ -91,11 +91,6 @@ class MethodTask:
         return colmaps if self.is_colmaps else self.all_options.mapping
 
     @property
-    def focal_vote(self) -> bool:
-        """Whether verified pairs vote on cameras that nobody knows."""
-        return not self.is_colmaps and self.all_options.holds_vote
-
-    @property
     def layout(self) -> Layout:
         """Paths of the comparison."""
         return Layout(self.output_path)

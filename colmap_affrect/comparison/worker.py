@@ -13,7 +13,7 @@ import shutil
 import sys
 import time
 from base64 import b64decode
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +31,6 @@ from colmap_affrect.colmap.database import (
 )
 from colmap_affrect.colmap.database_copy import copy_database
 from colmap_affrect.colmap.verification import (
-    ExtractedPx,
     verified_pairs,
     verify,
 )
@@ -52,16 +51,15 @@ from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import Recipe
-from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context
-from colmap_affrect.stages.escalate import escalate, unmeasured_pairs
+from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide
 from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
-from colmap_affrect.stages.verify import extracted_px, verify_matches
+from colmap_affrect.stages.verify import verify_matches
 
 logger = logging.getLogger("colmap_affrect")
 
@@ -197,29 +195,25 @@ def _seed_result(task: MethodTask, seed: int, folder: Path, progress: "_Reported
     mapper = MAPPERS.make(task.mapping.changed(random_seed=seed))
     workspace = Workspace(task.folder).branch(folder) if task.method.recipe else Workspace(folder)
     context = Context(workspace, task.all_options.resources, progress=told)
-    size_px: ExtractedPx = None
-    silent: Collection[Pair] = ()
     with watch.step("verify"):
         if task.method.recipe:
             verify_matches(context, options)
-            size_px, silent = extracted_px(context), unmeasured_pairs(context)
         else:
             num_pairs = len(unverified_pairs(database_path))
             with told.stage("verify", num_pairs, "pairs") as advance:
                 verify(database_path, options, advance=advance)
             shutil.copy(task.layout.cameras, workspace.cameras)
-        if task.focal_vote:
-            may_share = task.all_options.cameras.mode == "auto"
-            files = database_path, workspace.cameras
-            hold_vote(*files, options, size_px, may_share=may_share, silent=silent)
+    may_share = task.all_options.may_share
     with watch.step("map"):
         if task.method.recipe:
             guide(context)
-            _, models = map_images(context, mapper)
+            _, models = map_images(context, mapper, may_share=may_share)
         else:
             with told.stage("map", len(names), "images") as advance:
                 records = read_camera_records(workspace.cameras)
-                mapping = MappingTask(database_path, task.image_path, cameras=records)
+                mapping = MappingTask(
+                    database_path, task.image_path, cameras=records, may_share=may_share
+                )
                 models = map_database(mapper, mapping, folder / "sparse", advance)
     largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
     model_path = folder / "sparse" / "0" if models else None

@@ -15,7 +15,6 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.cancellable import run_cancellable
 from colmap_affrect.colmap.checks import FATAL, refuse_unusable
 from colmap_affrect.colmap.database import generated_pairs, image_ids, open_database, spatial_pairs
-from colmap_affrect.colmap.initial_cameras import record_cameras
 from colmap_affrect.colmap.verification import VerificationOptions, two_view_options
 from colmap_affrect.colmap.verification import verify as verify_database
 from colmap_affrect.errors import OptionError, PairListError
@@ -27,12 +26,10 @@ from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs
 from colmap_affrect.pairs.retrieval import retrieved_pairs
 from colmap_affrect.parallel.executor import Threads
 from colmap_affrect.progress import SILENT, Advance, Progress
-from colmap_affrect.project.outputs import temporary_folder
 from colmap_affrect.project.report import StageReport
 from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import ExtractionOptions
 from colmap_affrect.stages import verify as verify_stage
-from colmap_affrect.stages.cameras import hold_vote
 from colmap_affrect.stages.context import Context, Resources
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract, write_descriptors, write_images_and_keypoints
@@ -233,7 +230,6 @@ def verify(
     options: GivenVerification = None,
     *,
     pairs_path: PathLike | None = None,
-    check_cameras: bool = False,
     random_seed: int | None = None,
     cancellation_token: Token = None,
 ) -> None:
@@ -242,8 +238,7 @@ def verify(
     As ``pycolmap.geometric_verification``, with the preset for sparse sets (or ``options``, ours or
     those of pycolmap that have a counterpart). Every match is checked first, because one that
     points at no keypoint ends the process inside COLMAP: DatabaseError. ``pairs_path`` lists the
-    pairs to verify, two names per line; all by default. With ``check_cameras`` all verified pairs
-    vote on cameras whose focal length is no prior; those that they know become priors.
+    pairs to verify, two names per line; all by default.
     """
     path, pairs = Path(database_path), None
     verification = translate.verification_options(options, random_seed)
@@ -254,11 +249,6 @@ def verify(
             listed = read_pairs(Path(pairs_path), list(ids))
             pairs = {(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in listed}
         verify_database(path, verification, advance=advance, pairs=pairs)
-    if check_cameras:
-        with temporary_folder(path.parent) as folder:
-            records = folder / "cameras.json"
-            record_cameras(path, records)
-            hold_vote(path, records, verification, may_share=False)
 
 
 def _match(

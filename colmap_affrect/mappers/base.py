@@ -59,6 +59,7 @@ class MappingTask:
         guided: (M, 2) features of pairs of image ids that only guided matching has matched.
         measured: (M, 2) inliers of measured frames, of pairs of image names that have others, too.
         cameras: what is known of the cameras, by id.
+        may_share: images of one size may turn out to share a camera that nobody knows.
         depth_at: depth maps of the images, where there are any.
     """
 
@@ -70,6 +71,7 @@ class MappingTask:
     guided: Mapping[tuple[int, int], NDArray[np.int64]] = field(default_factory=dict)
     measured: Mapping[tuple[str, str], NDArray[np.int64]] = field(default_factory=dict)
     cameras: Mapping[int, CameraRecord] = field(default_factory=dict)
+    may_share: bool = False
     depth_at: DepthLookup | None = None
 
     @property

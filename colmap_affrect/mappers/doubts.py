@@ -7,6 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +76,7 @@ MIN_BASELINE_DEG = 1.0
 """Between two cameras, as their points see them. Rotations are right within a tenth of a degree at
 best, which moves centres by as much: the direction between nearer ones is off by 5 degrees then."""
 
+FOCAL_CONTRADICTED = "the given focal length does not fit"
 FOCAL_DOUBT = "any focal length fits, and the place of the camera depends on that"
 MIRRORED_COPY = "mirrored copy of"
 
@@ -102,17 +104,23 @@ class Doubts:
     impossible: tuple[str, ...] = ()
 
 
-def find_doubts(model: MappedModel, task: MappingTask, loose: Collection[str] = ()) -> Doubts:
+def find_doubts(
+    model: MappedModel,
+    task: MappingTask,
+    loose: Collection[str] = (),
+    fitting_px: Mapping[str, float] = MappingProxyType({}),
+) -> Doubts:
     """Look for everything that is wrong with a model or may be.
 
     Args:
         model: with all its images, also of bridges.
         task: what it was made from.
         loose: images whose points do not tell the focal length.
+        fitting_px: focal lengths that fit, by image, where given ones do not.
     """
     graph = graph_of(task)
     agreements: dict[Ids, float] = {}
-    doubts = _image_doubts(model, graph, task, agreements, loose)
+    doubts = _image_doubts(model, graph, task, agreements, loose, fitting_px)
     images = dict(doubts.images)
     for name, why in hanging_images(model.reconstruction, graph, task, agreements).items():
         images[name] = "; ".join(filter(None, [images.get(name), why]))
@@ -152,6 +160,7 @@ def _image_doubts(
     task: MappingTask,
     agreements: dict[Ids, float],
     loose: Collection[str] = (),
+    fitting_px: Mapping[str, float] = MappingProxyType({}),
 ) -> Doubts:
     """Judge the images one by one; ``agreements`` of pairs are taken if known, and added to."""
     reconstruction = model.reconstruction
@@ -183,7 +192,11 @@ def _image_doubts(
             *_place_doubts(near[image_id], len(registered) - 1),
             *_copy_doubts(graph.names.get(originals.get(image_id, -1))),
             *_bridge_doubts(bridges.get(image.name)),
-            *_focal_doubts(task.cameras.get(image.camera_id), is_loose=image.name in loose),
+            *_focal_doubts(
+                task.cameras.get(image.camera_id),
+                fitting_px.get(image.name),
+                is_loose=image.name in loose,
+            ),
         ]
         if found:
             reasons[image.name] = "; ".join(text for text, _ in found)
@@ -260,12 +273,12 @@ def _bridge_doubts(bridge: Bridge | None) -> Iterator[tuple[str, bool]]:
         yield f"bridged by {bridge.pair[0]}, where only {some} depths agree on the scale", False
 
 
-def _focal_doubts(record: CameraRecord | None, *, is_loose: bool) -> Iterator[tuple[str, bool]]:
-    if record and record.is_contradicted:
-        yield (
-            f"the verified pairs contradict the given focal length, {record.focal_px:.0f} px",
-            False,
-        )
+def _focal_doubts(
+    record: CameraRecord | None, fitting_px: float | None, *, is_loose: bool
+) -> Iterator[tuple[str, bool]]:
+    if record and fitting_px:
+        given = f"{FOCAL_CONTRADICTED}, {record.focal_px:.0f} px"
+        yield f"{given}: {fitting_px:.0f} px does", False
     if is_loose:
         yield FOCAL_DOUBT, False
 

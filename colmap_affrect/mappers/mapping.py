@@ -10,7 +10,7 @@ from colmap_affrect.mappers.arrivals import arrivals
 from colmap_affrect.mappers.base import MappedModel, Mapper, MappingTask
 from colmap_affrect.mappers.doubts import FOCAL_DOUBT, find_doubts, without_impossible
 from colmap_affrect.mappers.existing import require_extends
-from colmap_affrect.mappers.loose_cameras import loose_images
+from colmap_affrect.mappers.loose_cameras import contradicted_focals, loose_images
 from colmap_affrect.mappers.snapshots import snapshots_of, with_snapshots
 from colmap_affrect.mappers.summaries import model_folders, read_summary, write_summary
 from colmap_affrect.project.outputs import remove_own
@@ -95,7 +95,8 @@ def summarize(mapped: MappedModel, task: MappingTask, *, is_largest: bool) -> Mo
     """Count what a model holds, and judge it."""
     model = mapped.reconstruction
     loose = loose_images(model, task) if is_largest and not task.extend else ()
-    doubts = find_doubts(mapped, task, loose)
+    fitting_px = {} if task.extend else contradicted_focals(model, task)
+    doubts = find_doubts(mapped, task, loose, fitting_px)
     images = [model.images[image_id] for image_id in model.reg_image_ids()]
     focals = {i.name: float(model.cameras[i.camera_id].mean_focal_length()) for i in images}
     return ModelSummary(

@@ -8,9 +8,10 @@ from typing import Annotated, Literal
 from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import keep_inliers
 from colmap_affrect.colmap.database_copy import copy_database, copy_without_pairs
+from colmap_affrect.colmap.sharing import share_cameras, with_shared_cameras
 from colmap_affrect.mappers.adjustment import EXIF_SIGMA, NOISE_PX, Adjuster, FocalPrior
 from colmap_affrect.mappers.base import MappedModel, MappingTask
-from colmap_affrect.mappers.evidence import Evidence
+from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
 from colmap_affrect.mappers.loops import contradicting_pairs
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of
@@ -65,8 +66,7 @@ class SparseMapper(IncrementalMapper):
                 for model in best:
                     task.extend.restore(model.reconstruction)
         else:
-            native.mapper.init_max_forward_motion = 1.0  # the evidence decides about such pairs
-            best = self._best(search, task, output_path)
+            best = self._with_or_without_sharing(search, task, output_path)
         if native.extract_colors and task.image_path:
             for model in best:
                 model.reconstruction.extract_colors_for_all_images(task.image_path)
@@ -101,6 +101,27 @@ class SparseMapper(IncrementalMapper):
         )
         return Search(adjuster, Evidence(graph, priors), native, self.options.num_seeds, show)
 
+    def _with_or_without_sharing(
+        self, search: Search, task: MappingTask, output_path: Path
+    ) -> list[MappedModel]:
+        """Let images of one size share unknown cameras, unless the evidence is against that."""
+        search.native.mapper.init_max_forward_motion = 1.0  # the evidence decides on such pairs
+        cameras = with_shared_cameras(task.cameras)
+        if not task.may_share or len(cameras) == len(task.cameras):
+            return self._best(search, task, output_path)
+        path = output_path / "shared.db"
+        copy_database(task.database_path, path)
+        share_cameras(path, cameras)
+        sharing = replace(task, database_path=path, cameras=cameras)
+        graph = graph_of(sharing, search.native.min_num_matches)
+        together = self._search(sharing, graph, search.native, search.show)
+        shared = self._best(together, sharing, output_path)
+        if shared and graph.is_explained_by(shared[0].reconstruction):
+            return shared
+        free = self._best(search, task, output_path)
+        is_worse = together.evidence_of(shared) < search.evidence_of(free) - MIN_GAIN
+        return free if is_worse else shared
+
     def _best(self, search: Search, task: MappingTask, output_path: Path) -> list[MappedModel]:
         """Map with the pairs as some databases have them; return what has most evidence.
 
@@ -113,6 +134,7 @@ class SparseMapper(IncrementalMapper):
         path, tried = output_path / "reduced.db", set[frozenset[Ids]]()
         best: list[MappedModel] = []
         if task.measured:
+            path.unlink(missing_ok=True)
             copy_database(task.database_path, path)
             keep_inliers(path, task.measured)
             best = search.best(PairGraph.read(path, native.min_num_matches, task.depth_at))

@@ -185,7 +185,7 @@ def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str
     scale = 100 / (high - low) if high > low else 0.0
     rows = []
     for camera in shown:
-        spread = camera["rival_px"] or camera["spread_px"]
+        spread = camera["rival_px"]
         ends = spread or [camera["focal_px"]] * 2
         refined = camera["refined_px"]
         rows.append(
@@ -210,7 +210,7 @@ def _cameras(report: ReconstructionReport, index: Mapping[str, int]) -> dict[str
 
 
 def _focals(camera: Mapping[str, Any]) -> list[float]:
-    spread = camera["rival_px"] or camera["spread_px"] or []
+    spread = camera["rival_px"] or []
     return [value for value in (camera["focal_px"], camera["refined_px"], *spread) if value]
 
 

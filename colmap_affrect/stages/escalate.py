@@ -119,14 +119,6 @@ def pair_levels(context: Context) -> dict[str, int]:
     return counts
 
 
-def unmeasured_pairs(context: Context) -> list[Pair]:
-    """Return the verified pairs that matches of measured frames alone do not verify.
-
-    There are none where the others tie fewer than half of the images that all of them tie.
-    """
-    return [pair for pair, indices in measured_inliers(context).items() if not len(indices)]
-
-
 def measured_inliers(context: Context) -> dict[Pair, Indices]:
     """Return the (M, 2) inliers that verified pairs have as measured frames have it, if others.
 

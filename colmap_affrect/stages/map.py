@@ -14,6 +14,7 @@ from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.features.weights import install_hint
 from colmap_affrect.features.weights import missing as missing_weights
 from colmap_affrect.mappers.base import Mapper, MappingTask
+from colmap_affrect.mappers.doubts import FOCAL_CONTRADICTED
 from colmap_affrect.mappers.existing import ExistingModel, Extension, read_existing, require_extends
 from colmap_affrect.mappers.mapping import map_database, read_models
 from colmap_affrect.mappers.pair_graph import PairGraph
@@ -38,7 +39,12 @@ TOO_FEW = "more photographs: two that can be read and show the same from two pla
 
 
 def map_images(
-    context: Context, mapper: Mapper, extend: Extension | None = None, *, overwrite: bool = False
+    context: Context,
+    mapper: Mapper,
+    extend: Extension | None = None,
+    *,
+    may_share: bool | None = None,
+    overwrite: bool = False,
 ) -> tuple[StageReport, list[ModelSummary]]:
     """Reconstruct; only when the verified pairs, or the model that is extended, have changed.
 
@@ -61,7 +67,7 @@ def map_images(
             f"{workspace.sparse}: its model extends another one; give --extend again, or "
             "--overwrite to map from the beginning"
         )
-    task = _task(context, existing)
+    task = _task(context, existing, may_share)
     if known == inputs:
         models = read_models(workspace.sparse, task)
         return StageReport("map", time.perf_counter() - start, 0, len(models)), models
@@ -84,7 +90,7 @@ def map_images(
     return StageReport("map", wall_s, len(models), warnings=warnings), models
 
 
-def _task(context: Context, existing: ExistingModel | None) -> MappingTask:
+def _task(context: Context, existing: ExistingModel | None, may_share: bool | None) -> MappingTask:
     """Return what there is to map; another program's database has no matches and depths of ours."""
     workspace = context.workspace
     copied = workspace.is_copy
@@ -95,8 +101,16 @@ def _task(context: Context, existing: ExistingModel | None) -> MappingTask:
         guided={} if copied else guided_matches(context),
         measured={} if copied else measured_inliers(context),
         cameras=read_camera_records(workspace.cameras),
+        may_share=_may_share(context) if may_share is None else may_share,
         depth_at=None if copied else depth_lookup(context),
     )
+
+
+def _may_share(context: Context) -> bool:
+    """Tell whether nothing is said of which photographs share a camera."""
+    if context.workspace.is_copy:
+        return False
+    return context.inputs.cameras.mode == "auto" and not context.inputs.from_database
 
 
 def _inputs(workspace: Workspace, extend: Extension | None) -> str:
@@ -192,9 +206,8 @@ def advice(
     is_inconsistent = bool(models and (models[0].doubts or models[0].num_contradicted))
     recipes = [] if workspace.is_copy else _other_recipes(context)
     texts = []
-    if any(record.is_contradicted for record in read_camera_records(workspace.cameras).values()):
-        texts.append("run again without the given focal lengths, or with others: pairs contradict "
-                     "them")  # fmt: skip
+    if models and any(FOCAL_CONTRADICTED in why for why in models[0].doubtful.values()):
+        texts.append("run again without the given focal lengths, or with others: they do not fit")
     if missing:
         texts += recipes
     has_cameras = workspace.is_copy or Context(workspace).inputs.from_database
@@ -206,11 +219,6 @@ def advice(
     if workspace.is_copy:
         texts.append("run --from-database, with --image-path, makes new features for its images")
     else:
-        cameras = colmap_database.all_cameras(workspace.database)
-        same_size = len({(camera.width, camera.height) for camera in cameras}) == 1
-        if len(cameras) > 1 and same_size and not any(c.has_prior_focal_length for c in cameras):
-            texts.append("run again with --camera-mode single, if one camera took all: their size "
-                         "is the same")  # fmt: skip
         masks = Context(workspace).inputs.masks
         if (missing or is_inconsistent) and not (masks.path or masks.camera_path):
             texts.append(

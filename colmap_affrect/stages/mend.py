@@ -34,7 +34,6 @@ from colmap_affrect.geometry.arrays import Indices
 from colmap_affrect.pairs.base import Pair
 from colmap_affrect.project.outputs import database_files
 from colmap_affrect.project.workspace import Workspace
-from colmap_affrect.stages.cameras import choose_cameras
 from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.copy import copy_verified
 from colmap_affrect.stages.escalate import escalate
@@ -197,9 +196,7 @@ def mend(context: Context, *, follows: bool) -> None:
     if not is_copied:
         delete_pairs(workspace, found.deleted.values())
         found = _without_others(context, found)
-    # After a vote pairs would be verified by other cameras than they were.
-    is_all = is_copied or (len(found.pairs) and _has_voted(workspace))
-    if found.lost or (found.written and is_all):
+    if found.lost or (found.written and is_copied):
         _make_again(context, found, begun, follows=follows)
         return
     for what, done in (found.kept, "which is kept"), (found.written, "and is written again"):
@@ -261,7 +258,6 @@ def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows
         original or f"{workspace.features.name} and {workspace.matches.name}",
         f", what was there is {kept.name}" if kept else "",
     )
-    has_voted = _has_voted(workspace)
     workspace.rewind()
     if not (follows and "verify" in begun):
         return
@@ -271,8 +267,6 @@ def _make_again(context: Context, found: Edits, begun: Sequence[str], *, follows
     verify_matches(context)
     if "escalate" in begun:
         escalate(context)
-    if has_voted:
-        choose_cameras(context)
     if "guide" in begun:
         guide(context)
 
@@ -289,15 +283,8 @@ def _put_aside(workspace: Workspace) -> Path | None:
     return kept
 
 
-def _has_voted(workspace: Workspace) -> bool:
-    with suppress(AffrectError):
-        records = read_camera_records(workspace.cameras).values()
-        return any(camera.low_px is not None for camera in records)
-    return False
-
-
 def _keep_cameras(workspace: Workspace, changed: Sequence[int]) -> None:
-    """Count intrinsics that were changed in the database as known: no vote is to change them."""
+    """Count intrinsics that were changed in the database as known: mapping keeps them."""
     if not changed:
         return
     records = read_camera_records(workspace.cameras)
@@ -307,9 +294,6 @@ def _keep_cameras(workspace: Workspace, changed: Sequence[int]) -> None:
                 records[camera.camera_id],
                 source="given",
                 focal_px=float(camera.mean_focal_length()),
-                low_px=None,
-                high_px=None,
                 why="changed in the database",
-                may_be_shared=False,
             )
     write_camera_records(workspace.cameras, records)

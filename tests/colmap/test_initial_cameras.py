@@ -232,7 +232,7 @@ def test_records_are_kept_and_follow_the_images_that_come_later(
     record_cameras(path, records_path, initial)
     (record,) = read_camera_records(records_path).values()
     assert (record.names, record.source, record.size) == (("a.jpg",), "exif", (90, 60))
-    voted = CameraRecord(("a.jpg",), "pairs", 70.0, 65.0, 75.0, "", (90, 60))
+    voted = CameraRecord(("a.jpg",), "pairs", 70.0, "", (90, 60))
     write_camera_records(records_path, {1: voted})
     imported(path, photos, NAMES)
     record_cameras(path, records_path, initial)

@@ -348,4 +348,3 @@ def test_colmaps_sift_is_verified_and_mapped_as_colmap_does_it(scene, tmp_path, 
     presets = [(t.verification.preset_name, t.mapping.preset_name) for t in tasks]
     assert presets == [("colmap", "colmap"), ("sparse", "sparse")]
     assert [task.mapping.name for task in tasks] == ["incremental", "sparse"]
-    assert [task.focal_vote for task in tasks] == [False, True]

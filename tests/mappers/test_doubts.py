@@ -405,12 +405,13 @@ def test_images_whose_points_do_not_tell_their_focal_length(tmp_path: Path) -> N
     assert doubts.impossible == ()
 
 
-def test_given_focal_length_that_the_pairs_contradict(tmp_path: Path) -> None:
+def test_given_focal_length_that_does_not_fit(tmp_path: Path) -> None:
     model, task = scene(tmp_path)
     image = last(model)
-    record = CameraRecord((image.name,), "given", 720.4, given=("focal",), is_contradicted=True)
-    doubts = find_doubts(model, replace(task, cameras={image.camera_id: record}))
-    text = "the verified pairs contradict the given focal length, 720 px"
+    record = CameraRecord((image.name,), "given", 720.4, given=("focal",))
+    given = replace(task, cameras={image.camera_id: record})
+    doubts = find_doubts(model, given, (), {image.name: 910.2})
+    text = "the given focal length does not fit, 720 px: 910 px does"
     assert (doubts.images, doubts.impossible) == ({image.name: text}, ())
 
 

@@ -13,7 +13,7 @@ from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.mappers.base import MappingTask
 from colmap_affrect.mappers.loose_cameras import loose_images
 
-UNKNOWN = CameraRecord(("a",), "guess", 1500.0, 500.0, 2500.0, size=(640, 480))
+UNKNOWN = CameraRecord(("a",), "guess", 1500.0, size=(640, 480))
 NUM_IMAGES, STEP_DEG = 5, 30.0
 DISTANCE, NOISE_PX = 6.0, 0.3
 

@@ -30,7 +30,7 @@ from colmap_affrect.mappers.pair_graph import PairGraph
 
 TRUE_FOCAL, SIZE, NUM_IMAGES = 1280.0, (1024, 768), 4
 NOISE_PX = 0.5
-UNKNOWN = CameraRecord(("a",), "guess", 1000.0, 500.0, 2000.0, size=SIZE)
+UNKNOWN = CameraRecord(("a",), "guess", 1000.0, size=SIZE)
 Scene = tuple[Path, pycolmap.Reconstruction]
 
 
@@ -185,9 +185,9 @@ def test_given_focal_lengths_are_refined_where_that_is_asked_for(
     monkeypatch.setattr(adjustment.Adjuster, "adjust", recorded)
     mapper = mapper_of(keep_given_intrinsics=keep)
     task = task_with_given_cameras(scene[0])
-    (model,) = map_database(mapper, task, tmp_path / "sparse", lambda _: None)
+    (found,) = mapper.map(task, tmp_path, 0, lambda _: None)
     assert set().union(*held) == (set(task.cameras) if keep else set())
-    assert (set(model.focals_px.values()) == {TRUE_FOCAL}) is keep
+    assert (set(focals(found.reconstruction)) == {TRUE_FOCAL}) is keep
 
 
 def test_an_adjustment_of_some_images_holds_cameras_that_others_share() -> None:

@@ -183,7 +183,7 @@ def test_run_again_does_nothing_twice(copy: Workspace, photos: Path) -> None:
     done = {stage.name: (stage.num_done, stage.num_kept) for stage in report.stages}
     assert done == {
         "extract": (0, 4), "pairs": (6, 0), "match": (0, 6), "verify": (0, 6),
-        "cameras": (0, 1), "guide": (0, 0), "map": (0, 1),
+        "guide": (0, 0), "map": (0, 1),
     }  # fmt: skip
     assert report.status == "ok"
     assert {path: path.read_bytes() for path in before} == before
