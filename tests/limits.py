@@ -16,11 +16,11 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "colmap_affrect"
 LIMITS = {
-    "lines of the package": 32_390,
-    "lines of the tests": 27_690,
-    "lines of the longest file": 500,
-    "lines of the longest function": 63,
-    "imports between folders": 171,
+    "lines of the package": 30_300,
+    "lines of the tests": 24_950,
+    "lines of the longest file": 450,
+    "lines of the longest function": 60,
+    "imports between folders": 170,
     "words of ARCHITECTURE.md": 2_500,
     "words of BENCHMARKS.md": 2_500,
 }
