@@ -119,10 +119,9 @@ class ExistingModel:
     def restore(self, model: pycolmap.Reconstruction) -> None:
         """Give an extended model the poses that it had before, to the bit, and images it lost.
 
-        Where poses may move, the model as a whole is moved back onto them.
+        The model as a whole is moved back onto them: COLMAP gives it another scale.
         """
-        if self.refine:
-            _move_onto(model, self.images)
+        _move_onto(model, self.images)
         for image in self.images:
             frame = model.frame(image.frame_id)
             if not (frame.has_pose() and self.refine):

@@ -67,6 +67,8 @@ class SparseMapper(IncrementalMapper):
                     task.extend.restore(model.reconstruction)
         else:
             best = self._with_or_without_sharing(search, task, output_path)
+            for model in best:
+                model.reconstruction.normalize()  # as COLMAP does
         if native.extract_colors and task.image_path:
             for model in best:
                 model.reconstruction.extract_colors_for_all_images(task.image_path)
