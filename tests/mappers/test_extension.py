@@ -91,6 +91,10 @@ def poses(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
     return {image.name: image.cam_from_world().matrix() for image in images}
 
 
+def center(pose: np.ndarray) -> np.ndarray:
+    return -pose[:, :3].T @ pose[:, 3]
+
+
 def cameras(model: pycolmap.Reconstruction) -> dict[str, list[float]]:
     images = [model.image(image_id) for image_id in model.reg_image_ids()]
     return {image.name: model.camera(image.camera_id).params.tolist() for image in images}
@@ -149,9 +153,12 @@ def test_old_poses_may_move_and_stay_in_their_frame(
     assert cameras(model) != {**cameras(model), **cameras(old)}
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.01])
 def test_new_images_are_where_they_were_taken(
-    database: Path, old: pycolmap.Reconstruction, tmp_path: Path
+    database: Path, old: pycolmap.Reconstruction, tmp_path: Path, scale: float
 ) -> None:
+    old = pycolmap.Reconstruction(old)
+    old.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
     path = written(old, tmp_path / "old")
     model, _ = extended(database, read_existing(Extension(path), database), tmp_path)
     native = mapper_of().native(NOTHING_KNOWN, SEED)
@@ -160,9 +167,13 @@ def test_new_images_are_where_they_were_taken(
     whole = pycolmap.incremental_mapping(database, tmp_path, tmp_path / "all", options=native)[0]
     one, other = poses(model), poses(whole)
     first, *others = sorted(one)
+    ratios: list[float] = []
     for name in others:
         rotations = [p[name][:, :3] @ p[first][:, :3].T for p in (one, other)]
         assert np.trace(rotations[0] @ rotations[1].T) > 3 - 1e-4
+        steps = [np.linalg.norm(center(p[name]) - center(p[first])) for p in (one, other)]
+        ratios.append(float(steps[0] / steps[1]))
+    assert max(ratios) < 1.01 * min(ratios)
 
 
 def test_images_without_matches_stay_in_the_model(
