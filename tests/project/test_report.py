@@ -111,7 +111,7 @@ def test_summary_is_one_screen_with_names_reasons_and_numbers() -> None:
         "2 without warps, 1 with warps (asift)\n",
         "came in     č d.png bridged by a.png, 32 of 36 depths agree, scale +-3.1%",
         "3 of 10 verified",
-        "cameras     focal lengths: 2 from EXIF, 1 uncertain",
+        "cameras     focal lengths: 2 from EXIF, 1 not known beforehand",
         "points      120, each in 2.25 images",
         "0.51 px",
         "2, of 2, 2 images",
