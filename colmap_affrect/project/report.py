@@ -109,7 +109,7 @@ class StageReport:
     """One stage of a run.
 
     Attributes:
-        name: extract, pairs, match, verify, cameras, escalate, guide or map.
+        name: extract, pairs, match, verify, escalate, guide or map.
         wall_s: seconds.
         num_done: images, pairs, cameras or models made now.
         num_kept: those found done already.

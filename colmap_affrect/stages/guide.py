@@ -1,10 +1,9 @@
 """Guide: matches of verified pairs once more, where their geometry allows them.
 
-For the pairs of images that hang on few tracks through three images, or that the caller names:
-those that mapping lost. Guided matches are less exact than others, and where they outweigh these a
-model becomes less accurate; so images that register well are left alone, and what was there before
-stays on record (``guided.h5``) for the last adjustment. The raw matches stay as they are, as with
-COLMAP's own guided matching.
+For the pairs of images that hang on few tracks through three images, or that the caller names.
+Guided matches are less exact than others, and where they outweigh these a model becomes less
+accurate; so other images are left alone, and what was there before stays on record (``guided.h5``),
+to be told from it. The raw matches stay as they are, as with COLMAP's own guided matching.
 """
 
 import time
