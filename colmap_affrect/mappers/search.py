@@ -131,7 +131,7 @@ class Search:
         """Return what keeps unknown focal lengths near those of a model, times a factor."""
         near = {
             key: FocalPrior(factor * model.cameras[key].mean_focal_length(), SHARED_SIGMA)
-            for key in self.unknown.keys() & set(model.cameras)
+            for key in self._unknown_in(model)
         }
         return replace(self.adjuster, priors={**self.adjuster.priors, **near})
 
@@ -140,8 +140,13 @@ class Search:
         return all(
             abs(math.log(model.cameras[key].mean_focal_length() / adjuster.priors[key].focal_px))
             <= SAME_FOCAL
-            for key in self.unknown.keys() & {c.camera_id for c in cameras_of(model).values()}
+            for key in self._unknown_in(model)
         )
+
+    def _unknown_in(self, model: pycolmap.Reconstruction) -> set[int]:
+        """Return the cameras of the registered images that nobody knows."""
+        used = {camera.camera_id for camera in cameras_of(model).values()}
+        return used & self.unknown.keys()
 
     def _with_free_cameras(
         self, graph: PairGraph, model: pycolmap.Reconstruction
