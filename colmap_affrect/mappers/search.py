@@ -157,7 +157,8 @@ class Search:
             The model and its evidence.
         """
         free = self.grower(graph)
-        free.finish(model, MEDIUM)
+        if self.unknown:
+            free.finish(model, MEDIUM)
         most = self.evidence.of(model)
         if len(self.unknown) != 1 or self.evidence.is_confirmed(model):
             return model, most  # several cameras: there are too many other focal lengths
