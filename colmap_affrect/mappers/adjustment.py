@@ -59,6 +59,13 @@ class FocalPrior:
         return 0.5 * (math.log(max(focal_px, 1e-9) / self.focal_px) / self.sigma) ** 2
 
 
+def priors_of(
+    cameras: Iterable[pycolmap.Camera], records: Mapping[int, CameraRecord]
+) -> dict[int, FocalPrior]:
+    """Return what is known of the focal lengths of cameras, by id."""
+    return {c.camera_id: FocalPrior.of(c, records.get(c.camera_id)) for c in cameras}
+
+
 @dataclass(frozen=True)
 class Adjuster:
     """Adjusts models.

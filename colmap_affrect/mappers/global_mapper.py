@@ -14,7 +14,7 @@ from colmap_affrect.colmap.database import all_cameras
 from colmap_affrect.colmap.model_files import read_written_model
 from colmap_affrect.colmap.native_options import Plain, differences, resolve, set_values
 from colmap_affrect.errors import MappingError
-from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, FocalPrior
+from colmap_affrect.mappers.adjustment import FINAL, NOISE_PX, Adjuster, priors_of
 from colmap_affrect.mappers.base import MappedModel, MapperOptions, MappingTask
 from colmap_affrect.parallel.executor import return_freed_memory
 from colmap_affrect.parallel.subprocesses import child, end_with
@@ -87,10 +87,7 @@ class GlobalMapper:
         for key in moved:
             model.cameras[key].params = given[key]
         if moved:
-            priors = {
-                key: FocalPrior.of(camera, task.cameras.get(key))
-                for key, camera in model.cameras.items()
-            }
+            priors = priors_of(model.cameras.values(), task.cameras)
             Adjuster(priors, NOISE_PX, options, frozenset(constant)).adjust(model, FINAL)
 
     def native(self, task: MappingTask, random_seed: int) -> pycolmap.GlobalPipelineOptions:

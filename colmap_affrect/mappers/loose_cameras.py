@@ -17,6 +17,7 @@ from colmap_affrect.mappers.adjustment import (
     USUAL_SIGMA,
     Adjuster,
     FocalPrior,
+    priors_of,
 )
 from colmap_affrect.mappers.base import MappingTask
 
@@ -40,7 +41,7 @@ def loose_images(model: pycolmap.Reconstruction, task: MappingTask) -> tuple[str
     """
     images = [model.images[image_id] for image_id in model.reg_image_ids()]
     used = {image.camera_id for image in images}
-    priors = {key: FocalPrior.of(model.cameras[key], task.cameras.get(key)) for key in sorted(used)}
+    priors = priors_of((model.cameras[key] for key in sorted(used)), task.cameras)
     unknown = [key for key, p in priors.items() if p.sigma > EXIF_SIGMA and key in task.cameras]
     if not unknown or len(images) > MAX_NUM_IMAGES or model.num_points3D() == 0:
         return ()
@@ -68,9 +69,7 @@ def contradicted_focals(model: pycolmap.Reconstruction, task: MappingTask) -> di
     given = {key for key in used if "focal" in task.cameras[key].given}
     if not given or len(images) > MAX_NUM_IMAGES or model.num_points3D() == 0:
         return {}
-    priors = {
-        key: FocalPrior.of(camera, task.cameras.get(key)) for key, camera in model.cameras.items()
-    }
+    priors = priors_of(model.cameras.values(), task.cameras)
     free = priors | {key: FocalPrior(priors[key].focal_px, USUAL_SIGMA) for key in given}
     refining = pycolmap.BundleAdjustmentOptions(refine_extra_params=False)
     held, freed = _with_fewer_points(model), _with_fewer_points(model)

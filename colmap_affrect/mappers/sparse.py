@@ -9,7 +9,7 @@ from colmap_affrect.colmap import pycolmap
 from colmap_affrect.colmap.database import keep_inliers
 from colmap_affrect.colmap.database_copy import copy_database, copy_without_pairs
 from colmap_affrect.colmap.sharing import share_cameras, with_shared_cameras
-from colmap_affrect.mappers.adjustment import EXIF_SIGMA, NOISE_PX, Adjuster, FocalPrior
+from colmap_affrect.mappers.adjustment import EXIF_SIGMA, NOISE_PX, Adjuster, priors_of
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
@@ -81,8 +81,7 @@ class SparseMapper(IncrementalMapper):
         native: pycolmap.IncrementalPipelineOptions,
         show: Callable[[int], None],
     ) -> Search:
-        cameras = {camera.camera_id: camera for camera in graph.cameras.values()}
-        priors = {key: FocalPrior.of(c, task.cameras.get(key)) for key, c in cameras.items()}
+        priors = priors_of(graph.cameras.values(), task.cameras)
         if self.options.keep_given_intrinsics:
             constant = {key for key, record in task.cameras.items() if record.is_fixed}
         else:
