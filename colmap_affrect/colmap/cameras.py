@@ -7,7 +7,7 @@ flag for a focal length, that somebody knows it; ``cameras.json`` beside it says
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -332,3 +332,17 @@ def unknown_names(
     others = [name for name in given if name and not (image_path / name).is_file()]
     is_model = any(camera.label.startswith("model/") for camera in given.values())
     return [] if is_model and given.keys() & set(names) else others
+
+
+def with_shared_cameras(records: Mapping[int, CameraRecord]) -> dict[int, CameraRecord]:
+    """Return records in which images of one size share a camera where nothing is known of it."""
+    groups: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for key, record in sorted(records.items()):
+        if record.source == "guess" and not record.given:
+            groups[record.size].append(key)
+    shared = dict(records)
+    for keys in groups.values():
+        same = [shared.pop(key) for key in keys]
+        names = sorted(name for record in same for name in record.names)
+        shared[keys[0]] = replace(same[0], names=tuple(names))
+    return shared

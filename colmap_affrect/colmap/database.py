@@ -8,7 +8,7 @@ import errno
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -278,22 +278,6 @@ def replace_matches(
         if database.exists_two_view_geometry(image_id1, image_id2):
             database.delete_two_view_geometry(image_id1, image_id2)
     write_matches(database, image_id1, image_id2, indices)
-
-
-def keep_inliers(path: Path, inliers: Mapping[tuple[str, str], Indices]) -> None:
-    """Let verified pairs of image names have (M, 2) of their inliers.
-
-    Those that keep none count as verified in vain.
-    """
-    ids = image_ids(path)
-    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
-        for (first, second), indices in inliers.items():
-            pair, geometry = (ids[first], ids[second]), pycolmap.TwoViewGeometry()
-            if len(indices):
-                geometry = database.read_two_view_geometry(*pair)
-                geometry.inlier_matches = indices.astype(np.uint32)
-            database.delete_two_view_geometry(*pair)
-            database.write_two_view_geometry(*pair, geometry)
 
 
 def camera_matrix(camera: pycolmap.Camera) -> Array:

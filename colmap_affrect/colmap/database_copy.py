@@ -7,7 +7,7 @@ is read and copied by SQLite itself, and COLMAP opens only the copy.
 import logging
 import sqlite3
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
@@ -157,16 +157,6 @@ def copy_without_features(source: Path, target: Path) -> None:
         _add_frames(database)
 
     copy_database(source, target, FATAL_FOR_IMAGES, change)
-
-
-def copy_without_pairs(source: Path, target: Path, pairs: Iterable[tuple[int, int]]) -> None:
-    """Copy a database and leave out the two-view geometries of some pairs of image ids."""
-
-    def change(database: pycolmap.Database) -> None:
-        for pair in pairs:
-            database.delete_two_view_geometry(*pair)
-
-    copy_database(source, target, change=change)
 
 
 def _add_frames(database: pycolmap.Database) -> None:

@@ -80,6 +80,15 @@ class Grower:
             self._refine(mapper, max_iterations)
         mapper.end_reconstruction(False)
 
+    def fill(self, model: pycolmap.Reconstruction, max_iterations: int) -> None:
+        """Find all points of a model that some of them made, and adjust it."""
+        mapper = pycolmap.IncrementalMapper(self.cache)
+        mapper.begin_reconstruction(model)
+        for image_id in model.reg_image_ids():
+            mapper.triangulate_image(self.triangulation, image_id)
+        self._refine(mapper, max_iterations)
+        mapper.end_reconstruction(False)
+
     def _refine(self, mapper: pycolmap.IncrementalMapper, max_iterations: int) -> None:
         mapper.retriangulate(self.triangulation)
         mapper.complete_and_merge_tracks(self.triangulation)

@@ -1,19 +1,23 @@
 """The verified pairs of a database, and how well poses agree with them."""
 
+import copy
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.cameras import CameraRecord
 from colmap_affrect.colmap.database import open_database
 from colmap_affrect.colmap.poses import Pose, relative_pose
 from colmap_affrect.colmap.two_views import decomposed_homography, homography_matrix
+from colmap_affrect.geometry.arrays import rows_in
 from colmap_affrect.geometry.epipolar import sampson_errors
 from colmap_affrect.geometry.two_views import (
     Depths,
@@ -44,6 +48,9 @@ MAX_PAIRS_OF_IMAGE = 15
 MIN_NUM_MATCHES = 15
 """Pairs with fewer inliers are left out, as by COLMAP's mappers."""
 
+NUM_TRACKS, NUM_MATCHES_OF_PAIR = 500, 100
+"""Tracks of an image, and matches of a pair, that tell poses as well as all of them do."""
+
 MIN_SHARE = 0.5
 """A pair speaks for poses when at least this share of its inliers agrees."""
 
@@ -55,12 +62,17 @@ class VerifiedPair:
     Attributes:
         ids: of the two images.
         matches: (M, 2) features that are inliers.
-        homography: (3, 3) from image 1 to image 2, where COLMAP found one.
+        geometry: of the pair in the database.
     """
 
     ids: tuple[int, int]
     matches: NDArray[np.int64]
-    homography: NDArray[np.float64] | None
+    geometry: pycolmap.TwoViewGeometry
+
+    @property
+    def homography(self) -> NDArray[np.float64] | None:
+        """(3, 3) from image 1 to image 2, where COLMAP found one."""
+        return homography_matrix(self.geometry)
 
     @property
     def weight(self) -> float:
@@ -96,10 +108,12 @@ class PairGraph:
         cache: the same for pycolmap's mappers.
         names: by image id.
         cameras: by image id, as in the database.
-        keypoints: (N, 2) px by image id.
+        keypoints: (N, 2) px by image id, of the images of pairs.
         pairs: sorted by ids.
+        weak: verified pairs that are not among the strongest, and in the cache only.
+        min_num_matches: pairs with fewer inliers are left out.
         depth_at: depth maps of the images, where there are any.
-        left_out: ids of the verified pairs that are not among the strongest.
+        unthinned: the same pairs with all their matches, where this graph has some of them.
     """
 
     cache: pycolmap.DatabaseCache
@@ -107,8 +121,10 @@ class PairGraph:
     cameras: CameraById
     keypoints: Mapping[int, NDArray[np.float32]]
     pairs: tuple[VerifiedPair, ...]
+    weak: tuple[VerifiedPair, ...]
+    min_num_matches: int
     depth_at: DepthLookup | None = None
-    left_out: frozenset[tuple[int, int]] = frozenset()
+    unthinned: Self | None = None
 
     @classmethod
     def read(
@@ -121,37 +137,81 @@ class PairGraph:
         with open_database(path) as database:
             images = {image.image_id: image for image in database.read_all_images()}
             cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-            pair_ids, geometries = database.read_two_view_geometries()
             verified = [
                 VerifiedPair(
                     pycolmap.pair_id_to_image_pair(pair_id),
                     np.asarray(geometry.inlier_matches, np.int64),
-                    homography_matrix(geometry),
+                    geometry,
                 )
-                for pair_id, geometry in zip(pair_ids, geometries, strict=True)
+                for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True)
                 if len(geometry.inlier_matches) >= min_num_matches
             ]
-            pairs = _strongest(verified)
             options = pycolmap.DatabaseCacheOptions(min_num_matches=min_num_matches)
             cache = pycolmap.DatabaseCache.create(database, options)
-            used = {image_id for pair in pairs for image_id in pair.ids}
             keypoints = {
                 image_id: np.array(database.read_keypoints(image_id)[:, :2], np.float32)
-                for image_id in used
+                for image_id in {image_id for pair in verified for image_id in pair.ids}
             }
-        return cls(
-            cache,
-            {image_id: images[image_id].name for image_id in images},
-            {image_id: cameras[images[image_id].camera_id] for image_id in images},
-            keypoints,
-            tuple(sorted(pairs, key=lambda pair: pair.ids)),
-            depth_at,
-            frozenset(pair.ids for pair in verified).difference(pair.ids for pair in pairs),
-        )
+        names = {image_id: image.name for image_id, image in images.items()}
+        of_images = {image_id: cameras[image.camera_id] for image_id, image in images.items()}
+        strong, weak = _strongest(verified)
+        return cls(cache, names, of_images, keypoints, strong, weak, min_num_matches, depth_at)
 
-    def without(self, ids: Collection[tuple[int, int]]) -> Self:
-        """Leave out some pairs; the cache keeps them."""
-        return replace(self, pairs=tuple(pair for pair in self.pairs if pair.ids not in ids))
+    @property
+    def whole(self) -> Self:
+        """The graph with all matches."""
+        return self.unthinned or self
+
+    def without(self, ids: Collection[Ids]) -> Self:
+        """Leave out some pairs."""
+        kept = self._with((p for p in self._verified if p.ids not in ids), self.cache)
+        return replace(kept, unthinned=self.unthinned and self.unthinned.without(ids))
+
+    def with_inliers(self, inliers: Mapping[Ids, NDArray[np.int64]]) -> Self:
+        """Leave some pairs only those (M, 2) inliers."""
+        kept = self._with(
+            (_with_some(pair, inliers.get(pair.ids)) for pair in self._verified), self.cache
+        )
+        return replace(kept, unthinned=self.unthinned and self.unthinned.with_inliers(inliers))
+
+    @property
+    def _verified(self) -> tuple[VerifiedPair, ...]:
+        return self.pairs + self.weak
+
+    def with_cameras(self, records: Mapping[int, CameraRecord]) -> Self:
+        """Give images the cameras that records say they have, of those of the graph."""
+        camera_of = {name: key for key, record in records.items() for name in record.names}
+        cache = _empty_copy(self.cache, camera_of)
+        cameras = {i: cache.cameras[image.camera_id] for i, image in cache.images.items()}
+        moved = self._with(self._verified, cache)
+        return replace(moved, cameras={**self.cameras, **cameras})
+
+    def thinned(self) -> Self:
+        """Leave out tracks where the others tell the poses as well; itself where they are few.
+
+        Each image keeps its ``NUM_TRACKS`` tracks of most images, each pair
+        ``NUM_MATCHES_OF_PAIR`` matches at least.
+        """
+        pairs = self._verified
+        kept = _kept_matches(pairs, {i: len(points) for i, points in self.keypoints.items()})
+        if 2 * sum(map(np.sum, kept)) > sum(map(len, kept)):
+            return self
+        some = (replace(p, matches=p.matches[k]) for p, k in zip(pairs, kept, strict=True))
+        return replace(self._with(some, self.cache), unthinned=self)
+
+    def _with(self, verified: Iterable[VerifiedPair], cache: pycolmap.DatabaseCache) -> Self:
+        """Return a graph of other pairs, with the cameras and images of a cache."""
+        kept = [pair for pair in verified if len(pair.matches) >= self.min_num_matches]
+        new = _empty_copy(cache)
+        for pair in kept:
+            geometry = copy.copy(pair.geometry)
+            geometry.inlier_matches = pair.matches.astype(np.uint32)
+            new.correspondence_graph.add_two_view_geometry(*pair.ids, geometry)
+        new.correspondence_graph.finalize()
+        used = {image_id for pair in kept for image_id in pair.ids}
+        keypoints = {i: points for i, points in self.keypoints.items() if i in used}
+        strong, weak = _strongest(kept)
+        return replace(self, cache=new, keypoints=keypoints, pairs=strong, weak=weak)
 
     def points(self, pair: VerifiedPair) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the (M, 2) px of the inliers in both images."""
@@ -277,12 +337,94 @@ def _agrees(
     return (errors <= tolerance) & sides, depths
 
 
-def _strongest(pairs: Iterable[VerifiedPair]) -> list[VerifiedPair]:
-    """Return the pairs among the ``MAX_PAIRS_OF_IMAGE`` strongest of one of their images."""
+def _strongest(
+    pairs: Iterable[VerifiedPair],
+) -> tuple[tuple[VerifiedPair, ...], tuple[VerifiedPair, ...]]:
+    """Return the pairs among the ``MAX_PAIRS_OF_IMAGE`` strongest of one image, and the others."""
     counts: Counter[int] = Counter()
-    kept = []
+    strong: list[VerifiedPair] = []
+    weak: list[VerifiedPair] = []
     for pair in sorted(pairs, key=lambda pair: (-len(pair.matches), pair.ids)):
-        if min(counts[image_id] for image_id in pair.ids) < MAX_PAIRS_OF_IMAGE:
-            kept.append(pair)
+        is_strong = min(counts[image_id] for image_id in pair.ids) < MAX_PAIRS_OF_IMAGE
+        (strong if is_strong else weak).append(pair)
         counts.update(pair.ids)
-    return kept
+    return tuple(sorted(strong, key=lambda pair: pair.ids)), tuple(weak)
+
+
+def _with_some(pair: VerifiedPair, inliers: NDArray[np.int64] | None) -> VerifiedPair:
+    """Return a pair with those of its matches that are among some; with all if None."""
+    if inliers is None:
+        return pair
+    return replace(pair, matches=pair.matches[rows_in(pair.matches, inliers)])
+
+
+def _empty_copy(
+    cache: pycolmap.DatabaseCache, camera_of: Mapping[str, int] = MappingProxyType({})
+) -> pycolmap.DatabaseCache:
+    """Return cameras and images without pairs; some images, by name, have another camera.
+
+    Cameras without images go, and their rigs.
+    """
+    new = pycolmap.DatabaseCache()
+    rigs = {rig.ref_sensor_id: rig for rig in cache.rigs.values()}
+    frames, images = dict(cache.frames), []
+    for image in map(copy.copy, cache.images.values()):
+        key = camera_of.get(image.name, image.camera_id)
+        if key != image.camera_id:
+            sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, key)
+            frame = pycolmap.Frame(frame_id=image.frame_id, rig_id=rigs[sensor].rig_id)
+            frame.add_data_id(pycolmap.data_t(sensor, image.image_id))
+            frames[image.frame_id], image.camera_id = frame, key
+        images.append(image)
+    used = {frame.rig_id for frame in frames.values()}
+    sensors = {sensor for rig_id in used for sensor in cache.rigs[rig_id].sensor_ids()}
+    for camera in cache.cameras.values():
+        if pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera.camera_id) in sensors:
+            new.add_camera(camera)
+    for rig_id in sorted(used):
+        new.add_rig(cache.rigs[rig_id])
+    for frame in frames.values():
+        new.add_frame(frame)
+    for image in images:
+        new.add_image(image)
+    for prior in cache.pose_priors:
+        new.add_pose_prior(prior)
+    return new
+
+
+def _kept_matches(
+    pairs: Sequence[VerifiedPair], num_keypoints: Mapping[int, int]
+) -> list[NDArray[np.bool_]]:
+    """Return for each pair which of its matches are of tracks that are kept, (M,)."""
+    if not pairs:
+        return []
+    ids = sorted(num_keypoints)
+    starts = dict(zip(ids, np.cumsum([0, *(num_keypoints[i] for i in ids)]), strict=False))
+    total = sum(num_keypoints.values())
+    matches = [pair.matches + [starts[i] for i in pair.ids] for pair in pairs]
+    edges = np.concatenate(matches)
+    track_of = np.arange(total)
+    while True:  # the lowest number in reach becomes that of the track
+        before = track_of.copy()
+        lowest = track_of[edges].min(axis=1)
+        np.minimum.at(track_of, edges[:, 0], lowest)
+        np.minimum.at(track_of, edges[:, 1], lowest)
+        track_of = track_of[track_of]
+        if np.array_equal(track_of, before):
+            break
+    image_of = np.repeat(np.arange(len(ids)), [num_keypoints[i] for i in ids])
+    nodes = np.unique(edges)
+    sizes = np.bincount(track_of[nodes], minlength=total)
+    both = np.unique(np.stack([track_of[nodes], image_of[nodes]]), axis=1)
+    num_images = np.bincount(both[0], minlength=total)
+    order = np.lexsort((np.random.default_rng(0).random(total), -num_images, sizes > num_images))
+    rank = np.empty(total, np.int64)
+    rank[order] = np.arange(total)
+    kept = np.zeros(total, bool)
+    for index in range(len(ids)):
+        tracks = both[0][both[1] == index]
+        kept[tracks[np.argsort(rank[tracks])[:NUM_TRACKS]]] = True
+    of_pairs = [track_of[nodes_of_pair[:, 0]] for nodes_of_pair in matches]
+    for tracks in of_pairs:
+        kept[tracks[np.argsort(rank[tracks])[:NUM_MATCHES_OF_PAIR]]] = True
+    return [kept[tracks] for tracks in of_pairs]

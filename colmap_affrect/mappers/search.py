@@ -64,7 +64,7 @@ class Search:
         while left:
             adjuster = left.pop(0)
             grower = self.grower(graph, adjuster)
-            found = self.joined(graph, grower, self._grown(graph, grower), NUM_STARTS)
+            found = self.joined(graph, adjuster, self._grown(graph, grower), NUM_STARTS)
             if not found:
                 continue
             model, evidence = self._with_free_cameras(graph, found[0].reconstruction)
@@ -76,7 +76,7 @@ class Search:
                 most, best = evidence, found
                 if adjuster in usual and not agrees:
                     left.insert(0, self._as_found(model))
-            if self._is_certain(model, graph, agrees=agrees):
+            if self.is_certain(model, graph, agrees=agrees):
                 break
         if not best:
             return []
@@ -90,15 +90,18 @@ class Search:
         grower, again = near.grower(graph), pycolmap.Reconstruction(start)
         grower.finish(again)
         models = sorted([again, *near._grown(graph, grower)], key=self.evidence.of, reverse=True)
-        found = near.joined(graph, grower, models, NUM_STARTS)
+        found = near.joined(graph, near.adjuster, models, NUM_STARTS)
         for model in found:
             grower.finish(model.reconstruction)
         return found
 
-    def _is_certain(
-        self, model: pycolmap.Reconstruction, graph: PairGraph, *, agrees: bool
+    def is_certain(
+        self, model: pycolmap.Reconstruction, graph: PairGraph, *, agrees: bool = True
     ) -> bool:
-        """Tell whether a model has all images, and features of three images confirm it."""
+        """Tell whether a model has all images, and all pairs or features of three confirm it.
+
+        The pairs do if its unknown focal lengths are those that it was made with.
+        """
         if model.num_reg_images() < len(graph.keypoints):
             return False
         explained = agrees and graph.is_explained_by(model)
@@ -174,14 +177,21 @@ class Search:
         return model, most
 
     def joined(
-        self, graph: PairGraph, grower: Grower, models: Models, num_starts: int
+        self, graph: PairGraph, adjuster: Adjuster, models: Models, num_starts: int
     ) -> list[MappedModel]:
-        """Return the best model that bridges make of some, best first, and those left out of it."""
+        """Return the best model that bridges make of some, best first, and those left out of it.
+
+        Bridges need all points, for theirs are to lie beside them.
+        """
         if not models:
             return []
         if graph.is_explained_by(models[0]):
             return [MappedModel(models[0])]
-        joiner = Joiner(graph, grower, self.evidence)
+        grower = self.grower(graph.whole, adjuster)
+        if graph.unthinned:
+            for model in models:
+                grower.fill(model, MEDIUM)
+        joiner = Joiner(graph.whole, grower, self.evidence)
         joined = [
             joiner.join(model, models[:index] + models[index + 1 :])
             for index, model in enumerate(models[:num_starts])

@@ -1,25 +1,22 @@
 """The sparse mapper: mapping as one estimate, for small sets with few matches."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 from colmap_affrect.colmap import pycolmap
-from colmap_affrect.colmap.database import keep_inliers
-from colmap_affrect.colmap.database_copy import copy_database, copy_without_pairs
-from colmap_affrect.colmap.sharing import share_cameras, with_shared_cameras
-from colmap_affrect.mappers.adjustment import EXIF_SIGMA, NOISE_PX, Adjuster, priors_of
+from colmap_affrect.colmap.cameras import with_shared_cameras
+from colmap_affrect.mappers.adjustment import EXIF_SIGMA, FINAL, NOISE_PX, Adjuster, priors_of
 from colmap_affrect.mappers.base import MappedModel, MappingTask
 from colmap_affrect.mappers.evidence import MIN_GAIN, Evidence
 from colmap_affrect.mappers.incremental import IncrementalMapper, PipelineOptions
-from colmap_affrect.mappers.loops import contradicting_pairs
+from colmap_affrect.mappers.moves import MOVES, State
 from colmap_affrect.mappers.pair_graph import Ids, PairGraph, graph_of
 from colmap_affrect.mappers.search import Search
 from colmap_affrect.options import within
 
 LARGE = 100  # images from which on COLMAP's own pipeline maps
-NONE: frozenset[Ids] = frozenset()
 
 
 class SparseOptions(PipelineOptions):
@@ -55,18 +52,19 @@ class SparseMapper(IncrementalMapper):
                 raise KeyboardInterrupt
             show(count)
 
-        search = self._search(task, graph, native, shown)
         if task.extend or len(graph.keypoints) >= LARGE:
             found = super().map(task, output_path, random_seed, show)
             if found and graph.is_explained_by(found[0].reconstruction):
                 return found
+            search = self._search(task, graph, native, shown)
             models = sorted((m.reconstruction for m in found), key=search.evidence.of, reverse=True)
-            best = search.joined(graph, search.grower(graph), models, num_starts=1)
+            best = search.joined(graph, search.adjuster, models, num_starts=1)
             if task.extend:
                 for model in best:
                     task.extend.restore(model.reconstruction)
         else:
-            best = self._with_or_without_sharing(search, task, output_path)
+            native.mapper.init_max_forward_motion = 1.0  # the evidence decides on such pairs
+            best = self._with_or_without_sharing(task, graph, native, shown)
             for model in best:
                 model.reconstruction.normalize()  # as COLMAP does
         if native.extract_colors and task.image_path:
@@ -103,70 +101,71 @@ class SparseMapper(IncrementalMapper):
         return Search(adjuster, Evidence(graph, priors), native, self.options.num_seeds, show)
 
     def _with_or_without_sharing(
-        self, search: Search, task: MappingTask, output_path: Path
+        self,
+        task: MappingTask,
+        graph: PairGraph,
+        native: pycolmap.IncrementalPipelineOptions,
+        show: Callable[[int], None],
     ) -> list[MappedModel]:
         """Let images of one size share unknown cameras, unless the evidence is against that."""
-        search.native.mapper.init_max_forward_motion = 1.0  # the evidence decides on such pairs
         cameras = with_shared_cameras(task.cameras)
         if not task.may_share or len(cameras) == len(task.cameras):
-            return self._best(search, task, output_path)
-        path = output_path / "shared.db"
-        copy_database(task.database_path, path)
-        share_cameras(path, cameras)
-        sharing = replace(task, database_path=path, cameras=cameras)
-        graph = graph_of(sharing, search.native.min_num_matches)
-        together = self._search(sharing, graph, search.native, search.show)
-        shared = self._best(together, sharing, output_path)
-        if shared and graph.is_explained_by(shared[0].reconstruction):
-            return shared
-        free = self._best(search, task, output_path)
-        is_worse = together.evidence_of(shared) < search.evidence_of(free) - MIN_GAIN
-        return free if is_worse else shared
+            return self._best(task, graph, native, show).with_all_points()
+        sharing = replace(task, cameras=cameras)
+        shared = self._best(sharing, graph.with_cameras(cameras), native, show)
+        if not shared.models or not graph.is_explained_by(shared.models[0].reconstruction):
+            free = self._best(task, graph, native, show)
+            if shared.evidence < free.evidence - MIN_GAIN:
+                return free.with_all_points()
+        return shared.with_all_points()
 
-    def _best(self, search: Search, task: MappingTask, output_path: Path) -> list[MappedModel]:
-        """Map with the pairs as some databases have them; return what has most evidence.
-
-        In the first one pairs have the matches of measured frames only, where there are others:
-        these are less exact, and verify sides that look the same. They join the rest to what is
-        known by then, first without pairs that they alone verify. Pairs that contradict their
-        loops, or the best model if it lacks images, are tried without.
-        """
-        graph, native = search.evidence.graph, search.native
-        path, tried = output_path / "reduced.db", set[frozenset[Ids]]()
-        best: list[MappedModel] = []
-        if task.measured:
-            path.unlink(missing_ok=True)
-            copy_database(task.database_path, path)
-            keep_inliers(path, task.measured)
-            best = search.best(PairGraph.read(path, native.min_num_matches, task.depth_at))
+    def _best(
+        self,
+        task: MappingTask,
+        graph: PairGraph,
+        native: pycolmap.IncrementalPipelineOptions,
+        show: Callable[[int], None],
+    ) -> "_Found":
+        """Return what has most evidence after all moves, made of tracks that tell the poses."""
+        thin = graph.thinned()
+        search = self._search(task, thin, native, show)
         ids = {name: image_id for image_id, name in graph.names.items()}
-        pairs = (
-            sorted((ids[a], ids[b])) for (a, b), left in task.measured.items() if not len(left)
-        )
-        unmeasured = frozenset((first, second) for first, second in pairs)
-
-        def contradicted() -> frozenset[Ids]:
-            has_all = best and best[0].reconstruction.num_reg_images() == len(graph.keypoints)
-            return graph.contradicted(best[0].reconstruction) if best and not has_all else NONE
-
-        moves: tuple[Callable[[], frozenset[Ids]], ...] = (
-            lambda: unmeasured,
-            lambda: NONE,
-            lambda: contradicting_pairs(graph, native.random_seed),
-            contradicted,
-        )
-        for pairs_to_drop in moves:
-            wrong = pairs_to_drop()
-            if wrong in tried:
+        measured = {(ids[a], ids[b]): inliers for (a, b), inliers in task.measured.items()}
+        best, tried = _Found(search, thin, [], 0.0), set[frozenset[tuple[Ids, int]]]()
+        for name, move in MOVES.items():
+            start = best.models[0].reconstruction if best.models else None
+            if start and search.is_certain(start, thin):
+                break
+            reduction = move(State(thin, measured, native.random_seed, start))
+            if not reduction:
                 continue
-            tried.add(wrong)
-            reduced = graph
-            if wrong:
-                path.unlink(missing_ok=True)
-                copy_without_pairs(task.database_path, path, wrong)
-                reduced = PairGraph.read(path, native.min_num_matches, task.depth_at)
-            if best and reduced.is_explained_by(best[0].reconstruction):
+            reduced = reduction(thin)
+            pairs = frozenset((pair.ids, len(pair.matches)) for pair in reduced.pairs)
+            if pairs in tried or (start and reduced.is_explained_by(start)):
                 continue
-            start = best[0].reconstruction if best else None
-            best = max(best, search.best(reduced, start), key=search.evidence_of)
+            tried.add(pairs)
+            models = search.best(reduced, start)
+            evidence = search.evidence_of(models)
+            if not best.models or evidence > best.evidence:
+                moves = (*(best.models[0].moves if best.models else ()), name)
+                models = [replace(model, moves=moves) for model in models]
+                best = _Found(search, reduced, models, evidence)
         return best
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Models, that with most evidence first, and the pairs that made them."""
+
+    search: Search
+    graph: PairGraph
+    models: list[MappedModel]
+    evidence: float
+
+    def with_all_points(self) -> list[MappedModel]:
+        """Return the models with all points that the pairs make."""
+        if self.graph.unthinned:
+            grower = self.search.grower(self.graph.unthinned)
+            for model in self.models:
+                grower.fill(model.reconstruction, FINAL)
+        return self.models

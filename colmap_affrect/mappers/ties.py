@@ -90,7 +90,7 @@ def _tied_frames(
         for ids, pairs in ties.items()
         if len(ids) == 2 and max(agreements[pair.ids] for pair in pairs) >= MIN_SHARE
     )
-    for first, second in graph.left_out:
+    for first, second in (pair.ids for pair in graph.weak):
         if first in frame_of and second in frame_of and frame_of[first] != frame_of[second]:
             frames.add_edge(frame_of[first], frame_of[second])
     return frames

@@ -151,14 +151,15 @@ def test_parts_that_weak_pairs_tie_beside_the_strongest_do_not_hang(
     graph = PairGraph.read(task.database_path)
     between = [pair.ids for pair in graph.pairs if len(part.intersection(pair.ids)) == 1]
     weak = next(i for i in graph.names if i not in part and i not in between[0])
-    for left_out, num_doubted in ((frozenset(), 2), (frozenset({(weak, max(part))}), 0)):
-        changed = replace(graph, left_out=left_out)
+    more = replace(graph.pairs[0], ids=(weak, max(part)))
+    for of_weak, num_doubted in (((), 2), ((more,), 0)):
+        changed = replace(graph, weak=of_weak)
         monkeypatch.setattr("colmap_affrect.mappers.doubts.graph_of", lambda _, g=changed: g)
         assert len(find_doubts(model, task).images) == num_doubted
     monkeypatch.setattr("colmap_affrect.mappers.pair_graph.MAX_PAIRS_OF_IMAGE", 1)
     strongest = PairGraph.read(task.database_path)
-    assert strongest.left_out == {p.ids for p in graph.pairs} - {p.ids for p in strongest.pairs}
-    assert strongest.left_out
+    assert strongest.weak
+    assert len(strongest.weak) + len(strongest.pairs) == len(graph.pairs)
 
 
 def test_images_that_several_pairs_contradict_hang_on_none(tmp_path: Path) -> None:

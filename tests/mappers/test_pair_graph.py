@@ -1,0 +1,95 @@
+"""Graphs of verified pairs, of which mapping takes a part."""
+
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mapping_tasks import task_with_given_cameras
+
+from colmap_affrect.colmap import pycolmap
+from colmap_affrect.colmap.cameras import CameraRecord, with_shared_cameras
+from colmap_affrect.colmap.database import open_database
+from colmap_affrect.colmap.poses import model_poses
+from colmap_affrect.geometry.arrays import rows_in
+from colmap_affrect.mappers.pair_graph import NUM_MATCHES_OF_PAIR, NUM_TRACKS, PairGraph
+from colmap_affrect.mappers.sparse import SparseMapper, SparseOptions
+
+NUM_IMAGES = 5
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A verified database of five images with a camera each, and with many tracks."""
+    path = tmp_path_factory.mktemp("scene") / "database.db"
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=NUM_IMAGES, num_frames_per_rig=1, num_points3D=2500
+    )
+    pycolmap.set_random_seed(3)
+    with open_database(path) as database:
+        pycolmap.synthesize_dataset(options, database)
+    return path
+
+
+def test_a_thinned_graph_has_some_tracks_whole_and_enough_of_each_image(path: Path) -> None:
+    graph = PairGraph.read(path)
+    thin = graph.thinned()
+    assert thin.whole is graph
+    assert [pair.ids for pair in thin.pairs] == [pair.ids for pair in graph.pairs]
+    kept = defaultdict(set)
+    for pair, whole in zip(thin.pairs, graph.pairs, strict=True):
+        assert NUM_MATCHES_OF_PAIR <= len(pair.matches) < len(whole.matches) / 2
+        assert rows_in(pair.matches, whole.matches).all()
+        for image_id, features in zip(pair.ids, pair.matches.T, strict=True):
+            kept[image_id].update(features.tolist())
+    assert all(len(features) >= NUM_TRACKS for features in kept.values())
+    for pair, whole in zip(thin.pairs, graph.pairs, strict=True):
+        inside = [np.isin(whole.matches[:, i], list(kept[whole.ids[i]])) for i in (0, 1)]
+        assert (inside[0] == inside[1]).all()
+        assert inside[0].sum() == len(pair.matches)
+    assert thin.thinned() is thin
+
+
+def test_a_model_of_some_tracks_gets_the_points_of_all(path: Path, tmp_path: Path) -> None:
+    (model,) = SparseMapper(SparseOptions()).map(
+        task_with_given_cameras(path), tmp_path, 0, lambda _: None
+    )
+    assert len(model_poses(model.reconstruction)) == NUM_IMAGES
+    assert model.reconstruction.num_points3D() > 2000
+    assert model.moves == ("with all pairs",)
+
+
+def test_pairs_and_inliers_leave_both_graphs_and_what_the_mappers_see(path: Path) -> None:
+    thin = PairGraph.read(path).thinned()
+    first, second, *others = [pair.ids for pair in thin.pairs]
+    some = thin.pairs[1].matches[::2]
+    less = thin.without([first]).with_inliers({second: some})
+    assert [pair.ids for pair in less.whole.pairs] == [second, *others]
+    assert (less.whole.pairs[0].matches == some).all()
+    assert (less.pairs[0].matches == some).all()
+    counts = less.cache.correspondence_graph.num_matches_between_all_images()
+    assert {pycolmap.pair_id_to_image_pair(key): count for key, count in counts.items()} == {
+        pair.ids: len(pair.matches) for pair in less.pairs
+    }
+    none = {second: some[:0]}
+    assert second not in [pair.ids for pair in thin.with_inliers(none).pairs]
+
+
+def test_images_get_the_cameras_of_records(path: Path) -> None:
+    graph = PairGraph.read(path)
+    sizes = [(1024, 768)] * 3 + [(768, 1024)] * 2
+    records = {
+        camera.camera_id: CameraRecord((graph.names[i],), "guess", 1000.0, size=size)
+        for (i, camera), size in zip(sorted(graph.cameras.items()), sizes, strict=True)
+    }
+    shared = with_shared_cameras(records)
+    assert len(shared) == 2
+    together = graph.with_cameras(shared)
+    assert {together.cameras[i].camera_id for i in together.cameras} == shared.keys()
+    model = pycolmap.Reconstruction()
+    model.load(together.cache)
+    assert set(model.cameras) == shared.keys()
+    assert len(model.rigs) == 2
+    for image in model.images.values():
+        assert image.name in shared[image.camera_id].names
+    assert len({camera.camera_id for camera in graph.cameras.values()}) == NUM_IMAGES
