@@ -230,8 +230,6 @@ COMPARISON = (
     _path("--ground-truth-path", "MODEL",
         "folder of a COLMAP model with true poses of the photographs, in any frame"),
 )  # fmt: skip
-VIEWER = _flag("--viewer",
-    "also comparison.rrd for rerun (pip install 'colmap-affrect[viewer]')")  # fmt: skip
 
 EVALUATION = (
     _choice("protocol", ["evd", "svp", "imc", "pairs"],

@@ -159,10 +159,7 @@ def compare(options: argparse.Namespace) -> int:
     from colmap_affrect.comparison.methods import parse_methods
     from colmap_affrect.comparison.tables import summary, to_json
     from colmap_affrect.comparison.task import CompareOptions
-    from colmap_affrect.comparison.viewer import log_comparison, require_viewer
 
-    if options.viewer:
-        require_viewer()
     depth = given.depth_settings(options)
     methods = options.methods and parse_methods(options.methods, depth)
     comparison = compare(
@@ -180,9 +177,6 @@ def compare(options: argparse.Namespace) -> int:
     show(to_json(comparison) if options.json else summary(comparison))
     if not options.json:
         show(f"\npictures: {options.output_path / 'report.html'}")
-    if options.viewer:
-        path = log_comparison(comparison, options.output_path)
-        show(f"for rerun: {path}", file=sys.stderr)
     return _comparison_exit_code(comparison, options)
 
 

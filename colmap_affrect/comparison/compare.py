@@ -25,7 +25,7 @@ from colmap_affrect.comparison import DEFAULT_METHODS, LEARNED_METHODS, worker
 from colmap_affrect.comparison.methods import Method, parse_methods, without_weights
 from colmap_affrect.comparison.page import write_page
 from colmap_affrect.comparison.pose_scores import disagreeing_images, pose_scores
-from colmap_affrect.comparison.results import Comparison, MethodResult
+from colmap_affrect.comparison.results import Comparison, MethodResult, SeedResult
 from colmap_affrect.comparison.tables import to_json
 from colmap_affrect.comparison.task import CompareOptions, Layout, MethodTask
 from colmap_affrect.errors import ComparisonError, OptionError, StaleStoreError
@@ -118,7 +118,6 @@ class _Plan:
         options.resources.require_device()
         for seed in options.seeds:
             options.verification.changed(random_seed=seed)
-        mapping = MAPPERS.make(options.mapping).options
         inputs = options.inputs(image_path)
         inputs.check()
         names = inputs.names()
@@ -128,34 +127,33 @@ class _Plan:
                 "needs at least two images"
             )
         inputs.check_names(names)
-        pairs = exhaustive_pairs(names)
-        if options.pairs != PairOptions(match_list_path=options.pairs.match_list_path):
+        match_list = options.pairs.match_list_path
+        if options.pairs != PairOptions(match_list_path=match_list):
             raise OptionError("pairs: a comparison matches all pairs, or those of match_list_path")
-        if options.pairs.match_list_path:
-            pairs = list(read_pairs(Path(options.pairs.match_list_path), names))
+        pairs = read_pairs(Path(match_list), names) if match_list else exhaustive_pairs(names)
         truth = _ground_truth(options.ground_truth_path, names)
-        options = replace(options, mapping=mapping)
+        options = replace(options, mapping=MAPPERS.make(options.mapping).options)
         files = {file.file_name: file for group in lacking.values() for file in group}
         hint = install_hint(files.values()).removesuffix(", or ")
         absent = f"{', '.join(lacking)}: {hint}" if lacking else ""
-        return cls(image_path, layout, options, methods, names, pairs, truth, absent)
+        return cls(image_path, layout, options, methods, names, list(pairs), truth, absent)
 
     @cached_property
     def inputs(self) -> dict[str, Any]:
         """What all methods begin with, for the record; digests stand for the files."""
-        options = self.options
-        given = options.inputs(self.image_path)
+        given = self.options.inputs(self.image_path)
         files = {name: given.photographs.files(name) for name in self.names}
         files[""] = given.camera_files
         digests = {name: content_of(paths).digest[:NUM_DIGITS] for name, paths in files.items()}
+        masks = self.options.masks.to_mapping()
         return {
             "photographs": digests,
             "images": _fingerprint(self.names),
             "pairs": _fingerprint([f"{first}\n{second}" for first, second in self.pairs]),
-            "camera": options.cameras.to_mapping(),
-            "masks": {key: bool(path) for key, path in options.masks.to_mapping().items()},
-            "verification": _without_seed(options.verification),
-            "mapping": _without_seed(options.mapping),
+            "camera": self.options.cameras.to_mapping(),
+            "masks": {key: bool(path) for key, path in masks.items()},
+            "verification": _without_seed(self.options.verification),
+            "mapping": _without_seed(self.options.mapping),
         }
 
     def settings(self) -> dict[str, Any]:
@@ -163,14 +161,12 @@ class _Plan:
         keys = ("image_list_path", "from_database", "ground_truth_path")
         paths: dict[str, Path | None] = {key: getattr(self.options, key) for key in keys}
         return {
-            "camera": self.inputs["camera"],
+            **{key: self.inputs[key] for key in ("camera", "verification", "mapping")},
             "masks": self.options.masks.to_mapping(),
             **{key: str(path.resolve()) if path else "" for key, path in paths.items()},
             "match_list_path": self.options.pairs.match_list_path,
             "not_compared": self.not_compared,
             "preset": self.options.mapping.preset_name,
-            "verification": self.inputs["verification"],
-            "mapping": self.inputs["mapping"],
         }
 
 
@@ -275,40 +271,33 @@ def _run(task: MethodTask, progress: Progress, title: str) -> MethodResult:
         failed = failed or f"its process ended {ending}{memory}; {log_path} may say why"
     result = None if failed else task.finished()
     return result or MethodResult(
-        task.method.label, summary=task.method.summary, folder=task.shown_folder, failed=failed
+        task.method.label, summary=task.method.summary, folder=task.begun().folder, failed=failed
     )
 
 
 def _measured(results: Sequence[MethodResult], plan: _Plan) -> tuple[MethodResult, ...]:
     """Add what needs the models: scores against ground truth, and where models contradict."""
-    folder, truth, measured = plan.layout.path, plan.truth, []
-    all_poses = {
+    folder, truth = plan.layout.path, plan.truth
+    poses = {
         result.name: [
             read_poses(folder / seed.model_path) if seed.model_path else {} for seed in result.seeds
         ]
         for result in results
     }
-    for result in results:
-        poses, seeds = all_poses[result.name], result.seeds
-        first, *later = poses or [{}]
-        if truth is not None:
-            seeds = tuple(
-                replace(seed, scores=pose_scores(found, truth, plan.names))
-                for seed, found in zip(seeds, poses, strict=True)
-            )
-        unstable = {image for other in later for image in disagreeing_images(first, other)}
-        others = {
-            name: disagreeing_images(first, other[0])
-            for name, other in all_poses.items()
-            if other and name != result.name
-        }
-        contradicted = {other: images for other, images in others.items() if images}
-        measured.append(
-            replace(
-                result,
-                seeds=seeds,
-                unstable_names=tuple(sorted(unstable)),
-                disagreements=contradicted,
-            )
+    firsts = {name: of_seeds[0] for name, of_seeds in poses.items() if of_seeds}
+
+    def with_scores(seed: SeedResult, of_seed: Poses) -> SeedResult:
+        return replace(seed, scores=pose_scores(of_seed, truth, plan.names)) if truth else seed
+
+    def measured(result: MethodResult) -> MethodResult:
+        first = firsts.get(result.name, {})
+        others = {n: disagreeing_images(first, p) for n, p in firsts.items() if n != result.name}
+        unstable = {name for p in poses[result.name][1:] for name in disagreeing_images(first, p)}
+        return replace(
+            result,
+            seeds=tuple(map(with_scores, result.seeds, poses[result.name])),
+            unstable_names=tuple(sorted(unstable)),
+            disagreements={name: images for name, images in others.items() if images},
         )
-    return tuple(measured)
+
+    return tuple(map(measured, results))
