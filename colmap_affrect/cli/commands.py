@@ -298,12 +298,7 @@ def align(options: argparse.Namespace) -> None:
 def doctor(options: argparse.Namespace) -> int:
     from colmap_affrect.doctor import diagnose
 
-    diagnosis = diagnose(
-        options.path,
-        image_path=options.image_path,
-        weights_path=options.weights,
-        progress=given.progress(options),
-    )
+    diagnosis = diagnose(options.path, image_path=options.image_path, weights_path=options.weights)
     show(diagnosis.to_json() if options.json else diagnosis.summary())
     return EXIT_FAILED if diagnosis.num_errors else EXIT_OK
 

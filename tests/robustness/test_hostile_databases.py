@@ -19,7 +19,6 @@ from colmap_affrect.doctor.findings import Findings
 from colmap_affrect.doctor.folder import examine_database
 from colmap_affrect.errors import DatabaseError
 from colmap_affrect.interop.pycolmap_api import extract_features
-from colmap_affrect.progress import SILENT
 
 ROWS = [
     ("UPDATE images SET camera_id = 999 WHERE image_id = 1", "images whose camera does not exist"),
@@ -46,7 +45,7 @@ def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def num_errors(path: Path) -> int:
     """What the doctor finds in a database; the installation is left out, which takes long."""
-    findings = Findings(SILENT)
+    findings = Findings()
     examine_database(findings, path, None)
     return findings.diagnosis().num_errors
 
