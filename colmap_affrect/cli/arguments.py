@@ -245,7 +245,7 @@ EVALUATION = (
         "equal budget: match only the strongest N features of each image, warps included",
         type=int),
     _value("--protocol-options", "KEY=VALUE",
-        "settings of the protocol, e.g. magsac_threshold_px=1 (evd), max_num_iterations=1000 "
+        "settings of the protocol, e.g. threshold_px=1, max_num_iterations=1000 "
         "(svp, imc: what the code of the paper did)", **MANY),
 )  # fmt: skip
 

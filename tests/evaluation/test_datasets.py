@@ -57,17 +57,15 @@ def test_sequences_as_oxfords(tmp_path: Path) -> None:
 
 
 def test_pairs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
-    write_extreme_views(tmp_path, ["good", "imageless", "truthless", "flat", "broken", "aside"])
+    write_extreme_views(tmp_path, ["good", "imageless", "truthless", "broken", "aside"])
     (tmp_path / "2" / "imageless.png").unlink()
     (tmp_path / "h" / "truthless.txt").unlink()
-    np.savetxt(tmp_path / "h" / "flat.txt", TRUTH[[0, 0, 0]])
     (tmp_path / "1" / "broken.png").write_bytes(b"no image")
     np.savetxt(tmp_path / "h" / "aside.txt", np.array([[1, 0, 900], [0, 1, 0], [0, 0, 1]]))
     problems = {pair.name: pair.problem for pair in load_evd(tmp_path).pairs}
     assert problems["good"] == ""
     assert "imageless.png: missing" in problems["imageless"]
     assert "truthless.txt: cannot be read" in problems["truthless"]
-    assert "singular" in problems["flat"]
     assert "not a readable image" in problems["broken"]
     assert "shows no part of image 1" in problems["aside"]
 
@@ -118,14 +116,14 @@ def test_pairs_without_an_image_or_pose_are_left_out_and_named(svp: Path) -> Non
 @pytest.mark.parametrize(("file", "old", "new"), [
     ("cameras.txt", "SIMPLE_RADIAL", "ROUND"),
     ("cameras.txt", "300.0", "nan"),
-    ("images.txt", "1 0.99", "1 2.99"),
+    ("images.txt", "1 0.99", "1 one"),
 ])  # fmt: skip
 def test_unusable_cameras_and_poses_are_refused(svp: Path, file: str, old: str, new: str) -> None:
     path = svp / "0" / file
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(EvaluationError, match=r"COLMAP cannot read it|quaternion of length 3"):
+    with pytest.raises(EvaluationError, match=r"cannot be read|not finite"):
         load_svp(svp)
 
 
@@ -181,8 +179,7 @@ def test_names_with_dashes_and_pairs_of_unknown_images(imc: Path) -> None:
     ({"K": np.diag([np.nan, 300, 1])}, "K is empty or has values that are not finite"),
     ({"K": np.diag([300.0, 300, 1])}, r"K is not \[\[fx, 0, cx\]"),
     ({"T": None}, "cannot be read"),
-    ({"R": 2 * pose(0)[0]}, "R is not orthonormal"),
-    ({"R": pose(0)[0] * [1, 1, -1]}, "or a reflection"),
+    ({"R": np.eye(2)}, r"R has shape \(2, 2\)"),
 ])  # fmt: skip
 def test_unusable_calibration_is_refused(imc: Path, changes: Entry, fault: str) -> None:
     scenes.write_calibration(imc, 0, **changes)
@@ -285,7 +282,6 @@ def test_poses_and_points_in_pixels_of_both_origins(
 
 @pytest.mark.parametrize(("changes", "problem"), [
     ({"homography": [[1, 2], [3, 4]]}, r"has shape \(2, 2\)"),
-    ({"relative_pose": posed(rotation=(2 * np.eye(3)).tolist())}, "not orthonormal"),
     ({"relative_pose": posed(centre=[0, 0, 0])}, "relative_pose needs"),
     ({"correspondences": "../points.txt"}, "must be a file in the folder"),
 ])  # fmt: skip
