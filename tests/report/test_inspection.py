@@ -28,7 +28,6 @@ from colmap_affrect.geometry.affine import (
     fit_canvas,
     image_corners,
     lafs_from_keypoints,
-    project,
     rectifying_affine,
 )
 from colmap_affrect.recipes import ExtractionOptions
@@ -44,13 +43,7 @@ from colmap_affrect.rectifiers.whole_image import (
     IdentityOptions,
 )
 from colmap_affrect.report.inspection import inspect_image
-from colmap_affrect.report.regions import (
-    PALETTE,
-    circle_origin,
-    region_middle,
-    tinted,
-)
-from colmap_affrect.report.sheet import DPI, WIDTH_INCHES, printable
+from colmap_affrect.report.sheet import DPI, PALETTE, WIDTH_INCHES, printable, tinted
 from colmap_affrect.stages.one_image import ImageExtractor
 
 SIZE = (300, 200)
@@ -217,22 +210,6 @@ def test_names_of_every_kind_are_written_and_drawn(tmp_path: Path) -> None:
 
 
 # --- Parts
-
-
-@pytest.mark.parametrize(
-    "item", [affine_warp(3.0, 0.4, (30, 20, 60, 45)), homography_warp(0)], ids=["affine", "plane"]
-)
-def test_ellipse_of_a_warp_becomes_a_circle(item: Rectification) -> None:
-    assert item.region is not None
-    middle = region_middle(item.region, item.region_origin)
-    radius_px = 1e-3  # so small that the homography is affine around it
-    ellipse = circle_origin(item, middle, radius_px).T
-    center = project(item.rectified_from_image, middle[None])
-    radii = np.linalg.norm(project(item.rectified_from_image, ellipse) - center, axis=1)
-    assert radii.std() / radii.mean() < 1e-4
-    x, y = (ellipse - middle).T
-    area = np.abs(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2
-    assert area == pytest.approx(np.pi * radius_px**2, rel=0.02)  # of a polygon of 24 sides
 
 
 def test_region_is_tinted_where_it_lies(tmp_path: Path) -> None:
