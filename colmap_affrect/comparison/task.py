@@ -1,8 +1,7 @@
 """What one method of a comparison is to do, and where everything lies.
 
-``shared/`` has what all methods begin with: a database of cameras and images, and the lists of
-images and pairs. ``methods/NAME/`` is a workspace with the features and raw matches of a method,
-and ``methods/NAME/seed-K/`` has the two-view geometries and models of one seed.
+``methods/NAME/`` is a workspace with the features and raw matches of a method, and
+``methods/NAME/seed-K/`` has the two-view geometries and models of one seed.
 """
 
 from collections.abc import Sequence
@@ -19,6 +18,8 @@ from colmap_affrect.comparison.results import MethodResult
 from colmap_affrect.comparison.sift import describe_options
 from colmap_affrect.errors import StaleStoreError
 from colmap_affrect.mappers.base import MAPPERS, MapperOptions
+from colmap_affrect.pairs.base import Pair, PairList
+from colmap_affrect.pairs.lists import exhaustive_pairs, read_pairs
 from colmap_affrect.pipeline import InputOptions
 from colmap_affrect.project.outputs import remove_own
 from colmap_affrect.project.record import first_difference
@@ -26,6 +27,7 @@ from colmap_affrect.project.workspace import Workspace
 from colmap_affrect.recipes import DEFAULT_MAPPERS
 
 DEFAULT_SEEDS = (0, 1, 2)
+METHODS = "methods"  # folder of all methods
 RESULT = TypeAdapter(MethodResult)  # from and to JSON
 
 
@@ -46,25 +48,10 @@ class CompareOptions(InputOptions):
     seeds: Sequence[int] = DEFAULT_SEEDS
     ground_truth_path: Path | None = None
 
-
-class Layout:
-    """Paths below the folder of a comparison.
-
-    ``inputs`` records what ``shared`` was made from, and the options that all methods have.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.shared, self.methods = path / "shared", path / "methods"
-        self.inputs = self.shared / "inputs.json"
-        self.database = self.shared / "database.db"
-        self.cameras = self.shared / "cameras.json"
-        self.images = self.shared / "images.txt"
-        self.pairs = self.shared / "pairs.txt"
-
-    def image_names(self) -> list[str]:
-        """Read the list of images."""
-        return self.images.read_text(encoding="utf-8").splitlines()
+    def pairs_of(self, names: Sequence[str]) -> PairList | list[Pair]:
+        """Return the pairs of images to match: those of the list if there is one, else all."""
+        listed = self.pairs.match_list_path
+        return read_pairs(Path(listed), names) if listed else exhaustive_pairs(names)
 
 
 @dataclass(frozen=True)
@@ -87,18 +74,21 @@ class MethodTask:
     def mapping(self) -> MapperOptions:
         """Mapper and its options, chosen in the same way."""
         if self.method.label == SIFT_COLMAP:
-            return MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset("colmap")
+            options: MapperOptions = MAPPERS.part(DEFAULT_MAPPERS["colmap"]).Options.preset(
+                "colmap"
+            )
+            return options
         return self.all_options.mapping
-
-    @property
-    def layout(self) -> Layout:
-        """Paths of the comparison."""
-        return Layout(self.output_path)
 
     @property
     def folder(self) -> Path:
         """Folder of the results of the method."""
-        return self.layout.methods / self.method.folder_name
+        return self.output_path / METHODS / self.method.folder_name
+
+    @property
+    def failure(self) -> Path:
+        """Why its process ended before everything was done."""
+        return self.folder / "failed.txt"
 
     @property
     def result(self) -> Path:
@@ -146,3 +136,4 @@ class MethodTask:
                 "or another --output-path"
             )
         Workspace(self.folder).begin()
+        self.failure.unlink(missing_ok=True)

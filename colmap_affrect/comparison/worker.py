@@ -1,11 +1,9 @@
 """One method of a comparison, in a process of its own: ``python -m ... TASK``.
 
 Its peak memory is the method's, and when it dies the other methods go on. What was done stays:
-run again, it goes on. Progress, and how it ended, are lines of JSON on stdout; everything else
-that is printed goes to stderr.
+run again, it goes on. Progress goes to stdout; everything else that is printed goes to stderr.
 """
 
-import json
 import logging
 import os
 import pickle
@@ -13,11 +11,10 @@ import shutil
 import sys
 import time
 from base64 import b64decode
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from pydantic import TypeAdapter
 
@@ -28,21 +25,21 @@ from colmap_affrect.colmap.database import (
     open_database,
     unverified_pairs,
 )
-from colmap_affrect.colmap.database_copy import copy_database
+from colmap_affrect.colmap.database_copy import copy_database, copy_without_features
+from colmap_affrect.colmap.initial_cameras import import_images, record_cameras
 from colmap_affrect.colmap.verification import verified_pairs, verify
 from colmap_affrect.comparison.methods import SIFT_AFFINE_DSP
 from colmap_affrect.comparison.results import SeedResult
-from colmap_affrect.comparison.sift import extract_sift, match_sift, rename_images
+from colmap_affrect.comparison.sift import extract_sift, match_sift
 from colmap_affrect.comparison.task import RESULT, MethodTask
-from colmap_affrect.errors import AffrectError
+from colmap_affrect.errors import AffrectError, ComparisonError
 from colmap_affrect.mappers.base import MAPPERS, MappingTask
 from colmap_affrect.mappers.mapping import map_database
-from colmap_affrect.pairs.base import Pair, PairOptions
-from colmap_affrect.pairs.lists import read_pairs
+from colmap_affrect.pairs.base import Pair
 from colmap_affrect.parallel.executor import peak_memory_bytes
 from colmap_affrect.parallel.subprocesses import end_with
-from colmap_affrect.progress import SILENT, Advance, Progress, Stopwatch
-from colmap_affrect.project.atomic_files import replace_bytes
+from colmap_affrect.progress import SILENT, Progress, Stopwatch
+from colmap_affrect.project.atomic_files import replace_bytes, replace_text
 from colmap_affrect.project.outputs import new_results
 from colmap_affrect.project.report import ModelSummary
 from colmap_affrect.project.workspace import Workspace
@@ -51,7 +48,6 @@ from colmap_affrect.stages.context import Context
 from colmap_affrect.stages.escalate import escalate
 from colmap_affrect.stages.extract import extract
 from colmap_affrect.stages.guide import guide
-from colmap_affrect.stages.inputs import Inputs
 from colmap_affrect.stages.map import map_images
 from colmap_affrect.stages.match import match
 from colmap_affrect.stages.pairs import choose_pairs
@@ -65,28 +61,31 @@ logger = logging.getLogger("colmap_affrect")
 def main() -> None:
     """Run the method that the task asks for, unless its parent ends before."""
     end_with(int(sys.argv[2]))
-    progress = _Reported(_take_stdout())
+    shown = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what others print
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     logger.addHandler(handler)
+    task, title = pickle.loads(b64decode(sys.argv[1]))  # noqa: S301 (of our parent)
     try:
-        task: MethodTask = pickle.loads(b64decode(sys.argv[1]))  # noqa: S301 (of our parent)
         with Workspace(task.folder).locked():
-            _Method(task, progress).run()
+            _Method(task, Progress(shown, 1).titled(title)).run()
     except AffrectError as error:
-        progress.say(failed=str(error))
+        replace_text(task.failure, str(error))
     except Exception as error:
         logger.exception("failed")
-        progress.say(failed=f"{type(error).__name__}: {error}")
+        replace_text(task.failure, f"{type(error).__name__}: {error}")
 
 
 class _Method:
     """A method that is run; what is done of it is on disk after every stage."""
 
-    def __init__(self, task: MethodTask, progress: "_Reported") -> None:
+    def __init__(self, task: MethodTask, progress: Progress) -> None:
         self.task, self.progress = task, progress
         self.options, self.result = task.all_options, task.begun()
-        self.database = task.folder / "database.db"
+        self.inputs = self.options.inputs(task.image_path)
+        self.workspace = Workspace(task.folder)
+        self.database = self.workspace.database
 
     def run(self) -> None:
         """Extract, match, verify and map; what is there is kept."""
@@ -110,21 +109,22 @@ class _Method:
             self._keep(wall_s={**self.result.wall_s, name: time.perf_counter() - start})
 
     def _match_sift(self) -> None:
-        affine, layout = self.task.method.label == SIFT_AFFINE_DSP, self.task.layout
-        if not self.database.exists():
-            copy_database(layout.database, self.database)
-        ids = image_ids(layout.database)
-        rename_images(self.database, {image_id: name for name, image_id in ids.items()})
-        names = layout.image_names()
-        pairs = read_pairs(layout.pairs, names)
-        images = self.task.image_path, names, self.options.masks
+        affine, names = self.task.method.label == SIFT_AFFINE_DSP, self.inputs.names()
 
         def extract_all() -> None:
             with self.progress.stage("extract", len(names), "images") as advance:
-                self._keep(failures=extract_sift(self.database, *images, affine=affine))
+                failures = self._import_images(names)
+                taken = [name for name in names if name not in failures]
+                if not taken:
+                    raise ComparisonError(f"COLMAP cannot use any of the {len(names)} images")
+                images = self.task.image_path, taken, self.options.masks
+                failures |= extract_sift(self.database, *images, affine=affine)
+                self._keep(failures=failures)
                 advance(len(names))
 
         def match_all() -> None:
+            taken = image_ids(self.database).keys()
+            pairs = [pair for pair in self.options.pairs_of(names) if taken >= set(pair)]
             with self.progress.stage("match", len(pairs), "pairs") as advance:
                 match_sift(self.database, pairs)
                 advance(len(pairs))
@@ -132,20 +132,27 @@ class _Method:
         self._stage("extract", extract_all)
         self._stage("match", match_all)
 
+    def _import_images(self, names: Sequence[str]) -> dict[str, str]:
+        """Make the database that features go into; return the images that COLMAP does not take."""
+        source = self.options.from_database
+        initial = None if source else self.inputs.initial_cameras
+        known = read_camera_records(source.with_name("cameras.json")) if source else None
+        if source and not self.database.exists():
+            copy_without_features(source, self.database)
+        rejected = import_images(self.database, self.task.image_path, names, self.options.cameras)
+        record_cameras(self.database, self.workspace.cameras, initial, known)
+        mode = self.options.cameras.mode
+        reason = f"COLMAP cannot read it, or does not take it (camera mode {mode})"
+        return dict.fromkeys(rejected, reason)
+
     def _match_recipe(self, recipe: Recipe) -> None:
-        layout = self.task.layout
-        context = Context(Workspace(self.task.folder), self.options.resources, None, self.progress)
-        inputs = Inputs.of(
-            self.task.image_path,
-            image_list_path=layout.images,
-            from_database=layout.database,
-            masks=self.options.masks,
-        )
-        self._stage(
-            "extract",
-            lambda: self._keep(failures=extract(context, inputs, recipe).failures),
-        )
-        choose_pairs(context, PairOptions(match_list_path=str(layout.pairs.resolve())))
+        context = Context(self.workspace, self.options.resources, None, self.progress)
+
+        def extract_all() -> None:
+            self._keep(failures=extract(context, self.inputs, recipe).failures)
+
+        self._stage("extract", extract_all)
+        choose_pairs(context, self.options.pairs)
         self._stage("match", lambda: match(context))
         if self.task.method.escalates:
             verification = self.task.verification.changed(random_seed=self.options.seeds[0])
@@ -172,7 +179,7 @@ class _Method:
             database.clear_two_view_geometries()
             names = {image.image_id: image.name for image in database.read_all_images()}
         run_seed = self._map_recipe if self.task.method.recipe else self._map_sift
-        models = run_seed(seed, folder, watch)
+        models = run_seed(seed, folder, watch, self.progress.titled(f"seed {seed}, "))
         largest = models[0] if models else ModelSummary((), 0, 0.0, 0.0)
         inliers = verified_pairs(database_path, self.task.verification.min_num_inliers)
         return SeedResult(
@@ -189,24 +196,27 @@ class _Method:
             doubts=largest.doubts,
         )
 
-    def _map_recipe(self, seed: int, folder: Path, watch: Stopwatch) -> Sequence[ModelSummary]:
-        workspace = Workspace(self.task.folder).branch(folder)
-        context = Context(workspace, self.options.resources, None, self.progress.of_seed(seed))
+    def _map_recipe(
+        self, seed: int, folder: Path, watch: Stopwatch, progress: Progress
+    ) -> Sequence[ModelSummary]:
+        context = Context(self.workspace.branch(folder), self.options.resources, None, progress)
         with watch.step("verify"):
             verify_matches(context, self.task.verification.changed(random_seed=seed))
         with watch.step("map"):
             guide(context)
             mapper = MAPPERS.make(self.task.mapping.changed(random_seed=seed))
-            return map_images(context, mapper, may_share=self.options.may_share)[1]
+            return map_images(context, mapper)[1]
 
-    def _map_sift(self, seed: int, folder: Path, watch: Stopwatch) -> Sequence[ModelSummary]:
-        path, progress = folder / "database.db", self.progress.of_seed(seed)
+    def _map_sift(
+        self, seed: int, folder: Path, watch: Stopwatch, progress: Progress
+    ) -> Sequence[ModelSummary]:
+        path = folder / "database.db"
         options = self.task.verification.changed(random_seed=seed)
         num_pairs, num_images = len(unverified_pairs(path)), len(image_ids(path))
         with watch.step("verify"), progress.stage("verify", num_pairs, "pairs") as advance:
             verify(path, options, advance=advance)
-        shutil.copy(self.task.layout.cameras, folder)
-        cameras, may_share = read_camera_records(self.task.layout.cameras), self.options.may_share
+        shutil.copy(self.workspace.cameras, folder)
+        cameras, may_share = read_camera_records(self.workspace.cameras), self.options.may_share
         mapper = MAPPERS.make(self.task.mapping.changed(random_seed=seed))
         task = MappingTask(path, self.task.image_path, cameras=cameras, may_share=may_share)
         with watch.step("map"), progress.stage("map", num_images, "images") as advance:
@@ -216,35 +226,6 @@ class _Method:
 def _pair(*names: Any) -> Pair:
     first, second = sorted(names)
     return first, second
-
-
-class _Reported(Progress):
-    """Progress that is told to the parent process, in stages whose names end with the suffix."""
-
-    def __init__(self, parent: TextIO, suffix: str = "") -> None:
-        super().__init__()
-        self._parent, self._suffix = parent, suffix
-
-    @contextmanager
-    def stage(self, name: str, total: int, unit: str) -> Iterator[Advance]:
-        self.say(stage=f"{name}{self._suffix}", total=total, unit=unit)
-        yield lambda count: self.say(advance=count)
-
-    def of_seed(self, seed: int) -> "_Reported":
-        """Return the same whose stages name the seed."""
-        return _Reported(self._parent, f", seed {seed}")
-
-    def say(self, **event: Any) -> None:
-        """Write a line of JSON for the parent."""
-        self._parent.write(json.dumps(event) + "\n")
-        self._parent.flush()
-
-
-def _take_stdout() -> TextIO:
-    """Return stdout for the lines of JSON; what others print goes to stderr from now on."""
-    stream = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-    return stream
 
 
 if __name__ == "__main__":
