@@ -44,10 +44,8 @@ CORRECT_PX = 3.0
 GRID_STEP_PX = 4
 MAX_ERROR_PX, MAX_ERROR_DEG = 5.0, 5.0  # homographies and rotations of solved pairs are better
 HOMOGRAPHY_LIMITS_PX = (1.0, 2.0, 3.0, 5.0, 10.0, 20.0)  # the paper's table on EVD
-POSE_LIMITS_DEG = {"all": MAX_ERROR_DEG, "all < 10°": 10.0, "all < 20°": 20.0}
 MAX_AUC_ERROR_DEG = 10.0
 NUM_WXBS_LIMITS = 20  # the score of WxBS is the mean share within 0, 1, ... 19 px
-SHOWN_LIMITS_PX = (1, 2, 3, 5, 10, 20)
 
 
 def estimate_matrix(
@@ -208,14 +206,14 @@ def rays(camera: pycolmap.Camera, points: Points) -> Points:
 def pose_columns(results: Results, *, by_category: bool = True) -> dict[str, float]:
     """Return shares of pairs with a rotation error below 5 degrees, by category and of all.
 
-    Also below 10 and 20 degrees, and the area under the curve of the larger of rotation and
-    direction error up to 10 degrees. Categories are in the order of the results.
+    Also the area under the curve of the larger of rotation and direction error up to 10 degrees.
+    Categories are in the order of the results.
     """
-    columns = {}
-    for title in (*dict.fromkeys(r.category for r in results if by_category), *POSE_LIMITS_DEG):
-        limit, every = POSE_LIMITS_DEG.get(title, MAX_ERROR_DEG), title in POSE_LIMITS_DEG
-        below = [r.error < limit for r in results if every or r.category == title]
-        columns[title] = sum(below) / max(1, len(below))
+    groups: dict[str, list[bool]] = {}
+    for result in results if by_category else ():
+        groups.setdefault(result.category, []).append(result.error < MAX_ERROR_DEG)
+    groups["all"] = [result.error < MAX_ERROR_DEG for result in results]
+    columns = {title: sum(below) / max(1, len(below)) for title, below in groups.items()}
     largest = [max(r.error, r.details.get("direction_error_deg", math.inf)) for r in results]
     area = area_under_curve(largest, len(results), MAX_AUC_ERROR_DEG)
     return {**columns, f"pose AUC {MAX_AUC_ERROR_DEG:g}°": area}
@@ -233,7 +231,7 @@ class Correspondences:
         """Score by the fundamental matrix of OpenCV's USAC_MAGSAC, as WxBS does.
 
         ``error`` is the median of the symmetric epipolar distances of the correspondences, in px.
-        The pair is solved as far as the score of WxBS says. Details: :func:`recalls`.
+        The pair is solved as far as :func:`wxbs_score` says.
         """
         estimate = partial(estimate_matrix, cv2.findFundamentalMat, (points1, points2))
         found = []
@@ -242,9 +240,8 @@ class Correspondences:
             distances = symmetric_epipolar_distances(matrix, *np.hsplit(self.points, 2))
             found.append((float(np.median(distances)), count, other, distances))
         error, num_inliers, _, distances = median_low(found)
-        details = recalls(distances)
-        solved = details["wxbs_score"]
-        return PairScore(error, num_inliers, None, details, solved, "correspondences")
+        score = wxbs_score(distances)
+        return PairScore(error, num_inliers, solved=score, kind="correspondences")
 
 
 def symmetric_epipolar_distances(matrix: Array | None, points1: Points, points2: Points) -> Array:
@@ -262,18 +259,14 @@ def symmetric_epipolar_distances(matrix: Array | None, points1: Points, points2:
     return np.asarray(np.nan_to_num(distances, nan=np.inf))
 
 
-def recalls(distances_px: Array) -> dict[str, float]:
-    """Return the score of WxBS, and shares of (N,) distances up to single limits."""
-    shares = [float((distances_px <= limit).mean()) for limit in range(21)]
-    score = float(np.mean(shares[:NUM_WXBS_LIMITS]))
-    return {"wxbs_score": score, **{f"recall_{px}px": shares[px] for px in SHOWN_LIMITS_PX}}
+def wxbs_score(distances_px: Array) -> float:
+    """Return the mean share of (N,) distances within 0, 1, ... 19 px, as WxBS has it."""
+    return float(np.mean([(distances_px <= limit).mean() for limit in range(NUM_WXBS_LIMITS)]))
 
 
 def correspondence_columns(results: Results) -> dict[str, float]:
-    """Return the means of :func:`recalls` over results, at least one, under names for people."""
-    keys = {f"within {px} px": f"recall_{px}px" for px in SHOWN_LIMITS_PX}
-    keys = {"WxBS score": "wxbs_score", **keys}
-    return {name: fmean(result.details[key] for result in results) for name, key in keys.items()}
+    """Return the mean score of results, at least one."""
+    return {"WxBS score": fmean(result.solved for result in results)}
 
 
 def columns_by_kind(results: Results) -> dict[str, float]:
