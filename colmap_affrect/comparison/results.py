@@ -192,6 +192,7 @@ class MethodResult:
         values: dict[str, Any] = plain(self)
         if self.failed:
             return {key: values[key] for key in KEPT_OF_FAILED}
+        del values["failed"]
         return {
             **{key: self.span(key) for key in MEASURES},
             "correct": self.correct,
