@@ -205,7 +205,7 @@ def evaluate(options: argparse.Namespace) -> int:
     )
     show(evaluation.to_json() if options.json else evaluation.summary())
     if not options.json:
-        show(f"\nplots, all pairs: {options.output_path}")
+        show(f"\nplot, all pairs: {options.output_path}")
     failures = {name: why for recipe in evaluation.recipes for name, why in recipe.failures.items()}
     return _exit_code(failures, options)
 

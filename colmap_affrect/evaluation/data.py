@@ -85,7 +85,7 @@ class EvaluationPair:
 
     name: str
     images: tuple[EvaluationImage, EvaluationImage]
-    category: str = ""  # of difficulty, as tables and plots group pairs; empty for none
+    category: str = ""  # of difficulty, as tables group pairs; empty for none
     truth: Any = None  # one of :mod:`colmap_affrect.evaluation.truths`
     problem: str = ""
 
