@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -30,6 +31,10 @@ Views = Mapping[str, tuple[pycolmap.Camera, Pose]]
 PAIR_LIST_SUFFIX = "_image_pairs.txt"
 CATEGORY_DEG = 10
 CALIBRATION_PREFIX = "calibration_"
+UNREADABLE = (
+    OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, EOFError,
+)  # fmt: skip
+"""What reading a damaged text, JSON, npy or HDF5 file, or a camera of it, may raise."""
 ORIGIN_PX = {"center": 0.0, "corner": float(pixel_from_colmap(np.zeros(1))[0])}
 
 
@@ -137,7 +142,7 @@ def read_views(folder: Path) -> Views:
     """Read ``images.txt`` and ``cameras.txt``; EvaluationError when that cannot be done."""
     cameras, views = {}, {}
     posed = [line for line in _lines(folder / "images.txt") if stem(line) != line]  # not points
-    try:
+    with _reading(folder):
         for line in _lines(folder / "cameras.txt"):
             key, model, width, height, *words = line.split()
             params = finite_numbers(words, (-1,), f"{folder / 'cameras.txt'}: camera {key}")
@@ -151,8 +156,6 @@ def read_views(folder: Path) -> Views:
             turn.normalize()
             pose = turn.matrix(), np.array(translation, dtype=np.float64)
             views[stem(name)] = cameras[key], pose
-    except (ValueError, LookupError, RuntimeError) as error:
-        raise EvaluationError(f"{folder}: cannot be read ({error!r})") from error
     return views
 
 
@@ -165,11 +168,22 @@ def stem(name: str) -> str:
 
 def _lines(path: Path) -> list[str]:
     """Return the lines of a text file that are not empty or comments."""
-    try:
+    with _reading(path):
         lines = map(str.strip, path.read_text(encoding="utf-8-sig").splitlines())
         return [line for line in lines if line and not line.startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
-        raise EvaluationError(f"{path}: cannot be read ({error})") from error
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Make one EvaluationError of whatever a damaged file leads to."""
+    try:
+        yield
+    except OptionError as error:
+        raise EvaluationError(str(error)) from error
+    except UNREADABLE as error:
+        raise EvaluationError(
+            f"{path}: cannot be read ({error!r}); see docs/own-evaluation-set.md for the format"
+        ) from error
 
 
 def _imc_scene(lists_path: Path) -> Dataset:
@@ -182,11 +196,9 @@ def _imc_scene(lists_path: Path) -> Dataset:
     for limit in range(10):
         path = lists_path / f"keys-th-0.{limit}.npy"
         if limit or path.exists():
-            try:
+            with _reading(path):
                 keys = np.load(path, allow_pickle=False).ravel().tolist()
-            except (OSError, ValueError, EOFError) as error:
-                raise EvaluationError(f"{path}: cannot be read ({error})") from error
-            bins |= {_split(str(key), views): f"0.{limit}" for key in keys}
+                bins |= {_split(str(key), views): f"0.{limit}" for key in keys}
     return _posed_pairs(scene, root / "images", views, bins, lambda *names: bins[names])
 
 
@@ -202,11 +214,8 @@ def _split(key: str, known: Views) -> Names:
 
 def read_calibration(path: Path) -> tuple[pycolmap.Camera, Pose]:
     """Read the camera and cam_from_world of an image; EvaluationError says what is wrong."""
-    try:
-        with h5py.File(path) as file:
-            given = {key: np.squeeze(file[key][()]) for key in ("K", "R", "T")}
-    except (OSError, TypeError, ValueError, RuntimeError, KeyError, AttributeError) as error:
-        raise EvaluationError(f"{path}: cannot be read ({error})") from error
+    with _reading(path), h5py.File(path) as file:
+        given = {key: np.squeeze(file[key][()]) for key in ("K", "R", "T")}
     camera = pinhole(finite_numbers(given["K"], (3, 3), f"{path}: K"), f"{path}: K")
     translation = finite_numbers(given["T"], (3,), f"{path}: T")
     return camera, (finite_numbers(given["R"], (3, 3), f"{path}: R"), translation)
@@ -243,16 +252,10 @@ def load_pairs(folder: Path) -> Dataset:
     A pair whose images or truth cannot be used is returned with its problem.
     """
     path = folder / "pairs.json"
-    try:
+    with _reading(path):
         content = json.loads(path.read_text(encoding="utf-8-sig"))
         entries = [_entry(each, f"{path}: pairs[{k}]") for k, each in enumerate(content["pairs"])]
         offset_px = ORIGIN_PX[content.get("pixel_origin", "center")]
-    except OptionError as error:
-        raise EvaluationError(str(error)) from error
-    except (OSError, ValueError, RecursionError, LookupError, TypeError) as error:
-        raise EvaluationError(
-            f"{path}: cannot be read ({error!r}); its format is in docs/own-evaluation-set.md"
-        ) from error
     names = [entry.name for entry in entries]
     if twice := [name for name in names if names.count(name) > 1]:
         raise EvaluationError(f"{path}: two pairs are called '{twice[0]}'; give them names")
@@ -298,10 +301,8 @@ def _truth(
     if isinstance(numbers, str):
         if leads_outside(numbers):
             raise EvaluationError(f"{numbers}: must be a file in the folder of the pairs")
-        try:
+        with _reading(folder / numbers):
             numbers = np.loadtxt(folder / numbers, ndmin=2)
-        except (OSError, ValueError) as error:
-            raise EvaluationError(f"{folder / numbers}: cannot be read ({error})") from error
     if entry.homography is not None:
         center = np.array([[1.0, 0.0, offset_px], [0.0, 1.0, offset_px], [0.0, 0.0, 1.0]])
         matrix = center @ finite_numbers(numbers, (3, 3), f"{name}: homography")
