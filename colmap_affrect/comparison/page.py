@@ -33,12 +33,7 @@ FILTERS = {
     "none": "Registered by none",
 }
 
-KINDS = {
-    "shared": "registered by other methods, too",
-    "only": "registered by this method only",
-    "uncertain": "doubtful, or contradicts other seeds or methods",
-    "wrong": "at a wrong place",
-}
+KINDS = {"shared": "registered", "uncertain": "doubtful", "wrong": "at a wrong place"}
 """How cameras are drawn; each has a colour of this name."""
 
 
@@ -106,16 +101,12 @@ class Mark(Node):
     """What one method does with one photograph."""
 
     column: Column
-    # doubtful, or in a pose that contradicts those of other seeds or of most other methods
-    is_uncertain: bool
-    is_only: bool  # usually registered by no other method
+    is_uncertain: bool  # doubtful, and ground truth does not say that it is right
 
     @property
     def kind(self) -> str:
         """One of ``KINDS``."""
-        if self.is_wrong:
-            return "wrong"
-        return "uncertain" if self.is_uncertain else "only" if self.is_only else "shared"
+        return "wrong" if self.is_wrong else "uncertain" if self.is_uncertain else "shared"
 
 
 @dataclass(frozen=True)
@@ -130,9 +121,11 @@ class Card:
 
 def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
     """Return the contact sheet."""
-    cards = []
+    cards, with_truth = [], comparison.names_with_truth
     for number, name in enumerate(comparison.image_names, 1):
-        marks = tuple(_mark(column, number, name, comparison) for column in columns)
+        marks = tuple(
+            _mark(column, number, name, has_truth=name in with_truth) for column in columns
+        )
         tests = {
             "all": True,
             "differ": len({name in c.method.usually_registered for c in columns}) > 1,
@@ -146,46 +139,23 @@ def cards_of(columns: Sequence[Column], comparison: Comparison) -> list[Card]:
     return cards
 
 
-def _mark(column: Column, number: int, name: str, comparison: Comparison) -> Mark:
-    """Mark what a method does with a photograph.
-
-    Where ground truth does not know its pose it is uncertain in a method that doubts it, and in one
-    that contradicts most others that register it, not in all that one contradicts.
-    """
+def _mark(column: Column, number: int, name: str, *, has_truth: bool) -> Mark:
     method, seeds = column.method, column.method.seeds
-    has_truth, finished = name in comparison.names_with_truth, comparison.finished
     registering = [seed for seed in seeds if name in seed.registered_names]
     correct = [s for s in registering if s.scores is not None and name in s.scores.correct_names]
+    state, text = "always", f"{column.name}: registered"
     if not registering:
-        state, text = "never", "not registered"
-    elif len(registering) == len(seeds):
-        state, text = "always", "registered"
-    else:
-        state, text = "sometimes", f"registered with {len(registering)} of {len(seeds)} seeds"
+        state, text = "never", f"{column.name}: not registered"
+    elif len(registering) < len(seeds):
+        state = "sometimes"
+        text += f" with {len(registering)} of {len(seeds)} seeds"
     is_wrong = has_truth and len(correct) < len(registering)
     if is_wrong:
         text += f", correctly with {len(correct)}" if correct else ", wrongly"
     elif correct:
         text += ", correctly"
-    others = [other for other, names in method.disagreements.items() if name in names]
-    doubt, is_unstable = method.usually_doubted.get(name), name in method.unstable_names
-    if not has_truth or is_wrong:
-        if doubt:
-            text += f", doubtful: {doubt}"
-        if is_unstable:
-            text += ", in poses that contradict each other from seed to seed"
-        if others:
-            text += f", in a pose that contradicts that of {' and '.join(others)}"
-    num_others = sum(name in other.seeds[0].registered_names for other in finished) - 1
-    is_odd = 2 * len(others) > max(0, num_others)
-    is_only = [name in other.usually_registered for other in finished].count(True) == 1
-    return Mark(
-        number,
-        name,
-        state,
-        is_wrong,
-        f"{column.name}: {text}",
-        column=column,
-        is_uncertain=not has_truth and (bool(doubt) or is_unstable or is_odd),
-        is_only=is_only and name in method.usually_registered and len(finished) > 1,
-    )
+    doubt = method.usually_doubted.get(name)
+    if doubt and (is_wrong or not has_truth):
+        text += f", doubtful: {doubt}"
+    is_uncertain = bool(doubt) and not has_truth
+    return Mark(number, name, state, is_wrong, text, column=column, is_uncertain=is_uncertain)

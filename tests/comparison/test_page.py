@@ -129,20 +129,6 @@ def test_marks_say_what_each_method_does_with_a_photograph(page: Page) -> None:
     assert {group: groups.count(group) for group in set(groups)} == expected
 
 
-def test_of_methods_that_contradict_each_other_the_odd_one_is_marked(
-    comparison: Comparison,
-) -> None:
-    name, (sift, _, default) = NAMES[0], comparison.methods
-    odd = replace(default, name="odd", disagreements={"sift": (name,), "default": (name,)})
-    others = [replace(each, disagreements={"odd": (name,)}) for each in (sift, default)]
-
-    assert uncertain(comparison, odd, *others) == []  # ground truth calls all of them right
-    odd, *others = map(without_truth, (odd, *others))
-    assert uncertain(comparison, odd, *others) == [(name, "odd")]
-    two = replace(odd, disagreements={"sift": (name,)}), others[0]
-    assert sorted(uncertain(comparison, *two)) == [(name, "odd"), (name, "sift")]
-
-
 def test_photographs_that_their_method_doubts_are_marked(comparison: Comparison) -> None:
     method = without_truth(comparison.methods[2])
     loose = [replace(seed, doubtful={NAMES[1]: "any focal length fits"}) for seed in method.seeds]
