@@ -24,12 +24,21 @@ class Finding:
     advice: str
 
 
-@dataclass(frozen=True)
+@dataclass
 class Diagnosis:
-    """The result of an examination: what was found, worst first, and what was looked at."""
+    """The result of an examination: what was found, and what was looked at."""
 
-    findings: tuple[Finding, ...]
-    checked: tuple[str, ...]
+    checked: list[str] = field(default_factory=list)
+    _found: list[Finding] = field(default_factory=list, init=False)
+
+    def add(self, severity: Severity, where: Path | str, what: str, advice: str) -> None:
+        """Add what is wrong with a file, folder or part of the installation, and what helps."""
+        self._found.append(Finding(severity, str(where), what, advice))
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What was found, the worst first."""
+        return tuple(sorted(self._found, key=lambda found: SEVERITIES.index(found.severity)))
 
     @property
     def num_errors(self) -> int:
@@ -37,7 +46,7 @@ class Diagnosis:
         return self._count("error")
 
     def _count(self, severity: Severity) -> int:
-        return sum(finding.severity == severity for finding in self.findings)
+        return sum(finding.severity == severity for finding in self._found)
 
     def summary(self) -> str:
         """Return text for people."""
@@ -55,23 +64,6 @@ class Diagnosis:
             "num_errors": self.num_errors,
             "num_warnings": self._count("warning"),
             "findings": [dataclasses.asdict(finding) for finding in self.findings],
-            "checked": list(self.checked),
+            "checked": self.checked,
         }
         return json.dumps(content, indent=2, ensure_ascii=False)
-
-
-@dataclass
-class Findings:
-    """Collects what is found and what was examined."""
-
-    checked: list[str] = field(default_factory=list)
-    found: list[Finding] = field(default_factory=list)
-
-    def add(self, severity: Severity, where: Path | str, what: str, advice: str) -> None:
-        """Add what is wrong with a file, folder or part of the installation, and what helps."""
-        self.found.append(Finding(severity, str(where), what, advice))
-
-    def diagnosis(self) -> Diagnosis:
-        """Return what was found, the worst first."""
-        ordered = sorted(self.found, key=lambda finding: SEVERITIES.index(finding.severity))
-        return Diagnosis(tuple(ordered), tuple(self.checked))

@@ -13,7 +13,7 @@ from colmap_affrect.colmap.checks import CHECKS, check_database, check_image_fil
 from colmap_affrect.colmap.database import geometry_digest
 from colmap_affrect.colmap.database_copy import copy_as_it_is, newest_schema_version, refuse_newer
 from colmap_affrect.colmap.model_files import SUMMARY, registered_names
-from colmap_affrect.doctor.findings import Findings
+from colmap_affrect.doctor.findings import Diagnosis
 from colmap_affrect.errors import AffrectError, DatabaseError, OptionError, WorkspaceError, such_as
 from colmap_affrect.mappers.summaries import model_folders, read_summary
 from colmap_affrect.pairs.lists import read_pairs
@@ -30,7 +30,7 @@ SAME_RUN = "give the same 'run' or 'extract' again (run.log has the command)"
 
 
 def examine_database(
-    findings: Findings, path: Path, image_path: Path | None, advice: str = ""
+    diagnosis: Diagnosis, path: Path, image_path: Path | None, advice: str = ""
 ) -> bool:
     """Examine a COLMAP database, and the sizes of its photographs if their folder is given.
 
@@ -42,30 +42,30 @@ def examine_database(
         tables, problems = check_database(path)
     except DatabaseError as error:
         recover = "'sqlite3 FILE .recover' may save a part of a damaged database"
-        findings.add("error", path, _without_path(path, error), advice or recover)
+        diagnosis.add("error", path, _without_path(path, error), advice or recover)
         return False
     quoted = shlex.quote(str(path))
     if version < newest:
         copy = shlex.quote(str(path.with_suffix(".old.db")))
-        findings.add(
+        diagnosis.add(
             "note", path,
             f"has the tables of an older COLMAP (schema {version}, now {newest}); COLMAP 4 and "
             "pycolmap change them as soon as they open it, and an older COLMAP cannot read it "
             "any more",
             f"keep a copy: cp {quoted} {copy}",
         )  # fmt: skip
-    findings.checked.append(f"{path}: {tables.summary()}")
+    diagnosis.checked.append(f"{path}: {tables.summary()}")
     if image_path is not None:
         problems |= check_image_files(tables, image_path)
-        findings.checked.append(f"{image_path}: sizes of the photographs")
+        diagnosis.checked.append(f"{image_path}: sizes of the photographs")
     for kind in sorted(problems, key=list(CHECKS).index):
         severity, what, usual = CHECKS[kind]
         items = f" ({len(problems[kind])}): {such_as(problems[kind], MAX_ITEMS_SHOWN)}"
-        findings.add(severity, path, f"{what}{items}", advice or usual.format(path=quoted))
+        diagnosis.add(severity, path, f"{what}{items}", advice or usual.format(path=quoted))
     return True
 
 
-def examine_folder(findings: Findings, path: Path, image_path: Path | None) -> None:
+def examine_folder(diagnosis: Diagnosis, path: Path, image_path: Path | None) -> None:
     """Examine an output folder, unless somebody is working in it."""
     workspace = Workspace(path)
     if path.suffix == ".affrect" and not workspace.database.exists():
@@ -74,14 +74,14 @@ def examine_folder(findings: Findings, path: Path, image_path: Path | None) -> N
         if not workspace.database.exists():
             what = "neither an output folder of colmap-affrect nor one with a database.db"
             advice = "give the --output-path of a run, or a COLMAP database"
-            findings.add("error", path, what, advice)
+            diagnosis.add("error", path, what, advice)
             return
         what = "is no output folder of colmap-affrect (it has no config.toml)"
-        findings.add(
+        diagnosis.add(
             "note", path, f"{what}; only its database is checked",
             "use another --output-path for colmap-affrect",
         )  # fmt: skip
-        examine_database(findings, workspace.database, image_path)
+        examine_database(diagnosis, workspace.database, image_path)
         return
     with ExitStack() as stack:
         try:
@@ -90,31 +90,31 @@ def examine_folder(findings: Findings, path: Path, image_path: Path | None) -> N
             in_use = isinstance(error.__cause__, TimeoutError)
             writable = "make it writable before running anything in it"
             advice = "run doctor again when it is done" if in_use else writable
-            findings.add("warning", path, _without_path(path, error), advice)
+            diagnosis.add("warning", path, _without_path(path, error), advice)
             if in_use:
                 return
-        _Examination(findings, workspace).examine(image_path)
+        _Examination(diagnosis, workspace).examine(image_path)
 
 
 class _Examination:
     """Examines an output folder that nobody else is working in."""
 
-    def __init__(self, findings: Findings, workspace: Workspace) -> None:
-        self.findings, self.workspace = findings, workspace
+    def __init__(self, diagnosis: Diagnosis, workspace: Workspace) -> None:
+        self.diagnosis, self.workspace = diagnosis, workspace
         self.path, self.quoted = workspace.path, shlex.quote(str(workspace.path))
 
     def examine(self, image_path: Path | None) -> None:
         """Read every file as runs do."""
         for left in sorted(p for kind in LEFTOVERS for p in self.path.glob(kind)):
             remove = f"remove it: rm -r {shlex.quote(str(left))}"
-            self.findings.add("note", left, "left behind by a run that was killed", remove)
+            self.diagnosis.add("note", left, "left behind by a run that was killed", remove)
         database, context = self.workspace.database, Context(self.workspace)
         record = self._read(self.workspace.config, self._record)
         done = self._stages(record, context) if record is not None else []
         self._read(self.workspace.cameras, lambda: read_camera_records(self.workspace.cameras))
         for store in (context.features, context.matches, context.guided) if done else ():
             self._read(store.path, store.check_all)
-            self.findings.checked.append(f"{store.path}: all values")
+            self.diagnosis.checked.append(f"{store.path}: all values")
         if "extract" in done:
             self._require(self.workspace.features)
             names = self._read(self.path, lambda: list(context.inputs.names()))
@@ -127,7 +127,7 @@ class _Examination:
         if database.exists():
             remake = f"remove it and {SAME_RUN}: it is made anew"
             advice = remake if done and not self.workspace.users_database else ""
-            is_usable = examine_database(self.findings, database, image_path, advice)
+            is_usable = examine_database(self.diagnosis, database, image_path, advice)
             if is_usable and "map" in done:
                 self._models()
 
@@ -138,12 +138,12 @@ class _Examination:
         except AffrectError as error:
             what, _, usual = _without_path(path, error).partition("; ")
             restore = f"restore it, or use another --output-path than {self.quoted}"
-            self.findings.add("error", path, what, advice or usual or restore)
+            self.diagnosis.add("error", path, what, advice or usual or restore)
             return None
 
     def _require(self, path: Path) -> bool:
         if not path.exists():
-            self.findings.add("error", path, "is missing", f"{SAME_RUN} to make it anew")
+            self.diagnosis.add("error", path, "is missing", f"{SAME_RUN} to make it anew")
         return path.exists()
 
     def _record(self) -> Mapping[str, Any]:
@@ -162,7 +162,7 @@ class _Examination:
         optional = {"guide"}  # map does that when needed
         if "extract" in done and not context.extraction.escalation:
             optional.add("escalate")
-        self.findings.checked.append(
+        self.diagnosis.checked.append(
             f"{self.path}: stages on record: {', '.join(done) or 'none'}; recipe "
             f"{record.get('recipe', '')}"
         )
@@ -170,7 +170,7 @@ class _Examination:
         if following and not self.workspace.users_database:
             command = f"run 'colmap-affrect {following[0]} --output-path {self.quoted}', or "
             advice = f"{command if done else ''}{SAME_RUN}"
-            self.findings.add("note", self.path, f"not run yet: {', '.join(following)}", advice)
+            self.diagnosis.add("note", self.path, f"not run yet: {', '.join(following)}", advice)
         return done
 
     def _models(self) -> None:
@@ -181,24 +181,24 @@ class _Examination:
         )
         inputs = self._read(sparse, self.workspace.models_made_from)
         if inputs == "":
-            self.findings.add("warning", sparse, "mapping did not finish", f"{remake}'")
+            self.diagnosis.add("warning", sparse, "mapping did not finish", f"{remake}'")
         sizes = [self._read(f, partial(self._num_images, f)) for f in model_folders(sparse)]
         listed = ", ".join(str(size) for size in sizes if size) or "no"
-        self.findings.checked.append(f"{sparse}: models of {listed} images")
+        self.diagnosis.checked.append(f"{sparse}: models of {listed} images")
         if inputs:
             with TemporaryDirectory() as temporary:  # COLMAP would change the original
                 copy = Path(temporary) / "database.db"
                 copy_as_it_is(self.workspace.database, copy)
                 if not inputs.startswith(geometry_digest(copy)):
                     what = "the models were made before pairs were verified anew"
-                    self.findings.add("warning", sparse, what, f"{remake}'")
+                    self.diagnosis.add("warning", sparse, what, f"{remake}'")
 
     def _num_images(self, folder: Path) -> int:
         """Return how many images a model has; StoreError if it is damaged."""
         if not read_summary(folder):
             remake = f"run 'colmap-affrect map --output-path {self.quoted} --overwrite'"
             what = "is missing or damaged: how the model came about is not known any more"
-            self.findings.add("error", folder / SUMMARY, what, remake)
+            self.diagnosis.add("error", folder / SUMMARY, what, remake)
         return len(registered_names(folder))
 
 
